@@ -1,0 +1,1 @@
+"""Floor 1: camera models, the stereo rig, rectification."""

@@ -1,0 +1,45 @@
+"""Array aliases, shape checks and the typed compile decorator that every kernel uses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[F], F]:
+    """Compile a function with Numba, cached on disk so that a second run starts at once.
+
+    `fastmath` lets the compiler reorder sums; never set it where NaN marks the invalid.
+    """
+    decorate: Any = numba.njit(cache=True, parallel=parallel, fastmath=fastmath, nogil=True)
+    return cast(Callable[[F], F], decorate)
+
+
+def expect_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...]) -> None:
+    """Raise `ValueError` unless `array.shape` matches `shape`, where None matches any length."""
+    fits = array.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        wanted = "x".join("N" if n is None else str(n) for n in shape)
+        raise ValueError(f"{name} has shape {array.shape}, expected {wanted}")
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """The same data as a read-only view: what a frozen dataclass hands out can't be written through."""
+    view = array.view()
+    view.flags.writeable = False
+    return view

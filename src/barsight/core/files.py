@@ -1,0 +1,86 @@
+"""Outputs that are written whole or not at all: a temporary name beside the target, then a rename."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from barsight.core.errors import OutputError
+
+
+@contextlib.contextmanager
+def atomic_path(target: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `target`; on success it becomes `target`, on any failure it is gone."""
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with translated_os_errors(target):
+            yield temporary
+            temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def atomic_directory(target: Path, *, replace: bool = False) -> Iterator[Path]:
+    """Yield a fresh folder beside `target`; its files become `target`'s on success, are gone on failure.
+
+    Where `target` exists, `replace` moves the new files over its own of the same names and leaves others
+    alone; without it an existing non-empty `target` is an `OutputError`.
+    """
+    target = target.absolute()
+    if target.exists() and not target.is_dir():
+        raise OutputError(f"{target}: is a file; name a folder")
+    if not replace and target.is_dir() and any(target.iterdir()):
+        raise OutputError(f"{target}: exists and is not empty; name another folder or remove it")
+    with translated_os_errors(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
+    try:
+        with translated_os_errors(target):
+            staging.chmod(0o777 & ~_umask())
+            yield staging
+            if target.is_dir():
+                for path in sorted(staging.iterdir()):
+                    _replace(path, target / path.name)
+            else:
+                staging.replace(target)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def translated_os_errors(target: Path) -> Iterator[None]:
+    """Turn the operating system's refusals (full disk, no permission) into one `OutputError` line."""
+    try:
+        yield
+    except OSError as error:
+        advice = {
+            errno.ENOSPC: "the disk is full; free some space or name another folder",
+            errno.EDQUOT: "the disk quota is used up; free some space or name another folder",
+            errno.EACCES: "no permission to write there; name another folder",
+            errno.EPERM: "no permission to write there; name another folder",
+            errno.EROFS: "the file system is read-only; name another folder",
+            errno.ENOTDIR: "a part of the path is a file; name another folder",
+            errno.EEXIST: "exists already; name another",
+            errno.EFBIG: "the file grew past the size limit; free some space or raise the limit",
+        }.get(error.errno or 0)
+        if advice is None:
+            raise
+        raise OutputError(f"{target}: {advice}") from error
+
+
+def _replace(source: Path, target: Path) -> None:
+    if target.is_dir() and not target.is_symlink():
+        shutil.rmtree(target)
+    source.replace(target)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

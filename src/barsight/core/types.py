@@ -1,0 +1,245 @@
+"""What travels between the stages: frozen records whose fields say shape, unit and frame.
+
+The frames are `yard` (or `world`), `body` (the IMU), `cam0`, `cam1` (raw cameras), `rect0` (the left camera
+after rectification) and `crane`; docs/conventions.md defines them. No match and no depth are NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, expect_shape
+from barsight.core.pose import Pose
+
+
+@dataclass(frozen=True, eq=False)
+class StereoFrame:
+    """One raw pair. left, right: (H, W) uint8, cam0 and cam1. stamp_ns: cam0's clock."""
+
+    stamp_ns: int
+    left: UInt8
+    right: UInt8
+
+    def __post_init__(self) -> None:
+        expect_shape("left", self.left, (None, None))
+        expect_shape("right", self.right, (None, None))
+
+
+@dataclass(frozen=True)
+class RefusedFrame:
+    """A frame that can't be used, and why. The run goes on without it."""
+
+    stamp_ns: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples:
+    """stamp_ns: (N,) int64 increasing. gyro_radps, accel_mps2: (N, 3) in `body`."""
+
+    stamp_ns: Int64
+    gyro_radps: Float64
+    accel_mps2: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class CraneSamples:
+    """The encoders' place of the crane's reference point.
+
+    stamp_ns: (N,) int64 increasing. position_m: (N, 3) in `yard`: bridge x, trolley y, hoist z.
+    crane_to_body_m: (3,) the body's origin minus the crane point, yard axes.
+    yard_from_body_nominal: (3, 3) attitude of the body as mounted. position_std_m: one reading's sigma.
+    """
+
+    stamp_ns: Int64
+    position_m: Float64
+    crane_to_body_m: Float64
+    yard_from_body_nominal: Float64
+    position_std_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class LaserProfile:
+    """A reference contour along X. x_m, y_m, z_m: (N,) in `yard`, x increasing. range_std_m: its sigma."""
+
+    profile: int
+    x_m: Float64
+    y_m: Float64
+    z_m: Float64
+    range_std_m: float
+
+
+@dataclass(frozen=True)
+class RectifiedCamera:
+    """The geometry of a rectified pair: depth = focal_px * baseline_m / (disparity + doffs_px).
+
+    focal_px is common to both; (cx_px, cy_px) is the left principal point; doffs_px = cx_right - cx_left
+    [Middlebury 2014]. width, height in pixels.
+    """
+
+    focal_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    doffs_px: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedPair:
+    """left, right: (H, W) uint8 with matches on the same row, x_right = x_left - disparity.
+
+    left_valid, right_valid: (H, W) bool, False where the raw image has no such pixel.
+    """
+
+    stamp_ns: int
+    left: UInt8
+    right: UInt8
+    left_valid: Bool
+    right_valid: Bool
+    camera: RectifiedCamera
+
+    def __post_init__(self) -> None:
+        shape = (self.camera.height, self.camera.width)
+        for name in ("left", "right", "left_valid", "right_valid"):
+            expect_shape(name, getattr(self, name), shape)
+
+
+@dataclass(frozen=True)
+class DisparityRange:
+    """Candidates lowest_px <= d < highest_px, whole pixels."""
+
+    lowest_px: int
+    highest_px: int
+
+    def __post_init__(self) -> None:
+        if self.highest_px <= self.lowest_px:
+            raise ValueError(f"the disparity range {self.lowest_px}:{self.highest_px} is empty")
+
+    @property
+    def count(self) -> int:
+        """The number of whole candidates."""
+        return self.highest_px - self.lowest_px
+
+
+@dataclass(frozen=True, eq=False)
+class Disparity:
+    """disparity_px, sigma_px (one standard deviation): (H, W) float32, NaN where there is no match."""
+
+    disparity_px: Float32
+    sigma_px: Float32
+
+    def __post_init__(self) -> None:
+        expect_shape("disparity_px", self.disparity_px, (None, None))
+        expect_shape("sigma_px", self.sigma_px, self.disparity_px.shape)
+
+    @property
+    def coverage(self) -> float:
+        """The share of pixels that have a disparity."""
+        return float(np.isfinite(self.disparity_px).mean()) if self.disparity_px.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPoints:
+    """The points of one view, in `rect0`.
+
+    xyz_m: (N, 3) float32. range_sigma_m: (N,) float32, noise along the viewing ray (averages out over views).
+    shared_sigma_m: (N,) float32, the part that the calibration causes (the same in every view).
+    intensity: (N,) uint8.
+    """
+
+    stamp_ns: int
+    xyz_m: Float32
+    range_sigma_m: Float32
+    shared_sigma_m: Float32
+    intensity: UInt8
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrame:
+    """Where one frame was taken. reference_from_body: target is `yard` or `world`.
+
+    covariance: (6, 6), rotation (rad) then translation (m), both in the reference frame's axes.
+    """
+
+    stamp_ns: int
+    reference_from_body: Pose
+    covariance: Float64
+
+    def __post_init__(self) -> None:
+        expect_shape("covariance", self.covariance, (6, 6))
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of the frames that could be placed, in time's order, and the refused ones.
+
+    reference: `yard` or `world`. sensors: which were used. warnings: sentences for the result.
+    """
+
+    reference: str
+    frames: tuple[PosedFrame, ...]
+    refused: tuple[RefusedFrame, ...]
+    sensors: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def stamp_ns(self) -> Int64:
+        """(N,) the frames' stamps."""
+        return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
+
+    @property
+    def positions_m(self) -> Float64:
+        """(N, 3) the body's places in the reference frame."""
+        places = [frame.reference_from_body.translation for frame in self.frames]
+        return np.array(places, dtype=np.float64).reshape(-1, 3)
+
+    @property
+    def length_m(self) -> float:
+        """The way along the frames."""
+        return float(np.linalg.norm(np.diff(self.positions_m, axis=0), axis=1).sum())
+
+
+class Source:
+    """Codes of where a cell's height comes from (`height.tif` band `source`, `contour.csv`)."""
+
+    UNKNOWN = 0
+    VISION = 1
+    LASER = 2
+    FILLED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """Heights along X at one y. x_m, y_m, z_m, sigma_m: (N,), NaN where unknown. source: (N,) `Source`."""
+
+    profile: int
+    x_m: Float64
+    y_m: Float64
+    z_m: Float64
+    sigma_m: Float64
+    source: UInt8
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How a contour agrees with a reference profile; all in mm but for the coverage.
+
+    samples: compared points. coverage_pct: share of the reference's points that vision measured.
+    bias is vision minus reference; loa_low, loa_high are Bland-Altman's 95 % limits of agreement.
+    """
+
+    profile: int
+    y_m: float
+    samples: int
+    coverage_pct: float
+    bias_mm: float
+    mae_mm: float
+    rmse_mm: float
+    p95_mm: float
+    max_mm: float
+    loa_low_mm: float
+    loa_high_mm: float
