@@ -1,0 +1,15 @@
+"""The one shape that every stereo method has."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+
+
+class StereoMethod(Protocol):
+    """From a rectified pair to the left image's disparity. A method keeps no state between calls."""
+
+    def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        """Match within `candidates`; NaN where there is no match or either image is invalid."""
+        ...

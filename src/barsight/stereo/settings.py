@@ -1,0 +1,39 @@
+"""The choice of a stereo method and its settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from barsight.core.errors import ConfigError
+from barsight.stereo.method import StereoMethod
+from barsight.stereo.sgbm import Sgbm, SgbmSettings
+
+
+@dataclass(frozen=True)
+class StereoSettings:
+    """Dense stereo."""
+
+    method: Literal["sgbm"] = "sgbm"
+    """Which method matches the pairs."""
+    lowest_disparity_px: int | None = None
+    """First candidate; found from the images when not given."""
+    highest_disparity_px: int | None = None
+    """End of the candidates; found from the images when not given."""
+    calibration_sigma_px: float = 0.05
+    """Disparity error that the calibration may cause everywhere alike (1 sigma)."""
+    max_depth_m: float = 40.0
+    """Points further away are left out."""
+    sgbm: SgbmSettings = field(default_factory=SgbmSettings)
+
+    def __post_init__(self) -> None:
+        low, high = self.lowest_disparity_px, self.highest_disparity_px
+        if low is not None and high is not None and high <= low:
+            raise ConfigError(f"the disparity range {low}:{high} is empty")
+        if self.calibration_sigma_px < 0 or self.max_depth_m <= 0:
+            raise ConfigError("calibration_sigma_px can't be negative, max_depth_m must be positive")
+
+
+def make_method(settings: StereoSettings) -> StereoMethod:
+    """The method that the settings name."""
+    return Sgbm(settings.sgbm)

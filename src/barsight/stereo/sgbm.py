@@ -1,0 +1,115 @@
+"""OpenCV's semi-global block matching [Hirschmueller 2008] as a stereo method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.errors import ConfigError
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+
+_MODES = {
+    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    "5path": cv2.STEREO_SGBM_MODE_SGBM,
+    "8path": cv2.STEREO_SGBM_MODE_HH,
+    "hh4": cv2.STEREO_SGBM_MODE_HH4,
+}
+_SUBPIXEL_STEPS = 16
+
+
+@dataclass(frozen=True)
+class SgbmSettings:
+    """OpenCV's SGBM."""
+
+    mode: Literal["3way", "5path", "8path", "hh4"] = "hh4"
+    """Paths along which costs are summed; 8path is the slowest and needs the whole cost volume."""
+    block_px: int = 5
+    """Side of the matching block, odd."""
+    uniqueness_pct: int = 5
+    """How much better than the second best the winner must be."""
+    speckle_px: int = 100
+    """Connected patches smaller than this are dropped."""
+    subpixel_sigma_px: float = 0.21
+    """The part of the error that image noise doesn't explain: pixel locking and smoothing."""
+
+    def __post_init__(self) -> None:
+        if self.block_px < 1 or self.block_px % 2 == 0:
+            raise ConfigError(f"block_px must be odd and positive, not {self.block_px}")
+        if not 0 <= self.uniqueness_pct <= 100:
+            raise ConfigError(f"uniqueness_pct must lie in 0...100, not {self.uniqueness_pct}")
+        if self.speckle_px < 0 or self.subpixel_sigma_px < 0:
+            raise ConfigError("speckle_px and subpixel_sigma_px can't be negative")
+
+
+@dataclass(frozen=True)
+class Sgbm:
+    """`StereoMethod` over OpenCV's SGBM; sigma from the measured noise and the gradients in the block."""
+
+    settings: SgbmSettings
+
+    def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        """See `StereoMethod`. Rows of 16 candidates at a time, as OpenCV wants."""
+        settings = self.settings
+        block = settings.block_px
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=candidates.lowest_px,
+            numDisparities=-(-candidates.count // 16) * 16,
+            blockSize=block,
+            P1=8 * block * block,
+            P2=32 * block * block,
+            disp12MaxDiff=1,
+            preFilterCap=31,
+            uniquenessRatio=settings.uniqueness_pct,
+            speckleWindowSize=settings.speckle_px,
+            speckleRange=2,
+            mode=_MODES[settings.mode],
+        )
+        left, right = _padded(pair.left, candidates), _padded(pair.right, candidates)
+        pad = left.shape[1] - pair.left.shape[1]
+        fixed_point = matcher.compute(left, right)[:, pad:]
+        disparity = fixed_point.astype(np.float32) / _SUBPIXEL_STEPS
+        disparity[fixed_point < candidates.lowest_px * _SUBPIXEL_STEPS] = np.nan
+        disparity[~pair.left_valid] = np.nan
+        disparity[~_lands_on_valid(disparity, pair)] = np.nan
+        sigma = np.hypot(_noise_sigma(pair, block), np.float32(settings.subpixel_sigma_px))
+        sigma[np.isnan(disparity)] = np.nan
+        return Disparity(disparity, sigma.astype(np.float32))
+
+
+def _padded(image: UInt8, candidates: DisparityRange) -> UInt8:
+    """OpenCV leaves the first `highest` columns empty; padding on the left gives them back."""
+    pad = max(candidates.highest_px, 0)
+    padded: UInt8 = cv2.copyMakeBorder(image, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
+    return padded
+
+
+def _lands_on_valid(disparity: Float32, pair: RectifiedPair) -> Bool:
+    width = disparity.shape[1]
+    column = np.arange(width, dtype=np.float32)[None, :] - disparity
+    inside = (column >= 0) & (column <= width - 1)
+    target = np.where(inside, column, 0).astype(np.int32)
+    landed: Bool = inside & np.take_along_axis(pair.right_valid, target, axis=1)
+    return landed
+
+
+def _noise_sigma(pair: RectifiedPair, block: int) -> Float32:
+    """(H, W) Cramer-Rao bound of a block match: sqrt(2) image sigma over the root of the summed gradients."""
+    gradient = cv2.Sobel(pair.left, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    energy = cv2.boxFilter(gradient * gradient, -1, (block, block), normalize=False)
+    noise = image_noise(pair.left)
+    sigma: Float32 = np.sqrt(2 * noise * noise / np.maximum(energy, 1e-3), dtype=np.float32).clip(max=1)
+    return sigma
+
+
+def image_noise(image: UInt8) -> float:
+    """The image's noise, one sigma in grey levels: robust, from a Laplacian that planes don't excite
+    [Immerkaer 1996], with the median instead of the mean so that texture counts less.
+    """
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
+    response = cv2.filter2D(image, cv2.CV_32F, mask)[1:-1, 1:-1]
+    spread = float(np.median(np.abs(response[::3, ::3]))) / 0.6745
+    return max(spread / 6.0, 0.5)
