@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from barsight.calibration.documents import ImuNoise
 from barsight.calibration.rig import StereoRig
+from barsight.core.errors import ConfigError
 from barsight.core.types import (
     CraneSamples,
     ImuSamples,
@@ -15,6 +17,32 @@ from barsight.core.types import (
     RefusedFrame,
     StereoFrame,
 )
+
+
+@dataclass(frozen=True)
+class RecordingSettings:
+    """How a recording is read.
+
+    pair_tolerance_s: how far apart the stamps of a left and a right picture may lie. EuRoC's cameras are
+        triggered together and their stamps agree exactly; 2 ms leave room for drivers that stamp on arrival,
+        while a crane at 0.5 m/s moves no more than 1 mm in that time.
+    camchain, imu_yaml: Kalibr's files for a bag; found in or beside the bag where they aren't named.
+    cam0_topic, cam1_topic, imu_topic: a bag's topics; default the camchain's `rostopic`, else recognised by
+        the message type.
+    """
+
+    pair_tolerance_s: float = 0.002
+    camchain: Path | None = None
+    imu_yaml: Path | None = None
+    cam0_topic: str | None = None
+    cam1_topic: str | None = None
+    imu_topic: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.pair_tolerance_s < 1:
+            raise ConfigError(
+                f"recording.pair_tolerance_s is {self.pair_tolerance_s} s; give a value from 0 to below 1 s"
+            )
 
 
 @dataclass(frozen=True)
@@ -45,6 +73,11 @@ class Recording(Protocol):
     def rig(self) -> StereoRig: ...
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what the reader had to assume (a frame rate, a missing file), for the result."""
+        ...
+
+    @property
     def index(self) -> FrameIndex:
         """The frames that `frames` will yield, without reading any image."""
         ...
@@ -55,6 +88,10 @@ class Recording(Protocol):
 
     def imu(self) -> ImuSamples | None:
         """The IMU in `body`, or None where the recording has none."""
+        ...
+
+    def imu_noise(self) -> ImuNoise | None:
+        """The IMU's noise densities and walks as the recording states them, or None."""
         ...
 
     def crane(self) -> CraneSamples | None:

@@ -1,0 +1,150 @@
+"""Calibration files as text: YAML that names the file and the key when something in it can't be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from barsight.core.arrays import Float64
+from barsight.core.errors import CalibrationError
+from barsight.core.pose import Pose
+
+ROTATION_DECIMALS = 13
+TRANSLATION_DECIMALS = 12
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """The IMU's noise model, Kalibr's units.
+
+    gyro_density: rad/s/sqrt(Hz). gyro_walk: rad/s^2/sqrt(Hz). accel_density: m/s^2/sqrt(Hz).
+    accel_walk: m/s^3/sqrt(Hz). rate_hz: as the file states it.
+    """
+
+    gyro_density: float
+    gyro_walk: float
+    accel_density: float
+    accel_walk: float
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class Document:
+    """One YAML mapping and the file it came from. Every getter raises `CalibrationError` naming both."""
+
+    path: Path
+    values: dict[str, Any]
+    prefix: str = ""
+
+    def error(self, key: str, problem: str, remedy: str) -> CalibrationError:
+        """The error to raise about one key."""
+        return CalibrationError(self.path, f"{self.prefix}{key}: {problem}", remedy)
+
+    def get(self, key: str) -> Any:
+        """The raw value of a key that must be there."""
+        if self.values.get(key) is None:
+            raise self.error(key, "is missing", "add the key or take the calibration's original file")
+        return self.values[key]
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A finite number; the default where the key is absent and a default is given."""
+        if default is not None and self.values.get(key) is None:
+            return default
+        return self.numbers_in(key, [self.get(key)])[0]
+
+    def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
+        """A list of finite numbers, of this length where one is given."""
+        value = self.get(key)
+        if not isinstance(value, list):
+            raise self.error(key, "is not a list of numbers", "write it as [a, b, ...]")
+        numbers = self.numbers_in(key, value)
+        if count is not None and len(numbers) != count:
+            raise self.error(key, f"has {len(numbers)} numbers, expected {count}", "correct the list")
+        return numbers
+
+    def numbers_in(self, key: str, value: Sequence[Any]) -> tuple[float, ...]:
+        """The elements as finite floats. YAML 1.1 reads `1e-5` as text, so text is tried too."""
+        try:
+            numbers = tuple(float(v) for v in value if not isinstance(v, bool))
+        except (TypeError, ValueError):
+            numbers = ()
+        if len(numbers) != len(value):
+            raise self.error(key, "holds something that is no number", "correct the entry")
+        if not np.isfinite(numbers).all():
+            raise self.error(key, "is not finite", "replace NaN or inf by the calibrated number")
+        return numbers
+
+    def matrix(self, key: str) -> Float64:
+        """(4, 4) from `{rows, cols, data}` (EuRoC), from four rows of four (Kalibr) or from 16 numbers."""
+        value = self.get(key)
+        if isinstance(value, dict):
+            value = value.get("data")
+        if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
+            value = [number for row in value for number in row]
+        if not isinstance(value, list) or len(value) != 16:
+            raise self.error(key, "is not a 4x4 matrix", "give 16 numbers, row by row")
+        return np.array(self.numbers_in(key, value), dtype=np.float64).reshape(4, 4)
+
+    def pose(self, key: str, target: str, source: str, *, inverted: bool = False) -> Pose:
+        """`target_from_source` out of a 4x4 matrix; with `inverted` the file stores `source_from_target`."""
+        matrix = self.matrix(key)
+        try:
+            return canonical_pose(target, source, matrix, inverted=inverted)
+        except ValueError as error:
+            raise self.error(key, str(error), "a calibration must hold a rotation; copy it again") from None
+
+    def section(self, key: str) -> Document:
+        """A mapping inside this one."""
+        value = self.get(key)
+        if not isinstance(value, dict):
+            raise self.error(key, "is not a mapping", "compare with Kalibr's file format")
+        return Document(self.path, value, f"{self.prefix}{key}.")
+
+
+def read_document(path: Path) -> Document:
+    """Read a YAML mapping; a first line `%YAML:1.0` (OpenCV's, which YAML forbids) is passed over."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise CalibrationError(path, "no such file", "a calibration is needed to measure") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(path, f"can't be read ({error})", "take the original file") from None
+    lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
+    try:
+        values = yaml.safe_load("\n".join(lines))
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}: " if mark else ""
+        problem = getattr(error, "problem", None) or "not readable"
+        raise CalibrationError(path, f"{where}not YAML ({problem})", "take the original file") from None
+    if not isinstance(values, dict):
+        raise CalibrationError(path, "is empty or no list of keys", "take the original file")
+    return Document(path, {str(key): value for key, value in values.items()})
+
+
+def write_document(path: Path, values: dict[str, Any]) -> None:
+    """Write a YAML mapping; floats as Python's `repr`, so that they read back bit for bit."""
+    path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding="utf-8")
+
+
+def canonical_pose(target: str, source: str, matrix: Float64, *, inverted: bool = False) -> Pose:
+    """A mounting whose numbers don't depend on which of its two directions a file stores.
+
+    EuRoC stores `body_from_cam`, Kalibr `cam_from_body`; the detour over the inverse costs some 1e-16. The
+    rotation is made orthonormal and rounded to 1e-13, which is fine enough for `Pose` to keep it as it is
+    (it projects above 1e-12), the translation to 1e-12 m; so both files give the same bits. The inverse is
+    the matrix's, not the transpose: a rotation rounded to 1e-13 isn't orthonormal to 1e-16.
+    Raises ValueError where the matrix holds no rotation.
+    """
+    if inverted:
+        Pose.from_matrix(source, target, matrix)
+        matrix = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    pose = Pose.from_matrix(target, source, matrix)
+    rotation = np.round(pose.rotation, ROTATION_DECIMALS) + 0.0
+    translation = np.round(pose.translation, TRANSLATION_DECIMALS) + 0.0
+    return Pose(target, source, rotation, translation)

@@ -1,0 +1,97 @@
+"""Stored pictures to (H, W) uint8 gray, refusing what is torn.
+
+OpenCV fills the missing rows of a cut PNG or JPEG with gray and says so on stderr only, so a picture is
+checked before it is decoded: a PNG chunk by chunk with its checksums, a JPEG by its end marker.
+Colour becomes gray by the weights 0.299 R + 0.587 G + 0.114 B [ITU-R BT.601]; 16 bits become 8 by the same
+fixed scale for every frame (65535 -> 255), so that brightness stays comparable along a recording.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from barsight.core.arrays import UInt8
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_SIGNATURE = b"\xff\xd8\xff"
+
+
+class TornImageError(ValueError):
+    """A picture that can't be used; the text says why, without the file's name."""
+
+
+def decode_gray(data: bytes) -> UInt8:
+    """(H, W) uint8 out of the bytes of a PNG, JPEG or another file OpenCV reads.
+
+    Raises `TornImageError` for a picture that is cut short, damaged or of an unknown kind.
+    """
+    if not data:
+        raise TornImageError("is empty")
+    if data.startswith(PNG_SIGNATURE):
+        check_png(data)
+    elif data.startswith(JPEG_SIGNATURE) and b"\xff\xd9" not in data[-64:]:
+        raise TornImageError("is a JPEG cut short (no end marker)")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise TornImageError("is no readable picture")
+    return to_gray(image)
+
+
+def to_gray(image: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8:
+    """(H, W) uint8 out of (H, W), (H, W, 3) BGR or (H, W, 4) BGRA, 8 or 16 bits.
+
+    Raises `TornImageError` for other kinds, and for 16-bit pictures that use the lowest 12 bits only: those
+    would come out all but black.
+    """
+    if image.dtype == np.uint16:
+        brightest = int(image.max(initial=0))
+        if 0 < brightest < 4096:
+            raise TornImageError(
+                f"is a 16-bit picture whose brightest value is {brightest}: scale it to the full 16 bits"
+            )
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise TornImageError(f"has {image.dtype} pixels; 8 or 16 bits are needed")
+    if image.ndim == 3:
+        if image.shape[2] == 1:
+            image = image[:, :, 0]
+        elif image.shape[2] in (3, 4):
+            code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+            image = cv2.cvtColor(image, code)
+        else:
+            raise TornImageError(f"has {image.shape[2]} channels; 1, 3 or 4 are needed")
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def check_png(data: bytes) -> tuple[int, int]:
+    """Walk a PNG's chunks, lengths and checksums; (width, height). Raises `TornImageError`. [PNG spec 5.3]"""
+    view = memoryview(data)
+    place, size = len(PNG_SIGNATURE), (0, 0)
+    has_pixels = False
+    while place + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, place)
+        kind = data[place + 4 : place + 8]
+        end = place + 12 + length
+        if end > len(data):
+            break
+        (checksum,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(view[place + 4 : end - 4]) != checksum:
+            raise TornImageError(f"is a damaged PNG (wrong checksum in its {kind.decode('latin-1')} part)")
+        if kind == b"IHDR":
+            size = struct.unpack_from(">II", data, place + 8)
+        elif kind == b"IDAT":
+            has_pixels = True
+        elif kind == b"IEND":
+            if not has_pixels or min(size) < 1:
+                raise TornImageError("is a PNG without pixels")
+            return size
+        place = end
+    raise TornImageError(f"is a PNG cut short (after {len(data)} bytes)")

@@ -1,0 +1,76 @@
+"""Which left picture belongs to which right one, and the reading of such a pair from two files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.camera import Camera
+from barsight.calibration.rig import StereoRig
+from barsight.core.arrays import Int64, UInt8
+from barsight.core.errors import InputError
+from barsight.core.stamps import Pairing, pair_stamps, seconds_to_ns
+from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.recording.base import FrameIndex
+from barsight.recording.images import TornImageError, decode_gray
+
+
+@dataclass(frozen=True, eq=False)
+class PairedStamps:
+    """left_ns, right_ns: all stamps of the two cameras. pairing: indices into them. index: for the stages."""
+
+    left_ns: Int64
+    right_ns: Int64
+    pairing: Pairing
+    index: FrameIndex
+
+
+def pair_cameras(path: Path, left_ns: Int64, right_ns: Int64, tolerance_s: float) -> PairedStamps:
+    """Pair two cameras' stamps. Raises `InputError` about `path` where not a single pair comes together."""
+    pairing = pair_stamps(left_ns, right_ns, seconds_to_ns(tolerance_s))
+    if pairing.left.size == 0:
+        nearest = np.abs(left_ns[:, None][:1000] - right_ns[None, :1000]).min() / 1e6
+        raise InputError(
+            path,
+            f"no left picture has a right one within {tolerance_s * 1e3:g} ms (the nearest is {nearest:g} ms "
+            "away)",
+            "raise the pair tolerance if the clocks drift, else check that both folders are of one recording",
+        )
+    limit = f"within {tolerance_s * 1e3:g} ms"
+    left_only = [(int(left_ns[k]), f"cam0 only: no picture of cam1 {limit}") for k in pairing.left_only]
+    right_only = [(int(right_ns[k]), f"cam1 only: no picture of cam0 {limit}") for k in pairing.right_only]
+    unpaired = tuple(RefusedFrame(stamp, reason) for stamp, reason in sorted(left_only + right_only))
+    stamps = tuple(int(stamp) for stamp in left_ns[pairing.left])
+    return PairedStamps(left_ns, right_ns, pairing, FrameIndex(stamps, unpaired))
+
+
+def read_pair(
+    stamp_ns: int, root: Path, left: Path, right: Path, rig: StereoRig
+) -> StereoFrame | RefusedFrame:
+    """One pair from two files; refused, with the file's name below `root`, where either can't be used."""
+    images = []
+    for path, camera in ((left, rig.cam0), (right, rig.cam1)):
+        try:
+            images.append(decode_for(camera, path.read_bytes()))
+        except FileNotFoundError:
+            return RefusedFrame(stamp_ns, f"{path.relative_to(root)} is missing")
+        except OSError as error:
+            return RefusedFrame(stamp_ns, f"{path.relative_to(root)} can't be read ({error.strerror})")
+        except TornImageError as error:
+            return RefusedFrame(stamp_ns, f"{path.relative_to(root)} {error}")
+    return StereoFrame(stamp_ns, images[0], images[1])
+
+
+def decode_for(camera: Camera, data: bytes) -> UInt8:
+    """Decode a stored picture; `TornImageError` too where it does not have the calibration's size."""
+    return expect_size(camera, decode_gray(data))
+
+
+def expect_size(camera: Camera, image: UInt8) -> UInt8:
+    """The image itself; `TornImageError` where it does not have the calibration's size."""
+    height, width = image.shape
+    if (width, height) != (camera.width, camera.height):
+        raise TornImageError(f"is {width}x{height}, the calibration is for {camera.width}x{camera.height}")
+    return image

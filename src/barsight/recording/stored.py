@@ -1,0 +1,43 @@
+"""Pictures as they are stored, for copying a recording from one format to another without decoding."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from barsight.recording.base import Recording
+from barsight.recording.pairing import PairedStamps
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StoredImage:
+    """One picture's bytes. camera: 0 or 1. kind: `png`, `jpg`, ..., as a file's suffix."""
+
+    camera: int
+    stamp_ns: int
+    kind: str
+    data: bytes
+
+
+class Source(Recording, Protocol):
+    """A recording that hands out its pictures undecoded: all of Barsight's readers."""
+
+    @property
+    def camera_stamps(self) -> PairedStamps:
+        """All pictures' stamps, paired or not."""
+        ...
+
+    def stored_images(self) -> Iterator[StoredImage]:
+        """Every picture's bytes as stored, both cameras in time's order."""
+        ...
+
+
+def merged(pairs: PairedStamps, left: Sequence[T], right: Sequence[T]) -> Iterator[tuple[int, int, T]]:
+    """(camera, stamp, item) of both cameras in time's order, cam0 first where they agree."""
+    both = [(int(stamp), 0, k) for k, stamp in enumerate(pairs.left_ns)]
+    both += [(int(stamp), 1, k) for k, stamp in enumerate(pairs.right_ns)]
+    for stamp, camera, k in sorted(both):
+        yield camera, stamp, (left if camera == 0 else right)[k]
