@@ -1,0 +1,1 @@
+"""Floor 2: feature points and their matching."""

@@ -1,0 +1,60 @@
+"""ORB features [Rublee 2011] spread evenly over the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, UInt8
+
+_PATCH_PX = 31
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """pixels: (N, 2) float32, x and y. descriptors: (N, 32) uint8."""
+
+    pixels: Float32
+    descriptors: UInt8
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def chosen(self, kept: Bool) -> Features:
+        """The features for which `kept` (N,) is true."""
+        return Features(self.pixels[kept], self.descriptors[kept])
+
+
+def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Features:
+    """At most `count` ORB features, the strongest of each cell of a (rows, columns) grid.
+
+    Detection uses a low FAST threshold so that dark, dull steel yields features too; the grid keeps a bright
+    label from taking them all.
+    """
+    orb = cv2.ORB.create(nfeatures=4 * count, fastThreshold=7, edgeThreshold=_PATCH_PX, patchSize=_PATCH_PX)
+    keypoints = orb.detect(image, None)
+    if not keypoints:
+        return _no_features()
+    places = np.array([k.pt for k in keypoints], dtype=np.float32)
+    strength = np.array([k.response for k in keypoints], dtype=np.float32)
+    height, width = image.shape
+    row = (places[:, 1] * cells[0] / height).astype(int).clip(0, cells[0] - 1)
+    column = (places[:, 0] * cells[1] / width).astype(int).clip(0, cells[1] - 1)
+    cell = row * cells[1] + column
+    order = np.lexsort((-strength, cell))
+    first = np.searchsorted(cell[order], cell[order], side="left")
+    rank = np.arange(len(order)) - first
+    kept = np.sort(order[rank < max(1, count // (cells[0] * cells[1]))])
+    described, descriptors = orb.compute(image, [keypoints[i] for i in kept])
+    if descriptors is None or not described:
+        return _no_features()
+    return Features(
+        np.array([k.pt for k in described], dtype=np.float32),
+        descriptors,
+    )
+
+
+def _no_features() -> Features:
+    return Features(np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8))

@@ -1,0 +1,1 @@
+"""Floor 3: from sensors to the trajectory of the body."""
