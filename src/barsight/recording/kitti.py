@@ -193,7 +193,9 @@ def _rig(path: Path, projections: tuple[Float64, Float64], sizes: tuple[tuple[in
     cameras, places = [], []
     for p, (width, height) in zip(projections, sizes, strict=True):
         try:
-            cameras.append(Camera(width, height, p[0, 0], p[1, 1], p[0, 2], p[1, 2]))
+            cameras.append(
+                Camera(width, height, float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
+            )
         except ValueError as error:
             raise CalibrationError(path, str(error), "take the sequence's own calib.txt") from None
         # P = K [I | t]: t is where the reference camera's origin lies in this camera.

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from barsight.core.errors import InputError
+from barsight.recording.bag import BagRecording
 from barsight.recording.base import RecordingSettings
 from barsight.recording.euroc import EurocRecording
 from barsight.recording.kitti import KittiRecording, is_kitti
 from barsight.recording.stored import Source
 
+BAG_KINDS = {".bag": "ros1", ".mcap": "ros2-mcap", ".db3": "ros2-sqlite3"}
 KNOWN = (
     "an EuRoC folder (holding mav0), a KITTI odometry sequence (calib.txt, image_0, image_1), a ROS 1 .bag, "
     "a ROS 2 bag folder (metadata.yaml), a .mcap or a .db3"
@@ -24,8 +26,44 @@ def open_recording(path: Path, settings: RecordingSettings | None = None) -> Sou
     settings = settings or RecordingSettings()
     if not path.exists():
         raise InputError(path, "no such file or folder", "check the path")
-    if path.is_dir() and ((path / "mav0").is_dir() or (path / "cam0").is_dir() or (path / "cam1").is_dir()):
+    if path.is_file():
+        if path.suffix not in BAG_KINDS:
+            raise InputError(path, "is a file of an unknown kind", f"give {KNOWN}")
+        return BagRecording(path, path, BAG_KINDS[path.suffix], settings)
+    if any((path / name).is_dir() for name in ("mav0", "cam0", "cam1")):
         return EurocRecording(path, settings)
-    if path.is_dir() and is_kitti(path):
+    bags = sorted(file for file in path.iterdir() if file.suffix in BAG_KINDS and file.is_file())
+    if (path / "metadata.yaml").is_file() or bags:
+        return _open_bag_folder(path, bags, settings)
+    if is_kitti(path):
         return KittiRecording(path, settings)
-    raise InputError(path, "is no recording that Barsight knows", f"give {KNOWN}")
+    raise InputError(path, "is no recording that Barsight knows", f"give {_hint(path) or KNOWN}")
+
+
+def _open_bag_folder(path: Path, bags: list[Path], settings: RecordingSettings) -> BagRecording:
+    kinds = {BAG_KINDS[bag.suffix] for bag in bags}
+    if (path / "metadata.yaml").is_file():
+        return BagRecording(path, path, kinds.pop() if len(kinds) == 1 else "ros2", settings)
+    if len(bags) > 1:
+        names = ", ".join(bag.name for bag in bags)
+        raise InputError(
+            path,
+            f"holds several bags and no metadata.yaml: {names}",
+            "name one of them, or `ros2 bag reindex`",
+        )
+    return BagRecording(path, bags[0], kinds.pop(), settings)
+
+
+def _hint(path: Path) -> str:
+    """The folder inside, where just one of them is a recording."""
+    inside = [
+        child
+        for child in sorted(path.iterdir())
+        if child.is_dir()
+        and (
+            (child / "mav0").is_dir()
+            or (child / "metadata.yaml").is_file()
+            or (child / "calib.txt").is_file()
+        )
+    ]
+    return f"the folder inside, {inside[0]}" if len(inside) == 1 else ""

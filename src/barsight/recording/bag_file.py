@@ -1,0 +1,122 @@
+"""A bag file of any kind as a stream of messages; `rosbags` reads it, no ROS is needed.
+
+A torn bag makes the parsers below raise all kinds of errors; every one becomes an `InputError` here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from barsight.core.errors import InputError
+from barsight.core.stamps import NS_PER_S
+
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
+IMU_TYPE = "sensor_msgs/msg/Imu"
+POINT_TYPE = "geometry_msgs/msg/PointStamped"
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag, its message type and how many messages it holds."""
+
+    name: str
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as stored. stamp_ns: its header's stamp."""
+
+    topic: str
+    kind: str
+    stamp_ns: int
+    data: bytes
+
+
+class BagFile:
+    """One bag. Every call of `messages` opens it anew and reads once from front to back.
+
+    Raises `InputError` for a bag that is cut short, damaged or not indexed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._is_ros1 = path.suffix == ".bag"
+        with self._opened() as reader:
+            self._typestore = reader.typestore
+            counts: dict[tuple[str, str], int] = {}
+            for connection in reader.connections:
+                key = (connection.topic, connection.msgtype)
+                counts[key] = counts.get(key, 0) + connection.msgcount
+        self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+    def messages(self, names: Collection[str]) -> Iterator[RawMessage]:
+        """The messages of these topics in the order of their receipt."""
+        with self._opened() as reader:
+            chosen = [connection for connection in reader.connections if connection.topic in names]
+            stream = reader.messages(connections=chosen)
+            while chosen:
+                try:
+                    connection, _, data = next(stream)
+                    stamp = self._header_stamp(data)
+                except StopIteration:
+                    return
+                except MemoryError:
+                    raise
+                except Exception as error:
+                    raise self._torn(error) from error
+                yield RawMessage(connection.topic, connection.msgtype, stamp, data)
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object with the fields of its definition. Raises ValueError where it is torn."""
+        typestore = self._typestore
+        read = typestore.deserialize_ros1 if self._is_ros1 else typestore.deserialize_cdr
+        try:
+            return read(message.data, message.kind)
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise ValueError(f"is a torn message ({_short(error)})") from error
+
+    def _header_stamp(self, data: bytes) -> int:
+        """Both ROS 1 (after `seq`) and CDR (after four bytes that say the byte order) put it at byte 4."""
+        if len(data) < 12:
+            raise ValueError("a message is too short for a header")
+        seconds, nanoseconds = struct.unpack_from("<II" if self._is_ros1 or data[1] & 1 else ">II", data, 4)
+        return int(seconds) * NS_PER_S + int(nanoseconds)
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[AnyReader]:
+        try:
+            reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader.open()
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise self._torn(error) from error
+        try:
+            yield reader
+        finally:
+            reader.close()
+
+    def _torn(self, error: Exception) -> InputError:
+        remedy = "copy it again, or repair it with `ros2 bag reindex` or `mcap recover`"
+        if self._is_ros1:
+            remedy = "copy it again, or repair it with `rosbag reindex`"
+        return InputError(self.path, f"can't be read, it may be cut short ({_short(error)})", remedy)
+
+
+def _short(error: Exception) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text.rstrip(".")[:160]

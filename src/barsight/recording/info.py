@@ -1,0 +1,166 @@
+"""What a recording holds: sensors, rates, gaps, pairs, calibration. Decodes one pair at most."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.camera import Camera
+from barsight.calibration.rig import StereoRig
+from barsight.core.arrays import Int64
+from barsight.core.stamps import NS_PER_S
+from barsight.core.types import CraneSamples, LaserProfile, RefusedFrame
+from barsight.recording.sensors import imu_hints
+from barsight.recording.stored import Source
+
+GAP_FACTOR = 1.5
+
+
+@dataclass(frozen=True)
+class StreamInfo:
+    """One sensor's samples. rate_hz: from the median interval, NaN below two samples.
+
+    gaps: intervals over 1.5 times the median. longest_gap_s: the longest of them, 0 where there is none.
+    """
+
+    name: str
+    count: int
+    first_ns: int
+    last_ns: int
+    rate_hz: float
+    gaps: int
+    longest_gap_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        return (self.last_ns - self.first_ns) / NS_PER_S
+
+
+@dataclass(frozen=True)
+class CalibrationSummary:
+    """The rig in the numbers people compare. baseline_m: distance of the cameras. angle_deg: between them."""
+
+    cam0: Camera
+    cam1: Camera
+    baseline_m: float
+    angle_deg: float
+    timeshift_cam_imu_ms: float
+
+
+@dataclass(frozen=True)
+class CraneInfo:
+    """lowest_m, highest_m: the encoders' extents in `yard` (bridge x, trolley y, hoist z)."""
+
+    lowest_m: tuple[float, float, float]
+    highest_m: tuple[float, float, float]
+    position_std_m: float
+
+
+@dataclass(frozen=True)
+class ProfileInfo:
+    """One laser profile: its number, count of points, y, and extent along x (m, `yard`)."""
+
+    profile: int
+    count: int
+    y_m: float
+    x_first_m: float
+    x_last_m: float
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """Everything `barsight info` prints. dropped: pictures without partner, with the reason.
+
+    first_refused: why the first pair can't be used, None where it can. notes: what the reader assumed and
+    what looks odd.
+    """
+
+    path: Path
+    format: str
+    is_simulated: bool
+    streams: tuple[StreamInfo, ...]
+    pairs: int
+    dropped: tuple[RefusedFrame, ...]
+    first_refused: str | None
+    calibration: CalibrationSummary
+    crane: CraneInfo | None
+    laser: tuple[ProfileInfo, ...]
+    notes: tuple[str, ...]
+
+
+def describe(recording: Source) -> RecordingInfo:
+    """Look a recording through. Raises `InputError` where a sensor's file is wrong, as measuring would."""
+    stamps = recording.camera_stamps
+    streams = [stream_info("cam0", stamps.left_ns), stream_info("cam1", stamps.right_ns)]
+    notes = list(recording.notes)
+    imu, crane, laser = recording.imu(), recording.crane(), recording.laser()
+    if imu is not None:
+        streams.append(stream_info("imu0", imu.stamp_ns))
+        notes += imu_hints(imu)
+    if crane is not None:
+        streams.append(stream_info("crane0", crane.stamp_ns))
+    first = next(iter(recording.frames()), None)
+    return RecordingInfo(
+        path=recording.path,
+        format=recording.format,
+        is_simulated=recording.is_simulated,
+        streams=tuple(streams),
+        pairs=len(recording.index.stamps_ns),
+        dropped=recording.index.unpaired,
+        first_refused=first.reason if isinstance(first, RefusedFrame) else None,
+        calibration=_calibration(recording.rig),
+        crane=_crane(crane) if crane is not None else None,
+        laser=_laser(laser),
+        notes=(*notes, *_time_notes(streams)),
+    )
+
+
+def stream_info(name: str, stamp_ns: Int64) -> StreamInfo:
+    """Count, rate and gaps of increasing stamps (N,), N >= 1."""
+    steps = np.diff(stamp_ns)
+    if steps.size == 0:
+        return StreamInfo(name, stamp_ns.size, int(stamp_ns[0]), int(stamp_ns[-1]), float("nan"), 0, 0.0)
+    median = float(np.median(steps))
+    gaps = steps[steps > GAP_FACTOR * median]
+    longest = float(gaps.max()) / NS_PER_S if gaps.size else 0.0
+    return StreamInfo(
+        name, stamp_ns.size, int(stamp_ns[0]), int(stamp_ns[-1]), NS_PER_S / median, gaps.size, longest
+    )
+
+
+def _calibration(rig: StereoRig) -> CalibrationSummary:
+    place = rig.cam0_from_cam1
+    cosine = (float(np.trace(place.rotation)) - 1) / 2
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return CalibrationSummary(rig.cam0, rig.cam1, rig.baseline_m, angle, rig.timeshift_cam_imu_ns / 1e6)
+
+
+def _crane(crane: CraneSamples) -> CraneInfo:
+    low, high = crane.position_m.min(axis=0).tolist(), crane.position_m.max(axis=0).tolist()
+    return CraneInfo((low[0], low[1], low[2]), (high[0], high[1], high[2]), crane.position_std_m)
+
+
+def _laser(profiles: Iterable[LaserProfile]) -> tuple[ProfileInfo, ...]:
+    return tuple(
+        ProfileInfo(p.profile, p.x_m.size, float(np.median(p.y_m)), float(p.x_m[0]), float(p.x_m[-1]))
+        for p in profiles
+    )
+
+
+def _time_notes(streams: Iterable[StreamInfo]) -> Iterable[str]:
+    """A sensor whose clock runs elsewhere: its samples don't span the pictures."""
+    cam0, *others = streams
+    for stream in others:
+        before = (stream.first_ns - cam0.first_ns) / NS_PER_S
+        after = (cam0.last_ns - stream.last_ns) / NS_PER_S
+        if stream.first_ns > cam0.last_ns or stream.last_ns < cam0.first_ns:
+            yield f"{stream.name} and cam0 have no time in common: their clocks differ"
+        elif stream.name != "cam1" and max(before, after) > 0.1:
+            yield (
+                f"{stream.name} does not span the pictures: {max(before, 0):.2f} s missing at the start, "
+                f"{max(after, 0):.2f} s at the end"
+            )
