@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from barsight.calibration.documents import ImuNoise
 from barsight.calibration.rig import StereoRig
 from barsight.core.types import (
     CraneSamples,
@@ -41,6 +42,10 @@ class SelectedSensors:
         return self.whole.rig
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        return self.whole.notes
+
+    @property
     def index(self) -> FrameIndex:
         return self.whole.index
 
@@ -49,6 +54,9 @@ class SelectedSensors:
 
     def imu(self) -> ImuSamples | None:
         return self.whole.imu() if "imu" in self.use else None
+
+    def imu_noise(self) -> ImuNoise | None:
+        return self.whole.imu_noise() if "imu" in self.use else None
 
     def crane(self) -> CraneSamples | None:
         return self.whole.crane() if "crane" in self.use else None

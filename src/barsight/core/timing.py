@@ -1,0 +1,32 @@
+"""How long the stages of a run take."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+
+
+class Stopwatch:
+    """Adds up seconds and frames by stage, from any thread; stages that overlap count each in full."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+        self._frames: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    @contextlib.contextmanager
+    def __call__(self, stage: str, frames: int = 0) -> Iterator[None]:
+        """Time the block under it, whether or not it raises."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - start
+                self._frames[stage] = self._frames.get(stage, 0) + frames
+
+    def entries(self) -> tuple[tuple[str, float, int], ...]:
+        """(stage, seconds, frames) in the order in which the stages first ended."""
+        return tuple((stage, seconds, self._frames[stage]) for stage, seconds in self._seconds.items())

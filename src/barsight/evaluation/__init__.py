@@ -1,0 +1,1 @@
+"""Floor 6: agreement with references, scores against truth, benchmarks."""

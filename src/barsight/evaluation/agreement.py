@@ -1,0 +1,55 @@
+"""Agreement of a contour with a laser profile: two methods compared, neither taken as truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.core.types import Agreement, Contour, LaserProfile, Source
+
+
+def difference(contour: Contour, laser: LaserProfile) -> Float64:
+    """Vision minus laser (m) at each laser point (N,), NaN where vision measured nothing there."""
+    if contour.x_m.size == 0:
+        return np.full(laser.x_m.shape, np.nan)
+    measured = np.where(contour.source == Source.VISION, contour.z_m, np.nan)
+    spacing = contour.x_m[1] - contour.x_m[0] if contour.x_m.size > 1 else 0.01
+    place = (laser.x_m - contour.x_m[0]) / spacing
+    before = np.floor(place + 1e-3).astype(np.int64)
+    share = np.clip(place - before, 0, 1)
+    inside = (before >= 0) & (before < measured.size)
+    k = before.clip(0, measured.size - 1)
+    following = (k + 1).clip(0, measured.size - 1)
+    on_sample = share < 2e-3
+    z = np.where(on_sample, measured[k], measured[k] * (1 - share) + measured[following] * share)
+    return np.where(inside, z, np.nan) - laser.z_m
+
+
+def agree(contour: Contour, laser: LaserProfile) -> Agreement | Failed:
+    """Bias, limits of agreement [Bland 1986], MAE, RMSE, P95 and max in mm; coverage of the laser's points.
+
+    Failed `no-overlap` where fewer than two points can be compared.
+    """
+    error = difference(contour, laser)
+    compared = error[np.isfinite(error)] * 1e3
+    if compared.size < 2:
+        return Failed(
+            "no-overlap",
+            f"profile {laser.profile}: {compared.size} of {error.size} laser points were measured by vision",
+        )
+    bias, spread = float(compared.mean()), float(compared.std(ddof=1))
+    size = np.abs(compared)
+    return Agreement(
+        profile=laser.profile,
+        y_m=float(np.median(laser.y_m)),
+        samples=int(compared.size),
+        coverage_pct=100 * compared.size / error.size,
+        bias_mm=bias,
+        mae_mm=float(size.mean()),
+        rmse_mm=float(np.sqrt((compared**2).mean())),
+        p95_mm=float(np.percentile(size, 95)),
+        max_mm=float(size.max()),
+        loa_low_mm=bias - 1.96 * spread,
+        loa_high_mm=bias + 1.96 * spread,
+    )

@@ -1,0 +1,1 @@
+"""Floor 4: all views fused into one height surface, and contours cut from it."""

@@ -1,0 +1,69 @@
+"""Contours: the surface cut along X at a given y."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float64, UInt8
+from barsight.core.types import Contour, LaserProfile, Source
+from barsight.mapping.surface import Surface
+
+SPACING_M = 0.01
+_JUMP_M = 0.03
+
+
+def cut_contours(
+    surface: Surface, laser: tuple[LaserProfile, ...], profile_y_m: tuple[float, ...]
+) -> tuple[Contour, ...]:
+    """A contour at each y asked for; without any at each laser profile; without a laser in the middle.
+
+    At a laser profile the samples fall on the laser's own x grid, continued over the whole surface.
+    """
+    if profile_y_m:
+        places = [(number, y, 0.0) for number, y in enumerate(profile_y_m)]
+    elif laser:
+        places = [(p.profile, float(np.median(p.y_m)), float(p.x_m[0])) for p in laser]
+    else:
+        places = [(0, (surface.rows[0] + surface.rows[1] - 1) / 2 * surface.cell_m, 0.0)]
+    return tuple(cut(surface, number, y, phase) for number, y, phase in places)
+
+
+def cut(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0) -> Contour:
+    """Samples every 10 mm along the whole surface, on the grid through x = phase_m.
+
+    Each is the bilinear mean of the four cells around it, without those that lie more than 30 mm above or
+    below the nearest one, so that an edge stays an edge. Unknown where the nearest cell is unknown.
+    """
+    first, last = ((column * surface.cell_m - phase_m) / SPACING_M for column in surface.columns)
+    x = phase_m + np.arange(np.ceil(first), np.floor(last) + 1) * SPACING_M
+    column = np.floor(x / surface.cell_m + 1e-6).astype(np.int64)
+    row = int(np.floor(y_m / surface.cell_m + 1e-6))
+    if x.size == 0:
+        return Contour(profile, x, x.copy(), x.copy(), x.copy(), np.empty(0, np.uint8))
+    start = int(column[0])
+    layers = surface.window(start, row, int(column[-1]) - start + 2, 2)
+    share_x = np.clip(x / surface.cell_m - column, 0, 1)
+    share_y = min(max(y_m / surface.cell_m - row, 0.0), 1.0)
+    corners = [(j, column - start + i) for j in (0, 1) for i in (0, 1)]
+    weights = np.stack(
+        [(share_y if j else 1 - share_y) * (share_x if i else 1 - share_x) for j in (0, 1) for i in (0, 1)]
+    )
+    z = np.stack([layers.z_m[c] for c in corners]).astype(np.float64)
+    sigma = np.stack([layers.sigma_m[c] for c in corners]).astype(np.float64)
+    source = np.stack([layers.source[c] for c in corners])
+    return Contour(profile, x, np.full(x.shape, y_m), *_blend(z, sigma, source, weights))
+
+
+def _blend(z: Float64, sigma: Float64, source: UInt8, weights: Float64) -> tuple[Float64, Float64, UInt8]:
+    """(4, N) corners to height, sigma and source (N,)."""
+    nearest = np.argmax(weights, axis=0)[None, :]
+    z_nearest = np.take_along_axis(z, nearest, axis=0)
+    source_nearest = np.take_along_axis(source, nearest, axis=0)
+    joined = (source == source_nearest) & (np.abs(z - z_nearest) <= _JUMP_M)
+    w = np.where(joined, weights, 0.0)
+    with np.errstate(invalid="ignore"):
+        w /= w.sum(axis=0)
+    known = source_nearest[0] != Source.UNKNOWN
+    height = np.where(known, np.where(joined, w * z, 0).sum(axis=0), np.nan)
+    spread = np.where(known, np.where(joined, w * sigma, 0).sum(axis=0), np.nan)
+    return height, spread, source_nearest[0]

@@ -1,0 +1,137 @@
+"""Robust fusion: each cell keeps a few heights, every view votes for one, the best supported stays.
+
+A view's height joins the kept one within its gate (weighted mean, weighted squares for the scatter) or opens
+another; a wrong match thus stands alone and is outvoted. The work of a view doesn't depend on those before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Int8, Int32, Int64, kernel
+from barsight.mapping.observation import CellObservations
+from barsight.mapping.settings import MapSettings
+from barsight.mapping.tiles import (
+    GREY,
+    SHARED,
+    SLOTS,
+    SQUARES,
+    TILE_CELLS,
+    VIEWS,
+    WEIGHT,
+    TileStore,
+    Z,
+)
+
+PRIOR_VIEWS = 4.0
+"""How many views' worth the stated sigmas weigh against the views' own scatter."""
+
+
+def fuse(store: TileStore, view: CellObservations, settings: MapSettings) -> None:
+    """Add one view to the tiles in `store`."""
+    columns, rows = view.x // TILE_CELLS, view.y // TILE_CELLS
+    numbers = rows.astype(np.int64) * (1 << 31) + columns
+    order = np.argsort(numbers, kind="stable")
+    edges = np.flatnonzero(np.diff(numbers[order], prepend=numbers[order[:1]] - 1))
+    for first, last in zip(edges, [*edges[1:], order.size], strict=True):
+        members = order[first:last]
+        key = (int(columns[members[0]]), int(rows[members[0]]))
+        _vote(
+            store.take(key),
+            members,
+            view.x - key[0] * TILE_CELLS,
+            view.y - key[1] * TILE_CELLS,
+            view.z_m,
+            view.variance_m2,
+            view.shared_m,
+            view.intensity,
+            settings.gate_sigma,
+            settings.least_gate_m,
+        )
+
+
+@kernel()
+def _vote(
+    tile: Float32,
+    members: Int64,
+    x: Int32,
+    y: Int32,
+    z: Float32,
+    variance: Float32,
+    shared: Float32,
+    intensity: Float32,
+    gate_sigma: float,
+    least_gate: float,
+) -> None:
+    for m in members:
+        slots = tile[y[m], x[m]]
+        best, best_gap = -1, np.inf
+        empty, weakest = -1, 0
+        for s in range(SLOTS):
+            if slots[s, VIEWS] == 0:
+                if empty < 0:
+                    empty = s
+                continue
+            gap = abs(slots[s, Z] - z[m])
+            spread = variance[m] + 1.0 / slots[s, WEIGHT]
+            if gap < best_gap and gap <= max(gate_sigma * np.sqrt(spread), least_gate):
+                best, best_gap = s, gap
+            if slots[s, VIEWS] < slots[weakest, VIEWS]:
+                weakest = s
+        w = 1.0 / max(variance[m], 1e-10)
+        if best >= 0:
+            total = slots[best, WEIGHT] + w
+            step = z[m] - slots[best, Z]
+            share = w / total
+            slots[best, Z] += share * step
+            slots[best, SQUARES] += w * step * step * (1 - share)
+            slots[best, WEIGHT] = total
+            slots[best, VIEWS] += 1
+            slots[best, SHARED] += share * (shared[m] - slots[best, SHARED])
+            slots[best, GREY] += share * (intensity[m] - slots[best, GREY])
+            continue
+        target = empty
+        if target < 0:
+            if slots[weakest, VIEWS] > 1:
+                continue
+            target = weakest
+        slots[target, Z] = z[m]
+        slots[target, WEIGHT] = w
+        slots[target, SQUARES] = 0
+        slots[target, VIEWS] = 1
+        slots[target, SHARED] = shared[m]
+        slots[target, GREY] = intensity[m]
+
+
+@kernel()
+def elect(tile: Float32, min_views: int, top_share: float) -> Int8:
+    """Which of each cell's heights is the surface, (rows, columns), -1 where none has enough views.
+
+    Of the heights that enough views support, measured against the best supported one, the highest wins.
+    """
+    rows, columns = tile.shape[:2]
+    winner = np.full((rows, columns), -1, np.int8)
+    for i in range(rows):
+        for j in range(columns):
+            slots = tile[i, j]
+            most = 0.0
+            for s in range(SLOTS):
+                most = max(most, slots[s, VIEWS])
+            needed = max(float(min_views), top_share * most)
+            best = -1
+            for s in range(SLOTS):
+                if slots[s, VIEWS] >= needed and (best < 0 or slots[s, Z] > slots[best, Z]):
+                    best = s
+            winner[i, j] = best
+    return winner
+
+
+def height_sigma(slots: Float32) -> Float32:
+    """(N, FIELDS) fused heights to one sigma each (N,).
+
+    The weights' own noise, scaled by how the views really scatter, and the calibration's part whole: it is
+    the same in all views and doesn't average out.
+    """
+    scatter = (PRIOR_VIEWS + slots[:, SQUARES]) / (PRIOR_VIEWS + slots[:, VIEWS] - 1)
+    sigma: Float32 = np.sqrt(scatter / slots[:, WEIGHT] + slots[:, SHARED] ** 2)
+    return sigma

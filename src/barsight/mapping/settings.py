@@ -1,0 +1,41 @@
+"""The settings of the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from barsight.core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """The height surface and the contours."""
+
+    cell_m: float | None = None
+    """Side of a cell; 0.01 in the yard, else fitted to the pictures' resolution."""
+    min_views: int = 2
+    """A cell seen in fewer frames is unknown (one is enough where the recording has only one)."""
+    top_share: float = 0.35
+    """Of several heights in a cell the highest wins that has this share of the best-seen one's views."""
+    gate_sigma: float = 3.0
+    """Heights nearer than this many sigma are one surface."""
+    least_gate_m: float = 0.015
+    """Heights nearer than this are one surface however small their sigma."""
+    fill_m: float = 0.03
+    """Unknown cells no further than this from seen ones on opposite sides are filled, and flagged so."""
+    max_sigma_m: float = 0.5
+    """Points less sure than this are left out."""
+    resident_tiles: int = 64
+    """Tiles of 256 x 256 cells kept in memory (6 MiB each); the others wait on disk."""
+    profile_y_m: tuple[float, ...] = ()
+    """Where to cut contours; at the laser's profiles when not given, else in the middle."""
+
+    def __post_init__(self) -> None:
+        if self.cell_m is not None and not 0.001 <= self.cell_m <= 10:
+            raise ConfigError(f"cell_m must lie in 0.001...10, not {self.cell_m}")
+        if self.min_views < 1 or self.resident_tiles < 16:
+            raise ConfigError("min_views must be at least 1 and resident_tiles at least 16")
+        if not 0 < self.top_share <= 1:
+            raise ConfigError(f"top_share must lie in 0...1, not {self.top_share}")
+        if self.gate_sigma <= 0 or self.least_gate_m < 0 or self.fill_m < 0 or self.max_sigma_m <= 0:
+            raise ConfigError("gate_sigma, least_gate_m, fill_m and max_sigma_m can't be negative")

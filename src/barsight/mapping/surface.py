@@ -1,0 +1,254 @@
+"""The height surface: views in, finished tiles out, windows of it read back as layers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.types import Source
+from barsight.mapping.fusion import elect, height_sigma
+from barsight.mapping.settings import MapSettings
+from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
+
+_HALO = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """A rectangle of the surface, [y, x] with y rising: z_m, sigma_m (NaN where unknown), views, source."""
+
+    z_m: Float32
+    sigma_m: Float32
+    views: Float32
+    source: UInt8
+
+    @classmethod
+    def unknown(cls, rows: int, columns: int) -> Layers:
+        """A rectangle of which nothing is known."""
+        nan = np.full((rows, columns), np.nan, np.float32)
+        return cls(
+            nan, nan.copy(), np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.uint8)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CloudPart:
+    """A tile's points: xyz_m (N, 3) float32 in the reference frame, intensity, sigma_z_m, views (N,)."""
+
+    xyz_m: Float32
+    intensity: UInt8
+    sigma_z_m: Float32
+    views: Float32
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A finished height surface whose tiles lie in `folder`.
+
+    Cell (column, row) has its centre at (column * cell_m, row * cell_m). columns, rows: first and one past
+    the last cell that is known. Counts are cells by source.
+    """
+
+    folder: Path
+    cell_m: float
+    columns: tuple[int, int]
+    rows: tuple[int, int]
+    seen: int
+    filled: int
+    median_sigma_m: float
+    tiles: frozenset[TileKey]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the rectangle that holds everything known."""
+        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+
+    def window(self, column: int, row: int, columns: int, rows: int) -> Layers:
+        """The rectangle from cell (column, row) on; unknown where there is no tile."""
+        layers = Layers.unknown(rows, columns)
+        for tile_row in range(row // TILE_CELLS, (row + rows - 1) // TILE_CELLS + 1):
+            for tile_column in range(column // TILE_CELLS, (column + columns - 1) // TILE_CELLS + 1):
+                if (tile_column, tile_row) in self.tiles:
+                    tile = _read_tile(self.folder, (tile_column, tile_row))
+                    _paste(tile, (tile_column, tile_row), layers, column, row)
+        return layers
+
+    def cloud(self) -> Iterator[CloudPart]:
+        """Every height that enough views support, sides and lower surfaces included, tile by tile."""
+        for key in sorted(self.tiles):
+            with np.load(self.folder / f"cloud_{key[0]}_{key[1]}.npz") as part:
+                yield CloudPart(part["xyz"], part["intensity"], part["sigma"], part["views"])
+
+
+def finish(store: TileStore, folder: Path, cell_m: float, min_views: int, settings: MapSettings) -> Surface:
+    """Elect each tile's surface, fill narrow gaps across tile borders, and write the tiles into `folder`."""
+    keys = store.keys()
+    seen = 0
+    for key in keys:
+        tile = store.take(key)
+        elected = _elected(tile, min_views, settings.top_share)
+        _write_tile(folder, key, elected, "elected")
+        _write_cloud(folder, key, tile, cell_m, min_views)
+        seen += int((elected.source == Source.VISION).sum())
+        store.drop(key)
+    reach = round(settings.fill_m / cell_m)
+    filled, sigmas = 0, []
+    columns, rows = [], []
+    for key in keys:
+        layers = _filled(folder, key, frozenset(keys), reach)
+        _write_tile(folder, key, layers, "surface")
+        known = layers.source != Source.UNKNOWN
+        filled += int((layers.source == Source.FILLED).sum())
+        if known.any():
+            sigmas.append(layers.sigma_m[layers.source == Source.VISION][::17])
+            columns += [key[0] * TILE_CELLS + int(c) for c in _span(known.any(axis=0))]
+            rows += [key[1] * TILE_CELLS + int(r) for r in _span(known.any(axis=1))]
+    for key in keys:
+        _tile_file(folder, key, "elected").unlink()
+    all_sigmas = np.concatenate(sigmas) if sigmas else np.empty(0, np.float32)
+    return Surface(
+        folder=folder,
+        cell_m=cell_m,
+        columns=(min(columns), max(columns) + 1) if columns else (0, 0),
+        rows=(min(rows), max(rows) + 1) if rows else (0, 0),
+        seen=seen,
+        filled=filled,
+        median_sigma_m=float(np.median(all_sigmas)) if all_sigmas.size else float("nan"),
+        tiles=frozenset(keys),
+    )
+
+
+def _elected(tile: Float32, min_views: int, top_share: float) -> Layers:
+    winner = elect(tile, min_views, top_share)
+    layers = Layers.unknown(TILE_CELLS, TILE_CELLS)
+    row, column = np.nonzero(winner >= 0)
+    won = tile[row, column, winner[row, column]]
+    layers.z_m[row, column] = won[:, Z]
+    layers.sigma_m[row, column] = height_sigma(won)
+    layers.views[row, column] = won[:, VIEWS]
+    layers.source[row, column] = Source.VISION
+    return layers
+
+
+def _filled(folder: Path, key: TileKey, keys: frozenset[TileKey], reach: int) -> Layers:
+    """The tile with its narrow gaps filled, looking `reach` cells (at most the halo) into its neighbours."""
+    reach = min(reach, _HALO)
+    side = TILE_CELLS + 2 * _HALO
+    around = Layers.unknown(side, side)
+    column, row = key[0] * TILE_CELLS - _HALO, key[1] * TILE_CELLS - _HALO
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            neighbour = (key[0] + i, key[1] + j)
+            if neighbour in keys:
+                _paste(_read_tile(folder, neighbour, "elected"), neighbour, around, column, row)
+    if reach > 0:
+        fill_gaps(around, reach)
+    inner = slice(_HALO, _HALO + TILE_CELLS)
+    return Layers(
+        around.z_m[inner, inner], around.sigma_m[inner, inner],
+        around.views[inner, inner], around.source[inner, inner],
+    )  # fmt: skip
+
+
+def fill_gaps(layers: Layers, reach: int) -> None:
+    """Fill, in place, unknown cells that have seen ones within `reach` on opposite sides, along x or along y.
+
+    The height is interpolated between the two (the nearer pair wins), its sigma is half their difference at
+    the least, and its source says FILLED.
+    """
+    seen = layers.source == Source.VISION
+    unknown = ~seen
+    if not unknown.any() or not seen.any():
+        return
+    across_x = _bridge(layers.z_m, layers.sigma_m, seen, reach)
+    across_y = tuple(a.T for a in _bridge(layers.z_m.T, layers.sigma_m.T, seen.T, reach))
+    take_x = across_x[2] <= across_y[2]
+    gap = np.where(take_x, across_x[2], across_y[2])
+    fill = unknown & np.isfinite(gap)
+    layers.z_m[fill] = np.where(take_x, across_x[0], across_y[0])[fill]
+    layers.sigma_m[fill] = np.where(take_x, across_x[1], across_y[1])[fill]
+    layers.source[fill] = Source.FILLED
+
+
+def _bridge(z: Float32, sigma: Float32, seen: Bool, reach: int) -> tuple[Float32, Float32, Float32]:
+    """Along each row: height, sigma and gap (cells, inf if too wide) between the seen cells on both sides."""
+    width = z.shape[1]
+    index = np.arange(width)[None, :]
+    before = np.maximum.accumulate(np.where(seen, index, -(10**6)), axis=1)
+    after = np.minimum.accumulate(np.where(seen, index, 10**6)[:, ::-1], axis=1)[:, ::-1]
+    to_before, to_after = index - before, after - index
+    bridged = (to_before <= reach) & (to_after <= reach)
+    left = np.take_along_axis(z, before.clip(0, width - 1), axis=1)
+    right = np.take_along_axis(z, after.clip(0, width - 1), axis=1)
+    gap = np.maximum(to_before + to_after, 1)
+    share = (to_before / gap).astype(np.float32)
+    worst = np.maximum(
+        np.take_along_axis(sigma, before.clip(0, width - 1), axis=1),
+        np.take_along_axis(sigma, after.clip(0, width - 1), axis=1),
+    )
+    height = left * (1 - share) + right * share
+    return (
+        height.astype(np.float32),
+        np.hypot(worst, np.abs(right - left) / 2).astype(np.float32),
+        np.where(bridged, gap, np.inf).astype(np.float32),
+    )
+
+
+def _write_cloud(folder: Path, key: TileKey, tile: Float32, cell_m: float, min_views: int) -> None:
+    row, column, slot = np.nonzero(tile[..., VIEWS] >= min_views)
+    kept = tile[row, column, slot]
+    xyz = np.column_stack(
+        [
+            (column + key[0] * TILE_CELLS) * cell_m,
+            (row + key[1] * TILE_CELLS) * cell_m,
+            kept[:, Z],
+        ]
+    ).astype(np.float32)
+    np.savez(
+        folder / f"cloud_{key[0]}_{key[1]}.npz",
+        xyz=xyz,
+        intensity=kept[:, GREY].round().clip(0, 255).astype(np.uint8),
+        sigma=height_sigma(kept),
+        views=kept[:, VIEWS],
+    )
+
+
+def _span(occupied: Bool) -> tuple[int, int]:
+    index = np.flatnonzero(occupied)
+    return int(index[0]), int(index[-1])
+
+
+def _tile_file(folder: Path, key: TileKey, kind: str) -> Path:
+    return folder / f"{kind}_{key[0]}_{key[1]}.npy"
+
+
+def _write_tile(folder: Path, key: TileKey, layers: Layers, kind: str) -> None:
+    stacked = np.stack([layers.z_m, layers.sigma_m, layers.views, layers.source.astype(np.float32)])
+    np.save(_tile_file(folder, key, kind), stacked)
+
+
+@lru_cache(maxsize=48)
+def _read_tile(folder: Path, key: TileKey, kind: str = "surface") -> Layers:
+    z, sigma, views, source = np.load(_tile_file(folder, key, kind))
+    return Layers(z, sigma, views, source.astype(np.uint8))
+
+
+def _paste(tile: Layers, key: TileKey, into: Layers, column: int, row: int) -> None:
+    """Copy the part of the tile that overlaps the rectangle whose first cell is (column, row)."""
+    rows, columns = into.z_m.shape
+    left, top = key[0] * TILE_CELLS - column, key[1] * TILE_CELLS - row
+    target = (
+        slice(max(top, 0), min(top + TILE_CELLS, rows)),
+        slice(max(left, 0), min(left + TILE_CELLS, columns)),
+    )
+    source = (
+        slice(target[0].start - top, target[0].stop - top),
+        slice(target[1].start - left, target[1].stop - left),
+    )
+    for name in ("z_m", "sigma_m", "views", "source"):
+        getattr(into, name)[target] = getattr(tile, name)[source]

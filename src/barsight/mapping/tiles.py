@@ -1,0 +1,62 @@
+"""Square tiles of the map: a few in memory, the others on disk."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+
+from barsight.core.arrays import Float32
+
+TILE_CELLS = 256
+SLOTS = 4
+"""Heights kept per cell."""
+FIELDS = 6
+"""Of each height: mean z, weight (sum of 1 / variance), weighted squares about the mean, views, shared sigma,
+grey level."""
+Z, WEIGHT, SQUARES, VIEWS, SHARED, GREY = range(FIELDS)
+
+TileKey = tuple[int, int]
+
+
+class TileStore:
+    """Tiles by (column, row) number: (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS) float32, [y, x].
+
+    At most `resident` tiles are held; the one untouched for longest goes to a file in `scratch` and comes
+    back when it is needed, so memory doesn't grow with the yard.
+    """
+
+    def __init__(self, scratch: Path, resident: int) -> None:
+        self._scratch = scratch
+        self._resident = resident
+        self._held: OrderedDict[TileKey, Float32] = OrderedDict()
+        self._known: set[TileKey] = set()
+
+    def keys(self) -> list[TileKey]:
+        """All tiles that hold anything, in a fixed order."""
+        return sorted(self._known)
+
+    def take(self, key: TileKey) -> Float32:
+        """The tile to read and write; a fresh one where there is none yet."""
+        tile = self._held.pop(key, None)
+        if tile is None:
+            while len(self._held) >= self._resident:
+                oldest, evicted = self._held.popitem(last=False)
+                np.save(self._file(oldest), evicted)
+            if key in self._known:
+                tile = np.load(self._file(key))
+            else:
+                tile = np.zeros((TILE_CELLS, TILE_CELLS, SLOTS, FIELDS), np.float32)
+                self._known.add(key)
+        self._held[key] = tile
+        return tile
+
+    def drop(self, key: TileKey) -> None:
+        """Forget a tile."""
+        self._held.pop(key, None)
+        self._known.discard(key)
+        self._file(key).unlink(missing_ok=True)
+
+    def _file(self, key: TileKey) -> Path:
+        return self._scratch / f"slots_{key[0]}_{key[1]}.npy"

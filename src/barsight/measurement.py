@@ -1,0 +1,70 @@
+"""What a measurement yields: the record that the result files and the report are written from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from barsight.core.arrays import Float32, UInt8
+from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
+from barsight.mapping.surface import Surface
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """How long a stage took in all, seconds, and over how many frames (0 where it isn't done by frame)."""
+
+    name: str
+    seconds: float
+    frames: int = 0
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A warning or a veto: `code` is stable and short, `message` a sentence."""
+
+    code: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A frame that a stage refused."""
+
+    stage: str
+    frame: RefusedFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """One rectified left picture (H, W) uint8 and its disparity (H, W) float32, for people to look at."""
+
+    left: UInt8
+    disparity_px: Float32
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A measured recording; `surface` reads its tiles from a scratch folder that must still be there."""
+
+    recording_path: Path
+    recording_format: str
+    is_simulated: bool
+    calibration_hash: str
+    configuration_hash: str
+    input_hashes: dict[str, str]
+    configuration: dict[str, Any]
+    trajectory: Trajectory
+    frames_total: int
+    frames_used: int
+    refusals: tuple[Refusal, ...]
+    sensors_used: tuple[str, ...]
+    surface: Surface
+    contours: tuple[Contour, ...]
+    laser: tuple[LaserProfile, ...]
+    agreements: tuple[Agreement, ...]
+    stages: tuple[StageTime, ...]
+    warnings: tuple[Notice, ...]
+    peak_memory_mib: float
+    preview: Preview | None
