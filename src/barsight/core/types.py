@@ -127,10 +127,14 @@ class DisparityRange:
 
 @dataclass(frozen=True, eq=False)
 class Disparity:
-    """disparity_px, sigma_px (one standard deviation): (H, W) float32, NaN where there is no match."""
+    """disparity_px, sigma_px (one standard deviation): (H, W) float32, NaN where there is no match.
+
+    bias_sigma_px: the part of sigma_px that other views of the same surface repeat, such as pixel locking.
+    """
 
     disparity_px: Float32
     sigma_px: Float32
+    bias_sigma_px: float = 0.0
 
     def __post_init__(self) -> None:
         expect_shape("disparity_px", self.disparity_px, (None, None))
@@ -147,7 +151,7 @@ class StereoPoints:
     """The points of one view, in `rect0`.
 
     xyz_m: (N, 3) float32. range_sigma_m: (N,) float32, noise along the viewing ray (averages out over views).
-    shared_sigma_m: (N,) float32, the part that the calibration causes (the same in every view).
+    shared_sigma_m: (N,) float32, the part that is the same in every view (calibration, the method's bias).
     intensity: (N,) uint8.
     """
 

@@ -33,7 +33,7 @@ class SgbmSettings:
     """How much better than the second best the winner must be."""
     speckle_px: int = 100
     """Connected patches smaller than this are dropped."""
-    subpixel_sigma_px: float = 0.21
+    subpixel_sigma_px: float = 0.2
     """The part of the error that image noise doesn't explain: pixel locking and smoothing."""
 
     def __post_init__(self) -> None:
@@ -77,7 +77,7 @@ class Sgbm:
         disparity[~_lands_on_valid(disparity, pair)] = np.nan
         sigma = np.hypot(_noise_sigma(pair, block), np.float32(settings.subpixel_sigma_px))
         sigma[np.isnan(disparity)] = np.nan
-        return Disparity(disparity, sigma.astype(np.float32))
+        return Disparity(disparity, sigma.astype(np.float32), settings.subpixel_sigma_px)
 
 
 def _padded(image: UInt8, candidates: DisparityRange) -> UInt8:
