@@ -95,7 +95,7 @@ def write_imu(mav0: Path, body_from_imu: np.ndarray) -> None:
     rng = np.random.default_rng(1)
     rows = ["#timestamp [ns],wx,wy,wz,ax,ay,az"]
     for k in range(40):
-        values = [*rng.normal(0, 0.1, 3), *(rng.normal(0, 0.1, 3) + (0, 0, 9.81))]
+        values = [*rng.normal(0, 0.1, 3), *rng.normal((0, 0, 9.81), 0.1)]
         rows.append(",".join([str(START_NS + k * 5_000_000), *(repr(float(v)) for v in values)]))
     (folder / "data.csv").write_text("\n".join(rows) + "\n")
     matrix = {"cols": 4, "rows": 4, "data": [float(v) for v in body_from_imu.ravel()]}

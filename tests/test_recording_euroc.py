@@ -6,6 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
+
+from barsight.core.errors import CalibrationError, InputError
+from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.recording.base import RecordingSettings
+from barsight.recording.open import open_recording
 from recording_samples import (
     START_NS,
     STEP_NS,
@@ -19,12 +25,6 @@ from recording_samples import (
     write_euroc,
     write_imu,
 )
-from scipy.spatial.transform import Rotation
-
-from barsight.core.errors import CalibrationError, InputError
-from barsight.core.types import RefusedFrame, StereoFrame
-from barsight.recording.base import RecordingSettings
-from barsight.recording.open import open_recording
 
 
 def test_everything_is_read(tmp_path: Path) -> None:
@@ -124,9 +124,7 @@ def test_pairs_within_the_tolerance(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("left", "kept"), [(0, 2), (0.5, 2), (-12, 2), (-1, 2)])
-def test_a_picture_cut_short_is_refused_and_the_rest_goes_on(
-    tmp_path: Path, left: float, kept: int
-) -> None:
+def test_a_picture_cut_short_is_refused_and_the_rest_goes_on(tmp_path: Path, left: float, kept: int) -> None:
     write_euroc(tmp_path)
     path = tmp_path / "mav0" / "cam1" / "data" / f"{stamps(3)[1]}.png"
     data = path.read_bytes()
@@ -206,7 +204,11 @@ BAD = {
     "garbled sensor.yaml": (write("cam0/sensor.yaml", "a: [1, 2\nb"), CalibrationError, "not YAML"),
     "empty sensor.yaml": (write("cam0/sensor.yaml", "%YAML:1.0\n"), CalibrationError, "is empty"),
     "binary sensor.yaml": (write("cam0/sensor.yaml", "\x01\x02"), CalibrationError, "cam0/sensor.yaml"),
-    "no rotation": (break_sensor(1, T_BS=SCALED), CalibrationError, "cam1/sensor.yaml: T_BS: .*not a rotation"),
+    "no rotation": (
+        break_sensor(1, T_BS=SCALED),
+        CalibrationError,
+        "cam1/sensor.yaml: T_BS: .*not a rotation",
+    ),
     "reflection": (break_sensor(0, T_BS=MIRRORED), CalibrationError, "T_BS: .*reflection"),
     "short T_BS": (break_sensor(0, T_BS={"data": [1.0]}), CalibrationError, "T_BS: is not a 4x4 matrix"),
     "NaN in T_BS": (break_sensor(0, T_BS={"data": [float("nan")] * 16}), CalibrationError, "not finite"),
@@ -279,7 +281,7 @@ def test_no_such_folder_and_no_recording(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="file of an unknown kind"):
         open_recording(tmp_path / "a.txt")
     write_euroc(tmp_path / "inside")
-    with pytest.raises(InputError, match="give the folder inside, .*inside"):
+    with pytest.raises(InputError, match=r"give the folder inside, .*inside"):
         open_recording(tmp_path)
 
 

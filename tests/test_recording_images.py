@@ -6,9 +6,9 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from recording_samples import picture, png
 
 from barsight.recording.images import PNG_SIGNATURE, TornImageError, check_png, decode_gray, to_gray
+from recording_samples import picture, png
 
 
 def test_a_whole_png_is_read_unchanged() -> None:

@@ -52,7 +52,9 @@ class BagFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._is_ros1 = path.suffix == ".bag"
+        self._is_ros1 = path.is_file() and path.suffix == ".bag"
+        self._files = _files(path)
+        _expect_whole_database(self._files)
         with self._opened() as reader:
             self._typestore = reader.typestore
             counts: dict[tuple[str, str], int] = {}
@@ -99,7 +101,7 @@ class BagFile:
     @contextlib.contextmanager
     def _opened(self) -> Iterator[AnyReader]:
         try:
-            reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader = AnyReader(self._files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             reader.open()
         except MemoryError:
             raise
@@ -115,6 +117,33 @@ class BagFile:
         if self._is_ros1:
             remedy = "copy it again, or repair it with `rosbag reindex`"
         return InputError(self.path, f"can't be read, it may be cut short ({_short(error)})", remedy)
+
+
+def _files(path: Path) -> list[Path]:
+    """What to hand to rosbags, which takes a ROS 2 folder for a ROS 1 file where its name ends in `.bag`."""
+    if path.is_dir() and path.suffix == ".bag":
+        return sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    return [path]
+
+
+def _expect_whole_database(paths: list[Path]) -> None:
+    """SQLite reads a file that lost its last pages without a word until a lost page is needed.
+
+    Its header says the page size (byte 16) and the count of pages (byte 28) [SQLite file format 1.3].
+    """
+    files = [file for path in paths for file in (path.glob("*.db3") if path.is_dir() else [path])]
+    for file in files:
+        if file.suffix != ".db3":
+            continue
+        with file.open("rb") as stream:
+            header = stream.read(100)
+        if len(header) < 100:
+            continue
+        page, pages = (struct.unpack_from(kind, header, at)[0] for kind, at in ((">H", 16), (">I", 28)))
+        if file.stat().st_size < (65536 if page == 1 else page) * pages:
+            raise InputError(
+                file, "can't be read, it is cut short", "copy it again, or repair it with `ros2 bag reindex`"
+            )
 
 
 def _short(error: Exception) -> str:

@@ -1,0 +1,77 @@
+"""What `barsight info` says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from barsight.recording.info import describe, stream_info
+from barsight.recording.info_print import print_info
+from barsight.recording.open import open_recording
+from recording_samples import START_NS, real, stamps, write_euroc
+
+
+def test_gaps_are_counted() -> None:
+    steps = np.array([10, 10, 10, 16, 10, 40, 10, 15]) * 1_000_000
+    info = stream_info("imu0", START_NS + np.concatenate([[0], np.cumsum(steps)]))
+    assert (info.count, info.gaps) == (9, 2)
+    assert info.longest_gap_s == 0.04
+    assert info.rate_hz == 100
+    assert info.duration_s == 0.121
+    alone = stream_info("cam0", np.array([START_NS]))
+    assert (alone.count, alone.gaps, alone.duration_s) == (1, 0, 0)
+    assert np.isnan(alone.rate_hz)
+
+
+def test_describe_and_print(tmp_path: Path) -> None:
+    root = write_euroc(tmp_path / "a [b] c", 4)
+    path = root / "mav0" / "cam1" / "data.csv"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    (root / "mav0" / "cam0" / "data" / f"{stamps(4)[0]}.png").write_bytes(b"x")
+    info = describe(open_recording(root))
+    assert info.pairs == 3
+    assert [frame.stamp_ns for frame in info.dropped] == [stamps(4)[3]]
+    assert info.first_refused == f"cam0/data/{stamps(4)[0]}.png is no readable picture"
+    assert [stream.name for stream in info.streams] == ["cam0", "cam1", "imu0", "crane0"]
+    assert info.streams[2].rate_hz == 200
+    assert info.calibration.timeshift_cam_imu_ms == -3.5
+    assert abs(info.calibration.baseline_m - np.linalg.norm([0.12, 0.001, -0.002])) < 1e-9
+    assert info.crane is not None
+    assert info.crane.highest_m[0] == pytest.approx(0.3)
+    assert [(p.profile, p.count) for p in info.laser] == [(0, 5), (3, 5)]
+    console = Console(width=140, record=True, file=(tmp_path / "log").open("w"))
+    print_info(info, console)
+    text = console.export_text()
+    console.file.close()
+    for part in ("a [b] c", "cam1", "200.00", "cam0 only", "no readable picture", "-3.500 ms"):
+        assert part in text
+    assert "120.02" in text
+
+
+def test_odd_things_are_noted(tmp_path: Path) -> None:
+    write_euroc(tmp_path, 8)
+    rows = [f"{k * 5_000_000},9,0,0,0,0,30" for k in range(10)]
+    (tmp_path / "mav0" / "imu0" / "data.csv").write_text("\n".join(rows) + "\n")
+    notes = " / ".join(describe(open_recording(tmp_path)).notes)
+    assert "30.00 m/s^2" in notes
+    assert "not in degrees/s" in notes
+    assert "imu0 and cam0 have no time in common" in notes
+    assert "crane0 does not span the pictures: 0.00 s missing at the start, 0.20 s at the end" in notes
+
+
+def test_no_picture_beyond_the_first_pair_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from barsight.recording import pairing
+
+    calls = []
+    decode = pairing.decode_gray
+    monkeypatch.setattr(pairing, "decode_gray", lambda data: calls.append(0) or decode(data))
+    describe(open_recording(write_euroc(tmp_path, 6)))
+    assert len(calls) == 2
+
+
+def test_real_info() -> None:
+    info = describe(open_recording(real("yard_dev")))
+    assert info.pairs == 19
+    assert info.notes == ()
+    assert info.first_refused is None
