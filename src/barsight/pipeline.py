@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import resource
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -88,7 +89,8 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     poses = {frame.stamp_ns: frame for frame in trajectory.frames}
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
-    view = _View(settings, rectifier, make_method(settings.stereo), cell_m, watch)
+    per_pixel = points_per_pixel(first, cell_m)
+    view = _View(settings, rectifier, make_method(settings.stereo), cell_m, per_pixel, watch)
     store = TileStore(scratch, settings.map.resident_tiles)
     used, preview = 0, None
     for done, outcome in enumerate(ordered_map(view, _placed(source, poses), WORKERS), start=1):
@@ -194,6 +196,11 @@ def choose_cell(first: FirstLook, *, has_crane: bool) -> float:
     return next((side for side in CELL_SIDES_M if side >= wanted), CELL_SIDES_M[-1])
 
 
+def points_per_pixel(first: FirstLook, cell_m: float) -> int:
+    """Points along each axis of a pixel so that no cell between two pixels stays empty."""
+    return min(max(1, math.ceil(first.pixel_on_surface_m / (0.9 * cell_m))), 4)
+
+
 @dataclass(frozen=True, eq=False)
 class _Seen:
     cells: CellObservations
@@ -208,6 +215,7 @@ class _View:
     rectifier: Rectifier
     method: StereoMethod
     cell_m: float
+    per_pixel: int
     watch: Stopwatch
 
     def __call__(self, placed: tuple[StereoFrame | RefusedFrame, PosedFrame]) -> _Seen | Refusal:
@@ -231,6 +239,7 @@ class _View:
                 stereo.calibration_sigma_px,
                 stereo.max_depth_m,
                 self.settings.map.max_sigma_m,
+                self.per_pixel,
             )
             body = posed.reference_from_body
             cells = observe(

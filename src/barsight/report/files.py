@@ -29,7 +29,7 @@ _CLOUD_POINT = np.dtype(
 
 
 def write_results(measurement: Measurement, folder: Path) -> None:
-    """All files that a measurement fills, into an existing folder."""
+    """All files that a measurement fills but result.json, into an existing folder."""
     write_trajectory(measurement.trajectory, folder / "trajectory.tum")
     write_cloud(measurement.surface, folder / "cloud.ply")
     write_height(measurement.surface, folder / "height.tif")
@@ -38,7 +38,6 @@ def write_results(measurement: Measurement, folder: Path) -> None:
         write_laser(measurement.laser, folder / "laser.csv")
     if measurement.preview is not None:
         write_preview(measurement.preview, folder / "preview.png")
-    write_summary(measurement, folder / "result.json")
 
 
 def write_trajectory(trajectory: Trajectory, target: Path) -> None:
@@ -161,11 +160,10 @@ def write_preview(preview: Preview, target: Path) -> None:
         path.write_bytes(encoded.tobytes())
 
 
-def write_summary(measurement: Measurement, target: Path) -> None:
-    """result.json."""
+def write_summary(content: dict[str, Any], target: Path) -> None:
+    """result.json from what `summary` says."""
     with atomic_path(target) as path:
-        text = json.dumps(summary(measurement), indent=1, allow_nan=False)
-        path.write_text(text + "\n", encoding="utf-8")
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def summary(measurement: Measurement) -> dict[str, Any]:

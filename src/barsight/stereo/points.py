@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
+from barsight.core.arrays import Float32
 from barsight.core.types import Disparity, RectifiedPair, StereoPoints
 
 _LEAST_NOISE_PX = 0.02
+_JUMP_PX = 1.0
 
 
 def triangulate(
@@ -15,31 +18,47 @@ def triangulate(
     shared_sigma_px: float,
     max_depth_m: float = float("inf"),
     max_sigma_m: float = float("inf"),
+    per_pixel: int = 1,
 ) -> StereoPoints:
     """Points in `rect0` of all pixels that have a disparity.
 
     depth = f b / (d + doffs); along the ray its sigma is depth^2 / (f b) * sigma_d * |ray|.
     shared_sigma_px is the disparity error that the calibration may cause, the same in every view; the
     method's own bias joins it. Pixels deeper than max_depth_m or less sure than max_sigma_m are left out.
+    per_pixel: points per pixel along each axis, for maps whose cells are finer than the pixels.
     """
     camera = pair.camera
-    shift = disparity.disparity_px + np.float32(camera.doffs_px)
+    strength = np.float32(camera.focal_px * camera.baseline_m)
+    shift = refine_grid(disparity.disparity_px, per_pixel) + np.float32(camera.doffs_px)
+    sigma = _repeat(disparity.sigma_px, per_pixel)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.float32(camera.focal_px * camera.baseline_m) / shift
-        usable = (shift > 0) & (depth <= max_depth_m)
-        per_px = depth * depth / np.float32(camera.focal_px * camera.baseline_m)
-        usable &= per_px * disparity.sigma_px <= max_sigma_m
+        depth = strength / shift
+        per_px = depth * depth / strength
+        usable = (shift > 0) & (depth <= max_depth_m) & (per_px * sigma <= max_sigma_m)
     rows, columns = np.nonzero(usable)
-    depth, per_px = depth[usable], per_px[usable]
-    ray_x = ((columns - camera.cx_px) / camera.focal_px).astype(np.float32)
-    ray_y = ((rows - camera.cy_px) / camera.focal_px).astype(np.float32)
+    depth, per_px, sigma = depth[usable], per_px[usable], sigma[usable]
+    ray_x = (((columns + 0.5) / per_pixel - 0.5 - camera.cx_px) / camera.focal_px).astype(np.float32)
+    ray_y = (((rows + 0.5) / per_pixel - 0.5 - camera.cy_px) / camera.focal_px).astype(np.float32)
     along_ray = (per_px * np.sqrt(1 + ray_x * ray_x + ray_y * ray_y)).astype(np.float32)
-    variance_px = disparity.sigma_px[usable] ** 2 - np.float32(disparity.bias_sigma_px**2)
-    noise_px = np.sqrt(np.maximum(variance_px, np.float32(_LEAST_NOISE_PX**2)))
+    noise_px = np.sqrt(np.maximum(sigma**2 - disparity.bias_sigma_px**2, _LEAST_NOISE_PX**2))
     return StereoPoints(
         stamp_ns=pair.stamp_ns,
         xyz_m=np.column_stack([ray_x * depth, ray_y * depth, depth]),
-        range_sigma_m=along_ray * noise_px,
+        range_sigma_m=(along_ray * noise_px).astype(np.float32),
         shared_sigma_m=along_ray * np.float32(np.hypot(shared_sigma_px, disparity.bias_sigma_px)),
-        intensity=pair.left[usable],
+        intensity=pair.left[rows // per_pixel, columns // per_pixel],
     )
+
+
+def refine_grid(disparity: Float32, per_pixel: int) -> Float32:
+    """(H, W) to (H * per_pixel, W * per_pixel), bilinear inside a surface, nearest at jumps and gaps."""
+    if per_pixel == 1:
+        return disparity
+    nearest = _repeat(disparity, per_pixel)
+    height, width = nearest.shape
+    smooth = cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.where(np.abs(smooth - nearest) <= _JUMP_PX, smooth, nearest)
+
+
+def _repeat(values: Float32, per_pixel: int) -> Float32:
+    return values if per_pixel == 1 else values.repeat(per_pixel, axis=0).repeat(per_pixel, axis=1)

@@ -1,0 +1,44 @@
+"""`barsight convert RECORDING -o OUT --to FORMAT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.recording.base import RecordingSettings
+from barsight.recording.convert import Target, convert
+from barsight.recording.open import open_recording
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and convert."""
+
+    def command(
+        recording: tyro.conf.Positional[Path],
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        to: Target,
+        settings: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
+    ) -> None:
+        """Write a recording in another format; pictures, stamps and numbers stay what they are.
+
+        Args:
+            recording: The recording to read.
+            out: The folder to write; it must not exist yet.
+            to: The format to write.
+            settings: How to read it.
+        """
+        console = Console(stderr=True)
+        source = open_recording(recording, settings)
+        with stages(console) as advance:
+            done = convert(source, out, to, lambda n, total: advance("pictures", n, total))
+        console.print(f"{done.images} pictures written to {done.out}", soft_wrap=True, highlight=False)
+        if done.left_out:
+            console.print(f"[yellow]{done.left_out} pictures were missing or torn and are left out[/yellow]")
+
+    call(command, "convert", arguments)

@@ -1,0 +1,44 @@
+"""`barsight demo`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from barsight.cli.arguments import call
+from barsight.cli.measure import measure_into, print_outcome
+from barsight.cli.progress import stages
+from barsight.core.errors import OutputError
+from barsight.pipeline import MeasureSettings
+from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.simulate import simulate
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and show."""
+
+    def command(out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("demo")) -> None:
+        """Simulate a small yard, measure it, and compare with its truth and its simulated laser.
+
+        Args:
+            out: The folder for the recording (OUT/recording) and the results (OUT/result).
+        """
+        console = Console(stderr=True)
+        recording, result = out / "recording", out / "result"
+        for folder in (recording, result):
+            if folder.exists():
+                raise OutputError(f"{folder}: exists already; remove it or name another folder with -o")
+        console.print("Simulating a small yard ...")
+        with stages(console) as advance:
+            simulate(recording, SimulationSettings.demo(), lambda n, total: advance("render", n, total))
+        console.print("Measuring it ...")
+        content = measure_into(recording, result, MeasureSettings(), console, truth_of=recording)
+        print_outcome(content, console, verbose=False)
+        console.print(f"report: {result / 'report.html'}", soft_wrap=True, highlight=False)
+        console.print(f"in 3D:  barsight view {result}", soft_wrap=True, highlight=False)
+
+    call(command, "demo", arguments)

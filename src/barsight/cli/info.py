@@ -1,0 +1,33 @@
+"""`barsight info RECORDING`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from barsight.cli.arguments import call
+from barsight.recording.base import RecordingSettings
+from barsight.recording.info import describe
+from barsight.recording.info_print import print_info
+from barsight.recording.open import open_recording
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and print."""
+
+    def command(
+        recording: tyro.conf.Positional[Path],
+        settings: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
+    ) -> None:
+        """Say what is in a recording: sensors, rates, gaps, dropped pictures and why, calibration.
+
+        Args:
+            recording: The recording.
+            settings: How to read it.
+        """
+        print_info(describe(open_recording(recording, settings)), Console())
+
+    call(command, "info", arguments)

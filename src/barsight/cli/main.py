@@ -1,0 +1,73 @@
+"""`barsight COMMAND ...`: finds the command, runs it, and turns a user's mistake into one line."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+import barsight
+from barsight.core.errors import BarsightError
+
+COMMANDS = {
+    "demo": "Simulate a small yard, measure it and compare with truth and laser: try this first",
+    "measure": "Measure a stereo recording: map, contours, trajectory, cloud, report",
+    "view": "Show a measured yard in 3D in the browser",
+    "info": "Say what is in a recording: sensors, rates, gaps, calibration",
+    "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
+    "simulate": "Render a recording of a bar yard with exact truth",
+    "score": "Compare a measured yard with the truth of its recording",
+    "report": "Write report.html anew from a measured yard's files",
+}
+INTERRUPTED = 130
+
+
+def main() -> None:
+    """The console script."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command and return the exit code: 0 done, 1-5 a user's mistake, 130 interrupted."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        _print_help()
+        return 0 if arguments else 2
+    if arguments[0] in ("-V", "--version"):
+        sys.stdout.write(f"barsight {barsight.__version__}\n")
+        return 0
+    name, rest = arguments[0], list(arguments[1:])
+    if name not in COMMANDS:
+        return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
+    try:
+        signal.signal(signal.SIGTERM, _interrupt)
+        module = importlib.import_module(f"barsight.cli.{name}")
+        module.run(rest)
+    except BarsightError as error:
+        return _refuse(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        return _refuse("interrupted; nothing half-written is left", INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _refuse(line: str, code: int) -> int:
+    sys.stderr.write(f"barsight: {' '.join(line.split())}\n")
+    return code
+
+
+def _print_help() -> None:
+    lines = "\n".join(f"  {name:<10}{summary}" for name, summary in COMMANDS.items())
+    sys.stdout.write(
+        f"barsight {barsight.__version__}: measure a yard of steel bars from a travelling crane\n\n"
+        f"usage: barsight COMMAND ...\n\ncommands:\n{lines}\n\n"
+        "barsight COMMAND --help explains a command and all its settings.\n"
+    )

@@ -1,0 +1,132 @@
+"""`barsight measure RECORDING -o OUT`."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from barsight.cli.arguments import call, config_path, load_settings
+from barsight.cli.progress import stages
+from barsight.core.errors import OutputError
+from barsight.core.files import atomic_directory
+from barsight.evaluation.truth import score
+from barsight.pipeline import MeasureSettings, measure
+from barsight.recording.open import open_recording
+from barsight.report.files import summary, write_results, write_summary
+from barsight.report.page import write_report
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and measure."""
+    default = load_settings(config_path(arguments), MeasureSettings)
+
+    def command(
+        recording: tyro.conf.Positional[Path],
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        settings: tyro.conf.OmitArgPrefixes[MeasureSettings] = default,
+        config: Path | None = None,
+        overwrite: bool = False,
+        verbose: Annotated[bool, tyro.conf.arg(aliases=("-v",))] = False,
+    ) -> None:
+        """Measure a stereo recording into OUT: map, contours, trajectory, cloud and report.html.
+
+        The recording may be an EuRoC folder, a KITTI odometry sequence or a ROS bag; barsight info shows
+        what is in it. Crane encoders give the trajectory in the yard; without them stereo odometry does.
+        OUT is written whole or not at all.
+
+        Args:
+            recording: The recording.
+            out: The folder for the results.
+            settings: Settings of the stages.
+            config: TOML file with settings; flags go before it.
+            overwrite: Replace the result files of an earlier run in OUT.
+            verbose: Print the time that each stage took.
+        """
+        console = Console(stderr=True)
+        measured = measure_into(recording, out, settings, console, overwrite=overwrite)
+        print_outcome(measured, console, verbose=verbose)
+        console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False)
+
+    call(command, "measure", arguments)
+
+
+def measure_into(
+    path: Path,
+    out: Path,
+    settings: MeasureSettings,
+    console: Console,
+    *,
+    overwrite: bool = False,
+    truth_of: Path | None = None,
+) -> dict[str, Any]:
+    """Measure, write all files and the report into `out`, and return what result.json says.
+
+    truth_of: a recording with truth to score against; only after the measuring is done.
+    """
+    if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
+        raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
+    recording = open_recording(path, settings.recording)
+    with atomic_directory(out, replace=overwrite) as staging:
+        scratch = staging / "scratch"
+        scratch.mkdir()
+        with stages(console) as advance:
+            measured = measure(recording, settings, scratch, advance)
+        content = summary(measured)
+        write_results(measured, staging)
+        shutil.rmtree(scratch)
+        if truth_of is not None:
+            content["truth"] = score(truth_of, staging)
+        write_summary(content, staging / "result.json")
+        write_report(staging, staging / "report.html")
+    return content
+
+
+def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -> None:
+    """The run in a few lines: frames, agreement with the laser, truth, warnings."""
+    frames, trajectory = content["frames"], content["trajectory"]
+    console.print(
+        f"{frames['used']} of {frames['total']} frames over {trajectory['length_m']:.2f} m "
+        f"({', '.join(content['sensors_used'])}), {content['map']['cells_seen']} cells of "
+        f"{1e3 * content['map']['cell_m']:.0f} mm seen, peak memory {content['peak_memory_mib']:.0f} MiB",
+        highlight=False,
+    )
+    if content["agreement"]:
+        console.print(_agreement_table(content["agreement"]))
+    if content["truth"]:
+        console.print(_truth_table(content["truth"]))
+    for warning in content["warnings"]:
+        console.print(f"[yellow]{escape(warning['code'])}:[/yellow] {escape(warning['message'])}")
+    if verbose:
+        table = Table("stage", "seconds", "per frame", title="Time by stage (worker seconds)")
+        for stage in content["stages"]:
+            each = f"{stage['seconds'] / stage['frames']:.3f}" if stage["frames"] else ""
+            table.add_row(stage["name"], f"{stage['seconds']:.2f}", each)
+        console.print(table)
+        for refused in frames["refused"]:
+            console.print(f"refused {refused['stamp_ns']} ({refused['stage']}): {escape(refused['reason'])}")
+
+
+def _agreement_table(agreements: list[dict[str, Any]]) -> Table:
+    table = Table(
+        "profile", "y m", "coverage %", "bias", "MAE", "RMSE", "P95", "max", title="Vision minus laser, mm"
+    )
+    for a in agreements:
+        numbers = (a[f"{name}_mm"] for name in ("bias", "mae", "rmse", "p95", "max"))
+        table.add_row(
+            str(a["profile"]), f"{a['y_m']:.2f}", f"{a['coverage_pct']:.1f}", *(f"{n:.2f}" for n in numbers)
+        )
+    return table
+
+
+def _truth_table(truth: dict[str, dict[str, float]]) -> Table:
+    table = Table("compared", "figures", title="Against truth")
+    for name, figures in truth.items():
+        table.add_row(name, ", ".join(f"{key} {value:g}" for key, value in figures.items()))
+    return table

@@ -1,0 +1,27 @@
+"""`barsight report OUT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from barsight.cli.arguments import call
+from barsight.report.page import write_report
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and write."""
+
+    def command(out: tyro.conf.Positional[Path]) -> None:
+        """Write report.html anew from the files of a measured yard.
+
+        Args:
+            out: A folder written by barsight measure.
+        """
+        write_report(out, out / "report.html")
+        Console(stderr=True).print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False)
+
+    call(command, "report", arguments)

@@ -1,0 +1,29 @@
+"""`barsight score RECORDING OUT`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from barsight.cli.arguments import call
+from barsight.evaluation.truth import score
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and compare."""
+
+    def command(recording: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
+        """Compare a measured yard with the truth of its simulated recording; prints JSON.
+
+        Args:
+            recording: The recording, with its folder truth.
+            out: The folder that barsight measure wrote from it.
+        """
+        json.dump(score(recording, out), sys.stdout, indent=1)
+        sys.stdout.write("\n")
+
+    call(command, "score", arguments)

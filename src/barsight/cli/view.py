@@ -1,0 +1,27 @@
+"""`barsight view OUT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from barsight.cli.arguments import call
+from barsight.viewer.view import view
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and serve until Ctrl-C."""
+
+    def command(out: tyro.conf.Positional[Path], port: int = 8080, browser: bool = True) -> None:
+        """Show a measured yard in 3D in the browser; works offline, Ctrl-C ends it.
+
+        Args:
+            out: A folder written by barsight measure.
+            port: The port on this machine to serve at.
+            browser: Open the browser.
+        """
+        view(out, port, browser)
+
+    call(command, "view", arguments)
