@@ -1,0 +1,205 @@
+"""The hall's lamps, and what of their light reaches each surface: baked once, as nothing in the yard moves.
+
+A lamp hangs at every `spacing` along X in each of two rows; its beam ends 1.5 spacings away, so at most
+three lamps of a row reach a place, and lamp number i of row r has slot (i mod 3) + 3 r there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, Int32, Int64, UInt8, kernel
+from barsight.simulation.rays import FAR, trace
+from barsight.simulation.scene import Grid, Scene
+
+SLOTS = 6
+TEXEL_M = 0.05
+AROUND = 16
+"""Lightmap cells around a bar."""
+FLOOR_MARGIN_M = 5.0
+
+
+class Lamps(NamedTuple):
+    """Where the lamps hang (m): spacing and offset along X, the rows' y, height z; half length along Y."""
+
+    spacing: float
+    offset: float
+    rows: Float64
+    z: float
+    half_length: float
+    power: float
+    ambient: float
+
+
+class Lightmap(NamedTuple):
+    """Light per texel. Texel t of primitive p: start[p] + s * around[p] + a; the floor is the last primitive.
+
+    start: (P + 2,). along, around: (P + 1,). A cylinder's `a` runs around it, a box's is its face (2 k for
+    -axis k, 2 k + 1 for +axis k), with `along` on its longest axis; the floor's texels lie along X, then Y.
+    diffuse: (T,) irradiance from lamps and hall. seen: (T, SLOTS) share of each lamp that is seen, 255 all.
+    """
+
+    start: Int64
+    along: Int32
+    around: Int32
+    diffuse: Float32
+    seen: UInt8
+    floor: Float64
+
+
+def hall_lamps(above_floor_m: float) -> Lamps:
+    """Two rows of lamps over a crane whose cameras hang `above_floor_m` high."""
+    z = above_floor_m + 3.5
+    return Lamps(5.0, 1.7, np.array([-4.2, 4.6]), z, 0.5, 0.75 * z * z, 0.34)
+
+
+def bake(scene: Scene, lamps: Lamps, rng: np.random.Generator) -> Lightmap:
+    """Send rays from every texel to the lamps and over the hall's ceiling."""
+    shape, _, cylinders = scene.primitives
+    count = len(shape)
+    along = np.ones(count + 1, dtype=np.int32)
+    around = np.full(count + 1, 6, dtype=np.int32)
+    around[:cylinders] = AROUND
+    along[:cylinders] = np.ceil(2 * shape[:cylinders, 13] / TEXEL_M)
+    along[cylinders:count] = np.ceil(2 * shape[cylinders:, 12:15].max(axis=1, initial=0) / TEXEL_M)
+    low = shape[:, :2].min(axis=0) - FLOOR_MARGIN_M
+    high = shape[:, :2].max(axis=0) + FLOOR_MARGIN_M
+    along[count], around[count] = np.ceil((high - low) / TEXEL_M)
+    start = np.concatenate([[0], np.cumsum(along.astype(np.int64) * around)])
+    floor = np.array([low[0], low[1], TEXEL_M])
+    diffuse = np.zeros(int(start[-1]), dtype=np.float32)
+    seen = np.zeros((int(start[-1]), SLOTS), dtype=np.uint8)
+    lightmap = Lightmap(start, along, around, diffuse, seen, floor)
+    rows = np.repeat(np.arange(count + 1, dtype=np.int32), along)
+    places = np.arange(len(rows), dtype=np.int64) - np.repeat(np.cumsum(along) - along, along)
+    order = rng.permutation(len(rows))
+    _bake(
+        shape, cylinders, scene.grid, lamps, lightmap, rows[order], places[order], _ceiling_directions(),
+        diffuse, seen,
+    )  # fmt: skip
+    return lightmap
+
+
+def _ceiling_directions() -> Float64:
+    """(16, 3) unit directions into the upper half space, three rings and the zenith."""
+    rings = ((15, 5), (35, 5), (60, 5))
+    directions = [(0.0, 0.0, 1.0)]
+    for number, (elevation_deg, count) in enumerate(rings):
+        elevation = np.radians(elevation_deg)
+        for k in range(count):
+            azimuth = 2 * np.pi * (k + number / 3 + 0.1) / count
+            directions.append(
+                (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
+            )
+    return np.array(directions)
+
+
+@kernel(parallel=True)
+def _bake(
+    shape: Float64, cylinders: int, grid: Grid, lamps: Lamps, lightmap: Lightmap, rows: Int32, places: Int64,
+    ceiling: Float64, diffuse: Float32, seen: UInt8,
+) -> None:  # fmt: skip
+    # Writes go to plain arrays: Numba 0.68 loses what a prange writes to a named tuple's field.
+    for r in numba.prange(rows.shape[0]):
+        p, s = rows[r], places[r]
+        for a in range(lightmap.around[p]):
+            x, y, z, nx, ny, nz = _texel(shape, cylinders, lightmap, p, s, a)
+            if z <= 0.0:
+                continue
+            t = lightmap.start[p] + s * lightmap.around[p] + a
+            light = _hall_light(shape, cylinders, grid, ceiling, x, y, z, nx, ny, nz) * lamps.ambient
+            middle = int(np.floor((x - lamps.offset) / lamps.spacing + 0.5))
+            for slot in range(6):
+                lamp = middle + (slot % 3 - middle + 1) % 3 - 1
+                lx, ly = lamp * lamps.spacing + lamps.offset - x, lamps.rows[slot // 3] - y
+                lz = lamps.z - z
+                square = lx * lx + ly * ly + lz * lz
+                distance = np.sqrt(square)
+                cosine = (lx * nx + ly * ny + lz * nz) / distance
+                if cosine <= -0.2:
+                    continue
+                share = 0.0
+                for end in range(2):
+                    ey = ly + (2 * end - 1) * 0.6 * lamps.half_length
+                    _, found = trace(shape, cylinders, grid, x, y, z, lx, ey, lz, 1e-6, 1.0, True)
+                    if found < 0:
+                        share += 0.5
+                seen[t, slot] = int(255 * share)
+                if cosine > 0:
+                    light += share * cosine * lamp_beam(lamps, lx) * (lz / distance) / square
+            diffuse[t] = light
+
+
+@kernel()
+def lamp_beam(lamps: Lamps, along_x: float) -> float:
+    """The lamp's power towards a place `along_x` away along X; zero from 1.5 spacings on."""
+    u = along_x / (1.5 * lamps.spacing)
+    return lamps.power * (1 - u * u) ** 2 if u * u < 1 else 0.0
+
+
+@kernel()
+def _hall_light(
+    shape: Float64, cylinders: int, grid: Grid, ceiling: Float64, x: float, y: float, z: float,
+    nx: float, ny: float, nz: float,
+) -> float:  # fmt: skip
+    """Irradiance from the hall itself, 1 for an open level surface, with a little that bounces anywhere."""
+    total, norm = 0.0, 0.0
+    for k in range(ceiling.shape[0]):
+        cx, cy, cz = ceiling[k, 0], ceiling[k, 1], ceiling[k, 2]
+        norm += cz
+        cosine = cx * nx + cy * ny + cz * nz
+        if cosine <= 0:
+            continue
+        _, found = trace(shape, cylinders, grid, x, y, z, cx, cy, cz, 1e-6, FAR, True)
+        if found < 0:
+            total += cosine
+    return 0.05 + 0.95 * total / norm
+
+
+@kernel()
+def _texel(
+    shape: Float64, cylinders: int, lightmap: Lightmap, p: int, s: int, a: int
+) -> tuple[float, float, float, float, float, float]:
+    """Middle of a texel, lifted 1 mm off the surface, and its normal."""
+    lift = 1e-3
+    if p == shape.shape[0]:
+        step = lightmap.floor[2]
+        return lightmap.floor[0] + (s + 0.5) * step, lightmap.floor[1] + (a + 0.5) * step, lift, 0.0, 0.0, 1.0
+    share = (s + 0.5) / lightmap.along[p] * 2 - 1
+    if p < cylinders:
+        angle = 2 * np.pi * (a + 0.5) / lightmap.around[p]
+        c, d, length = np.cos(angle), np.sin(angle), share * shape[p, 13]
+        nx = c * shape[p, 6] + d * shape[p, 9]
+        ny = c * shape[p, 7] + d * shape[p, 10]
+        nz = c * shape[p, 8] + d * shape[p, 11]
+        out = shape[p, 12] + lift
+        return (
+            shape[p, 0] + length * shape[p, 3] + out * nx,
+            shape[p, 1] + length * shape[p, 4] + out * ny,
+            shape[p, 2] + length * shape[p, 5] + out * nz,
+            nx, ny, nz,
+        )  # fmt: skip
+    face, sign = a // 2, 2.0 * (a % 2) - 1.0
+    longest = longest_axis(shape, p)
+    out = sign * (shape[p, 12 + face] + lift)
+    length = share * shape[p, 12 + longest] if longest != face else 0.0
+    i, j = 3 + 3 * face, 3 + 3 * longest
+    return (
+        shape[p, 0] + out * shape[p, i] + length * shape[p, j],
+        shape[p, 1] + out * shape[p, i + 1] + length * shape[p, j + 1],
+        shape[p, 2] + out * shape[p, i + 2] + length * shape[p, j + 2],
+        sign * shape[p, i], sign * shape[p, i + 1], sign * shape[p, i + 2],
+    )  # fmt: skip
+
+
+@kernel()
+def longest_axis(shape: Float64, p: int) -> int:
+    """The axis (0, 1, 2) along which a box is longest."""
+    k = 0
+    for axis in (1, 2):
+        if shape[p, 12 + axis] > shape[p, 12 + k]:
+            k = axis
+    return k

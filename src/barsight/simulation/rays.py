@@ -1,0 +1,165 @@
+"""Rays against the scene: exact intersections with capped cylinders and boxes, found by walking the grid."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from barsight.core.arrays import Float64, Int32, kernel
+from barsight.simulation.scene import Grid, Scene
+
+FAR = 1e30
+
+
+@kernel()
+def hit_cylinder(
+    shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
+) -> float:
+    """The first ray parameter over `near` at which the ray enters the capped cylinder, else FAR."""
+    cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
+    da = dx * shape[p, 3] + dy * shape[p, 4] + dz * shape[p, 5]
+    ca = cx * shape[p, 3] + cy * shape[p, 4] + cz * shape[p, 5]
+    a = dx * dx + dy * dy + dz * dz - da * da
+    b = cx * dx + cy * dy + cz * dz - ca * da
+    c = cx * cx + cy * cy + cz * cz - ca * ca - shape[p, 12] * shape[p, 12]
+    h = shape[p, 13]
+    if a > 1e-14:
+        root = b * b - a * c
+        if root < 0:
+            return FAR
+        t: float = (-b - math.sqrt(root)) / a
+        if t > near and abs(ca + t * da) <= h:
+            return t
+    if da != 0.0:
+        t = (-h - ca) / da if da > 0 else (h - ca) / da
+        if t > near and a * t * t + 2 * b * t + c <= 0:
+            return t
+    return FAR
+
+
+@kernel()
+def hit_box(
+    shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
+) -> float:
+    """The first ray parameter over `near` at which the ray enters the box, else FAR."""
+    cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
+    enter: float = -FAR
+    leave: float = FAR
+    for k in range(3):
+        ex, ey, ez = shape[p, 3 + 3 * k], shape[p, 4 + 3 * k], shape[p, 5 + 3 * k]
+        place = cx * ex + cy * ey + cz * ez
+        speed = dx * ex + dy * ey + dz * ez
+        half = shape[p, 12 + k]
+        if abs(speed) < 1e-14:
+            if abs(place) > half:
+                return FAR
+        else:
+            t0, t1 = (-half - place) / speed, (half - place) / speed
+            enter = max(enter, min(t0, t1))
+            leave = min(leave, max(t0, t1))
+    return enter if near < enter <= leave else FAR
+
+
+@kernel()
+def trace(
+    shape: Float64, cylinders: int, grid: Grid, ox: float, oy: float, oz: float,
+    dx: float, dy: float, dz: float, near: float, far: float, any_hit: bool,
+) -> tuple[float, int]:  # fmt: skip
+    """The first hit between `near` and `far`: (ray parameter, primitive), or (FAR, -1).
+
+    The floor z = 0 answers with the number of primitives as its id. With `any_hit` the first hit found is
+    good enough (shadows). [Amanatides 1987]
+    """
+    best, found = far, -1
+    if dz < 0.0:
+        t = -oz / dz
+        if near < t < best:
+            best, found = t, shape.shape[0]
+            if any_hit:
+                return best, found
+    lo, cell, n = grid.low, grid.cell, grid.counts
+    enter, leave = near, best
+    for k in range(3):
+        o = ox if k == 0 else (oy if k == 1 else oz)
+        d = dx if k == 0 else (dy if k == 1 else dz)
+        top = lo[k] + n[k] * cell[k]
+        if abs(d) < 1e-14:
+            if o < lo[k] or o > top:
+                enter = FAR
+        else:
+            t0, t1 = (lo[k] - o) / d, (top - o) / d
+            enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
+    if enter > leave:
+        return (best, found) if found >= 0 else (FAR, -1)
+    i = min(max(math.floor((ox + enter * dx - lo[0]) / cell[0]), 0), n[0] - 1)
+    j = min(max(math.floor((oy + enter * dy - lo[1]) / cell[1]), 0), n[1] - 1)
+    k = min(max(math.floor((oz + enter * dz - lo[2]) / cell[2]), 0), n[2] - 1)
+    si, sj, sk = 1 if dx > 0 else -1, 1 if dy > 0 else -1, 1 if dz > 0 else -1
+    tx = (lo[0] + (i + (si > 0)) * cell[0] - ox) / dx if abs(dx) > 1e-14 else FAR
+    ty = (lo[1] + (j + (sj > 0)) * cell[1] - oy) / dy if abs(dy) > 1e-14 else FAR
+    tz = (lo[2] + (k + (sk > 0)) * cell[2] - oz) / dz if abs(dz) > 1e-14 else FAR
+    ux = cell[0] / abs(dx) if abs(dx) > 1e-14 else FAR
+    uy = cell[1] / abs(dy) if abs(dy) > 1e-14 else FAR
+    uz = cell[2] / abs(dz) if abs(dz) > 1e-14 else FAR
+    while True:
+        c = (i * n[1] + j) * n[2] + k
+        for m in range(grid.first[c], grid.first[c + 1]):
+            p = grid.items[m]
+            if p < cylinders:
+                t = hit_cylinder(shape, p, ox, oy, oz, dx, dy, dz, near)
+            else:
+                t = hit_box(shape, p, ox, oy, oz, dx, dy, dz, near)
+            if t < best:
+                best, found = t, p
+                if any_hit:
+                    return best, found
+        step = min(tx, ty, tz)
+        if best <= step or step > leave:
+            break
+        if step == tz:
+            k += sk
+            tz += uz
+            if k < 0 or k >= n[2]:
+                break
+        elif step == tx:
+            i += si
+            tx += ux
+            if i < 0 or i >= n[0]:
+                break
+        else:
+            j += sj
+            ty += uy
+            if j < 0 or j >= n[1]:
+                break
+    return (best, found) if found >= 0 else (FAR, -1)
+
+
+@kernel(parallel=True)
+def _cast(
+    shape: Float64, cylinders: int, grid: Grid, origins: Float64, directions: Float64, distance: Float64,
+    primitive: Int32,
+) -> None:  # fmt: skip
+    step = 0 if origins.shape[0] == 1 else 1
+    for r in numba.prange(directions.shape[0]):
+        o, d = origins[r * step], directions[r]
+        t, p = trace(shape, cylinders, grid, o[0], o[1], o[2], d[0], d[1], d[2], 1e-6, FAR, False)
+        distance[r] = t if p >= 0 else np.inf
+        primitive[r] = p
+
+
+def cast_rays(scene: Scene, origins: Float64, directions: Float64) -> tuple[Float64, Int32]:
+    """The first hit of each ray.
+
+    origins: (N, 3) or (1, 3) in `yard`. directions: (N, 3), any length. Returns the ray parameter (N,), inf
+    where nothing is hit, and the primitive (N,), -1 for nothing and the number of primitives for the floor.
+    """
+    distance = np.empty(len(directions))
+    primitive = np.empty(len(directions), dtype=np.int32)
+    shape, _, cylinders = scene.primitives
+    _cast(
+        shape, cylinders, scene.grid, np.ascontiguousarray(origins), np.ascontiguousarray(directions),
+        distance, primitive,
+    )  # fmt: skip
+    return distance, primitive

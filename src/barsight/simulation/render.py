@@ -1,0 +1,226 @@
+"""A camera's view of the yard as linear grey levels: four rays a pixel, shaded from textures and lightmap."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, kernel
+from barsight.core.pose import Pose
+from barsight.simulation.lighting import Lamps, Lightmap, lamp_beam, longest_axis
+from barsight.simulation.rays import FAR, trace
+from barsight.simulation.scene import Grid, Primitives, Scene
+from barsight.simulation.textures import ALONG_M, AROUND_M, TILE
+
+FLOOR_ALBEDO = 0.22
+SPREAD_ALONG = 0.38
+"""Roughness along the bar: highlights are stretched that way [Ward 1992]."""
+SPREAD_AROUND = 0.17
+HIGHLIGHT = 0.2
+"""Radiance of a highlight's middle under a lamp, as a share of white paper's."""
+MASK = TILE - 1
+
+
+class Look(NamedTuple):
+    """What the shading reads besides the geometry."""
+
+    lamps: Lamps
+    lightmap: Lightmap
+    tile: Float32
+
+
+def render(scene: Scene, look: Look, rays: Float32, side: int, yard_from_cam: Pose) -> Float32:
+    """(H, W) float32 radiance, 1 about white paper under the lamps.
+
+    rays: (side H, side W, 2) float32, x and y of each sample's direction with z = 1: side^2 samples a pixel,
+    of which a pixel inside one primitive takes the diagonal ones only.
+    """
+    image = np.empty((rays.shape[0] // side, rays.shape[1] // side), dtype=np.float32)
+    _render(
+        scene.primitives, scene.grid, look.lamps, look.lightmap, look.tile, rays, side,
+        yard_from_cam.rotation.copy(), yard_from_cam.translation.copy(), image,
+    )  # fmt: skip
+    return image
+
+
+@kernel(parallel=True)
+def _render(
+    primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, tile: Float32, rays: Float32,
+    side: int, R: Float64, centre: Float64, image: Float32,
+) -> None:  # fmt: skip
+    shape, cylinders = primitives.shape, primitives.cylinders
+    ox, oy, oz = centre[0], centre[1], centre[2]
+    for v in numba.prange(image.shape[0]):
+        for u in range(image.shape[1]):
+            total, taken, first, same = 0.0, 0, -2, True
+            for n in range(side * side):
+                # The diagonal first: where it meets one primitive only, the other samples add nothing.
+                row = n % side
+                column = (row + n // side) % side
+                x, y = rays[v * side + row, u * side + column, 0], rays[v * side + row, u * side + column, 1]
+                dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
+                dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
+                dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
+                t, p = trace(shape, cylinders, grid, ox, oy, oz, dx, dy, dz, 1e-6, FAR, False)
+                if p >= 0:
+                    total += shade(primitives, lamps, lightmap, tile, p, ox, oy, oz, dx * t, dy * t, dz * t)
+                taken += 1
+                same = same and (first == -2 or first == p)
+                first = p
+                if same and taken == side and side > 1:
+                    break
+            image[v, u] = total / taken
+
+
+@kernel()
+def shade(
+    primitives: Primitives, lamps: Lamps, lightmap: Lightmap, tile: Float32, p: int,
+    ox: float, oy: float, oz: float, rx: float, ry: float, rz: float,
+) -> float:  # fmt: skip
+    """Radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz)."""
+    x, y, z = ox + rx, oy + ry, oz + rz
+    if p == primitives.shape.shape[0]:
+        return _shade_floor(lightmap, tile, p, x, y)
+    if p >= primitives.cylinders:
+        return _shade_box(primitives, lightmap, tile, p, x, y, z)
+    shape, material = primitives.shape, primitives.material
+    cx, cy, cz = x - shape[p, 0], y - shape[p, 1], z - shape[p, 2]
+    s = cx * shape[p, 3] + cy * shape[p, 4] + cz * shape[p, 5]
+    e = cx * shape[p, 6] + cy * shape[p, 7] + cz * shape[p, 8]
+    f = cx * shape[p, 9] + cy * shape[p, 10] + cz * shape[p, 11]
+    radius, half = shape[p, 12], shape[p, 13]
+    if e * e + f * f < radius * radius * (1 - 1e-6):
+        factor, _, _, _ = _texels(tile, e / AROUND_M + 37.0 * p, f / ALONG_M)
+        t = lightmap.start[p] + (lightmap.along[p] - 1 if s > 0 else 0) * lightmap.around[p]
+        end_face: float = 0.7 * material[p, 0] * factor * lightmap.diffuse[t]
+        return end_face
+    angle = math.atan2(f, e)
+    albedo, gloss, slope, _ = _texels(
+        tile,
+        (radius * angle + material[p, 4] * s + material[p, 2]) / AROUND_M,
+        (s * material[p, 5] + material[p, 3]) / ALONG_M,
+    )
+    weight = material[p, 7]
+    albedo = material[p, 0] * (1 + weight * (albedo - 1))
+    slope *= weight
+    if material[p, 6] > 0:
+        phase = 2 * math.pi * s / material[p, 6] + 2 * angle
+        albedo *= 1 + 0.22 * math.sin(phase)
+        gloss *= 1 + 0.35 * math.sin(phase + 0.6)
+    c, d = math.cos(angle + slope), math.sin(angle + slope)
+    t00, t01, t10, t11, ws, wa = _lightmap_place(lightmap, p, (s / half + 1) / 2, angle + slope)
+    light = lightmap.diffuse
+    diffuse = (light[t00] * (1 - wa) + light[t01] * wa) * (1 - ws) + (
+        light[t10] * (1 - wa) + light[t11] * wa
+    ) * ws
+    nx = c * shape[p, 6] + d * shape[p, 9]
+    ny = c * shape[p, 7] + d * shape[p, 10]
+    nz = c * shape[p, 8] + d * shape[p, 11]
+    shine = 0.0
+    if material[p, 1] > 0:
+        tx = c * shape[p, 9] - d * shape[p, 6]
+        ty = c * shape[p, 10] - d * shape[p, 7]
+        tz = c * shape[p, 11] - d * shape[p, 8]
+        away = 1 / math.sqrt(rx * rx + ry * ry + rz * rz)
+        middle = math.floor((x - lamps.offset) / lamps.spacing + 0.5)
+        for slot in range(6):
+            lamp = middle + (slot % 3 - middle + 1) % 3 - 1
+            lx, ly, lz = lamp * lamps.spacing + lamps.offset - x, lamps.rows[slot // 3] - y, lamps.z - z
+            near = 1 / math.sqrt(lx * lx + ly * ly + lz * lz)
+            hx, hy, hz = lx * near - rx * away, ly * near - ry * away, lz * near - rz * away
+            hn = hx * nx + hy * ny + hz * nz
+            if hn <= 0.1:
+                continue
+            ha = (hx * shape[p, 3] + hy * shape[p, 4] + hz * shape[p, 5]) / (hn * SPREAD_ALONG)
+            ht = (hx * tx + hy * ty + hz * tz) / (hn * SPREAD_AROUND)
+            exponent = ha * ha + ht * ht
+            if exponent > 9:
+                continue
+            share = lightmap.seen
+            seen = (share[t00, slot] * (1 - wa) + share[t01, slot] * wa) * (1 - ws) + (
+                share[t10, slot] * (1 - wa) + share[t11, slot] * wa
+            ) * ws
+            shine += seen / 255 * math.exp(-exponent) * lamp_beam(lamps, lx) * lz * near * near * near
+    radiance: float = albedo * diffuse + HIGHLIGHT * material[p, 1] * gloss * shine
+    return radiance
+
+
+@kernel()
+def _shade_floor(lightmap: Lightmap, tile: Float32, p: int, x: float, y: float) -> float:
+    _, _, _, fine = _texels(tile, x / ALONG_M, y / ALONG_M)
+    _, _, _, coarse = _texels(tile, (x + 0.31 * y) / (7.3 * ALONG_M), (y - 0.31 * x) / (7.3 * ALONG_M))
+    floor = lightmap.floor
+    i, j = (x - floor[0]) / floor[2] - 0.5, (y - floor[1]) / floor[2] - 0.5
+    i = min(max(i, 0.0), lightmap.along[p] - 1.001)
+    j = min(max(j, 0.0), lightmap.around[p] - 1.001)
+    i0, j0 = int(i), int(j)
+    wi, wj = i - i0, j - j0
+    t = lightmap.start[p] + i0 * lightmap.around[p] + j0
+    n, light = lightmap.around[p], lightmap.diffuse
+    diffuse = (light[t] * (1 - wj) + light[t + 1] * wj) * (1 - wi)
+    diffuse += (light[t + n] * (1 - wj) + light[t + n + 1] * wj) * wi
+    radiance: float = FLOOR_ALBEDO * fine * coarse * diffuse
+    return radiance
+
+
+@kernel()
+def _shade_box(
+    primitives: Primitives, lightmap: Lightmap, tile: Float32, p: int, x: float, y: float, z: float
+) -> float:
+    shape, material = primitives.shape, primitives.material
+    cx, cy, cz = x - shape[p, 0], y - shape[p, 1], z - shape[p, 2]
+    longest = longest_axis(shape, p)
+    face, sign, deepest, along, across = 0, 0, -1.0, 0.0, 0.0
+    for k in range(3):
+        place = cx * shape[p, 3 + 3 * k] + cy * shape[p, 4 + 3 * k] + cz * shape[p, 5 + 3 * k]
+        if k == longest:
+            along = place
+        else:
+            across += place
+        if abs(place) / shape[p, 12 + k] > deepest:
+            face, sign, deepest = k, 1 if place > 0 else 0, abs(place) / shape[p, 12 + k]
+    pattern, _, _, _ = _texels(tile, (across + material[p, 2]) / AROUND_M, (along + material[p, 3]) / ALONG_M)
+    n = lightmap.along[p]
+    i = min(max((along / shape[p, 12 + longest] + 1) / 2 * n - 0.5, 0.0), n - 1.0)
+    i0 = min(int(i), n - 1)
+    i1 = min(i0 + 1, n - 1)
+    t = lightmap.start[p] + 2 * face + sign
+    light = lightmap.diffuse
+    diffuse = light[t + 6 * i0] * (1 - i + i0) + light[t + 6 * i1] * (i - i0)
+    radiance: float = material[p, 0] * (1 + material[p, 7] * (pattern - 1)) * diffuse
+    return radiance
+
+
+@kernel()
+def _lightmap_place(
+    lightmap: Lightmap, p: int, share: float, angle: float
+) -> tuple[int, int, int, int, float, float]:
+    """The four texels around a place on a bar, and the weights of the second along and around it."""
+    n, m = lightmap.along[p], lightmap.around[p]
+    i = min(max(share * n - 0.5, 0.0), n - 1.0)
+    i0 = min(int(i), n - 1)
+    i1 = min(i0 + 1, n - 1)
+    a = angle / (2 * math.pi) * m - 0.5
+    low = math.floor(a)
+    a0, a1 = low % m, (low + 1) % m
+    t = lightmap.start[p]
+    return t + i0 * m + a0, t + i0 * m + a1, t + i1 * m + a0, t + i1 * m + a1, i - i0, a - low
+
+
+@kernel()
+def _texels(tile: Float32, a: float, b: float) -> tuple[float, float, float, float]:
+    """The tile's four channels at texel (a, b), bilinear, repeated without end."""
+    fa, fb = math.floor(a), math.floor(b)
+    wa, wb = a - fa, b - fb
+    i, j = int(fa) & MASK, int(fb) & MASK
+    i1, j1 = (i + 1) & MASK, (j + 1) & MASK
+    w00, w01, w10, w11 = (1 - wa) * (1 - wb), (1 - wa) * wb, wa * (1 - wb), wa * wb
+    return (
+        tile[i, j, 0] * w00 + tile[i, j1, 0] * w01 + tile[i1, j, 0] * w10 + tile[i1, j1, 0] * w11,
+        tile[i, j, 1] * w00 + tile[i, j1, 1] * w01 + tile[i1, j, 1] * w10 + tile[i1, j1, 1] * w11,
+        tile[i, j, 2] * w00 + tile[i, j1, 2] * w01 + tile[i1, j, 2] * w10 + tile[i1, j1, 2] * w11,
+        tile[i, j, 3] * w00 + tile[i, j1, 3] * w01 + tile[i1, j, 3] * w10 + tile[i1, j1, 3] * w11,
+    )

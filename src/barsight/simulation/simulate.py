@@ -1,0 +1,171 @@
+"""From settings to a recording on disk: stack a yard, drive over it, render, write the truth beside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.files import atomic_directory
+from barsight.core.pose import Pose
+from barsight.core.stamps import seconds_to_ns
+from barsight.simulation import layout
+from barsight.simulation.lighting import bake, hall_lamps
+from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
+from barsight.simulation.render import Look, render
+from barsight.simulation.scene import Scene, build_scene
+from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, record_imu, seconds, stamps
+from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.stock import Stock, stack_yard
+from barsight.simulation.textures import surface_tile
+from barsight.simulation.trajectory import CraneTrajectory
+from barsight.simulation.truth import SurfaceTruth, true_depth, write_bundles, write_rig
+
+CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
+GROUND_TRUTH_HZ = 200
+REST_BEFORE_FRAME_S = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """All that is fixed before the first picture: stock, scene, rig, way of the crane, frames' stamps."""
+
+    settings: SimulationSettings
+    stock: Stock
+    scene: Scene
+    mounted: MountedRig
+    trajectory: CraneTrajectory
+    frame_stamp_ns: Int64
+
+    @classmethod
+    def build(cls, settings: SimulationSettings) -> World:
+        """Draw everything from the seed; each part has its own stream, so that one can change alone."""
+        stock = stack_yard(settings, _stream(settings, 0))
+        scene = build_scene(stock, settings, _stream(settings, 1))
+        mounted = mount_rig(settings, _stream(settings, 2))
+        trajectory = CraneTrajectory.plan(
+            settings.length_m, settings.camera, settings.motion, mounted.nominal_yard_from_body,
+            _stream(settings, 3),
+        )  # fmt: skip
+        return cls(settings, stock, scene, mounted, trajectory, frame_stamps(settings, trajectory))
+
+    def yard_from_body(self, camera_stamp_ns: int) -> Pose:
+        """The exact pose at a camera stamp: t_imu = t_cam + timeshift."""
+        imu_stamp = camera_stamp_ns + self.mounted.rig.timeshift_cam_imu_ns
+        motion = self.trajectory.at(seconds(np.array([imu_stamp], dtype=np.int64)))
+        return Pose("yard", "body", motion.yard_from_body[0], motion.position_m[0])
+
+
+def simulate(
+    out: Path, settings: SimulationSettings, progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Write a simulated recording with its truth to the new folder `out`.
+
+    progress: called with (pairs written, pairs in all). Raises OutputError where `out` can't be written;
+    nothing half-written is left then, nor after an interruption.
+    """
+    with atomic_directory(out) as folder:
+        world = World.build(settings)
+        truth_folder = folder / "truth"
+        truth_folder.mkdir()
+        surface = SurfaceTruth(world.scene, settings)
+        imu = _write_slow_sensors(folder / "mav0", world, surface)
+        _write_pictures(folder, world, surface, progress)
+        surface.write(truth_folder)
+        write_bundles(world.stock.bundles, truth_folder)
+        write_rig(
+            world.mounted.rig, imu.gyro_bias_radps, imu.accel_bias_mps2, np.array(CRANE_TO_BODY_M), settings,
+            truth_folder,
+        )  # fmt: skip
+
+
+def frame_stamps(settings: SimulationSettings, trajectory: CraneTrajectory) -> Int64:
+    """(frames,) stamps on the camera's clock: the first and the last at rest, the others evenly along X."""
+    distance = settings.length_m + 2 * settings.motion.overrun_m
+    inner = trajectory.begin_x_m + distance * np.arange(1, settings.frames - 1) / (settings.frames - 1)
+    times = [trajectory.start_s - REST_BEFORE_FRAME_S]
+    times += [trajectory.time_at_x(float(x)) for x in inner]
+    times.append(trajectory.settled_s + REST_BEFORE_FRAME_S)
+    shift = seconds_to_ns(settings.sensors.timeshift_cam_imu_s)
+    return np.array([EPOCH_NS + seconds_to_ns(t) - shift for t in times], dtype=np.int64)
+
+
+def _write_slow_sensors(mav0: Path, world: World, surface: SurfaceTruth) -> ImuRecord:
+    settings, trajectory, rig = world.settings, world.trajectory, world.mounted.rig
+    sensors, lever = settings.sensors, np.array(CRANE_TO_BODY_M)
+    layout.write_body(mav0)
+    for name, camera, mounting in (
+        ("cam0", rig.cam0, rig.body_from_cam0),
+        ("cam1", rig.cam1, rig.body_from_cam1),
+    ):
+        layout.write_camera(mav0 / name, camera, mounting, world.frame_stamp_ns, sensors.timeshift_cam_imu_s)
+    imu = record_imu(trajectory, sensors, _stream(settings, 4))
+    layout.write_imu(mav0 / "imu0", imu, sensors)
+    stamp_ns, place = record_encoders(trajectory, sensors, lever, _stream(settings, 5))
+    nominal = world.mounted.nominal_yard_from_body
+    layout.write_crane(mav0 / "crane0", stamp_ns, place, lever, nominal, sensors)
+    if sensors.laser_y_m:
+        noise = _stream(settings, 6).normal(0, 1, surface.profile_z_m.shape) * sensors.laser_std_m
+        layout.write_laser(
+            mav0 / "laser0", surface.profile_x_m, surface.profile_y_m, surface.profile_z_m + noise,
+            sensors.laser_std_m,
+        )  # fmt: skip
+    truth_ns = stamps(trajectory.duration_s, GROUND_TRUTH_HZ)
+    motion = trajectory.at(seconds(truth_ns))
+    layout.write_ground_truth(
+        mav0 / "state_groundtruth_estimate0", truth_ns, motion.position_m, _quaternions(motion.yard_from_body)
+    )
+    return imu
+
+
+def _write_pictures(
+    folder: Path, world: World, surface: SurfaceTruth, progress: Callable[[int, int], None] | None
+) -> None:
+    settings, rig = world.settings, world.mounted.rig
+    lamps = hall_lamps(settings.camera.above_floor_m)
+    tile = surface_tile(_stream(settings, 7))
+    look = Look(lamps, bake(world.scene, lamps, _stream(settings, 8)), tile)
+    side = settings.camera.samples_per_side
+    cameras = (
+        ("cam0", rig.cam0, rig.body_from_cam0, 1.0),
+        ("cam1", rig.cam1, rig.body_from_cam1, settings.camera.cam1_gain),
+    )
+    rays = [sample_rays(camera, side) for _, camera, _, _ in cameras]
+    shares = [vignette(camera, settings.camera.vignetting) for _, camera, _, _ in cameras]
+    deep = depth_views(settings)
+    for number, stamp in enumerate(world.frame_stamp_ns.tolist()):
+        yard_from_body = world.yard_from_body(stamp)
+        surface.count_frame(rig, yard_from_body)
+        for k, (name, camera, mounting, gain) in enumerate(cameras):
+            yard_from_cam = yard_from_body @ mounting
+            radiance = render(world.scene, look, rays[k], side, yard_from_cam)
+            noise = _stream(settings, 9, 2 * number + k)
+            image = expose(radiance, shares[k], gain, settings.camera, noise)
+            layout.write_png(folder / "mav0" / name / "data" / f"{stamp}.png", image)
+            if number in deep:
+                depth = true_depth(world.scene, camera, yard_from_cam)
+                np.savez_compressed(folder / "truth" / f"depth_{name}_{stamp}.npz", z=depth)
+        if progress is not None:
+            progress(number + 1, settings.frames)
+
+
+def depth_views(settings: SimulationSettings) -> set[int]:
+    """Numbers of the frames whose true depth is stored, evenly spread."""
+    views = (np.arange(settings.depth_views) + 0.5) / max(settings.depth_views, 1) * settings.frames
+    return {int(v) for v in views}
+
+
+def _quaternions(rotations: Float64) -> Float64:
+    """(N, 4) w x y z, without jumps of sign."""
+    q = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
+    flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1, 1))
+    q[1:] *= flips[:, None]
+    return q
+
+
+def _stream(settings: SimulationSettings, *number: int) -> np.random.Generator:
+    return np.random.default_rng((settings.seed, *number))

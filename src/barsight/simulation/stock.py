@@ -1,0 +1,225 @@
+"""What lies in the yard: sections of bundles in layers, dunnage between them, straps around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.simulation.settings import BarKind, SimulationSettings
+
+PACKING = 1.003
+"""Distance of neighbouring bars' axes over their diameter."""
+END_CLEARANCE_M = 0.004
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """One bundle. Its axis is level, turned by yaw_rad from Y towards -X; all lengths in `yard`, metres.
+
+    centre_m: (3,) middle of the axis. cross_m: (count, 2) the bars' axes in the bundle's cross-section
+    (sideways, up). top_z_m: the highest point of its bars. on_top: no bundle lies on it.
+    """
+
+    section: int
+    layer: int
+    column: int
+    kind: BarKind
+    centre_m: Float64
+    yaw_rad: float
+    roll_rad: float
+    cross_m: Float64
+    length_m: float
+    ribbed: bool
+    on_top: bool = False
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of the circle around its bars."""
+        return _radius(self.kind)
+
+    @property
+    def top_z_m(self) -> float:
+        """The highest point of its bars."""
+        return float(self.centre_m[2] + self.cross_m[:, 1].max() + self.kind.diameter_m / 2)
+
+    @property
+    def axes(self) -> Float64:
+        """(3, 3) rows: sideways, along, up, in `yard`."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """A wooden beam of dunnage: centre_m (3,), half_m (3,) along itself, across, up; yaw_rad from X."""
+
+    centre_m: Float64
+    half_m: Float64
+    yaw_rad: float
+
+
+@dataclass(frozen=True)
+class Stock:
+    """Everything that lies on the floor."""
+
+    bundles: tuple[Bundle, ...]
+    beams: tuple[Beam, ...]
+
+
+def stack_yard(settings: SimulationSettings, rng: np.random.Generator) -> Stock:
+    """Fill `length_m` of the yard with sections of different height, kind of bar and length."""
+    bundles: list[Bundle] = []
+    beams: list[Beam] = []
+    x, section = 0.0, 0
+    while x < settings.length_m - 0.3:
+        kinds = settings.kinds
+        kind = kinds[(section + int(rng.integers(len(kinds)))) % len(kinds)] if section else kinds[0]
+        room = settings.length_m - x
+        span = min(room, rng.uniform(2.2, 4.2))
+        if room - span < 1.2:
+            span = room
+        new_bundles, new_beams = _section(settings, rng, section, kind, (x, x + span))
+        bundles += new_bundles
+        beams += new_beams
+        x += span + rng.uniform(0.3, 0.7)
+        section += 1
+    return Stock(tuple(bundles), tuple(beams))
+
+
+def hexagon(kind: BarKind) -> Float64:
+    """(count, 2) the bars' axes in a hexagonal packing, a row lying level, the middle bar first."""
+    rings, pitch = kind.rings, kind.diameter_m * PACKING
+    cells = [
+        (q + r / 2, r * np.sqrt(0.75))
+        for q in range(-rings, rings + 1)
+        for r in range(-rings, rings + 1)
+        if abs(q + r) <= rings
+    ]
+    places = pitch * np.array(sorted(cells, key=lambda cell: round(cell[0] ** 2 + cell[1] ** 2, 9)))
+    return places.reshape(-1, 2)
+
+
+def _radius(kind: BarKind) -> float:
+    return kind.diameter_m * (kind.rings * PACKING + 0.5)
+
+
+def _section(
+    settings: SimulationSettings, rng: np.random.Generator, section: int, kind: BarKind,
+    span_m: tuple[float, float],
+) -> tuple[list[Bundle], list[Beam]]:  # fmt: skip
+    yard = settings.yard
+    length = yard.bar_length_m * (1.0 if section % 3 != 1 else 0.8)
+    ribbed = bool(rng.random() < yard.ribbed_share)
+    columns = _columns(settings, rng, kind, span_m, length)
+    heights = _heights(len(columns), yard.max_layers, yard.missing_share, rng)
+    layers: list[list[Bundle]] = []
+    beams: list[Beam] = []
+    base = 0.0
+    for layer in range(max(heights, default=0)):
+        present = [c for c, height in enumerate(heights) if height > layer]
+        extent = (columns[present[0]][0] - _radius(kind), columns[present[-1]][0] + _radius(kind))
+        beams += _dunnage(yard.dunnage_m, base, extent, length, rng)
+        base += yard.dunnage_m
+        placed: list[Bundle] = []
+        for column in present:
+            x, yaw = columns[column] if layer == 0 else _above(columns[column], yard.skew_deg, rng)
+            x, yaw = _clear(x, yaw, placed, kind, length)
+            y = float(np.clip(rng.normal(0, 0.05), -0.12, 0.12))
+            placed.append(_bundle((section, layer, column), kind, (x, y, base), yaw, length, ribbed, rng))
+        layers.append(placed)
+        base = max(bundle.top_z_m for bundle in placed)
+    return [_covered(b, layers) for placed in layers for b in placed], beams
+
+
+def _columns(
+    settings: SimulationSettings, rng: np.random.Generator, kind: BarKind, span_m: tuple[float, float],
+    length: float,
+) -> list[tuple[float, float]]:  # fmt: skip
+    """(x, yaw) of the lowest layer's places, so far apart that skewed neighbours don't meet."""
+    columns: list[tuple[float, float]] = []
+    radius, yard = _radius(kind), settings.yard
+    x = span_m[0] + radius
+    while x + radius < span_m[1] or not columns:
+        yaw = _skew(yard.skew_deg, rng)
+        if columns:
+            x = columns[-1][0] + _needed(radius, yaw - columns[-1][1], length)
+            x += float(rng.gamma(2.0, yard.gap_m / 2)) if yard.gap_m > 0 else 0.0
+            if x + radius > span_m[1]:
+                break
+        columns.append((x, yaw))
+        x += 2 * radius
+    return columns
+
+
+def _needed(radius: float, difference_rad: float, length: float) -> float:
+    return 2 * radius + END_CLEARANCE_M + abs(difference_rad) * (length / 2 + 0.2)
+
+
+def _skew(skew_deg: float, rng: np.random.Generator) -> float:
+    return float(np.radians(np.clip(rng.normal(0, skew_deg), -1, 1))) if skew_deg > 0 else 0.0
+
+
+def _above(below: tuple[float, float], skew_deg: float, rng: np.random.Generator) -> tuple[float, float]:
+    """A place on the column below, a little beside it and turned a little otherwise."""
+    yaw = np.clip(below[1] + rng.normal(0, 0.3) * np.radians(skew_deg), -np.radians(1), np.radians(1))
+    return below[0] + float(rng.normal(0, 0.006)), float(yaw)
+
+
+def _clear(x: float, yaw: float, placed: list[Bundle], kind: BarKind, length: float) -> tuple[float, float]:
+    """Shift the bundle so far along X that it clears the one before it on its layer."""
+    if placed:
+        last = placed[-1]
+        x = max(x, float(last.centre_m[0]) + _needed(_radius(kind), yaw - last.yaw_rad, length))
+    return x, yaw
+
+
+def _heights(columns: int, max_layers: int, missing_share: float, rng: np.random.Generator) -> list[int]:
+    """Layers per column: runs of random height, single columns lower or empty."""
+    heights: list[int] = []
+    while len(heights) < columns:
+        run = int(rng.integers(1, max_layers + 1))
+        heights += [run] * int(rng.integers(1, 4))
+    heights = heights[:columns]
+    for column in range(columns):
+        if rng.random() < missing_share:
+            heights[column] = 0
+        elif rng.random() < 0.15:
+            heights[column] = max(1, heights[column] - 1)
+    if not any(heights):
+        heights[0] = 1
+    return heights
+
+
+def _bundle(
+    number: tuple[int, int, int], kind: BarKind, place: tuple[float, float, float], yaw: float, length: float,
+    ribbed: bool, rng: np.random.Generator,
+) -> Bundle:  # fmt: skip
+    """`place`: x, y of the middle and z of what the bundle lies on."""
+    roll = rng.uniform(0, np.pi / 3) if kind.count <= 7 else np.radians(rng.normal(0, 1.5))
+    c, s = np.cos(roll), np.sin(roll)
+    cross = hexagon(kind) @ np.array([[c, s], [-s, c]])
+    lowest = cross[:, 1].min() - kind.diameter_m / 2
+    centre = np.array([place[0], place[1], place[2] - lowest])
+    return Bundle(*number, kind, centre, yaw, float(roll), cross, length, ribbed)
+
+
+def _covered(bundle: Bundle, layers: list[list[Bundle]]) -> Bundle:
+    above = layers[bundle.layer + 1] if bundle.layer + 1 < len(layers) else []
+    reach = bundle.radius_m
+    covered = any(abs(other.centre_m[0] - bundle.centre_m[0]) < reach for other in above)
+    return replace(bundle, on_top=not covered)
+
+
+def _dunnage(
+    size: float, base: float, extent: tuple[float, float], length: float, rng: np.random.Generator
+) -> list[Beam]:
+    """Three beams along X under a layer."""
+    beams = []
+    for share in (-0.36, 0.0, 0.36):
+        begin, end = extent[0] - rng.uniform(0.05, 0.3), extent[1] + rng.uniform(0.05, 0.3)
+        centre = np.array([(begin + end) / 2, share * length + rng.normal(0, 0.06), base + size / 2])
+        half = np.array([(end - begin) / 2, size / 2, size / 2])
+        beams.append(Beam(centre, half, float(np.radians(rng.normal(0, 0.3)))))
+    return beams

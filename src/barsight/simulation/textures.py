@@ -1,0 +1,46 @@
+"""The surface's pattern: tiles of noise whose spectrum ends where the image sensor's does."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64
+
+TILE = 1024
+"""Texels per side; a power of two, so that an index wraps with a mask."""
+AROUND_M = 0.0015
+"""Texel size across a bar."""
+ALONG_M = 0.002
+"""Texel size along a bar."""
+
+
+def surface_tile(rng: np.random.Generator) -> Float32:
+    """(TILE, TILE, 4) periodic float32, first axis around the bar, second along it.
+
+    Channels: albedo factor (mean 1), gloss factor (mean 1), slope of the surface around the bar (rad),
+    isotropic albedo factor in texels of ALONG_M for floor and wood (mean 1).
+    """
+    streaks = _noise(rng, 0.0035, 0.05)
+    scale = _noise(rng, 0.007, 0.018)
+    grain = _noise(rng, 0.0024, 0.003)
+    rust = _noise(rng, 0.02, 0.06)
+    specks = _noise(rng, 0.0025, 0.007)
+    albedo = np.exp(0.11 * streaks + 0.09 * scale + 0.13 * grain + 0.08 * rust)
+    albedo *= np.where(specks > 2.5, 0.6, 1.0)
+    gloss = np.exp(0.3 * scale + 0.2 * grain - 0.25 * rust)
+    slope = 0.10 * _noise(rng, 0.012, 0.05) + 0.05 * _noise(rng, 0.004, 0.012)
+    coarse = _noise(rng, 0.0035, 0.0035) * 0.09 + _noise(rng, 0.015, 0.015) * 0.05
+    tile = np.stack([albedo / albedo.mean(), gloss / gloss.mean(), slope, np.exp(coarse)], axis=2)
+    return np.ascontiguousarray(tile, dtype=np.float32)
+
+
+def _noise(rng: np.random.Generator, around_m: float, along_m: float) -> Float64:
+    """(TILE, TILE) periodic Gaussian noise, zero mean, unit variance, smoothed with these sigmas."""
+    spectrum = np.fft.rfft2(rng.standard_normal((TILE, TILE)))
+    f_around = np.fft.fftfreq(TILE, AROUND_M)[:, None]
+    f_along = np.fft.rfftfreq(TILE, ALONG_M)[None, :]
+    spectrum *= np.exp(-2 * np.pi**2 * ((f_around * around_m) ** 2 + (f_along * along_m) ** 2))
+    spectrum[0, 0] = 0
+    noise = np.fft.irfft2(spectrum, s=(TILE, TILE))
+    scaled: Float64 = noise / noise.std()
+    return scaled

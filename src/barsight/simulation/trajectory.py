@@ -1,0 +1,194 @@
+"""The crane's way as exact functions of time: travel with acceleration and braking, sway, vibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.simulation.settings import CameraSettings, MotionSettings
+
+SMOOTHSTEP_PEAK_SLOPE = 1.875
+
+
+@dataclass(frozen=True, eq=False)
+class Jet:
+    """A function of time with its first and second derivative, each (N,); products follow Leibniz."""
+
+    value: Float64
+    rate: Float64
+    rate2: Float64
+
+    def __add__(self, other: Jet) -> Jet:
+        return Jet(self.value + other.value, self.rate + other.rate, self.rate2 + other.rate2)
+
+    def __mul__(self, other: Jet) -> Jet:
+        return Jet(
+            self.value * other.value,
+            self.rate * other.value + self.value * other.rate,
+            self.rate2 * other.value + 2 * self.rate * other.rate + self.value * other.rate2,
+        )
+
+    def scaled(self, factor: float) -> Jet:
+        """This times a constant."""
+        return Jet(factor * self.value, factor * self.rate, factor * self.rate2)
+
+    def shifted(self, offset: float) -> Jet:
+        """This plus a constant."""
+        return Jet(self.value + offset, self.rate, self.rate2)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The body at N instants. All (N, ...) in `yard` unless named.
+
+    position_m, velocity_mps, acceleration_mps2: (N, 3). yard_from_body: (N, 3, 3). body_rate_radps: (N, 3) in
+    `body`.
+    """
+
+    position_m: Float64
+    velocity_mps: Float64
+    acceleration_mps2: Float64
+    yard_from_body: Float64
+    body_rate_radps: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class CraneTrajectory:
+    """The body's way, defined for every instant (s on the IMU's clock, 0 at its first sample).
+
+    The crane rests until `start_s`, ramps up for `ramp_s`, brakes from `brake_s` for `ramp_s` and settles.
+    """
+
+    camera: CameraSettings
+    motion: MotionSettings
+    nominal_yard_from_body: Float64
+    phases_rad: Float64
+    begin_x_m: float
+    speed_mps: float
+    start_s: float
+    ramp_s: float
+    brake_s: float
+    settled_s: float
+    duration_s: float
+
+    @classmethod
+    def plan(
+        cls, length_m: float, camera: CameraSettings, motion: MotionSettings,
+        nominal_yard_from_body: Float64, rng: np.random.Generator,
+    ) -> CraneTrajectory:  # fmt: skip
+        """Travel from `overrun_m` before the stack to as far behind it."""
+        distance = length_m + 2 * motion.overrun_m
+        acceleration = motion.acceleration_mps2
+        speed = min(motion.speed_mps, float(np.sqrt(distance * acceleration / SMOOTHSTEP_PEAK_SLOPE)))
+        ramp = SMOOTHSTEP_PEAK_SLOPE * speed / acceleration
+        brake = motion.standstill_s + distance / speed
+        settled = brake + ramp + 1.0
+        phases = rng.uniform(0, 2 * np.pi, 16)
+        return cls(
+            camera, motion, nominal_yard_from_body, phases, -motion.overrun_m, speed,
+            motion.standstill_s, ramp, brake, settled, settled + motion.standstill_s,
+        )  # fmt: skip
+
+    def at(self, time_s: Float64) -> Motion:
+        """The exact motion at (N,) instants."""
+        t = np.asarray(time_s, dtype=np.float64)
+        x, y, z = self._place(t)
+        roll, pitch, yaw = self._turn(t)
+        turn = _about_z(yaw.value) @ _about_y(pitch.value) @ _about_x(roll.value)
+        e_x, e_y, e_z = np.eye(3)
+        yawed = _about_z(yaw.value)
+        rate = (
+            yaw.rate[:, None] * e_z
+            + pitch.rate[:, None] * (yawed @ e_y)
+            + roll.rate[:, None] * (yawed @ _about_y(pitch.value) @ e_x)
+        )
+        yard_from_body = turn @ self.nominal_yard_from_body
+        return Motion(
+            np.stack([x.value, y.value, z.value], axis=1),
+            np.stack([x.rate, y.rate, z.rate], axis=1),
+            np.stack([x.rate2, y.rate2, z.rate2], axis=1),
+            yard_from_body,
+            np.einsum("nij,ni->nj", yard_from_body, rate),
+        )
+
+    def time_at_x(self, x_m: float) -> float:
+        """When the travel (sway aside) has reached `x_m`, by bisection."""
+        low, high = self.start_s, self.brake_s + self.ramp_s
+        for _ in range(60):
+            middle = (low + high) / 2
+            reached = self.begin_x_m + self._travel(np.array([middle])).value[0]
+            low, high = (middle, high) if reached < x_m else (low, middle)
+        return (low + high) / 2
+
+    def _travel(self, t: Float64) -> Jet:
+        up, down = _ramp(t, self.start_s, self.ramp_s), _ramp(t, self.brake_s, self.ramp_s)
+        return up.scaled(self.speed_mps) + down.scaled(-self.speed_mps)
+
+    def _envelope(self, t: Float64) -> Jet:
+        """0 at rest, 1 under way; the sway dies down while the crane brakes and settles."""
+        fade = _smoothstep(t, self.brake_s, self.settled_s - self.brake_s)
+        return _smoothstep(t, self.start_s, self.ramp_s) * fade.scaled(-1).shifted(1)
+
+    def _wave(self, t: Float64, hertz: float, number: int) -> Jet:
+        omega = 2 * np.pi * hertz
+        angle = omega * t + self.phases_rad[number]
+        return Jet(np.sin(angle), omega * np.cos(angle), -(omega**2) * np.sin(angle))
+
+    def _place(self, t: Float64) -> tuple[Jet, Jet, Jet]:
+        envelope, sway, shake = self._envelope(t), self.motion.sway_hz, self.motion.vibration_hz
+        swing_m = 1.2 * np.radians(self.motion.sway_deg)
+        vibration = self.motion.vibration_m
+        x = self._wave(t, sway, 0).scaled(swing_m) + self._wave(t, shake, 1).scaled(vibration)
+        y = self._wave(t, 0.21 * sway, 2).scaled(2 * swing_m) + self._wave(t, 1.13 * shake, 3).scaled(
+            vibration
+        )
+        z = self._wave(t, 0.8 * sway, 4).scaled(0.6 * swing_m) + self._wave(t, 1.31 * shake, 5).scaled(
+            vibration
+        )
+        return (
+            self._travel(t).shifted(self.begin_x_m) + envelope * x,
+            (envelope * y).shifted(self.camera.trolley_y_m),
+            (envelope * z).shifted(self.camera.above_floor_m),
+        )
+
+    def _turn(self, t: Float64) -> tuple[Jet, Jet, Jet]:
+        envelope, sway, shake = self._envelope(t), self.motion.sway_hz, self.motion.vibration_hz
+        swing = np.radians(self.motion.sway_deg)
+        tremble = 0.5 * self.motion.vibration_m
+        roll = self._wave(t, 1.1 * sway, 6).scaled(swing) + self._wave(t, shake, 7).scaled(tremble)
+        pitch = self._wave(t, sway, 8).scaled(0.8 * swing) + self._wave(t, 1.2 * shake, 9).scaled(tremble)
+        yaw = self._wave(t, 0.37 * sway, 10).scaled(0.6 * swing)
+        return envelope * roll, envelope * pitch, envelope * yaw
+
+
+def _smoothstep(t: Float64, begin_s: float, span_s: float) -> Jet:
+    """From 0 to 1 with two continuous derivatives: 6u^5 - 15u^4 + 10u^3."""
+    u = np.clip((t - begin_s) / span_s, 0, 1)
+    rate = 30 * u**2 * (u - 1) ** 2 / span_s
+    rate2 = 60 * u * (u - 1) * (2 * u - 1) / span_s**2
+    return Jet(u**3 * (u * (6 * u - 15) + 10), rate, rate2)
+
+
+def _ramp(t: Float64, begin_s: float, span_s: float) -> Jet:
+    """The integral of the smooth step over time (s), and its derivatives."""
+    step = _smoothstep(t, begin_s, span_s)
+    u = np.clip((t - begin_s) / span_s, 0, 1)
+    beyond = np.maximum(t - begin_s - span_s, 0)
+    return Jet(span_s * (u**6 - 3 * u**5 + 2.5 * u**4) + beyond, step.value, step.rate)
+
+
+def _about_x(angle: Float64) -> Float64:
+    c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
+    return np.stack([one, zero, zero, zero, c, -s, zero, s, c], axis=1).reshape(-1, 3, 3)
+
+
+def _about_y(angle: Float64) -> Float64:
+    c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
+    return np.stack([c, zero, s, zero, one, zero, -s, zero, c], axis=1).reshape(-1, 3, 3)
+
+
+def _about_z(angle: Float64) -> Float64:
+    c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
+    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,126 @@
+"""The exact truth beside a recording: heights, what the cameras see, depth of some views, bundles, rig."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barsight.calibration.camera import Camera
+from barsight.calibration.rig import StereoRig
+from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.pose import Pose
+from barsight.simulation.optics import sample_rays
+from barsight.simulation.rays import cast_rays
+from barsight.simulation.scene import Scene
+from barsight.simulation.sensors import heights
+from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.stock import Bundle
+
+CELL_X_M, CELL_Y_M = 0.01, 0.02
+HALF_WIDTH_M = 3.8
+PROFILE_STEP_M = 0.01
+OCCLUSION_M = 0.001
+
+
+class SurfaceTruth:
+    """The height map, the laser's profiles, and a count per cell of the frames in which both cameras see it.
+
+    x_m (X,), y_m (Y,), z_m (X, Y), visible (X, Y); profile_x_m (N,), profile_z_m and profile_visible (K, N).
+    """
+
+    def __init__(self, scene: Scene, settings: SimulationSettings) -> None:
+        length = settings.length_m
+        self.x_m = np.round(-0.5 + CELL_X_M * np.arange(round((length + 1) / CELL_X_M)), 4)
+        self.y_m = np.round(-HALF_WIDTH_M + CELL_Y_M * np.arange(round(2 * HALF_WIDTH_M / CELL_Y_M)), 4)
+        self.profile_x_m = np.round(
+            -0.3 + PROFILE_STEP_M * np.arange(round((length + 0.6) / PROFILE_STEP_M)), 4
+        )
+        self.profile_y_m = np.array(settings.sensors.laser_y_m, dtype=np.float64)
+        shape = (len(self.x_m), len(self.y_m))
+        gx, gy = np.meshgrid(self.x_m, self.y_m, indexing="ij")
+        px, py = np.meshgrid(self.profile_x_m, self.profile_y_m)
+        self._scene = scene
+        x = np.concatenate([gx.ravel(), px.ravel()])
+        y = np.concatenate([gy.ravel(), py.ravel()])
+        self._points = np.column_stack([x, y, heights(scene, x, y)])
+        self._seen = np.zeros(len(self._points), dtype=np.int16)
+        self.z_m = self._points[: gx.size, 2].reshape(shape)
+        self.visible = self._seen[: gx.size].reshape(shape)
+        self.profile_z_m = self._points[gx.size :, 2].reshape(px.shape)
+        self.profile_visible = self._seen[gx.size :].reshape(px.shape)
+
+    def count_frame(self, rig: StereoRig, yard_from_body: Pose) -> None:
+        """Add one to every cell that both cameras see in this frame."""
+        reach = 2.0 * yard_from_body.translation[2] * max(rig.cam0.width, rig.cam0.height) / rig.cam0.fx_px
+        rows = np.flatnonzero(np.abs(self._points[:, 0] - yard_from_body.translation[0]) < reach)
+        for camera, mounting in ((rig.cam0, rig.body_from_cam0), (rig.cam1, rig.body_from_cam1)):
+            rows = rows[self._sees(camera, yard_from_body @ mounting, self._points[rows])]
+        self._seen[rows] += 1
+
+    def _sees(self, camera: Camera, yard_from_cam: Pose, points: Float64) -> Bool:
+        """(N,) whether a camera sees the points: in its image, and nothing between."""
+        in_camera = yard_from_cam.inverse().apply(points)
+        plane = in_camera[:, :2] / in_camera[:, 2:]
+        limit = 0.75 * np.hypot(camera.width, camera.height) / camera.fx_px
+        seen: Bool = (in_camera[:, 2] > 0.05) & ((plane**2).sum(axis=1) < limit**2)
+        pixels = camera.project(in_camera[seen])
+        inside = (pixels >= -0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(
+            axis=1
+        )
+        seen[seen] = inside
+        sight = points[seen] - yard_from_cam.translation
+        share, _ = cast_rays(self._scene, yard_from_cam.translation[None], sight)
+        seen[seen] = (1 - share) * np.linalg.norm(sight, axis=1) < OCCLUSION_M
+        return seen
+
+    def write(self, folder: Path) -> None:
+        """`height.npz`."""
+        arrays: dict[str, Any] = {"x": self.x_m, "y": self.y_m, "z": self.z_m.astype(np.float32)}
+        arrays |= {"visible": self.visible, "profile_x": self.profile_x_m, "profile_ys": self.profile_y_m}
+        for k in range(len(self.profile_y_m)):
+            arrays[f"profile_y{k}"] = self.profile_z_m[k].astype(np.float32)
+            arrays[f"profile_visible{k}"] = self.profile_visible[k]
+        np.savez_compressed(folder / "height.npz", **arrays)
+
+
+def true_depth(scene: Scene, camera: Camera, yard_from_cam: Pose) -> Float32:
+    """(H, W) depth along the raw camera's optical axis at each pixel's centre, m; inf where nothing is."""
+    plane = sample_rays(camera, 1).reshape(-1, 2).astype(np.float64)
+    directions = np.column_stack([plane, np.ones(len(plane))]) @ yard_from_cam.rotation.T
+    depth, _ = cast_rays(scene, yard_from_cam.translation[None], directions)
+    return depth.reshape(camera.height, camera.width).astype(np.float32)
+
+
+def write_bundles(bundles: tuple[Bundle, ...], folder: Path) -> None:
+    """`bundles.json`."""
+    rows = [
+        {
+            "sec": b.section, "lay": b.layer, "col": b.column, "center": b.centre_m.tolist(),
+            "yaw_deg": float(np.degrees(b.yaw_rad)), "bundle_radius": b.radius_m,
+            "bar_diameter": b.kind.diameter_m, "bars": b.kind.count, "length": b.length_m,
+            "top_z": b.top_z_m, "on_top": b.on_top,
+        }
+        for b in bundles
+    ]  # fmt: skip
+    (folder / "bundles.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+
+
+def write_rig(
+    rig: StereoRig, gyro_bias: Float64, accel_bias: Float64, lever_m: Float64, settings: SimulationSettings,
+    folder: Path,
+) -> None:  # fmt: skip
+    """`rig.json`."""
+    content = {
+        "gyro_bias0": gyro_bias.tolist(),
+        "accel_bias0": accel_bias.tolist(),
+        "T_BC0": rig.body_from_cam0.matrix.tolist(),
+        "T_C0C1": rig.cam0_from_cam1.matrix.tolist(),
+        "time_offset_s": settings.sensors.timeshift_cam_imu_s,
+        "lever": lever_m.tolist(),
+        "args": asdict(settings),
+    }
+    (folder / "rig.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
