@@ -285,6 +285,17 @@ def test_no_such_folder_and_no_recording(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
+def test_a_recording_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_euroc(tmp_path)
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(path / "cam0" / "sensor.yaml"))
+
+    monkeypatch.setattr("barsight.recording.euroc.read_rig", refuse)
+    with pytest.raises(InputError, match=r"cam0/sensor\.yaml: no permission to read it"):
+        open_recording(tmp_path)
+
+
 def test_real_euroc() -> None:
     recording = open_recording(real("euroc_v101_still"))
     assert abs(recording.rig.baseline_m - 0.11007) < 1e-4

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
 from barsight.recording.info import describe, stream_info
 from barsight.recording.info_print import print_info
 from barsight.recording.open import open_recording
-from recording_samples import START_NS, real, stamps, write_euroc
+from recording_samples import START_NS, camera_yaml, mounts, real, stamps, write_euroc
 
 
 def test_gaps_are_counted() -> None:
@@ -51,13 +52,26 @@ def test_describe_and_print(tmp_path: Path) -> None:
 
 def test_odd_things_are_noted(tmp_path: Path) -> None:
     write_euroc(tmp_path, 8)
+    for camera, matrix in enumerate(mounts()):
+        text = yaml.safe_dump(camera_yaml(matrix, timeshift_cam_imu=-3.5))
+        (tmp_path / "mav0" / f"cam{camera}" / "sensor.yaml").write_text(text)
     rows = [f"{k * 5_000_000},9,0,0,0,0,30" for k in range(10)]
     (tmp_path / "mav0" / "imu0" / "data.csv").write_text("\n".join(rows) + "\n")
     notes = " / ".join(describe(open_recording(tmp_path)).notes)
     assert "30.00 m/s^2" in notes
     assert "not in degrees/s" in notes
     assert "imu0 and cam0 have no time in common" in notes
+    assert "timeshift_cam_imu is -3.5 s" in notes
+    assert "not in mm" not in notes
     assert "crane0 does not span the pictures: 0.00 s missing at the start, 0.20 s at the end" in notes
+
+
+def test_a_crane_in_millimetres_is_noted(tmp_path: Path) -> None:
+    write_euroc(tmp_path)
+    rows = [f"{stamp},35000.0,120.0,8500.0" for stamp in stamps(3)]
+    (tmp_path / "mav0" / "crane0" / "data.csv").write_text("\n".join(rows) + "\n")
+    notes = describe(open_recording(tmp_path)).notes
+    assert any("the crane is up to 35000 m away" in note for note in notes)
 
 
 def test_no_picture_beyond_the_first_pair_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,8 @@ from barsight.recording.sensors import imu_hints
 from barsight.recording.stored import Source
 
 GAP_FACTOR = 1.5
+LARGE_SHIFT_S = 0.5
+LARGE_YARD_M = 3000.0
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def describe(recording: Source) -> RecordingInfo:
         calibration=_calibration(recording.rig),
         crane=_crane(crane) if crane is not None else None,
         laser=_laser(laser),
-        notes=(*notes, *_time_notes(streams)),
+        notes=(*notes, *_unit_notes(recording.rig, crane), *_time_notes(streams)),
     )
 
 
@@ -149,6 +151,15 @@ def _laser(profiles: Iterable[LaserProfile]) -> tuple[ProfileInfo, ...]:
         ProfileInfo(p.profile, p.x_m.size, float(np.median(p.y_m)), float(p.x_m[0]), float(p.x_m[-1]))
         for p in profiles
     )
+
+
+def _unit_notes(rig: StereoRig, crane: CraneSamples | None) -> Iterable[str]:
+    """Milliseconds and millimetres where seconds and metres belong."""
+    shift_s = rig.timeshift_cam_imu_ns / NS_PER_S
+    if abs(shift_s) > LARGE_SHIFT_S:
+        yield f"timeshift_cam_imu is {shift_s:g} s: check that it is not in milliseconds"
+    if crane is not None and float(np.abs(crane.position_m).max()) > LARGE_YARD_M:
+        yield f"the crane is up to {np.abs(crane.position_m).max():.0f} m away: check that it is not in mm"
 
 
 def _time_notes(streams: Iterable[StreamInfo]) -> Iterable[str]:

@@ -23,7 +23,14 @@ def open_recording(path: Path, settings: RecordingSettings | None = None) -> Sou
 
     Raises `InputError` for no such folder or an unknown format, and what the readers raise.
     """
-    settings = settings or RecordingSettings()
+    try:
+        return _open(path, settings or RecordingSettings())
+    except PermissionError as error:
+        name = error.filename or path
+        raise InputError(name, "no permission to read it", "ask its owner or copy the recording") from None
+
+
+def _open(path: Path, settings: RecordingSettings) -> Source:
     if not path.exists():
         raise InputError(path, "no such file or folder", "check the path")
     if path.is_file():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -101,9 +102,11 @@ def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
 
 
 def require_file(path: Path) -> None:
-    """Raise `InputError` unless there is such a file."""
+    """Raise `InputError` unless there is such a file and it may be read."""
     if not path.is_file():
         raise InputError(path, "no such file", "copy the recording again, with all its files")
+    if not os.access(path, os.R_OK):
+        raise InputError(path, "no permission to read it", "ask its owner or copy the recording")
 
 
 _REMEDY = "take the original file or mend the line"
