@@ -1,0 +1,33 @@
+"""The code blocks of the documents run, in order, as they stand."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from barsight.cli.main import COMMANDS
+
+ROOT = Path(__file__).parents[1]
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("name", ["docs/conventions.md"])
+def test_code_blocks_run(name: str) -> None:
+    blocks = BLOCK.findall((ROOT / name).read_text(encoding="utf-8"))
+    assert len(blocks) >= 4
+    namespace: dict[str, object] = {}
+    for block in blocks:
+        exec(compile(block, name, "exec"), namespace)
+
+
+def test_readme_names_every_command() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    missing = [name for name in COMMANDS if f"barsight {name}" not in readme]
+    assert missing == []
+
+
+def test_ci_runs_readmes_test_command() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    setup = ".venv/bin/python -m pip install --quiet --constraint requirements.lock --editable '.[dev]'"
+    assert setup in readme
+    assert setup in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
