@@ -30,7 +30,7 @@ def test_missing_pixels_count_as_bad_and_unknown_truth_does_not_count() -> None:
     score = score_disparity(found, truth, nonocc)
     assert (score.bad05_pct, score.bad1_pct, score.bad2_pct) == (75, 50, 50)
     assert score.nonocc_bad05_pct == pytest.approx(200 / 3)
-    assert score.nonocc_bad1_pct == pytest.approx(100 / 3)
+    assert score.nonocc_bad1_pct == score.nonocc_bad2_pct == pytest.approx(100 / 3)
     assert score.coverage_pct == 75 and score.nonocc_coverage_pct == pytest.approx(200 / 3)
     assert score.average_px == pytest.approx((0.4 + 0.6 + 2.5) / 3, abs=1e-6)
     assert score.median_px == pytest.approx(0.6, abs=1e-6)

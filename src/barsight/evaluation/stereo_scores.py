@@ -14,8 +14,8 @@ from barsight.core.types import Disparity
 class StereoScore:
     """Percentages are of the pixels with known truth, a missing disparity counts as bad.
 
-    bad05, bad1, bad2: wrong by more than 0.5, 1 and 2 px, all known pixels. nonocc_bad05, nonocc_bad1: of
-    those that both images see. average_px: mean absolute error and median_px: median, over the known pixels
+    bad05, bad1, bad2: wrong by more than 0.5, 1 and 2 px, all known pixels. nonocc_bad05, nonocc_bad1,
+    nonocc_bad2: of those that both images see. average_px: mean absolute error and median_px: median, over the known pixels
     that have a disparity. coverage_pct, nonocc_coverage_pct: pixels that have one. within1_pct, within2_pct:
     of the non-occluded that have one, those within 1 and 2 of their sigma.
     """
@@ -25,6 +25,7 @@ class StereoScore:
     bad2_pct: float
     nonocc_bad05_pct: float
     nonocc_bad1_pct: float
+    nonocc_bad2_pct: float
     average_px: float
     median_px: float
     coverage_pct: float
@@ -52,6 +53,7 @@ def score_disparity(disparity: Disparity, truth_px: Float32, nonocc: Bool) -> St
         bad2_pct=_percent(error > 2, known),
         nonocc_bad05_pct=_percent(error > 0.5, visible),
         nonocc_bad1_pct=_percent(error > 1, visible),
+        nonocc_bad2_pct=_percent(error > 2, visible),
         average_px=float(met.mean(dtype=np.float64)) if met.size else float("nan"),
         median_px=float(np.median(met)) if met.size else float("nan"),
         coverage_pct=_percent(has, known),
