@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from barsight.core.errors import ConfigError
+from barsight.stereo.barsight import BarsightSettings, BarsightStereo
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
@@ -14,7 +15,7 @@ from barsight.stereo.sgbm import Sgbm, SgbmSettings
 class StereoSettings:
     """Dense stereo."""
 
-    method: Literal["sgbm"] = "sgbm"
+    method: Literal["sgbm", "barsight"] = "barsight"
     """Which method matches the pairs."""
     lowest_disparity_px: int | None = None
     """First candidate; found from the images when not given."""
@@ -25,6 +26,7 @@ class StereoSettings:
     max_depth_m: float = 40.0
     """Points further away are left out."""
     sgbm: SgbmSettings = field(default_factory=SgbmSettings)
+    barsight: BarsightSettings = field(default_factory=BarsightSettings)
 
     def __post_init__(self) -> None:
         low, high = self.lowest_disparity_px, self.highest_disparity_px
@@ -36,4 +38,6 @@ class StereoSettings:
 
 def make_method(settings: StereoSettings) -> StereoMethod:
     """The method that the settings name."""
+    if settings.method == "barsight":
+        return BarsightStereo(settings.barsight)
     return Sgbm(settings.sgbm)

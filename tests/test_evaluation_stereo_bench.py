@@ -1,0 +1,123 @@
+"""Scores against hand-made truth, loading of scenes, and the tables of `bench stereo`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barsight.core.errors import InputError
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table, write_stereo_json
+from barsight.evaluation.stereo_scenes import load_scene, load_scenes, visible_in_both
+from barsight.evaluation.stereo_scores import score_disparity
+from barsight.stereo.disparity_files import write_disparity
+
+
+def _disparity(values: np.ndarray, sigma: float = 1.0) -> Disparity:
+    values = np.asarray(values, dtype=np.float32)
+    sigmas = np.where(np.isfinite(values), np.float32(sigma), np.float32(np.nan)).astype(np.float32)
+    return Disparity(values, sigmas)
+
+
+def test_missing_pixels_count_as_bad_and_unknown_truth_does_not_count() -> None:
+    truth = np.array([[10, 10, 10, 10, np.nan]], dtype=np.float32)
+    found = _disparity([[10.4, 10.6, 12.5, np.nan, 3]])
+    nonocc = np.array([[True, True, False, True, True]])
+    score = score_disparity(found, truth, nonocc)
+    assert (score.bad05_pct, score.bad1_pct, score.bad2_pct) == (75, 50, 50)
+    assert score.nonocc_bad05_pct == pytest.approx(200 / 3)
+    assert score.nonocc_bad1_pct == score.nonocc_bad2_pct == pytest.approx(100 / 3)
+    assert score.coverage_pct == 75 and score.nonocc_coverage_pct == pytest.approx(200 / 3)
+    assert score.average_px == pytest.approx((0.4 + 0.6 + 2.5) / 3, abs=1e-6)
+    assert score.median_px == pytest.approx(0.6, abs=1e-6)
+    assert (score.within1_pct, score.within2_pct) == (100, 100)
+
+
+def test_shares_within_sigma_of_a_gaussian_error_are_those_of_a_gaussian() -> None:
+    rng = np.random.default_rng(1)
+    truth = np.full((200, 200), 20, dtype=np.float32)
+    score = score_disparity(_disparity(truth + rng.normal(0, 0.3, truth.shape), 0.3), truth, truth > 0)
+    assert score.within1_pct == pytest.approx(68.27, abs=1)
+    assert score.within2_pct == pytest.approx(95.45, abs=0.5)
+
+
+def test_a_near_strip_hides_the_background_to_its_left_and_the_border_is_out_of_view() -> None:
+    truth = np.full((3, 40), 4, dtype=np.float32)
+    truth[:, 20:26] = 10
+    visible = visible_in_both(truth)
+    expected = np.ones(40, dtype=bool)
+    expected[:4] = False  # x - d < 0
+    expected[14:20] = False  # x - 4 = 10...15 are covered by 20...25 - 10
+    assert (visible == expected).all()
+
+
+def _write_scene(folder: Path, truth: np.ndarray, bits: int = 8) -> None:
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    wide = rng.integers(0, 256, (truth.shape[0], truth.shape[1] + 8)).astype(np.uint8)
+    left, right = wide[:, 8:], wide[:, : truth.shape[1]]
+    scale = 257 if bits == 16 else 1
+    for name, image in (("left", left), ("right", right)):
+        stored = image.astype(np.uint16) * scale if bits == 16 else image
+        assert cv2.imwrite(str(folder / f"{name}.png"), stored)
+    write_disparity(folder / "disp.pfm", _disparity(truth))
+
+
+def test_a_scene_is_loaded_from_8_and_16_bits_alike(tmp_path: Path) -> None:
+    truth = np.full((20, 60), 8, dtype=np.float32)
+    truth[0, 0] = np.nan
+    _write_scene(tmp_path / "a", truth)
+    _write_scene(tmp_path / "b", truth, bits=16)
+    first, second = load_scenes(tmp_path)
+    assert (first.pair.left == second.pair.left).all() and (first.pair.right == second.pair.right).all()
+    assert first.candidates == DisparityRange(0, 16)
+    assert np.isnan(first.truth_px[0, 0]) and not first.nonocc[0, 0]
+    assert not first.nonocc[:, :8].any() and first.nonocc[:, 8:].all()
+
+
+def test_nonocc_png_is_used_where_there_is_one(tmp_path: Path) -> None:
+    truth = np.full((20, 60), 8, dtype=np.float32)
+    _write_scene(tmp_path / "a", truth)
+    mask = np.zeros((20, 60), dtype=np.uint8)
+    mask[:, 30:] = 255
+    assert cv2.imwrite(str(tmp_path / "a" / "nonocc.png"), mask)
+    assert (load_scene(tmp_path / "a").nonocc == (mask == 255)).all()
+
+
+def test_a_missing_folder_and_a_torn_scene_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is no folder"):
+        load_scenes(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="holds no scene"):
+        load_scenes(tmp_path)
+    _write_scene(tmp_path / "a", np.full((20, 60), 8, dtype=np.float32))
+    (tmp_path / "a" / "right.png").unlink()
+    with pytest.raises(InputError, match=r"right\.png"):
+        load_scenes(tmp_path)
+
+
+def test_the_bench_prints_tables_and_writes_json(tmp_path: Path) -> None:
+    truth = np.full((20, 60), 8, dtype=np.float32)
+    _write_scene(tmp_path / "data" / "a", truth)
+    _write_scene(tmp_path / "data" / "b", truth + 2)
+
+    def constant(pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        assert candidates.count == 16
+        return _disparity(np.full(pair.left.shape, 8.0))
+
+    bench = bench_stereo(tmp_path / "data", {"constant": constant})
+    (result,) = bench.methods
+    assert [scene.score.bad1_pct for scene in result.scenes] == [0, 100]
+    assert result.mean.bad1_pct == 50 and result.mean.average_px == pytest.approx(1)
+    assert result.per_megapixel.repeats == 5
+    assert (
+        result.per_megapixel.fastest_ms <= result.per_megapixel.median_ms <= result.per_megapixel.slowest_ms
+    )
+    assert stereo_table(bench).row_count == 1 and scene_table(bench).row_count == 2
+    write_stereo_json(tmp_path / "out.json", bench)
+    stored = json.loads((tmp_path / "out.json").read_text())
+    assert stored["methods"][0]["mean"]["bad1_pct"] == 50
+    assert stored["provenance"]["commit"] and stored["provenance"]["cores"] >= 1
