@@ -10,7 +10,9 @@ import hashlib
 import json
 import math
 import resource
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -40,6 +42,7 @@ from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTim
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.selection import SelectedSensors
+from barsight.recording.sensors import imu_hints
 from barsight.stereo.disparity_range import find_range
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.points import triangulate
@@ -79,6 +82,8 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     with watch("look"):
         rectifier = Rectifier(source.rig)
         first = first_look(source, rectifier)
+        imu = source.imu()
+        hints = imu_hints(imu) if imu is not None else ()
         cell_m = settings.map.cell_m or choose_cell(first, has_crane=source.crane() is not None)
     total = len(source.index.stamps_ns)
 
@@ -89,8 +94,9 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     poses = {frame.stamp_ns: frame for frame in trajectory.frames}
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
-    per_pixel = points_per_pixel(first, cell_m)
-    view = _View(settings, rectifier, make_method(settings.stereo), cell_m, per_pixel, watch)
+    method = make_method(settings.stereo)
+    turn = threading.Lock() if method.uses_all_cores else nullcontext()
+    view = _View(settings, rectifier, method, turn, cell_m, points_per_pixel(first, cell_m), watch)
     store = TileStore(scratch, settings.map.resident_tiles)
     used, preview = 0, None
     for done, outcome in enumerate(ordered_map(view, _placed(source, poses), WORKERS), start=1):
@@ -118,6 +124,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         agreed = [agree(by_number[p.profile], p) for p in laser if p.profile in by_number]
 
     warnings = [Notice("assumed", text) for text in source.notes]
+    warnings += [Notice("imu", text) for text in hints]
     warnings += [Notice("trajectory", text) for text in trajectory.warnings]
     warnings += [Notice(a.code, a.reason) for a in agreed if isinstance(a, Failed)]
     if refusals:
@@ -214,6 +221,7 @@ class _View:
     settings: MeasureSettings
     rectifier: Rectifier
     method: StereoMethod
+    turn: AbstractContextManager[object]
     cell_m: float
     per_pixel: int
     watch: Stopwatch
@@ -227,10 +235,10 @@ class _View:
             pair = _rectified(self.rectifier, frame)
         if isinstance(pair, Failed):
             return Refusal("rectify", RefusedFrame(frame.stamp_ns, pair.reason))
-        with self.watch("stereo", 1):
-            candidates = _candidates(stereo, pair)
-            if isinstance(candidates, Failed):
-                return Refusal("stereo", RefusedFrame(frame.stamp_ns, candidates.reason))
+        candidates = _candidates(stereo, pair)
+        if isinstance(candidates, Failed):
+            return Refusal("stereo", RefusedFrame(frame.stamp_ns, candidates.reason))
+        with self.turn, self.watch("stereo", 1):
             disparity = self.method(pair, candidates)
         with self.watch("points", 1):
             points = triangulate(

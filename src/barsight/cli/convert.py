@@ -23,7 +23,7 @@ def run(arguments: Sequence[str]) -> None:
         recording: tyro.conf.Positional[Path],
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         to: Target,
-        settings: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
+        settings: Annotated[RecordingSettings, tyro.conf.arg(name="")] = RecordingSettings(),  # noqa: B008
     ) -> None:
         """Write a recording in another format; pictures, stamps and numbers stay what they are.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -20,7 +21,7 @@ def run(arguments: Sequence[str]) -> None:
 
     def command(
         recording: tyro.conf.Positional[Path],
-        settings: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
+        settings: Annotated[RecordingSettings, tyro.conf.arg(name="")] = RecordingSettings(),  # noqa: B008
     ) -> None:
         """Say what is in a recording: sensors, rates, gaps, dropped pictures and why, calibration.
 

@@ -30,7 +30,7 @@ def run(arguments: Sequence[str]) -> None:
     def command(
         recording: tyro.conf.Positional[Path],
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
-        settings: tyro.conf.OmitArgPrefixes[MeasureSettings] = default,
+        settings: Annotated[MeasureSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
         overwrite: bool = False,
         verbose: Annotated[bool, tyro.conf.arg(aliases=("-v",))] = False,

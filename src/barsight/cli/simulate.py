@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -20,7 +21,7 @@ def run(arguments: Sequence[str]) -> None:
 
     def command(
         out: tyro.conf.Positional[Path],
-        settings: tyro.conf.OmitArgPrefixes[SimulationSettings] = default,
+        settings: Annotated[SimulationSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
     ) -> None:
         """Render a recording of a bar yard, with exact truth, as an EuRoC folder.

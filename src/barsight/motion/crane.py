@@ -1,4 +1,4 @@
-"""The trajectory from the crane's encoders and the body's nominal attitude."""
+"""The trajectory from the crane's encoders and the body's nominal attitude, with the gyro's sway about it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float64, Int64
@@ -13,6 +14,7 @@ from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame, RefusedFrame, Trajectory
+from barsight.motion.sway import sway_at, turned_angle
 from barsight.recording.base import Recording
 
 
@@ -23,11 +25,17 @@ class CraneSettings:
     window_s: float = 0.35
     """Readings up to this far before and after a frame are fitted with a parabola."""
     attitude_std_deg: float = 0.15
-    """How far the body may sway from its nominal attitude (1 sigma, each axis)."""
+    """How far the body may sway from its nominal attitude (1 sigma, each axis), where no IMU measures it."""
+    sway_window_s: float = 8.0
+    """The gyro's mean and trend this long before and after a frame are taken off: what is left is sway."""
+    sway_std_deg: float = 0.02
+    """The attitude's error where the gyro measures the sway (1 sigma, each axis)."""
 
     def __post_init__(self) -> None:
-        if self.window_s <= 0 or self.attitude_std_deg < 0:
-            raise ConfigError("window_s must be positive, attitude_std_deg can't be negative")
+        if self.window_s <= 0 or self.sway_window_s <= 0:
+            raise ConfigError("window_s and sway_window_s must be positive")
+        if self.attitude_std_deg < 0 or self.sway_std_deg < 0:
+            raise ConfigError("attitude_std_deg and sway_std_deg can't be negative")
 
 
 @dataclass(frozen=True)
@@ -43,22 +51,35 @@ class CraneTrajectory:
             raise MeasurementError(
                 f"{recording.path}: no crane encoders; measure without them (--use stereo)"
             )
+        settings = self.settings
         shift = recording.rig.timeshift_cam_imu_ns
+        imu = recording.imu()
+        angle = turned_angle(imu) if imu is not None else np.empty((0, 3))
         placed: list[PosedFrame] = []
         refused: list[RefusedFrame] = []
+        without_sway = 0
         for stamp in recording.index.stamps_ns:
-            fit = fit_position(crane, stamp + shift, seconds_to_ns(self.settings.window_s))
+            advance()
+            fit = fit_position(crane, stamp + shift, seconds_to_ns(settings.window_s))
             if isinstance(fit, Failed):
                 refused.append(RefusedFrame(stamp, fit.reason))
-            else:
-                position, position_covariance = fit
-                covariance = np.zeros((6, 6))
-                covariance[:3, :3] = np.eye(3) * np.deg2rad(self.settings.attitude_std_deg) ** 2
-                covariance[3:, 3:] = position_covariance
-                pose = Pose("yard", "body", crane.yard_from_body_nominal, position + crane.crane_to_body_m)
-                placed.append(PosedFrame(stamp, pose, covariance))
-            advance()
-        return Trajectory("yard", tuple(placed), tuple(refused), ("crane",))
+                continue
+            attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
+            if imu is not None:
+                sway = sway_at(imu, angle, stamp + shift, settings.sway_window_s)
+                if isinstance(sway, Failed):
+                    without_sway += 1
+                else:
+                    attitude = attitude @ Rotation.from_rotvec(sway).as_matrix()
+                    attitude_std_deg = settings.sway_std_deg
+            covariance = np.zeros((6, 6))
+            covariance[:3, :3] = np.eye(3) * np.deg2rad(attitude_std_deg) ** 2
+            covariance[3:, 3:] = fit[1]
+            pose = Pose("yard", "body", attitude, fit[0] + crane.crane_to_body_m)
+            placed.append(PosedFrame(stamp, pose, covariance))
+        sensors = ("crane",) if imu is None or without_sway == len(placed) else ("crane", "imu")
+        warnings = (f"the IMU doesn't cover {without_sway} frames: nominal attitude",) if without_sway else ()
+        return Trajectory("yard", tuple(placed), tuple(refused), sensors, warnings)
 
 
 def fit_position(crane: CraneSamples, stamp_ns: int, window_ns: int) -> tuple[Float64, Float64] | Failed:

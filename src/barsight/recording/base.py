@@ -21,22 +21,21 @@ from barsight.core.types import (
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """How a recording is read.
-
-    pair_tolerance_s: how far apart the stamps of a left and a right picture may lie. EuRoC's cameras are
-        triggered together and their stamps agree exactly; 2 ms leave room for drivers that stamp on arrival,
-        while a crane at 0.5 m/s moves no more than 1 mm in that time.
-    camchain, imu_yaml: Kalibr's files for a bag; found in or beside the bag where they aren't named.
-    cam0_topic, cam1_topic, imu_topic: a bag's topics; default the camchain's `rostopic`, else recognised by
-        the message type.
-    """
+    """How a recording is read."""
 
     pair_tolerance_s: float = 0.002
+    """How far apart the stamps of a left and a right picture may lie. Triggered cameras' stamps agree
+    exactly; 2 ms leave room for drivers that stamp on arrival, in which a crane moves 1 mm."""
     camchain: Path | None = None
+    """Kalibr's camchain-imucam.yaml for a bag; found in or beside the bag when not given."""
     imu_yaml: Path | None = None
+    """Kalibr's imu.yaml for a bag; found in or beside the bag when not given."""
     cam0_topic: str | None = None
+    """A bag's topic of left pictures; the camchain's rostopic, else recognised by type, when not given."""
     cam1_topic: str | None = None
+    """A bag's topic of right pictures, likewise."""
     imu_topic: str | None = None
+    """A bag's topic of the IMU, likewise."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.pair_tolerance_s < 1:

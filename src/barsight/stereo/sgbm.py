@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -50,6 +50,7 @@ class Sgbm:
     """`StereoMethod` over OpenCV's SGBM; sigma from the measured noise and the gradients in the block."""
 
     settings: SgbmSettings
+    uses_all_cores: ClassVar[bool] = False
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`. Rows of 16 candidates at a time, as OpenCV wants."""
