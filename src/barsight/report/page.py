@@ -1,0 +1,195 @@
+"""The report page: one self-contained HTML file from the files of a measured folder."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from plotly.offline import get_plotlyjs
+
+from barsight.core.files import atomic_path
+from barsight.report.page_maps import MapFigure, map_figures
+from barsight.report.page_path import path_plots
+from barsight.report.pictures import read_raster
+from barsight.report.plots import Plot, compare, contour_plot, histogram_plot, limits_plot
+from barsight.result_folder import read_contours, read_laser, read_path, read_summary
+
+NONE = "–"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A key figure of the first lines: what it is, its value with unit, and a note in small print."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+def write_report(out_dir: Path, target: Path) -> None:
+    """Write the page of the folder `out_dir` to `target`, whole or not at all.
+
+    result.json must be there; a section whose file is missing says so in a sentence. Raises InputError for
+    a missing or torn file, OutputError where `target` can't be written.
+    """
+    page = render_page(out_dir)
+    with atomic_path(target) as path:
+        path.write_text(page, encoding="utf-8")
+
+
+def render_page(out_dir: Path) -> str:
+    """The page's HTML; see `write_report`."""
+    result = read_summary(out_dir)
+    laser = read_laser(out_dir)
+    compared = compare(read_contours(out_dir), laser)
+    path = read_path(out_dir)
+    height = out_dir / "height.tif"
+    maps: tuple[MapFigure, ...] = map_figures(read_raster(height), laser) if height.is_file() else ()
+    contours = [contour_plot(item) for item in compared]
+    agreement = [
+        found
+        for found in (histogram_plot(compared), limits_plot(compared, result.get("agreement") or []))
+        if found is not None
+    ]
+    ways = path_plots(path, str(result.get("reference", "world"))) if path else ()
+    template = _environment().get_template("page.html.jinja")
+    return template.render(
+        result=result,
+        figures=key_figures(result),
+        maps=maps,
+        contours=contours,
+        agreement_plots=agreement,
+        ways=ways,
+        plot_data=_plot_json([*contours, *agreement, *ways]),
+        has_laser=bool(laser),
+        stages=_stages(result),
+        refused_by_stage=_refused_by_stage(result),
+        configuration=list(flatten(result.get("configuration") or {})),
+        truth=list(flatten(result.get("truth") or {})),
+        preview=_preview(out_dir / "preview.png"),
+        plotly_js=get_plotlyjs(),
+        css=_resource("page.css"),
+        script=_resource("page_script.js.jinja"),
+    )
+
+
+def key_figures(result: dict[str, Any]) -> list[Figure]:
+    """What an operator looks at first."""
+    frames = result.get("frames") or {}
+    trajectory = result.get("trajectory") or {}
+    surface = result.get("map") or {}
+    refused = len(frames.get("refused") or [])
+    figures = [
+        Figure(
+            "Frames used", f"{frames.get('used', NONE)} of {frames.get('total', NONE)}", f"{refused} refused"
+        ),
+        Figure(
+            "Way", number(trajectory.get("length_m"), 2, "m"), number(trajectory.get("duration_s"), 1, "s")
+        ),
+    ]
+    for row in result.get("agreement") or []:
+        note = (
+            f"bias {number(row.get('bias_mm'), 1, 'mm')}, coverage {number(row.get('coverage_pct'), 1, '%')}"
+        )
+        label = f"MAE to laser, profile {row.get('profile')}"
+        figures.append(Figure(label, number(row.get("mae_mm"), 1, "mm"), note))
+    cells = {key: surface.get(f"cells_{key}") or 0 for key in ("seen", "filled", "unknown")}
+    total = sum(cells.values())
+    share = {key: 100 * count / total if total else math.nan for key, count in cells.items()}
+    note = f"filled {number(share['filled'], 1, '%')}, unknown {number(share['unknown'], 1, '%')}"
+    figures.append(Figure("Map seen", number(share["seen"], 1, "%"), note))
+    sigma = surface.get("median_sigma_m")
+    cell = surface.get("cell_m")
+    figures.append(
+        Figure(
+            "Median sigma",
+            number(None if sigma is None else sigma * 1e3, 1, "mm"),
+            f"cells of {number(None if cell is None else cell * 1e3, 0, 'mm')}",
+        )
+    )
+    seconds = sum(stage.get("seconds") or 0.0 for stage in result.get("stages") or [])
+    figures.append(Figure("Time in stages", number(seconds, 1, "s"), "summed over threads"))
+    figures.append(Figure("Peak memory", number(result.get("peak_memory_mib"), 0, "MiB")))
+    return figures
+
+
+def number(value: Any, decimals: int = 1, unit: str = "") -> str:
+    """A number for people, with a narrow space per thousand and the unit; a dash where there is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        return NONE
+    text = f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
+    return f"{text}\u00a0{unit}" if unit else text
+
+
+def plain(value: Any) -> str:
+    """Any value of result.json in one line."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Nested settings as dotted names with their values."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", plain(value)
+
+
+def _stages(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """The stages with their share of the whole time (%) and, where done by frame, seconds per frame."""
+    stages = result.get("stages") or []
+    whole = sum(stage.get("seconds") or 0.0 for stage in stages)
+    rows = []
+    for stage in stages:
+        seconds, frames = stage.get("seconds") or 0.0, stage.get("frames") or 0
+        share = 100 * seconds / whole if whole else 0.0
+        each = seconds / frames if frames else None
+        name = stage.get("name", NONE)
+        rows.append({"name": name, "seconds": seconds, "frames": frames, "each": each, "share": share})
+    return rows
+
+
+def _refused_by_stage(result: dict[str, Any]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for refused in (result.get("frames") or {}).get("refused") or []:
+        stage = str(refused.get("stage", NONE))
+        counts[stage] = counts.get(stage, 0) + 1
+    return counts
+
+
+def _plot_json(plots: list[Plot]) -> str:
+    """All figures for the script; `<` is escaped so that no text can end the element that carries it."""
+    figures = {plot.name: {"data": plot.traces, "layout": plot.layout} for plot in plots}
+    return json.dumps(figures, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _preview(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_resource),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = number
+    environment.filters["plain"] = plain
+    return environment
+
+
+def _resource(name: str) -> str:
+    return resources.files("barsight.report").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,124 @@
+"""The page's plots of the trajectory: from above, and position and attitude over time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.core.arrays import Float64
+from barsight.core.stamps import NS_PER_S
+from barsight.report.plots import MOST_POINTS, SERIES, Plot, Trace, numbers
+from barsight.result_folder import CameraPath
+
+LEAST_SPAN_MM = 20.0
+LEAST_SPAN_DEG = 0.2
+
+
+def path_plots(path: CameraPath, reference: str) -> tuple[Plot, ...]:
+    """From above, and over time. Empty where the path has no pose."""
+    if path.stamp_ns.size == 0:
+        return ()
+    step = -(-path.stamp_ns.size // MOST_POINTS)
+    thinned = CameraPath(path.stamp_ns[::step], path.position_m[::step], path.quaternion_xyzw[::step])
+    note = f" Every {step}th pose." if step > 1 else ""
+    return _from_above(thinned, reference, note), _over_time(thinned, reference, note)
+
+
+def _from_above(path: CameraPath, reference: str, note: str) -> Plot:
+    x, y, _ = path.position_m.T
+    dots = path.stamp_ns.size <= 400
+    traces: list[Trace] = [
+        {
+            "type": "scatter",
+            "mode": "lines+markers" if dots else "lines",
+            "name": "body",
+            "x": numbers(x, 4),
+            "y": numbers(y, 4),
+            "line": {"color": "--series-0", "width": 1.6},
+            "marker": {"color": "--series-0", "size": 5},
+        },
+        _mark("start", x[0], y[0], "--series-2"),
+        _mark("end", x[-1], y[-1], "--series-1"),
+    ]
+    half = max(float(np.ptp(x)), float(np.ptp(y)) * 3, 0.2) * 0.55
+    middle = (float(x.min()) + float(x.max())) / 2
+    layout = {
+        "xaxis": {"title": {"text": "x / m"}, "range": [middle - half, middle + half]},
+        "yaxis": {"title": {"text": "y / m"}, "scaleanchor": "x", "scaleratio": 1},
+    }
+    caption = f"The body's way from above in the {reference} frame, both axes at one scale.{note}"
+    return Plot("path-above", traces, layout, 320, caption)
+
+
+def _over_time(path: CameraPath, reference: str, note: str) -> Plot:
+    seconds = (path.stamp_ns - path.stamp_ns[0]) / NS_PER_S
+    moved_mm = (path.position_m - path.position_m[0]) * 1e3
+    turned_deg = turned_since_start_deg(path)
+    rows = [(f"Δ{axis} / mm", moved_mm[:, [k]], LEAST_SPAN_MM) for k, axis in enumerate("xyz")]
+    rows.append(("turned / °", turned_deg, LEAST_SPAN_DEG))
+    traces: list[Trace] = []
+    layout: dict[str, Any] = {"xaxis": {"title": {"text": "time / s"}, "anchor": f"y{len(rows)}"}}
+    share = 1 / len(rows)
+    for row, (title, values, least) in enumerate(rows):
+        axis = "y" if row == 0 else f"y{row + 1}"
+        top = 1 - row * share
+        layout["yaxis" if row == 0 else f"yaxis{row + 1}"] = {
+            "title": {"text": title},
+            "domain": [top - share * 0.84, top],
+            "range": _range(values, least),
+        }
+        for column in range(values.shape[1]):
+            single = values.shape[1] == 1
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": title.split(" ")[0] if single else f"about {'XYZ'[column]}",
+                    "showlegend": not single,
+                    "x": numbers(seconds, 3),
+                    "y": numbers(values[:, column], 3),
+                    "yaxis": axis,
+                    "line": {"color": SERIES[row if single else column], "width": 1.5},
+                }
+            )
+    caption = (
+        f"Position against the first frame, and the rotation since then as a rotation vector, "
+        f"{reference} axes.{note}"
+    )
+    return Plot("path-time", traces, layout, 620, caption)
+
+
+def turned_since_start_deg(path: CameraPath) -> Float64:
+    """(N, 3) rotation vector from the first attitude to each, reference axes, degrees.
+
+    A rotation has many vectors, 360 degrees apart; each is the one nearest to the one before it.
+    """
+    attitude = Rotation.from_quat(path.quaternion_xyzw)
+    vectors = (attitude * attitude[0].inv()).as_rotvec()
+    for k in range(1, len(vectors)):
+        angle = float(np.linalg.norm(vectors[k]))
+        if angle > 1e-9:
+            along = vectors[k] / angle
+            turns = np.round((float(along @ vectors[k - 1]) - angle) / (2 * np.pi))
+            vectors[k] += turns * 2 * np.pi * along
+    return np.degrees(vectors)
+
+
+def _mark(name: str, x: float, y: float, colour: str) -> Trace:
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": name,
+        "x": [round(float(x), 4)],
+        "y": [round(float(y), 4)],
+        "marker": {"color": colour, "size": 11, "symbol": "diamond"},
+    }
+
+
+def _range(values: Float64, least: float) -> list[float]:
+    """A range that holds all values and doesn't blow noise up to the panel's height."""
+    low, high = float(values.min()), float(values.max())
+    half = max((high - low) * 0.55, least / 2)
+    return [(low + high) / 2 - half, (low + high) / 2 + half]

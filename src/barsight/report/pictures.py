@@ -1,0 +1,226 @@
+"""The height map as pictures: read tile by tile, downsampled, coloured, ready for the page's SVG."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from barsight.core.arrays import Float32, Float64, UInt8
+from barsight.core.errors import InputError
+from barsight.core.types import Source
+
+BANDS = 4
+LONGEST_PX = 2400
+MOST_PIXELS = 3_000_000
+FOLD_ASPECT = 7.0
+"""A map longer than this many times its breadth is folded into strips below each other."""
+
+Codes = dict[int, tuple[int, int, int]]
+SOURCE_RGB: Codes = {
+    Source.VISION: (68, 119, 170),
+    Source.LASER: (34, 136, 51),
+    Source.FILLED: (238, 119, 51),
+}
+FILLED_TINT_RGB = (255, 90, 160)
+
+
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """height.tif made smaller: row 0 at the highest y, each pixel the mean of step x step cells.
+
+    z_m, sigma_m, views: (H, W) float32, NaN where no cell knows it. source: (H, W) uint8, the commonest code
+    of the known cells. cell_m: side of a pixel; (left_m, top_m): the outer corner of pixel (0, 0).
+    """
+
+    z_m: Float32
+    sigma_m: Float32
+    views: Float32
+    source: UInt8
+    cell_m: float
+    left_m: float
+    top_m: float
+    step: int
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A piece of a map: the picture as a data URI and the rectangle that it covers (m)."""
+
+    image: str
+    x_min_m: float
+    x_max_m: float
+    y_min_m: float
+    y_max_m: float
+
+
+def strip_count(width: int, height: int) -> int:
+    """Into how many strips along X a map of this shape is folded."""
+    aspect = width / max(height, 1)
+    return 1 if aspect <= FOLD_ASPECT else int(np.ceil(aspect / (FOLD_ASPECT - 1)))
+
+
+def read_raster(path: Path) -> Raster:
+    """Read height.tif segment by segment: memory holds the small map and a few tiles, whatever its size.
+
+    Raises InputError where the file is torn or is not four planar bands with a scale and a tie point.
+    """
+    try:
+        with tifffile.TiffFile(path) as file:
+            return _reduce(path, file.pages.first)
+    except (tifffile.TiffFileError, OSError, ValueError, KeyError, IndexError, RuntimeError) as error:
+        raise InputError(path, f"is torn ({error})", "measure the recording again") from error
+
+
+def _reduce(path: Path, page: tifffile.TiffPage) -> Raster:
+    shape = page.shape
+    if len(shape) != 3 or shape[0] != BANDS or min(shape) < 1 or page.planarconfig != 2:
+        raise InputError(
+            path, f"has the shape {shape}, not {BANDS} planar bands", "measure the recording again"
+        )
+    height, width = shape[1:]
+    step = _choose_step(width, height)
+    small = (-(-height // step), -(-width // step))
+    sums = np.zeros((3, *small))
+    counts = np.zeros((3, *small), np.int32)
+    codes = np.zeros((BANDS, *small), np.int32)
+    for data, index, _ in page.segments(maxworkers=1):
+        if data is None:
+            continue
+        band, row, column = int(index[0]), int(index[2]), int(index[3])
+        values = data[0, : height - row, : width - column, 0]
+        if band < 3:
+            known = np.isfinite(values)
+            _pool(np.where(known, values, 0), sums[band], row, column, step)
+            _pool(known, counts[band], row, column, step)
+        else:
+            for code in (Source.VISION, Source.LASER, Source.FILLED):
+                _pool(values == code, codes[code], row, column, step)
+    with np.errstate(invalid="ignore"):
+        z, sigma, views = np.where(counts > 0, sums / counts, np.nan).astype(np.float32)
+    source = codes.argmax(axis=0).astype(np.uint8)
+    source[codes.sum(axis=0) == 0] = Source.UNKNOWN
+    views[(source == Source.UNKNOWN) | (views <= 0)] = np.nan
+    z[source == Source.UNKNOWN] = np.nan
+    scale = page.tags["ModelPixelScaleTag"].value
+    tie = page.tags["ModelTiepointTag"].value
+    return Raster(z, sigma, views, source, float(scale[0]) * step, float(tie[3]), float(tie[4]), step)
+
+
+def _choose_step(width: int, height: int) -> int:
+    strip = -(-width // strip_count(width, height))
+    longest = max(strip, height)
+    return max(1, -(-longest // LONGEST_PX), int(np.ceil(np.sqrt(width * height / MOST_PIXELS))))
+
+
+def _pool(values: NDArray[np.generic], into: NDArray[np.generic], row: int, column: int, step: int) -> None:
+    """Add a segment, whose first cell is (row, column), to the sums of the blocks that it touches."""
+    first_row, first_column = row // step, column // step
+    rows = _block_starts(row, values.shape[0], step)
+    columns = _block_starts(column, values.shape[1], step)
+    kind = np.int32 if values.dtype == np.bool_ else np.float64
+    part = np.add.reduceat(np.add.reduceat(values.astype(kind), rows, axis=0), columns, axis=1)
+    target = into[first_row : first_row + part.shape[0], first_column : first_column + part.shape[1]]
+    np.add(target, part, out=target, casting="unsafe")
+
+
+def _block_starts(first: int, count: int, step: int) -> NDArray[np.int64]:
+    """Where in a run of cells, the first of which is `first`, new blocks begin."""
+    boundaries = np.arange((first // step + 1) * step, first + count, step) - first
+    return np.concatenate([[0], boundaries]).astype(np.int64)
+
+
+def colours(values: Float32, low: float, high: float, scale: int) -> UInt8:
+    """(H, W, 3) RGB on one of OpenCV's uniform colour scales; NaN gets the lowest colour."""
+    share = np.clip((np.nan_to_num(values, nan=low) - low) / max(high - low, 1e-9), 0, 1)
+    painted = cv2.applyColorMap(np.round(share * 255).astype(np.uint8), scale)
+    return np.asarray(painted[..., ::-1], dtype=np.uint8)
+
+
+def gradient_stops(scale: int, count: int = 9) -> tuple[str, ...]:
+    """The colour scale as CSS colours from low to high."""
+    ramp = colours(np.linspace(0, 1, count, dtype=np.float32)[None], 0.0, 1.0, scale)[0]
+    return tuple(f"rgb({r},{g},{b})" for r, g, b in ramp.tolist())
+
+
+def hillshade(z_m: Float32, cell_m: float) -> Float32:
+    """(H, W) light of a lamp in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat."""
+    known = np.isfinite(z_m)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
+    smooth = cv2.GaussianBlur(np.where(known, z_m, 0).astype(np.float32), (0, 0), 1.0)
+    surface = np.where(known, smooth / np.maximum(weight, 1e-6), np.nan)
+    with np.errstate(invalid="ignore"):
+        east = np.gradient(surface, cell_m, axis=1) if surface.shape[1] > 1 else np.zeros_like(surface)
+        north = -np.gradient(surface, cell_m, axis=0) if surface.shape[0] > 1 else np.zeros_like(surface)
+    facing: Float64 = (1 + (east - north) / np.sqrt(2)) / np.sqrt(1 + east**2 + north**2)
+    return np.nan_to_num(facing, nan=1.0).astype(np.float32)
+
+
+def paint_height(raster: Raster, low_m: float, high_m: float) -> UInt8:
+    """(H, W, 4): colour by height, darkened and lightened by the hillshade; filled cells tinted pink."""
+    base = colours(raster.z_m, low_m, high_m, cv2.COLORMAP_VIRIDIS).astype(np.float32)
+    light = np.clip(hillshade(raster.z_m, raster.cell_m), 0.0, 1.4)[..., None]
+    shaded = np.where(light < 1, base * (0.35 + 0.65 * light), base + (255 - base) * (light - 1) * 0.9)
+    filled = raster.source == Source.FILLED
+    shaded[filled] = 0.3 * shaded[filled] + 0.7 * np.array(FILLED_TINT_RGB)
+    return _with_alpha(shaded, np.isfinite(raster.z_m))
+
+
+def paint_scale(values: Float32, low: float, high: float, scale: int) -> UInt8:
+    """(H, W, 4): a plain colour scale, transparent where NaN."""
+    return _with_alpha(colours(values, low, high, scale), np.isfinite(values))
+
+
+def paint_source(source: UInt8) -> UInt8:
+    """(H, W, 4): a colour per code, transparent where unknown."""
+    picture = np.zeros((*source.shape, 3), np.uint8)
+    for code, rgb in SOURCE_RGB.items():
+        picture[source == code] = rgb
+    return _with_alpha(picture, source != Source.UNKNOWN)
+
+
+def _with_alpha(rgb: NDArray[np.generic], opaque: NDArray[np.bool_]) -> UInt8:
+    alpha = np.where(opaque, 255, 0).astype(np.uint8)
+    return np.dstack([np.clip(rgb, 0, 255).astype(np.uint8), alpha])
+
+
+def cut_strips(picture: UInt8, raster: Raster, *, lossless: bool) -> tuple[Strip, ...]:
+    """The picture in strips that fit a page, each a data URI of a WebP image."""
+    height, width = picture.shape[:2]
+    strips = []
+    count = strip_count(width, height)
+    breadth = -(-width // count)
+    for left in range(0, width, breadth):
+        part = picture[:, left : left + breadth]
+        strips.append(
+            Strip(
+                image=data_uri(part, lossless=lossless),
+                x_min_m=raster.left_m + left * raster.cell_m,
+                x_max_m=raster.left_m + (left + part.shape[1]) * raster.cell_m,
+                y_min_m=raster.top_m - height * raster.cell_m,
+                y_max_m=raster.top_m,
+            )
+        )
+    return tuple(strips)
+
+
+def data_uri(rgba: UInt8, *, lossless: bool) -> str:
+    """A picture (H, W, 4) as a data URI; OpenCV's WebP takes a quality over 100 for lossless."""
+    quality = 101 if lossless else 88
+    bgra = np.ascontiguousarray(rgba[..., [2, 1, 0, 3]])
+    encoded: UInt8 = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, quality])[1]
+    return "data:image/webp;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+
+
+def robust_range(values: Float32 | Float64, low_pct: float, high_pct: float) -> tuple[float, float]:
+    """Percentiles of the finite values; (0, 1) where there are none, never an empty range."""
+    known = values[np.isfinite(values)]
+    if known.size == 0:
+        return 0.0, 1.0
+    low, high = (float(v) for v in np.percentile(known, (low_pct, high_pct)))
+    return low, max(high, low + 1e-3)

@@ -1,0 +1,106 @@
+"""Floor 6: reading back the folder that `barsight measure` wrote, for the page and the viewer."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import InputError
+from barsight.core.stamps import parse_seconds
+from barsight.core.types import Contour, LaserProfile
+
+_REMEDY = "measure the recording again"
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """Where the body was. stamp_ns: (N,). position_m: (N, 3), quaternion_xyzw: (N, 4), reference axes."""
+
+    stamp_ns: Int64
+    position_m: Float64
+    quaternion_xyzw: Float64
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """result.json. Raises InputError where the folder or the file is missing or the file is torn."""
+    path = folder / "result.json"
+    remedy = "name a folder that `barsight measure` wrote"
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", remedy)
+    if not path.is_file():
+        raise InputError(folder, "has no result.json", remedy)
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(path, f"is not JSON ({error})", _REMEDY) from error
+    if not isinstance(summary, dict):
+        raise InputError(path, "is not a JSON object", _REMEDY)
+    return summary
+
+
+def read_path(folder: Path) -> CameraPath | None:
+    """trajectory.tum; None where there is none. Raises InputError for a line that is none of TUM's."""
+    path = folder / "trajectory.tum"
+    if not path.is_file():
+        return None
+    stamps: list[int] = []
+    numbers: list[list[float]] = []
+    for count, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            stamps.append(parse_seconds(fields[0]))
+            numbers.append([float(field) for field in fields[1:]])
+        except ValueError as error:
+            raise InputError(path, f"line {count} is not TUM ({error})", _REMEDY) from error
+        if len(numbers[-1]) != 7:
+            raise InputError(path, f"line {count} has {len(fields)} numbers instead of 8", _REMEDY)
+    table = np.array(numbers, dtype=np.float64).reshape(-1, 7)
+    return CameraPath(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
+
+
+def read_contours(folder: Path) -> tuple[Contour, ...]:
+    """contour.csv, a contour per profile; empty where there is no such file."""
+    table = _read_table(folder / "contour.csv", 6)
+    parts = _by_profile(table)
+    return tuple(
+        Contour(number, part[:, 1], part[:, 2], part[:, 3], part[:, 4], part[:, 5].astype(np.uint8))
+        for number, part in parts.items()
+    )
+
+
+def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
+    """laser.csv; empty where there is no such file. The files don't carry range_std_m: it is NaN."""
+    table = _read_table(folder / "laser.csv", 4)
+    parts = _by_profile(table)
+    return tuple(
+        LaserProfile(number, part[:, 1], part[:, 2], part[:, 3], float("nan"))
+        for number, part in parts.items()
+    )
+
+
+def _by_profile(table: Float64) -> dict[int, Float64]:
+    return {int(number): table[table[:, 0] == number] for number in np.unique(table[:, 0])}
+
+
+def _read_table(path: Path, columns: int) -> Float64:
+    """(N, columns) from a CSV with a header; an empty field is NaN."""
+    if not path.is_file():
+        return np.empty((0, columns))
+    lines = path.read_text(encoding="utf-8").splitlines()[1:]
+    if not lines:
+        return np.empty((0, columns))
+    filled = (line.replace(",,", ",nan,").replace(",,", ",nan,") for line in lines)
+    try:
+        table = np.loadtxt(filled, dtype=np.float64, delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise InputError(path, f"is torn ({str(error).split(';')[0]})", _REMEDY) from error
+    if table.shape[1] != columns:
+        raise InputError(path, f"has {table.shape[1]} columns instead of {columns}", _REMEDY)
+    return table
