@@ -17,7 +17,7 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.simulation.settings import CameraSettings, SimulationSettings
 
 LATTICE_PX = 8
-WHITE_DN = 230.0
+WHITE_DN = 215.0
 """Grey level of radiance 1 in cam0 before it is clipped."""
 
 

@@ -19,7 +19,7 @@ FLOOR_ALBEDO = 0.22
 SPREAD_ALONG = 0.38
 """Roughness along the bar: highlights are stretched that way [Ward 1992]."""
 SPREAD_AROUND = 0.17
-HIGHLIGHT = 0.2
+HIGHLIGHT = 0.28
 """Radiance of a highlight's middle under a lamp, as a share of white paper's."""
 MASK = TILE - 1
 

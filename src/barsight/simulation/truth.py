@@ -55,8 +55,8 @@ class SurfaceTruth:
 
     def count_frame(self, rig: StereoRig, yard_from_body: Pose) -> None:
         """Add one to every cell that both cameras see in this frame."""
-        reach = 2.0 * yard_from_body.translation[2] * max(rig.cam0.width, rig.cam0.height) / rig.cam0.fx_px
-        rows = np.flatnonzero(np.abs(self._points[:, 0] - yard_from_body.translation[0]) < reach)
+        low, high = _floor_reach(rig.cam0, yard_from_body @ rig.body_from_cam0)
+        rows = np.flatnonzero((self._points[:, 0] >= low) & (self._points[:, 0] <= high))
         for camera, mounting in ((rig.cam0, rig.body_from_cam0), (rig.cam1, rig.body_from_cam1)):
             rows = rows[self._sees(camera, yard_from_body @ mounting, self._points[rows])]
         self._seen[rows] += 1
@@ -85,6 +85,18 @@ class SurfaceTruth:
             arrays[f"profile_y{k}"] = self.profile_z_m[k].astype(np.float32)
             arrays[f"profile_visible{k}"] = self.profile_visible[k]
         np.savez_compressed(folder / "height.npz", **arrays)
+
+
+def _floor_reach(camera: Camera, yard_from_cam: Pose) -> tuple[float, float]:
+    """Bounds in x (m) of all that a camera over the floor can see, with a margin; infinite at the horizon."""
+    half = 0.65 * np.array([camera.width / camera.fx_px, camera.height / camera.fy_px])
+    corners = [[i * half[0], j * half[1], 1.0] for i in (-1, 1) for j in (-1, 1)]
+    rays = np.array(corners) @ yard_from_cam.rotation.T
+    if rays[:, 2].max() > -0.05:
+        return -np.inf, np.inf
+    x, _, z = yard_from_cam.translation
+    reached = np.append(x - rays[:, 0] / rays[:, 2] * z, x)
+    return float(reached.min()), float(reached.max())
 
 
 def true_depth(scene: Scene, camera: Camera, yard_from_cam: Pose) -> Float32:
