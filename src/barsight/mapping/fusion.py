@@ -73,7 +73,7 @@ def _vote(
                     empty = s
                 continue
             gap = abs(slots[s, Z] - z[m])
-            spread = variance[m] + 1.0 / slots[s, WEIGHT]
+            spread = variance[m] + 1.0 / slots[s, WEIGHT] + shared[m] ** 2 + slots[s, SHARED] ** 2
             if gap < best_gap and gap <= max(gate_sigma * np.sqrt(spread), least_gate):
                 best, best_gap = s, gap
             if slots[s, VIEWS] < slots[weakest, VIEWS]:
