@@ -113,7 +113,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
 
     with watch("surface"):
-        min_views = min(settings.map.min_views, used)
+        min_views = settings.map.min_views if used > 1 else 1
         surface = finish(store, scratch, cell_m, min_views, settings.map)
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")

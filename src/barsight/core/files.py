@@ -66,7 +66,7 @@ def translated_os_errors(target: Path) -> Iterator[None]:
             errno.EPERM: "no permission to write there; name another folder",
             errno.EROFS: "the file system is read-only; name another folder",
             errno.ENOTDIR: "a part of the path is a file; name another folder",
-            errno.EEXIST: "exists already; name another",
+            errno.EEXIST: "a part of the path is a file; name another folder",
             errno.EFBIG: "the file grew past the size limit; free some space or raise the limit",
         }.get(error.errno or 0)
         if advice is None:

@@ -1,0 +1,5 @@
+"""`python -m barsight` is the command `barsight`."""
+
+from barsight.cli.main import main
+
+main()

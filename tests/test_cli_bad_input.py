@@ -1,0 +1,300 @@
+"""What `barsight measure` does with a user's mistakes: one line, an exit code, and nothing left behind."""
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.cli.main import run
+from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.simulate import simulate
+
+TINY = SimulationSettings(
+    length_m=1.5,
+    frames=4,
+    seed=3,
+    camera=CameraSettings(width_px=320, height_px=256, focal_px=312.5),
+    yard=YardSettings(max_layers=2),
+)
+FAST = ("--stereo.method", "sgbm", "--map.cell-m", "0.05")
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("simulated") / "recording"
+    simulate(path, TINY)
+    return path
+
+
+@pytest.fixture
+def recording(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "recording"))
+
+
+def measure(recording: Path, capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
+    """Exit code and standard error of measuring into a fresh folder beside the recording."""
+    out = recording.parent / "out"
+    before = sorted(recording.parent.iterdir())
+    code = run(["measure", str(recording), "-o", str(out), *FAST, *flags])
+    if code:
+        left = sorted(path for path in recording.parent.iterdir() if path not in before)
+        assert left == [], "a failed run leaves nothing"
+    return code, capsys.readouterr().err
+
+
+def refused(
+    recording: Path, capsys: pytest.CaptureFixture[str], *words: str, flags: tuple[str, ...] = ()
+) -> str:
+    """Measuring fails with one line that holds all the words."""
+    code, text = measure(recording, capsys, *flags)
+    assert code in (2, 3, 4, 5)
+    assert text.count("\n") == 1 and text.startswith("barsight: ")
+    for word in words:
+        assert word in text
+    return text
+
+
+def edit(path: Path, change: Callable[[list[str]], list[str]]) -> None:
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+
+
+def pictures(recording: Path, camera: str) -> list[Path]:
+    return sorted((recording / "mav0" / camera / "data").glob("*.png"))
+
+
+def cut_short(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def test_a_whole_recording_measures(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, text = measure(recording, capsys)
+    assert code == 0 and "4 of 4 frames" in text
+    out = recording.parent / "out"
+    names = {path.name for path in out.iterdir()}
+    assert names == {
+        "result.json", "trajectory.tum", "cloud.ply", "height.tif", "contour.csv",
+        "laser.csv", "preview.png", "report.html",
+    }  # fmt: skip
+
+
+def test_no_such_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(tmp_path / "nothing", capsys, "nothing", "no such")
+
+
+def test_no_right_camera(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(recording / "mav0" / "cam1")
+    refused(recording, capsys, "cam1")
+
+
+def test_one_torn_picture_is_refused_and_the_run_goes_on(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torn = pictures(recording, "cam1")[1]
+    cut_short(torn)
+    code, text = measure(recording, capsys, "-v")
+    assert code == 0 and "3 of 4 frames" in text
+    assert torn.stem in text and torn.name in text
+
+
+def test_all_pictures_torn(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in pictures(recording, "cam0"):
+        cut_short(path)
+    refused(recording, capsys, "none of the 4 frames", ".png")
+
+
+def test_swapped_pictures(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mav0 = recording / "mav0"
+    (mav0 / "cam0" / "data").rename(mav0 / "aside")
+    (mav0 / "cam1" / "data").rename(mav0 / "cam0" / "data")
+    (mav0 / "aside").rename(mav0 / "cam1" / "data")
+    refused(recording, capsys, "swapped", "exchange")
+
+
+def test_swapped_calibration(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mav0 = recording / "mav0"
+    (mav0 / "cam0" / "sensor.yaml").rename(mav0 / "aside.yaml")
+    (mav0 / "cam1" / "sensor.yaml").rename(mav0 / "cam0" / "sensor.yaml")
+    (mav0 / "aside.yaml").rename(mav0 / "cam1" / "sensor.yaml")
+    refused(recording, capsys, "swapped")
+
+
+def test_calibration_with_a_non_rotation(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording / "mav0" / "cam0" / "sensor.yaml"
+    text = path.read_text()
+    start = text.index("data:")
+    number = next(word for word in text[start:].replace("[", " ").replace(",", " ").split() if "." in word)
+    path.write_text(text[:start] + text[start:].replace(number, "0.7", 1))
+    refused(recording, capsys, "sensor.yaml", "not a rotation")
+
+
+@pytest.mark.parametrize("sensor", ["cam0", "imu0", "crane0"])
+def test_stamps_out_of_order(recording: Path, capsys: pytest.CaptureFixture[str], sensor: str) -> None:
+    path = recording / "mav0" / sensor / "data.csv"
+    edit(path, lambda rows: [rows[0], rows[2], rows[1], *rows[3:]])
+    refused(recording, capsys, f"{sensor}/data.csv", "line 3", "sort")
+
+
+@pytest.mark.parametrize("sensor", ["cam1", "imu0", "crane0"])
+def test_doubled_stamps(recording: Path, capsys: pytest.CaptureFixture[str], sensor: str) -> None:
+    path = recording / "mav0" / sensor / "data.csv"
+    edit(path, lambda rows: [*rows[:3], rows[2], *rows[3:]])
+    refused(recording, capsys, f"{sensor}/data.csv", "line 4")
+
+
+def test_nan_in_the_imu(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording / "mav0" / "imu0" / "data.csv"
+    edit(path, lambda rows: [*rows[:5], rows[5].rsplit(",", 1)[0] + ",nan", *rows[6:]])
+    refused(recording, capsys, "imu0/data.csv", "line 6")
+    code, _ = measure(recording, capsys, "--use", "stereo", "crane")
+    assert code == 0, "without the IMU it measures"
+
+
+@pytest.mark.parametrize("sensor", ["cam0", "cam1", "imu0", "crane0", "laser0"])
+def test_empty_tables(recording: Path, capsys: pytest.CaptureFixture[str], sensor: str) -> None:
+    path = recording / "mav0" / sensor / "data.csv"
+    edit(path, lambda rows: rows[:1])
+    refused(recording, capsys, f"{sensor}/data.csv")
+
+
+def test_wrong_size_of_picture(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(
+        recording / "mav0" / "cam0" / "sensor.yaml",
+        lambda rows: [row.replace("320", "322") for row in rows],
+    )
+    refused(recording, capsys, "320x256")
+
+
+def test_out_under_a_file(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    blocker = recording.parent / "file"
+    blocker.write_text("in the way")
+    code = run(["measure", str(recording), "-o", str(blocker / "out"), *FAST])
+    assert code == 4
+    assert "name another folder" in capsys.readouterr().err
+    assert blocker.read_text() == "in the way"
+
+
+def test_out_not_empty(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = recording.parent / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("keep")
+    refused(recording, capsys, "not empty")
+    assert [path.name for path in out.iterdir()] == ["mine.txt"]
+
+
+def test_out_inside_the_recording(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["measure", str(recording), "-o", str(recording / "out"), *FAST]) == 4
+    assert "in the recording" in capsys.readouterr().err
+    assert not (recording / "out").exists()
+
+
+@pytest.mark.parametrize("writer", ["numpy.save", "tifffile.imwrite"])
+def test_disk_full_in_the_middle(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, writer: str
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(writer, full)
+    refused(recording, capsys, "disk is full", "out")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[stereo]\nmethod = 'magic'\n", ("stereo", "magic")),
+        ("[stereo]\nmax_dept_m = 3.0\n", ("max_dept_m",)),
+        ("[map]\ncell_m = -1.0\n", ("cell_m",)),
+        ("[map\n", ("TOML",)),
+    ],
+)
+def test_bad_configuration(
+    recording: Path, capsys: pytest.CaptureFixture[str], text: str, words: tuple[str, ...]
+) -> None:
+    path = recording.parent / "settings.toml"
+    path.write_text(text)
+    refused(recording, capsys, "settings.toml", *words, flags=("--config", str(path)))
+
+
+def test_impossible_flag(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(recording, capsys, "min_views", flags=("--map.min-views", "0"))
+
+
+def test_flags_go_before_the_configuration(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording.parent / "settings.toml"
+    path.write_text("[map]\nmin_views = 99\n[stereo.sgbm]\nblock_px = 7\n")
+    refused(recording, capsys, "99 frames", flags=("--config", str(path)))
+    code, _ = measure(recording, capsys, "--config", str(path), "--map.min-views", "2")
+    assert code == 0
+    assert '"block_px": 7' in (recording.parent / "out" / "result.json").read_text()
+
+
+def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["mesure"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_in_the_middle(recording: Path, sent: signal.Signals) -> None:
+    """Many copies of one frame keep the run busy; the signal comes once it has begun to write."""
+    mav0 = recording / "mav0"
+    for camera in ("cam0", "cam1"):
+        rows = (mav0 / camera / "data.csv").read_text().splitlines()
+        stamp, name = rows[2].split(",")
+        more = [f"{int(stamp) + 1000 * k},{name}" for k in range(1, 400)]
+        (mav0 / camera / "data.csv").write_text("\n".join([rows[0], rows[1], rows[2], *more]) + "\n")
+    out = recording.parent / "out"
+    before = set(recording.parent.iterdir())
+    command = [sys.executable, "-m", "barsight", "measure", str(recording), "-o", str(out), *FAST]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60
+        while set(recording.parent.iterdir()) == before and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(sent)
+        _, text = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert text.strip().splitlines()[-1] == "barsight: interrupted; nothing half-written is left"
+    assert "Traceback" not in text
+    assert set(recording.parent.iterdir()) == before
+
+
+def test_truth_is_never_read_by_a_measurement(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _ = measure(recording, capsys)
+    with_truth = (recording.parent / "out" / "contour.csv").read_bytes()
+    shutil.rmtree(recording / "truth")
+    shutil.rmtree(recording / "mav0" / "state_groundtruth_estimate0")
+    again = recording.parent / "again"
+    assert code == run(["measure", str(recording), "-o", str(again), *FAST]) == 0
+    assert (again / "contour.csv").read_bytes() == with_truth
+
+
+def test_a_bag_measures_to_the_same_bytes(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    measure(recording, capsys)
+    bag, from_bag = recording.parent / "bag", recording.parent / "from_bag"
+    assert run(["convert", str(recording), "-o", str(bag), "--to", "ros2-mcap"]) == 0
+    assert run(["measure", str(bag), "-o", str(from_bag), *FAST]) == 0
+    for name in ("contour.csv", "trajectory.tum", "cloud.ply", "height.tif"):
+        assert (recording.parent / "out" / name).read_bytes() == (from_bag / name).read_bytes(), name
+
+
+def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import json
+
+    measure(recording, capsys, "--use", "stereo", "imu")
+    result = json.loads((recording.parent / "out" / "result.json").read_text())
+    assert result["is_simulated"] is True
+    assert result["reference"] == "world"
+    assert result["sensors_used"] == ["stereo", "imu"]
+    assert result["frames"]["total"] == result["frames"]["used"] == 4
+    assert len(result["hashes"]["calibration"]) == 64
+    rows = np.loadtxt(recording.parent / "out" / "trajectory.tum")
+    assert rows.shape == (4, 8)
