@@ -28,9 +28,9 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
     """
     disparity = coarse_disparity(pair.left, pair.right)
     share = _finite_share(disparity)
-    if share < 0.25:
+    if share < 0.6:
         exchanged = _finite_share(coarse_disparity(pair.right, pair.left))
-        if exchanged > 2 * share and exchanged > 0.1:
+        if exchanged > 1.5 * share and exchanged > 0.1:
             return Failed(
                 "swapped",
                 f"left and right images are swapped: {100 * exchanged:.0f} % of the pixels match "
