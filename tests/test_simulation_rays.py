@@ -140,7 +140,7 @@ def test_open_floor_gets_the_light_of_the_formula(scene: Scene, lightmap: Lightm
 
 
 def test_render_is_the_mean_of_its_shaded_samples(scene: Scene, lightmap: Lightmap) -> None:
-    look = Look(hall_lamps(8.0), lightmap, surface_tile(np.random.default_rng(1)))
+    look = Look(hall_lamps(8.0), lightmap, surface_tile(np.random.default_rng(1), 0.0064))
     camera = Camera(96, 80, 120.0, 120.0, 47.5, 39.5)
     rotation = np.diag([1.0, -1.0, -1.0])
     pose = Pose("yard", "cam", rotation, np.array([0.8, 0.1, 3.0]))

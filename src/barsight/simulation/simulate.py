@@ -127,7 +127,7 @@ def _write_pictures(
 ) -> None:
     settings, rig = world.settings, world.mounted.rig
     lamps = hall_lamps(settings.camera.above_floor_m)
-    tile = surface_tile(_stream(settings, 7))
+    tile = surface_tile(_stream(settings, 7), settings.camera.above_floor_m / settings.camera.focal_px)
     look = Look(lamps, bake(world.scene, lamps, _stream(settings, 8)), tile)
     side = settings.camera.samples_per_side
     cameras = (

@@ -14,22 +14,27 @@ ALONG_M = 0.002
 """Texel size along a bar."""
 
 
-def surface_tile(rng: np.random.Generator) -> Float32:
+def surface_tile(rng: np.random.Generator, footprint_m: float) -> Float32:
     """(TILE, TILE, 4) periodic float32, first axis around the bar, second along it.
 
     Channels: albedo factor (mean 1), gloss factor (mean 1), slope of the surface around the bar (rad),
     isotropic albedo factor in texels of ALONG_M for floor and wood (mean 1).
+    footprint_m: a pixel's size on the floor. The pattern is drawn for 6.4 mm and grows with it, so that a
+    coarser camera finds contrast at its pixels' scale too and nothing finer to alias.
     """
-    streaks = _noise(rng, 0.0035, 0.05)
-    scale = _noise(rng, 0.007, 0.018)
-    grain = _noise(rng, 0.0024, 0.003)
+    grown = float(np.clip(footprint_m / 0.0064, 0.8, 8.0))
+    streaks = _noise(rng, 0.0035 * grown, 0.05)
+    scale = _noise(rng, 0.007 * grown, 0.018 * grown)
+    grain = _noise(rng, 0.0024 * grown, 0.003 * grown)
     rust = _noise(rng, 0.02, 0.06)
-    specks = _noise(rng, 0.0025, 0.007)
+    specks = _noise(rng, 0.0025 * grown, 0.007 * grown)
     albedo = np.exp(0.11 * streaks + 0.09 * scale + 0.13 * grain + 0.08 * rust)
     albedo *= np.where(specks > 2.5, 0.6, 1.0)
     gloss = np.exp(0.3 * scale + 0.2 * grain - 0.25 * rust)
-    slope = 0.10 * _noise(rng, 0.012, 0.05) + 0.05 * _noise(rng, 0.004, 0.012)
-    coarse = _noise(rng, 0.0035, 0.0035) * 0.09 + _noise(rng, 0.015, 0.015) * 0.05
+    slope = 0.10 * _noise(rng, 0.012, 0.05) + 0.05 * _noise(rng, 0.004 * grown, 0.012 * grown)
+    coarse = (
+        _noise(rng, 0.0035 * grown, 0.0035 * grown) * 0.09 + _noise(rng, 0.015 * grown, 0.015 * grown) * 0.05
+    )
     tile = np.stack([albedo / albedo.mean(), gloss / gloss.mean(), slope, np.exp(coarse)], axis=2)
     return np.ascontiguousarray(tile, dtype=np.float32)
 
