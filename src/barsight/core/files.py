@@ -15,14 +15,20 @@ from barsight.core.errors import OutputError
 
 @contextlib.contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `target`; on success it becomes `target`, on any failure it is gone."""
+    """Yield a temporary path beside `target`; on success it becomes `target`, on any failure it is gone.
+
+    `OutputError` where the folder isn't there or the system refuses to write.
+    """
+    if not target.parent.exists():
+        raise OutputError(f"{target}: there is no folder {target.parent}; make it or name another")
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         with translated_os_errors(target):
             yield temporary
             temporary.replace(target)
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            temporary.unlink()
 
 
 @contextlib.contextmanager
@@ -67,6 +73,7 @@ def translated_os_errors(target: Path) -> Iterator[None]:
             errno.EROFS: "the file system is read-only; name another folder",
             errno.ENOTDIR: "a part of the path is a file; name another folder",
             errno.EEXIST: "a part of the path is a file; name another folder",
+            errno.EISDIR: "is a folder; name a file",
             errno.EFBIG: "the file grew past the size limit; free some space or raise the limit",
         }.get(error.errno or 0)
         if advice is None:

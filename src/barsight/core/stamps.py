@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,14 @@ def format_seconds(stamp_ns: int) -> str:
 
 
 def parse_seconds(text: str) -> int:
-    """The inverse of `format_seconds`; any number of decimals, those past the ninth are cut."""
-    sign = -1 if text.startswith("-") else 1
-    whole, _, rest = text.lstrip("+-").partition(".")
-    return sign * (int(whole or "0") * NS_PER_S + int((rest + "000000000")[:9]))
+    """The inverse of `format_seconds`; any number of decimals, those past the ninth are cut.
+
+    Exponents are read too (`1.4e+09`, as `numpy.savetxt` writes). Raises ValueError for what is no number.
+    """
+    try:
+        return int(Decimal(text) * NS_PER_S)
+    except (ArithmeticError, ValueError):
+        raise ValueError(f"{text!r} is no time in seconds") from None
 
 
 def expect_increasing(stamps_ns: Int64, path: Path, first_line: int = 2) -> None:
@@ -87,6 +92,8 @@ def interpolate_at(query_ns: Int64, stamps_ns: Int64, values: Float64) -> Float6
 
     Returns (M, ...); NaN outside the stamps' span. Integer differences first, so that no nanosecond is lost.
     """
+    if stamps_ns.size == 0:
+        return np.full((query_ns.size, *values.shape[1:]), np.nan)
     k = np.clip(np.searchsorted(stamps_ns, query_ns, side="right") - 1, 0, max(stamps_ns.size - 2, 0))
     following = np.minimum(k + 1, stamps_ns.size - 1)
     span = np.maximum(stamps_ns[following] - stamps_ns[k], 1)

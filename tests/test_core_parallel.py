@@ -1,0 +1,84 @@
+"""Work over threads: order, bounded memory, exceptions at their turn; what the stages take; shapes."""
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from barsight.core.arrays import expect_shape, kernel
+from barsight.core.parallel import ordered_map
+from barsight.core.timing import Stopwatch
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_results_keep_the_items_order(workers: int) -> None:
+    def later_first(k: int) -> int:
+        time.sleep(0.002 * (k % 3 == 0))
+        return k * k
+
+    assert list(ordered_map(later_first, range(20), workers)) == [k * k for k in range(20)]
+    assert list(ordered_map(later_first, [], workers)) == []
+
+
+def test_no_more_items_are_taken_than_are_under_way() -> None:
+    taken = 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        for k in range(50):
+            taken += 1
+            yield k
+
+    for done, result in enumerate(ordered_map(lambda k: k, items(), 3), start=1):
+        assert result == done - 1
+        assert taken - done <= 3
+    assert taken == 50
+
+
+def test_an_exception_comes_at_its_turn() -> None:
+    results = ordered_map(lambda k: 1 / (3 - k), range(6), 4)
+    assert [next(results) for _ in range(3)] == [1 / 3, 1 / 2, 1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+def test_leaving_early_ends_the_threads() -> None:
+    before = threading.active_count()
+    started: list[int] = []
+    results = ordered_map(started.append, range(1000), 2)
+    next(results)
+    results.close()
+    assert threading.active_count() == before
+    assert len(started) <= 4
+
+
+def test_a_stopwatch_adds_up_and_survives_exceptions() -> None:
+    watch = Stopwatch()
+    for _ in range(2):
+        with watch("stereo", frames=1):
+            time.sleep(0.01)
+    with pytest.raises(RuntimeError), watch("points"):
+        raise RuntimeError
+    (first, seconds, frames), (second, _, none) = watch.entries()
+    assert (first, frames, second, none) == ("stereo", 2, "points", 0)
+    assert 0.02 <= seconds < 2
+
+
+def test_expect_shape() -> None:
+    expect_shape("points", np.zeros((5, 3)), (None, 3))
+    with pytest.raises(ValueError, match=r"points has shape \(5, 2\), expected Nx3"):
+        expect_shape("points", np.zeros((5, 2)), (None, 3))
+    with pytest.raises(ValueError, match="expected Nx3"):
+        expect_shape("points", np.zeros(3), (None, 3))
+
+
+@kernel()
+def _doubled(value: float) -> float:
+    return 2 * value
+
+
+def test_a_kernel_is_compiled() -> None:
+    assert _doubled(1.5) == 3.0
+    assert _doubled.signatures  # type: ignore[attr-defined]
