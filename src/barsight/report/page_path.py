@@ -98,11 +98,12 @@ def turned_since_start_deg(path: CameraPath) -> Float64:
     attitude = Rotation.from_quat(path.quaternion_xyzw)
     vectors = (attitude * attitude[0].inv()).as_rotvec()
     for k in range(1, len(vectors)):
-        angle = float(np.linalg.norm(vectors[k]))
-        if angle > 1e-9:
-            along = vectors[k] / angle
-            turns = np.round((float(along @ vectors[k - 1]) - angle) / (2 * np.pi))
-            vectors[k] += turns * 2 * np.pi * along
+        angle, before = float(np.linalg.norm(vectors[k])), float(np.linalg.norm(vectors[k - 1]))
+        if max(angle, before) < 1e-9:
+            continue
+        along = vectors[k] / angle if angle > 1e-9 else vectors[k - 1] / before
+        turns = np.round((float(along @ vectors[k - 1]) - angle) / (2 * np.pi))
+        vectors[k] += turns * 2 * np.pi * along
     return np.degrees(vectors)
 
 

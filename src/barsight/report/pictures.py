@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +18,20 @@ from barsight.core.errors import InputError
 from barsight.core.types import Source
 
 BANDS = 4
+_TORN = (
+    tifffile.TiffFileError,
+    zlib.error,
+    struct.error,
+    OSError,
+    ValueError,
+    KeyError,
+    IndexError,
+    RuntimeError,
+)
+"""What tifffile raises on a file that is cut short or is something else."""
 LONGEST_PX = 2400
 MOST_PIXELS = 3_000_000
+MOST_STRIPS = 12
 FOLD_ASPECT = 7.0
 """A map longer than this many times its breadth is folded into strips below each other."""
 
@@ -62,7 +76,7 @@ class Strip:
 def strip_count(width: int, height: int) -> int:
     """Into how many strips along X a map of this shape is folded."""
     aspect = width / max(height, 1)
-    return 1 if aspect <= FOLD_ASPECT else int(np.ceil(aspect / (FOLD_ASPECT - 1)))
+    return 1 if aspect <= FOLD_ASPECT else min(MOST_STRIPS, int(np.ceil(aspect / (FOLD_ASPECT - 1))))
 
 
 def read_raster(path: Path) -> Raster:
@@ -73,7 +87,9 @@ def read_raster(path: Path) -> Raster:
     try:
         with tifffile.TiffFile(path) as file:
             return _reduce(path, file.pages.first)
-    except (tifffile.TiffFileError, OSError, ValueError, KeyError, IndexError, RuntimeError) as error:
+    except InputError:
+        raise
+    except _TORN as error:
         raise InputError(path, f"is torn ({error})", "measure the recording again") from error
 
 

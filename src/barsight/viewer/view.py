@@ -1,0 +1,188 @@
+"""`barsight view`: the cloud, the camera's way and the contours in the browser, served by this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import socket
+import threading
+import webbrowser
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from barsight.core.arrays import Float32, Float64
+from barsight.core.errors import OutputError
+from barsight.core.types import Contour, LaserProfile
+from barsight.result_folder import CameraPath, read_contours, read_laser, read_path, read_summary
+from barsight.viewer.cloud import COLOURINGS, Cloud, colour, ramp, read_cloud
+
+HOST = "127.0.0.1"
+MOST_POINTS = 2_000_000
+MOST_AXES = 200
+MOST_LINE_POINTS = 20_000
+LASER_RGB, CONTOUR_RGB, PATH_RGB = (230, 40, 40), (255, 140, 0), (30, 110, 200)
+
+
+def view(out_dir: Path, port: int = 8080, open_browser: bool = True, most_points: int = MOST_POINTS) -> None:
+    """Serve the folder until Ctrl-C and print where. Port 0 takes a free one.
+
+    Raises InputError for a folder without a readable result.json and cloud.ply, OutputError where the port
+    is taken or may not be used.
+    """
+    with serving(out_dir, port, most_points) as url:
+        print(f"{out_dir}: {url} (Ctrl-C ends it)", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            if open_browser:
+                webbrowser.open(url)
+            threading.Event().wait()
+
+
+@contextlib.contextmanager
+def serving(out_dir: Path, port: int, most_points: int = MOST_POINTS) -> Iterator[str]:
+    """Serve the folder to this machine's browsers as long as the context is open; yields the URL."""
+    summary = read_summary(out_dir)
+    cloud = read_cloud(out_dir / "cloud.ply", most_points)
+    path, laser, contours = read_path(out_dir), read_laser(out_dir), read_contours(out_dir)
+    _expect_free(port)
+    with _quiet():
+        server = viser.ViserServer(host=HOST, port=port, label="barsight", verbose=False)
+    try:
+        if port not in (0, server.get_port()):
+            raise OutputError(f"port {port} was taken at this moment; name another with --port")
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.scene.set_up_direction("+z")
+        _aim(server, cloud, path)
+        _show_cloud(server, cloud)
+        _show_lines(server, path, laser, contours)
+        where = str(summary.get("reference", "world"))
+        simulated = " **SIMULATED.**" if summary.get("is_simulated") else ""
+        server.gui.add_markdown(f"{len(cloud.xyz_m):,} of {cloud.total:,} points, {where} frame.{simulated}")
+        yield f"http://{HOST}:{server.get_port()}"
+    finally:
+        with _quiet():
+            server.stop()
+
+
+def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
+    """viser announces itself in a box and says good-bye; the command line prints its own line."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def _expect_free(port: int) -> None:
+    """viser silently takes the next port where the wanted one is taken; here that is an error."""
+    if not 0 <= port <= 65535:
+        raise OutputError(f"port {port} does not exist; name one from 1024 to 65535 with --port")
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            reason = "is taken" if error.errno == errno.EADDRINUSE else "may not be used"
+            raise OutputError(f"port {port} {reason}; name another with --port") from error
+
+
+def _aim(server: viser.ViserServer, cloud: Cloud, path: CameraPath | None) -> None:
+    """Look at the bulk of the points and the camera's way, obliquely from the side of low y and above."""
+    low, high = np.percentile(cloud.xyz_m, (2, 98), axis=0).astype(np.float64)
+    if path is not None and path.stamp_ns.size:
+        low, high = (
+            np.minimum(low, path.position_m.min(axis=0)),
+            np.maximum(high, path.position_m.max(axis=0)),
+        )
+    middle = (low + high) / 2
+    reach = max(float(np.linalg.norm(high - low)), 0.5)
+    server.initial_camera.look_at = middle
+    server.initial_camera.position = middle + reach * np.array([-0.12, -0.75, 0.6])
+    server.initial_camera.fov = np.radians(50.0)
+    server.initial_camera.far = max(1000.0, 50 * reach)
+
+
+def _show_cloud(server: viser.ViserServer, cloud: Cloud) -> None:
+    size_mm = _spacing_m(cloud) * 1e3
+    first = colour(cloud, "height")
+    node = server.scene.add_point_cloud(
+        "/cloud", cloud.xyz_m, first.rgb, point_size=size_mm / 1e3, point_shape="square", precision="float32"
+    )
+    by = server.gui.add_dropdown("Colour by", COLOURINGS, initial_value="height")
+    scale = server.gui.add_image(ramp(first.scale))
+    caption = server.gui.add_markdown(f"{first.low:.0f} to {first.high:.0f} {first.unit}")
+    size = server.gui.add_slider("Point size / mm", 1.0, max(100.0, 4 * size_mm), 0.5, round(size_mm * 2) / 2)
+
+    @by.on_update
+    def _recolour(_: object) -> None:
+        chosen = colour(cloud, by.value)
+        node.colors = chosen.rgb
+        scale.image = ramp(chosen.scale)
+        caption.content = f"{chosen.low:.4g} to {chosen.high:.4g} {chosen.unit}"
+
+    @size.on_update
+    def _resize(_: object) -> None:
+        node.point_size = size.value / 1e3
+
+
+def _spacing_m(cloud: Cloud) -> float:
+    """About the distance of neighbouring points: the bulk's area shared by the points, 2 mm to 100 mm."""
+    low, high = np.percentile(cloud.xyz_m[:, :2], (2, 98), axis=0)
+    area = float(np.prod(np.maximum(high - low, 0.01)))
+    return float(np.clip(np.sqrt(area / len(cloud.xyz_m)), 0.002, 0.1))
+
+
+def _show_lines(
+    server: viser.ViserServer,
+    path: CameraPath | None,
+    laser: tuple[LaserProfile, ...],
+    contours: tuple[Contour, ...],
+) -> None:
+    """Each kind of line under one name, with a checkbox that hides it."""
+    if path is not None and path.stamp_ns.size:
+        _checkbox(server, "Camera path", "/path", True)
+        _line(server, "/path/line", path.position_m, PATH_RGB)
+        step = -(-path.stamp_ns.size // MOST_AXES)
+        server.scene.add_batched_axes(
+            "/path/frames",
+            batched_wxyzs=path.quaternion_xyzw[::step][:, [3, 0, 1, 2]],
+            batched_positions=path.position_m[::step],
+            axes_length=0.25,
+            axes_radius=0.01,
+        )
+    if laser:
+        _checkbox(server, "Laser profiles", "/laser", True)
+        for profile in laser:
+            points = np.stack([profile.x_m, profile.y_m, profile.z_m], axis=1)
+            _line(server, f"/laser/{profile.profile}", points, LASER_RGB)
+    if contours:
+        _checkbox(server, "Contours", "/contours", not laser)
+        for contour in contours:
+            points = np.stack([contour.x_m, contour.y_m, contour.z_m], axis=1)
+            _line(server, f"/contours/{contour.profile}", points, CONTOUR_RGB)
+    _checkbox(server, "Axes (1 m)", "/axes", True)
+    server.scene.add_frame("/axes/origin", axes_length=1.0, axes_radius=0.015)
+
+
+def _checkbox(server: viser.ViserServer, label: str, name: str, visible: bool) -> None:
+    node = server.scene.add_frame(name, show_axes=False, visible=visible)
+    box = server.gui.add_checkbox(label, visible)
+
+    @box.on_update
+    def _toggle(_: object) -> None:
+        node.visible = box.value
+
+
+def _line(server: viser.ViserServer, name: str, points_m: Float64, rgb: tuple[int, int, int]) -> None:
+    segments = line_segments(points_m)
+    if len(segments):
+        server.scene.add_line_segments(name, segments, rgb, thickness=3.0, thickness_units="screen")
+
+
+def line_segments(points_m: Float64) -> Float32:
+    """(M, 2, 3): the joints of consecutive points of (N, 3), open where a point is unknown.
+
+    A line of more than MOST_LINE_POINTS points is thinned.
+    """
+    thinned = points_m[:: max(1, -(-len(points_m) // MOST_LINE_POINTS))]
+    joints = np.stack([thinned[:-1], thinned[1:]], axis=1)
+    return joints[np.isfinite(joints).all(axis=(1, 2))].astype(np.float32)

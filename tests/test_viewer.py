@@ -1,0 +1,115 @@
+"""The viewer: it starts, serves this machine, stops; its mistakes are one line."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from barsight.core.errors import InputError, OutputError
+from barsight.viewer.cloud import COLOURINGS, colour, ramp, read_cloud
+from barsight.viewer.view import line_segments, serving, view
+from result_folders import write_folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_folder(tmp_path_factory.mktemp("out"))
+
+
+def get(url: str) -> tuple[int, bytes]:
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=10)
+    try:
+        connection.request("GET", "/")
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def test_it_serves_and_stops(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(folder, 0) as url:
+        status, body = get(url)
+        assert status == 200
+        assert b"<html" in body
+        with (
+            pytest.raises(OutputError, match=r"is taken; name another"),
+            serving(folder, urlsplit(url).port or 0),
+        ):
+            pass
+    with pytest.raises(ConnectionRefusedError):
+        get(url)
+    assert capsys.readouterr().out == ""
+
+
+def test_ctrl_c_ends_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+
+    def pressed(url: str) -> bool:
+        opened.append(url)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("barsight.viewer.view.webbrowser.open", pressed)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    view(folder, port, True)
+    assert opened == [f"http://127.0.0.1:{port}"]
+    assert opened[0] in capsys.readouterr().out
+
+
+def test_mistakes_are_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        view(tmp_path / "none", 0, False)
+    folder = write_folder(tmp_path / "out")
+    with pytest.raises(OutputError, match="port 70000"):
+        view(folder, 70000, False)
+    cloud = folder / "cloud.ply"
+    whole = cloud.read_bytes()
+    empty = whole[: whole.index(b"end_header") + 11].replace(b"vertex 5000", b"vertex 0")
+    for torn in (b"", b"ply\n", whole[:-1000], whole.replace(b"sigma_z", b"sigma_q"), empty):
+        cloud.write_bytes(torn)
+        with pytest.raises(InputError, match=r"cloud\.ply"):
+            view(folder, 0, False)
+    cloud.unlink()
+    with pytest.raises(InputError, match="no such file"):
+        view(folder, 0, False)
+
+
+def test_the_cloud_is_thinned_evenly(folder: Path) -> None:
+    whole = read_cloud(folder / "cloud.ply", 10_000)
+    thin = read_cloud(folder / "cloud.ply", 1700)
+    assert whole.xyz_m.shape == (5000, 3)
+    assert (thin.xyz_m.shape, thin.total) == ((1700, 3), 5000)
+    np.testing.assert_array_equal(thin.xyz_m, whole.xyz_m[np.arange(1700) * 5000 // 1700])
+
+
+@pytest.mark.parametrize("by", COLOURINGS)
+def test_colours_follow_the_property(folder: Path, by: str) -> None:
+    cloud = read_cloud(folder / "cloud.ply", 10_000)
+    painted = colour(cloud, by)
+    assert painted.rgb.shape == (5000, 3)
+    scale = ramp(painted.scale)[0]
+    values = {
+        "height": cloud.xyz_m[:, 2] * 1e3,
+        "intensity": cloud.intensity,
+        "sigma": cloud.sigma_m * 1e3,
+        "views": cloud.views,
+    }[by]
+    highest = int(np.argmax(values))
+    at_top = values[highest] > painted.low
+    np.testing.assert_array_equal(painted.rgb[highest], scale[255 if at_top else 0])
+    np.testing.assert_array_equal(painted.rgb[int(np.argmin(values))], scale[0])
+
+
+def test_lines_are_open_where_unknown() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [2, 0, np.nan], [3, 0, 0], [4, 0, 1.0]])
+    np.testing.assert_array_equal(line_segments(points), [[[0, 0, 0], [1, 0, 0]], [[3, 0, 0], [4, 0, 1]]])
+    assert 10_000 < len(line_segments(np.zeros((70_000, 3)))) <= 20_000
