@@ -66,12 +66,14 @@ class Camera:
 
     @property
     def is_ideal(self) -> bool:
-        """No lens distortion at all."""
-        return self.distortion is Distortion.NONE or not any(self.coefficients)
+        """No lens distortion at all. An equidistant lens bends rays even where its coefficients are zero."""
+        return self.distortion is not Distortion.EQUIDISTANT and not any(self.coefficients)
 
     def project(self, points: Float64) -> Float64:
         """(N, 3) points in the camera's frame (z > 0) to (N, 2) raw pixels."""
         pts = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
+        if len(pts) == 0:
+            return np.empty((0, 2))
         zero = np.zeros(3)
         coefficients = np.array(self.coefficients, dtype=np.float64)
         if self.distortion is Distortion.EQUIDISTANT:
