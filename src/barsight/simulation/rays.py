@@ -63,6 +63,25 @@ def hit_box(
 
 
 @kernel()
+def _inside(
+    grid: Grid, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float, far: float
+) -> tuple[float, float]:
+    """The part of near .. far that lies in the grid; empty (first over second) where the ray misses it."""
+    enter, leave = near, far
+    for k in range(3):
+        o = ox if k == 0 else (oy if k == 1 else oz)
+        d = dx if k == 0 else (dy if k == 1 else dz)
+        low, top = grid.low[k], grid.low[k] + grid.counts[k] * grid.cell[k]
+        if abs(d) < 1e-14:
+            if o < low or o > top:
+                enter = FAR
+        else:
+            t0, t1 = (low - o) / d, (top - o) / d
+            enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
+    return enter, leave
+
+
+@kernel()
 def trace(
     shape: Float64, cylinders: int, grid: Grid, ox: float, oy: float, oz: float,
     dx: float, dy: float, dz: float, near: float, far: float, any_hit: bool,
@@ -79,20 +98,10 @@ def trace(
             best, found = t, shape.shape[0]
             if any_hit:
                 return best, found
-    lo, cell, n = grid.low, grid.cell, grid.counts
-    enter, leave = near, best
-    for k in range(3):
-        o = ox if k == 0 else (oy if k == 1 else oz)
-        d = dx if k == 0 else (dy if k == 1 else dz)
-        top = lo[k] + n[k] * cell[k]
-        if abs(d) < 1e-14:
-            if o < lo[k] or o > top:
-                enter = FAR
-        else:
-            t0, t1 = (lo[k] - o) / d, (top - o) / d
-            enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
+    enter, leave = _inside(grid, ox, oy, oz, dx, dy, dz, near, best)
     if enter > leave:
         return (best, found) if found >= 0 else (FAR, -1)
+    lo, cell, n = grid.low, grid.cell, grid.counts
     i = min(max(math.floor((ox + enter * dx - lo[0]) / cell[0]), 0), n[0] - 1)
     j = min(max(math.floor((oy + enter * dy - lo[1]) / cell[1]), 0), n[1] - 1)
     k = min(max(math.floor((oz + enter * dz - lo[2]) / cell[2]), 0), n[2] - 1)

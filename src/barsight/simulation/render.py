@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, kernel
+from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.pose import Pose
 from barsight.simulation.lighting import Lamps, Lightmap, lamp_beam, longest_axis
 from barsight.simulation.rays import FAR, trace
@@ -116,36 +116,47 @@ def shade(
     diffuse = (light[t00] * (1 - wa) + light[t01] * wa) * (1 - ws) + (
         light[t10] * (1 - wa) + light[t11] * wa
     ) * ws
-    nx = c * shape[p, 6] + d * shape[p, 9]
-    ny = c * shape[p, 7] + d * shape[p, 10]
-    nz = c * shape[p, 8] + d * shape[p, 11]
     shine = 0.0
     if material[p, 1] > 0:
-        tx = c * shape[p, 9] - d * shape[p, 6]
-        ty = c * shape[p, 10] - d * shape[p, 7]
-        tz = c * shape[p, 11] - d * shape[p, 8]
-        away = 1 / math.sqrt(rx * rx + ry * ry + rz * rz)
-        middle = math.floor((x - lamps.offset) / lamps.spacing + 0.5)
-        for slot in range(6):
-            lamp = middle + (slot % 3 - middle + 1) % 3 - 1
-            lx, ly, lz = lamp * lamps.spacing + lamps.offset - x, lamps.rows[slot // 3] - y, lamps.z - z
-            near = 1 / math.sqrt(lx * lx + ly * ly + lz * lz)
-            hx, hy, hz = lx * near - rx * away, ly * near - ry * away, lz * near - rz * away
-            hn = hx * nx + hy * ny + hz * nz
-            if hn <= 0.1:
-                continue
-            ha = (hx * shape[p, 3] + hy * shape[p, 4] + hz * shape[p, 5]) / (hn * SPREAD_ALONG)
-            ht = (hx * tx + hy * ty + hz * tz) / (hn * SPREAD_AROUND)
-            exponent = ha * ha + ht * ht
-            if exponent > 9:
-                continue
-            share = lightmap.seen
-            seen = (share[t00, slot] * (1 - wa) + share[t01, slot] * wa) * (1 - ws) + (
-                share[t10, slot] * (1 - wa) + share[t11, slot] * wa
-            ) * ws
-            shine += seen / 255 * math.exp(-exponent) * lamp_beam(lamps, lx) * lz * near * near * near
+        away = -1 / math.sqrt(rx * rx + ry * ry + rz * rz)
+        place = (t00, t01, t10, t11, ws, wa)
+        eye = (rx * away, ry * away, rz * away)
+        shine = _shine(shape, p, lamps, lightmap.seen, place, (x, y, z), eye, (c, d))
     radiance: float = albedo * diffuse + HIGHLIGHT * material[p, 1] * gloss * shine
     return radiance
+
+
+@kernel()
+def _shine(
+    shape: Float64, p: int, lamps: Lamps, seen: UInt8, place: tuple[int, int, int, int, float, float],
+    point: tuple[float, float, float], eye: tuple[float, float, float], turn: tuple[float, float],
+) -> float:  # fmt: skip
+    """Light of the lamps that bar `p` mirrors to the eye; `turn`: cosine and sine of the normal's angle."""
+    t00, t01, t10, t11, ws, wa = place
+    x, y, z = point
+    c, d = turn
+    nx, tx = c * shape[p, 6] + d * shape[p, 9], c * shape[p, 9] - d * shape[p, 6]
+    ny, ty = c * shape[p, 7] + d * shape[p, 10], c * shape[p, 10] - d * shape[p, 7]
+    nz, tz = c * shape[p, 8] + d * shape[p, 11], c * shape[p, 11] - d * shape[p, 8]
+    shine = 0.0
+    middle = math.floor((x - lamps.offset) / lamps.spacing + 0.5)
+    for slot in range(6):
+        lamp = middle + (slot % 3 - middle + 1) % 3 - 1
+        lx, ly, lz = lamp * lamps.spacing + lamps.offset - x, lamps.rows[slot // 3] - y, lamps.z - z
+        near = 1 / math.sqrt(lx * lx + ly * ly + lz * lz)
+        hx, hy, hz = lx * near + eye[0], ly * near + eye[1], lz * near + eye[2]
+        hn = hx * nx + hy * ny + hz * nz
+        if hn <= 0.1:
+            continue
+        ha = (hx * shape[p, 3] + hy * shape[p, 4] + hz * shape[p, 5]) / (hn * SPREAD_ALONG)
+        ht = (hx * tx + hy * ty + hz * tz) / (hn * SPREAD_AROUND)
+        exponent = ha * ha + ht * ht
+        if exponent > 9:
+            continue
+        lit = (seen[t00, slot] * (1 - wa) + seen[t01, slot] * wa) * (1 - ws)
+        lit += (seen[t10, slot] * (1 - wa) + seen[t11, slot] * wa) * ws
+        shine += lit / 255 * math.exp(-exponent) * lamp_beam(lamps, lx) * lz * near * near * near
+    return shine
 
 
 @kernel()
