@@ -127,7 +127,7 @@ class StereoOdometry:
     def _look(self, pair: RectifiedPair) -> _View | Failed:
         camera, settings = pair.camera, self.settings
         features = detect_orb(pair.left, settings.features)
-        coarse = coarse_disparity(pair.left, pair.right)
+        coarse = coarse_disparity(pair.left, pair.right, camera.doffs_px)
         row = (features.pixels[:, 1] * coarse.shape[0] / camera.height).astype(int)
         column = (features.pixels[:, 0] * coarse.shape[1] / camera.width).astype(int)
         guess = coarse[row, column]

@@ -26,10 +26,11 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
 
     Failed `no-texture` where too little matches either way, `swapped` where left and right are exchanged.
     """
-    disparity = coarse_disparity(pair.left, pair.right)
+    doffs = pair.camera.doffs_px
+    disparity = coarse_disparity(pair.left, pair.right, doffs)
     share = _finite_share(disparity)
     if share < 0.6:
-        exchanged = _finite_share(coarse_disparity(pair.right, pair.left))
+        exchanged = _finite_share(coarse_disparity(pair.right, pair.left, -doffs))
         if exchanged > 1.5 * share and exchanged > 0.1:
             return Failed(
                 "swapped",
@@ -41,34 +42,38 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
     low, high = np.nanpercentile(disparity, (0.1, 99.9))
     margin = _MARGIN_PX + _MARGIN_SHARE * (high - low)
     ceiling = int(pair.camera.width * 0.9)
-    lowest = int(np.floor(min(max(low - margin, -pair.camera.doffs_px), ceiling - 16)))
+    lowest = int(np.floor(min(max(low - margin, -doffs), ceiling - 16)))
     highest = int(np.ceil(min(high + margin, ceiling)))
     return DisparityRange(lowest, lowest + max(16, -(-(highest - lowest) // 16) * 16))
 
 
-def coarse_disparity(left: UInt8, right: UInt8) -> Float32:
-    """Left-right consistent disparities of a quarter-size match, 1 px to 40 % of the width, else NaN.
+def coarse_disparity(left: UInt8, right: UInt8, doffs_px: float = 0.0) -> Float32:
+    """Left-right consistent disparities of a quarter-size match, else NaN.
 
+    From 1 px above -doffs_px, which is infinitely far, over 40 % of the width.
     Returns (H / 4, W / 4) float32 in full-size px.
     """
     size = (max(left.shape[1] // _SCALE, 32), max(left.shape[0] // _SCALE, 32))
     small_left = cv2.resize(left, size, interpolation=cv2.INTER_AREA)
     small_right = cv2.resize(right, size, interpolation=cv2.INTER_AREA)
     count = max(16, int(size[0] * _WIDEST_SHARE) // 16 * 16)
-    forward = _match(small_left, small_right, count)
+    scale = left.shape[1] / size[0]
+    infinity = -doffs_px / scale
+    lowest = int(np.floor(infinity))
+    forward = _match(small_left, small_right, lowest, count)
     # The right image's disparity: the same match with both images mirrored and exchanged.
-    backward = _match(cv2.flip(small_right, 1), cv2.flip(small_left, 1), count)[:, ::-1]
+    backward = _match(cv2.flip(small_right, 1), cv2.flip(small_left, 1), lowest, count)[:, ::-1]
     column = np.arange(size[0], dtype=np.float32)[None, :]
     target = np.rint(column - forward).astype(np.int32)
-    inside = (forward > 0.25) & (target >= 0)
+    inside = (forward > infinity + 1 / scale) & (target >= 0) & (target < size[0])
     there = np.take_along_axis(backward, target.clip(0, size[0] - 1), axis=1)
     consistent = inside & (np.abs(there - forward) <= 1)
-    return np.where(consistent, forward * np.float32(left.shape[1] / size[0]), np.float32(np.nan))
+    return np.where(consistent, forward * np.float32(scale), np.float32(np.nan))
 
 
-def _match(left: UInt8, right: UInt8, count: int) -> Float32:
+def _match(left: UInt8, right: UInt8, lowest: int, count: int) -> Float32:
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0,
+        minDisparity=lowest,
         numDisparities=count,
         blockSize=5,
         P1=200,
@@ -78,9 +83,11 @@ def _match(left: UInt8, right: UInt8, count: int) -> Float32:
         speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    matched: Float32 = matcher.compute(*padded)[:, count:].astype(np.float32) / 16
-    return matched
+    before, after = max(lowest + count, 0), max(-lowest, 0)
+    padded = [cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)]
+    matched = matcher.compute(*padded)[:, before : before + left.shape[1]]
+    disparity: Float32 = matched.astype(np.float32) / 16
+    return disparity
 
 
 def _finite_share(disparity: Float32) -> float:

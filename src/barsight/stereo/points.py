@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from barsight.core.arrays import Float32
+from barsight.core.arrays import Bool, Float32
 from barsight.core.types import Disparity, RectifiedPair, StereoPoints
 
 _LEAST_NOISE_PX = 0.02
@@ -57,8 +61,18 @@ def refine_grid(disparity: Float32, per_pixel: int) -> Float32:
     nearest = _repeat(disparity, per_pixel)
     height, width = nearest.shape
     smooth = cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.where(np.abs(smooth - nearest) <= _JUMP_PX, smooth, nearest)
+    return np.where(_repeat(_is_smooth(disparity), per_pixel), smooth, nearest)
 
 
-def _repeat(values: Float32, per_pixel: int) -> Float32:
+def _is_smooth(disparity: Float32) -> Bool:
+    """(H, W): no neighbour, oblique ones included, is unknown or further than a jump away."""
+    around = np.pad(disparity, 1, mode="edge")
+    height, width = disparity.shape
+    smooth = np.ones(disparity.shape, dtype=np.bool_)
+    for i, j in product(range(3), range(3)):
+        smooth &= np.abs(around[i : i + height, j : j + width] - disparity) <= _JUMP_PX
+    return smooth
+
+
+def _repeat(values: NDArray[Any], per_pixel: int) -> NDArray[Any]:
     return values if per_pixel == 1 else values.repeat(per_pixel, axis=0).repeat(per_pixel, axis=1)

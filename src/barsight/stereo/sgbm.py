@@ -19,6 +19,8 @@ _MODES = {
     "hh4": cv2.STEREO_SGBM_MODE_HH4,
 }
 _SUBPIXEL_STEPS = 16
+_CANDIDATE_STEP = 16
+_LEAST_TEXTURE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -47,18 +49,22 @@ class SgbmSettings:
 
 @dataclass(frozen=True)
 class Sgbm:
-    """`StereoMethod` over OpenCV's SGBM; sigma from the measured noise and the gradients in the block."""
+    """`StereoMethod` over OpenCV's SGBM; sigma from the measured noise and the gradients in the block.
+
+    Where a block has no gradient at all (black, saturated) nothing was matched and there is no disparity.
+    """
 
     settings: SgbmSettings
     uses_all_cores: ClassVar[bool] = False
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`. Rows of 16 candidates at a time, as OpenCV wants."""
+        """See `StereoMethod`."""
         settings = self.settings
         block = settings.block_px
+        count = -(-candidates.count // _CANDIDATE_STEP) * _CANDIDATE_STEP
         matcher = cv2.StereoSGBM.create(
             minDisparity=candidates.lowest_px,
-            numDisparities=-(-candidates.count // 16) * 16,
+            numDisparities=count,
             blockSize=block,
             P1=8 * block * block,
             P2=32 * block * block,
@@ -69,23 +75,24 @@ class Sgbm:
             speckleRange=2,
             mode=_MODES[settings.mode],
         )
-        left, right = _padded(pair.left, candidates), _padded(pair.right, candidates)
-        pad = left.shape[1] - pair.left.shape[1]
-        fixed_point = matcher.compute(left, right)[:, pad:]
+        # OpenCV leaves out the columns whose candidates run past a border: padding gives them back.
+        before, after = max(candidates.lowest_px + count, 0), max(-candidates.lowest_px, 0)
+        left, right = (
+            cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE)
+            for image in (pair.left, pair.right)
+        )
+        fixed_point = matcher.compute(left, right)[:, before : before + pair.left.shape[1]]
         disparity = fixed_point.astype(np.float32) / _SUBPIXEL_STEPS
-        disparity[fixed_point < candidates.lowest_px * _SUBPIXEL_STEPS] = np.nan
+        within = (disparity >= candidates.lowest_px) & (disparity <= candidates.highest_px - 1)
+        disparity[~within] = np.nan
         disparity[~pair.left_valid] = np.nan
         disparity[~_lands_on_valid(disparity, pair)] = np.nan
-        sigma = np.hypot(_noise_sigma(pair, block), np.float32(settings.subpixel_sigma_px))
+        texture = _texture(pair.left, block)
+        disparity[texture < _LEAST_TEXTURE] = np.nan
+        noise_sigma = _noise_sigma(texture, image_noise(pair.left))
+        sigma = np.hypot(noise_sigma, np.float32(settings.subpixel_sigma_px))
         sigma[np.isnan(disparity)] = np.nan
         return Disparity(disparity, sigma.astype(np.float32), settings.subpixel_sigma_px)
-
-
-def _padded(image: UInt8, candidates: DisparityRange) -> UInt8:
-    """OpenCV leaves the first `highest` columns empty; padding on the left gives them back."""
-    pad = max(candidates.highest_px, 0)
-    padded: UInt8 = cv2.copyMakeBorder(image, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
-    return padded
 
 
 def _lands_on_valid(disparity: Float32, pair: RectifiedPair) -> Bool:
@@ -97,13 +104,17 @@ def _lands_on_valid(disparity: Float32, pair: RectifiedPair) -> Bool:
     return landed
 
 
-def _noise_sigma(pair: RectifiedPair, block: int) -> Float32:
+def _texture(image: UInt8, block: int) -> Float32:
+    """(H, W) squared gradients along the row, grey levels per px, summed over each block."""
+    gradient = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    texture: Float32 = cv2.boxFilter(gradient * gradient, -1, (block, block), normalize=False)
+    return texture
+
+
+def _noise_sigma(texture: Float32, noise: float) -> Float32:
     """(H, W) Cramer-Rao bound of a block match: sqrt(2) image sigma over the root of the summed gradients."""
-    gradient = cv2.Sobel(pair.left, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    energy = cv2.boxFilter(gradient * gradient, -1, (block, block), normalize=False)
-    noise = image_noise(pair.left)
-    sigma: Float32 = np.sqrt(2 * noise * noise / np.maximum(energy, 1e-3), dtype=np.float32).clip(max=1)
-    return sigma
+    sigma: Float32 = np.sqrt(2 * noise**2 / np.maximum(texture, _LEAST_TEXTURE), dtype=np.float32)
+    return sigma.clip(max=1)
 
 
 def image_noise(image: UInt8) -> float:

@@ -1,0 +1,66 @@
+"""The disparity range found from the images, and what makes it fail."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.core.errors import Failed
+from barsight.core.types import DisparityRange, RectifiedPair
+from barsight.stereo.disparity_range import coarse_disparity, find_range
+from synthetic_scenes import camera, slanted_pair
+
+
+@pytest.mark.parametrize(("start_px", "slope"), [(12.4, (0.02, 0.01)), (60.2, (0.05, -0.03)), (90.0, (0, 0))])
+def test_the_range_holds_the_truth(start_px: float, slope: tuple[float, float]) -> None:
+    pair, truth = slanted_pair(480, 320, start_px, slope)
+    found = find_range(pair)
+    assert isinstance(found, DisparityRange)
+    assert found.lowest_px <= truth.min()
+    assert truth.max() < found.highest_px
+    assert found.count % 16 == 0
+    assert found.count < np.ptp(truth) + 64
+    assert found.lowest_px >= 0
+
+
+def test_converging_cameras_have_disparities_below_zero() -> None:
+    """With doffs 70 px depth reaches down to a disparity of -70 px."""
+    pair, truth = slanted_pair(480, 320, -30.0, doffs_px=70.0)
+    found = find_range(pair)
+    assert isinstance(found, DisparityRange)
+    assert -70 <= found.lowest_px <= truth.min()
+    assert truth.max() < found.highest_px
+
+
+def test_the_range_ends_at_infinity() -> None:
+    pair, _ = slanted_pair(480, 320, 3.0)
+    found = find_range(pair)
+    assert isinstance(found, DisparityRange)
+    assert found.lowest_px == 0
+
+
+@pytest.mark.parametrize("doffs_px", [0.0, 6.0])
+def test_swapped_images_are_found_out(doffs_px: float) -> None:
+    pair, _ = slanted_pair(480, 320, 40.0, doffs_px=doffs_px)
+    found = find_range(replace(pair, left=pair.right, right=pair.left))
+    assert isinstance(found, Failed)
+    assert found.code == "swapped"
+    assert "swapped" in found.reason
+
+
+def test_images_without_texture() -> None:
+    valid = np.ones((320, 480), dtype=np.bool_)
+    noise = np.random.default_rng(0).integers(126, 130, (2, 320, 480), dtype=np.uint8)
+    for left, right in (np.zeros((2, 320, 480), np.uint8), noise):
+        found = find_range(RectifiedPair(1, left, right, valid, valid, camera(480, 320)))
+        assert isinstance(found, Failed)
+        assert found.code == "no-texture"
+
+
+def test_coarse_disparity() -> None:
+    pair, truth = slanted_pair(480, 320, 40.0)
+    coarse = coarse_disparity(pair.left, pair.right)
+    assert coarse.shape == (80, 120)
+    error = coarse - truth[2::4, 2::4]
+    assert np.isfinite(error).mean() > 0.75
+    assert np.nanpercentile(np.abs(error), 95) < 2
