@@ -1,0 +1,85 @@
+"""Features spread over the image, mutual matches, and places to a fraction of a pixel."""
+
+import numpy as np
+import pytest
+
+from barsight.core.arrays import UInt8
+from barsight.features.matching import match_mutual, track
+from barsight.features.orb import Features, detect_orb
+from synthetic_scenes import Texture, quantised
+
+
+def shifted(dx: float, dy: float, noise: float = 0.0) -> UInt8:
+    """The same texture moved by (dx, dy) px to the right and down."""
+    u, v = np.meshgrid(np.arange(320.0) - dx, np.arange(240.0) - dy)
+    return quantised(Texture(3)(u, v) + np.random.default_rng(0).normal(0, noise or 1e-9, u.shape))
+
+
+def test_features_are_spread_over_the_cells() -> None:
+    """A label of much stronger contrast doesn't take them all."""
+    image = (128 + (shifted(0, 0).astype(float) - 128) * 0.3).astype(np.uint8)
+    label = np.random.default_rng(1).integers(0, 2, (10, 10), dtype=np.uint8) * 255
+    image[60:120, 60:120] = label.repeat(6, 0).repeat(6, 1)
+    found = detect_orb(image, 480, cells=(6, 8))
+    assert 240 < len(found) <= 480
+    row, column = (found.pixels[:, 1] // 40).astype(int), (found.pixels[:, 0] // 40).astype(int)
+    counts = np.bincount(row * 8 + column, minlength=48).reshape(6, 8)
+    assert counts.max() <= 10
+    assert (counts[1:-1, 1:-1] >= 5).all()
+
+
+def test_an_empty_image_has_no_features() -> None:
+    found = detect_orb(np.full((240, 320), 90, np.uint8), 500)
+    assert len(found) == 0
+    assert found.descriptors.shape == (0, 32)
+    assert match_mutual(found, found).shape == (0, 2)
+
+
+def test_matches_are_mutual() -> None:
+    first, second = detect_orb(shifted(0, 0), 600), detect_orb(shifted(7, -4), 600)
+    pairs = match_mutual(first, second)
+    assert len(pairs) > 100
+    assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
+    moved = second.pixels[pairs[:, 1]] - first.pixels[pairs[:, 0]]
+    assert (np.linalg.norm(moved - (7, -4), axis=1) < 3).mean() > 0.95
+
+
+def test_mutual_matching_is_brute_force() -> None:
+    rng = np.random.default_rng(2)
+    descriptors = rng.integers(0, 256, (40, 32), dtype=np.uint8)
+    flips = (rng.random((40, 32, 8)) < 0.05).astype(np.uint8)
+    noisy = descriptors ^ np.packbits(flips, axis=2)[..., 0]
+    noisy = np.vstack([noisy[::-1][:30], noisy[15:17]])  # 10 left out; two stand twice
+    places = np.zeros((40, 2), np.float32)
+    pairs = match_mutual(Features(places, descriptors), Features(places[:32], noisy))
+    distance = np.unpackbits(descriptors[:, None] ^ noisy[None], axis=2).sum(axis=2)
+    expected = []
+    for i in range(40):
+        j, second = np.argsort(distance[i], kind="stable")[:2]
+        if distance[:, j].argmin() == i and distance[i, j] < 0.9 * distance[i, second]:
+            expected.append((i, int(j)))
+    assert [tuple(pair) for pair in pairs.tolist()] == expected
+    assert len(expected) == 28
+
+
+@pytest.mark.parametrize("shift", [(0.3, -0.6), (5.25, 2.5)])
+def test_tracking_is_finer_than_a_twentieth_pixel(shift: tuple[float, float]) -> None:
+    source, target = shifted(0, 0), shifted(*shift)
+    places = detect_orb(source, 300).pixels
+    guesses = places + np.float32(np.round(shift))
+    before = guesses.copy()
+    found, kept = track(source, target, places, guesses)
+    assert kept.mean() > 0.95
+    error = np.linalg.norm(found[kept] - places[kept] - shift, axis=1)
+    assert np.median(error) < 0.02
+    assert np.percentile(error, 95) < 0.05
+    np.testing.assert_array_equal(guesses, before)
+
+
+def test_what_is_not_there_is_not_kept() -> None:
+    source, target = shifted(0, 0), quantised(Texture(9)(*np.meshgrid(np.arange(320.0), np.arange(240.0))))
+    places = detect_orb(source, 300).pixels
+    _, kept = track(source, target, places, places)
+    assert kept.mean() < 0.2
+    _, none = track(source, target, places[:0], places[:0])
+    assert none.shape == (0,)
