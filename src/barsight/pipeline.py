@@ -44,6 +44,7 @@ from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.selection import SelectedSensors
 from barsight.recording.sensors import imu_hints
 from barsight.stereo.disparity_range import find_range
+from barsight.stereo.gaps import without_gaps
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.points import triangulate
 from barsight.stereo.settings import StereoSettings, make_method
@@ -239,7 +240,8 @@ class _View:
         if isinstance(candidates, Failed):
             return Refusal("stereo", RefusedFrame(frame.stamp_ns, candidates.reason))
         with self.turn, self.watch("stereo", 1):
-            disparity = self.method(pair, candidates)
+            matched = self.method(pair, candidates)
+            disparity = without_gaps(matched, pair.left, stereo.gap_darkness)
         with self.watch("points", 1):
             points = triangulate(
                 pair,

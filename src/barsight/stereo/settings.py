@@ -25,6 +25,8 @@ class StereoSettings:
     """Disparity error that the calibration may cause everywhere alike (1 sigma)."""
     max_depth_m: float = 40.0
     """Points further away are left out."""
+    gap_darkness: float = 0.55
+    """Places darker than this share of their surroundings are gaps between bars: unknown; 0 keeps them."""
     sgbm: SgbmSettings = field(default_factory=SgbmSettings)
     barsight: BarsightSettings = field(default_factory=BarsightSettings)
 
@@ -34,6 +36,8 @@ class StereoSettings:
             raise ConfigError(f"the disparity range {low}:{high} is empty")
         if self.calibration_sigma_px < 0 or self.max_depth_m <= 0:
             raise ConfigError("calibration_sigma_px can't be negative, max_depth_m must be positive")
+        if not 0 <= self.gap_darkness < 1:
+            raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
 
 
 def make_method(settings: StereoSettings) -> StereoMethod:

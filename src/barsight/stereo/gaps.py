@@ -1,0 +1,38 @@
+"""Gaps between bars: narrow places so dark against their surroundings that no match of their own is there.
+
+A gully whose floor neither camera sees is a black stripe between two edges of the same surface. It matches
+perfectly at that surface's disparity, since both edges do, but nothing lies there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, UInt8
+from barsight.core.types import Disparity
+
+_AROUND_PX = 41
+
+
+def in_gap(image: UInt8, darkness: float) -> Bool:
+    """(H, W): pixels (3 x 3 mean) darker than `darkness` times the mean of the 41 x 41 around them."""
+    own = cv2.blur(image, (3, 3))
+    around = cv2.blur(image, (_AROUND_PX, _AROUND_PX))
+    dark: Bool = own < darkness * around.astype(np.float32)
+    return dark
+
+
+def without_gaps(disparity: Disparity, image: UInt8, darkness: float) -> Disparity:
+    """The disparity with gaps made unknown; darkness 0 leaves it as it is."""
+    if darkness <= 0:
+        return disparity
+    gap = in_gap(image, darkness)
+    nan = np.float32(np.nan)
+    return replace(
+        disparity,
+        disparity_px=np.where(gap, nan, disparity.disparity_px),
+        sigma_px=np.where(gap, nan, disparity.sigma_px),
+    )
