@@ -158,6 +158,12 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"height\.tif: is torn"):
             write_report(folder, tmp_path / "report.html")
     (folder / "height.tif").unlink()
+    preview = (folder / "preview.png").read_bytes()
+    for cut in (b"", preview[:30]):
+        (folder / "preview.png").write_bytes(cut)
+        with pytest.raises(InputError, match=r"preview\.png: is torn"):
+            write_report(folder, tmp_path / "report.html")
+    (folder / "preview.png").unlink()
     for name, text in (
         ("contour.csv", "a\n1,2\n"),
         ("contour.csv", "a\n0,1,x\n"),

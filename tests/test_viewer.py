@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.viewer.cloud import COLOURINGS, colour, ramp, read_cloud
+from barsight.viewer.cloud import COLOURINGS, colour, read_cloud
 from barsight.viewer.view import line_segments, serving, view
 from result_folders import write_folder
 
@@ -96,7 +96,6 @@ def test_colours_follow_the_property(folder: Path, by: str) -> None:
     cloud = read_cloud(folder / "cloud.ply", 10_000)
     painted = colour(cloud, by)
     assert painted.rgb.shape == (5000, 3)
-    scale = ramp(painted.scale)[0]
     values = {
         "height": cloud.xyz_m[:, 2] * 1e3,
         "intensity": cloud.intensity,
@@ -105,8 +104,8 @@ def test_colours_follow_the_property(folder: Path, by: str) -> None:
     }[by]
     highest = int(np.argmax(values))
     at_top = values[highest] > painted.low
-    np.testing.assert_array_equal(painted.rgb[highest], scale[255 if at_top else 0])
-    np.testing.assert_array_equal(painted.rgb[int(np.argmin(values))], scale[0])
+    np.testing.assert_array_equal(painted.rgb[highest], painted.ramp[255 if at_top else 0])
+    np.testing.assert_array_equal(painted.rgb[int(np.argmin(values))], painted.ramp[0])
 
 
 def test_lines_are_open_where_unknown() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from plotly.offline import get_plotlyjs
 from barsight.core.files import atomic_path
 from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_path import path_plots
-from barsight.report.pictures import read_raster
+from barsight.report.pictures import preview_uri, read_raster
 from barsight.report.plots import Plot, compare, contour_plot, histogram_plot, limits_plot
 from barsight.result_folder import read_contours, read_laser, read_path, read_summary
 
@@ -73,7 +72,7 @@ def render_page(out_dir: Path) -> str:
         refused_by_stage=_refused_by_stage(result),
         configuration=list(flatten(result.get("configuration") or {})),
         truth=list(flatten(result.get("truth") or {})),
-        preview=_preview(out_dir / "preview.png"),
+        preview=preview_uri(out_dir / "preview.png"),
         plotly_js=get_plotlyjs(),
         css=_resource("page.css"),
         script=_resource("page_script.js.jinja"),
@@ -170,12 +169,6 @@ def _plot_json(plots: list[Plot]) -> str:
     """All figures for the script; `<` is escaped so that no text can end the element that carries it."""
     figures = {plot.name: {"data": plot.traces, "layout": plot.layout} for plot in plots}
     return json.dumps(figures, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-def _preview(path: Path) -> str:
-    if not path.is_file():
-        return ""
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
 
 
 def _environment() -> jinja2.Environment:

@@ -108,11 +108,11 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         _bar(low * 1e3, high * 1e3, cv2.COLORMAP_VIRIDIS, "mm"),
         (tint, UNKNOWN_KEY),
     )
-    _, worst = robust_range(raster.sigma_m, 1, 98)
+    _, worst = robust_range(raster.sigma_m[raster.source == Source.VISION], 1, 95)
     sigma = MapFigure(
         "sigma",
         "Uncertainty",
-        "One standard deviation of the height; the colours end at the 98th percentile." + scaled,
+        "One standard deviation of the height; the colours end at the seen cells' 95th percentile." + scaled,
         _draw(paint_scale(raster.sigma_m, 0, worst, cv2.COLORMAP_MAGMA), raster, (), SMALL_MAP_TEXT),
         _bar(0, worst * 1e3, cv2.COLORMAP_MAGMA, "mm"),
         (UNKNOWN_KEY,),

@@ -233,6 +233,18 @@ def data_uri(rgba: UInt8, *, lossless: bool) -> str:
     return "data:image/webp;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
 
 
+def preview_uri(path: Path) -> str:
+    """preview.png, packed smaller, as a data URI; empty where there is none. InputError where it is torn."""
+    if not path.is_file():
+        return ""
+    stored = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    picture = cv2.imdecode(stored, cv2.IMREAD_COLOR) if stored.size else None
+    if picture is None:
+        raise InputError(path, "is torn", "measure the recording again")
+    opaque = np.full(picture.shape[:2], 255, np.uint8)
+    return data_uri(np.dstack([picture[..., ::-1], opaque]).astype(np.uint8), lossless=False)
+
+
 def robust_range(values: Float32 | Float64, low_pct: float, high_pct: float) -> tuple[float, float]:
     """Percentiles of the finite values; (0, 1) where there are none, never an empty range."""
     known = values[np.isfinite(values)]

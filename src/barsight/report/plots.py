@@ -125,7 +125,7 @@ def histogram_plot(compared: tuple[Compared, ...]) -> Plot | None:
         return None
     reach = max(10.0, _reach(together))
     bin_mm = next(side for side in (1, 2, 5, 10, 20, 50, 100, 1e9) if 2 * reach / side <= 80)
-    reach = np.ceil(reach / bin_mm) * bin_mm
+    reach = (np.ceil(reach / bin_mm) + 0.5) * bin_mm
     edges = np.arange(-reach, reach + bin_mm / 2, bin_mm)
     traces = []
     for order, (profile, error) in enumerate(errors.items()):

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from barsight.core.arrays import Float32, Float64
+from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import OutputError
 from barsight.core.types import Contour, LaserProfile
 from barsight.result_folder import CameraPath, read_contours, read_laser, read_path, read_summary
-from barsight.viewer.cloud import COLOURINGS, Cloud, colour, ramp, read_cloud
+from barsight.viewer.cloud import COLOURINGS, Cloud, colour, read_cloud
 
 HOST = "127.0.0.1"
 MOST_POINTS = 2_000_000
@@ -108,20 +108,25 @@ def _show_cloud(server: viser.ViserServer, cloud: Cloud) -> None:
         "/cloud", cloud.xyz_m, first.rgb, point_size=size_mm / 1e3, point_shape="square", precision="float32"
     )
     by = server.gui.add_dropdown("Colour by", COLOURINGS, initial_value="height")
-    scale = server.gui.add_image(ramp(first.scale))
+    scale = server.gui.add_image(_legend(first.ramp))
     caption = server.gui.add_markdown(f"{first.low:.0f} to {first.high:.0f} {first.unit}")
-    size = server.gui.add_slider("Point size / mm", 1.0, max(100.0, 4 * size_mm), 0.5, round(size_mm * 2) / 2)
+    size = server.gui.add_slider("Point size / mm", 1.0, 200.0, 0.5, round(size_mm * 2) / 2)
 
     @by.on_update
     def _recolour(_: object) -> None:
         chosen = colour(cloud, by.value)
         node.colors = chosen.rgb
-        scale.image = ramp(chosen.scale)
+        scale.image = _legend(chosen.ramp)
         caption.content = f"{chosen.low:.4g} to {chosen.high:.4g} {chosen.unit}"
 
     @size.on_update
     def _resize(_: object) -> None:
         node.point_size = size.value / 1e3
+
+
+def _legend(ramp: UInt8) -> UInt8:
+    """(12, 256, 3): the colours as a picture, low at the left."""
+    return np.tile(ramp, (12, 1, 1))
 
 
 def _spacing_m(cloud: Cloud) -> float:
