@@ -75,9 +75,14 @@ def lands_on_valid(disparity_px: Int32, pair: RectifiedPair) -> Bool:
 
 def mirrored_pair(pair: RectifiedPair) -> RectifiedPair:
     """Right for left as in a mirror: its left disparities are the pair's right ones, mirrored."""
-    pictures = [np.ascontiguousarray(one[:, ::-1]) for one in (pair.right, pair.left)]
-    masks = [np.ascontiguousarray(one[:, ::-1]) for one in (pair.right_valid, pair.left_valid)]
-    return RectifiedPair(pair.stamp_ns, *pictures, *masks, pair.camera)
+    return RectifiedPair(
+        stamp_ns=pair.stamp_ns,
+        left=np.ascontiguousarray(pair.right[:, ::-1]),
+        right=np.ascontiguousarray(pair.left[:, ::-1]),
+        left_valid=np.ascontiguousarray(pair.right_valid[:, ::-1]),
+        right_valid=np.ascontiguousarray(pair.left_valid[:, ::-1]),
+        camera=pair.camera,
+    )
 
 
 def fits(candidates: DisparityRange, width: int) -> bool:

@@ -16,7 +16,7 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.assembly import OutputSettings, assemble, fits, mirrored_pair, nothing
 from barsight.stereo.census_transform import census_codes, census_cost
-from barsight.stereo.consistency import agreement, filled_from_behind, weighted_median
+from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.cross_regions import CrossRegions, cross_filter, cross_regions
 from barsight.stereo.evidence import has_texture
 from barsight.stereo.outliers import region_vote
@@ -114,7 +114,7 @@ def census_winners(
         census_cost(left, right, pair.left_valid, pair.right_valid, lowest_px, slices)
         aggregate(slices)
 
-    return sweep(*pair.left.shape, candidates, fill)
+    return sweep(pair.left.shape, candidates, fill)
 
 
 def _regions(pair: RectifiedPair, settings: CensusSettings) -> CrossRegions:

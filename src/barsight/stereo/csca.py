@@ -24,7 +24,7 @@ from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.assembly import OutputSettings, assemble, fits, mirrored_pair, nothing
-from barsight.stereo.consistency import agreement, filled_from_behind, weighted_median
+from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.evidence import has_texture
 from barsight.stereo.gradient_cost import CostImages, GradientCostSettings, cost_images, gradient_cost
 from barsight.stereo.guided import guided_filter
@@ -125,7 +125,7 @@ def cross_scale_winners(pair: RectifiedPair, candidates: DisparityRange, setting
         aggregate(slices)
         _tie(slices, weights[0], lowest_px, tied)
 
-    return sweep(*finest.left.shape, candidates, fill)
+    return sweep(finest.left.shape, candidates, fill)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class _Scale:
 
 
 def _pyramid(pair: RectifiedPair, candidates: DisparityRange, scales: int) -> list[_Scale]:
-    """The finest first, without costs. Candidate d is (d + 1) // 2 one scale coarser, as in the authors' code."""
+    """The finest first, without costs. Candidate d is (d + 1) // 2 one scale coarser [authors' code]."""
     images = cost_images(
         pair.left.astype(np.float32), pair.right.astype(np.float32), pair.left_valid, pair.right_valid
     )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from barsight.core.arrays import Float32, kernel
+from barsight.core.arrays import Float32, Float64, kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def guided_filter(guide: Float32, radius_px: int, epsilon: float) -> GuidedFilte
     return GuidedFilter(guide, mean.astype(np.float32), inverse.astype(np.float32), radius_px)
 
 
-def box_mean(image: Float32, radius_px: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def box_mean(image: Float32, radius_px: int) -> Float64:
     """(H, W) float64 means over the windows of 2 r + 1, cut off at the border."""
     total = np.zeros((image.shape[0] + 1, image.shape[1] + 1))
     total[1:, 1:] = image.astype(np.float64).cumsum(0).cumsum(1)
@@ -53,7 +53,8 @@ def box_mean(image: Float32, radius_px: int) -> np.ndarray[tuple[int, ...], np.d
         - total[np.ix_(high[0], low[1])]
         + total[np.ix_(low[0], low[1])]
     )
-    return window / np.outer(high[0] - low[0], high[1] - low[1])
+    mean: Float64 = window / np.outer(high[0] - low[0], high[1] - low[1])
+    return mean
 
 
 @kernel(parallel=True, fastmath=True)

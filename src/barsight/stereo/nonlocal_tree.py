@@ -18,7 +18,7 @@ from barsight.core.arrays import Bool, Float32, Int32, kernel
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.assembly import OutputSettings, assemble, fits, mirrored_pair, nothing
-from barsight.stereo.consistency import agreement
+from barsight.stereo.left_right import agreement
 from barsight.stereo.evidence import has_texture
 from barsight.stereo.gradient_cost import GradientCostSettings, cost_images, gradient_cost
 from barsight.stereo.spanning_tree import SpanningTree, spanning_tree, tree_filter
@@ -84,7 +84,7 @@ def tree_winners(
         gradient_cost(images, lowest_px, settings.cost, slices)
         aggregate(slices)
 
-    return sweep(*pair.left.shape, candidates, fill)
+    return sweep(pair.left.shape, candidates, fill)
 
 
 def refined(
@@ -97,7 +97,7 @@ def refined(
         _distance(values, matched, lowest_px, slices)
         aggregate(slices)
 
-    return sweep(*values.shape, candidates, fill).candidate_px
+    return sweep(values.shape, candidates, fill).candidate_px
 
 
 def _median(values: Int32) -> Int32:

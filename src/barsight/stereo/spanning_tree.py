@@ -83,23 +83,23 @@ def _kept_edges(guide: UInt8) -> UInt8:
         for x in range(width):
             here = np.int32(guide[y, x])
             if x + 1 < width:
-                step = abs(here - np.int32(guide[y, x + 1]))
-                edges[starts[step]] = 2 * (y * width + x)
-                starts[step] += 1
+                across = abs(here - np.int32(guide[y, x + 1]))
+                edges[starts[across]] = 2 * (y * width + x)
+                starts[across] += 1
             if y + 1 < height:
-                step = abs(here - np.int32(guide[y + 1, x]))
-                edges[starts[step]] = 2 * (y * width + x) + 1
-                starts[step] += 1
+                down = abs(here - np.int32(guide[y + 1, x]))
+                edges[starts[down]] = 2 * (y * width + x) + 1
+                starts[down] += 1
     chief = np.arange(height * width).astype(np.int32)
     kept = np.zeros((height, width), dtype=np.uint8)
     missing = height * width - 1
     for edge in edges:
-        first, down = edge >> 1, edge & 1
+        first, is_down = edge >> 1, edge & 1
         one = _chief_of(chief, first)
-        other = _chief_of(chief, first + (width if down else 1))
+        other = _chief_of(chief, first + (width if is_down else 1))
         if one != other:
             chief[max(one, other)] = min(one, other)
-            kept[first // width, first % width] |= np.uint8(2 if down else 1)
+            kept[first // width, first % width] |= np.uint8(2 if is_down else 1)
             missing -= 1
             if missing == 0:
                 break
@@ -108,10 +108,11 @@ def _kept_edges(guide: UInt8) -> UInt8:
 
 @kernel()
 def _chief_of(chief: Int32, member: int) -> int:
-    while chief[member] != member:
-        chief[member] = chief[chief[member]]
-        member = chief[member]
-    return member
+    here = member
+    while chief[here] != here:
+        chief[here] = chief[chief[here]]
+        here = int(chief[here])
+    return here
 
 
 @kernel()

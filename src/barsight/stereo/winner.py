@@ -23,7 +23,7 @@ class Winners:
     """The best candidate of each pixel so far, all (H, W); `take_slices` writes into it.
 
     candidate_px: int32, whole. cost, below, above: its cost and those of the candidates one lower and one
-    higher, inf where there was none. last: the costs of the last candidate seen. highest: the worst cost.
+    higher, inf where there was none. last: the costs of the last candidate seen.
     """
 
     candidate_px: Int32
@@ -31,14 +31,13 @@ class Winners:
     below: Float32
     above: Float32
     last: Float32
-    highest: Float32
 
 
 def no_winners(height: int, width: int) -> Winners:
     """Before the first slice."""
     shape = (height, width)
-    infinite = [np.full(shape, np.inf, dtype=np.float32) for _ in range(4)]
-    return Winners(np.zeros(shape, dtype=np.int32), *infinite, np.full(shape, -np.inf, dtype=np.float32))
+    cost, below, above, last = (np.full(shape, np.inf, dtype=np.float32) for _ in range(4))
+    return Winners(np.zeros(shape, dtype=np.int32), cost, below, above, last)
 
 
 def take_slices(winners: Winners, slices: Float32, lowest_px: int) -> None:
@@ -51,17 +50,17 @@ def take_slices(winners: Winners, slices: Float32, lowest_px: int) -> None:
         winners.below,
         winners.above,
         winners.last,
-        winners.highest,
     )
 
 
 def sweep(
-    height: int, width: int, candidates: DisparityRange, fill: Callable[[int, Float32], None]
+    shape: tuple[int, ...], candidates: DisparityRange, fill: Callable[[int, Float32], None]
 ) -> Winners:
     """The winners of all candidates; `fill(lowest_px, slices)` writes the costs of the next K of them.
 
-    K is 16 at most: the memory of the sweep is 21 float32 images.
+    shape: of the image, (H, W). K is 16 at most: the memory of the sweep is 21 float32 images.
     """
+    height, width = shape
     winners = no_winners(height, width)
     block = np.empty((min(_BLOCK, candidates.count), height, width), dtype=np.float32)
     for first in range(candidates.lowest_px, candidates.highest_px, _BLOCK):
@@ -80,7 +79,8 @@ def between_candidates(winners: Winners) -> Float32:
     slope = winners.below - winners.above
     usable = np.isfinite(bend) & (bend > 0)
     offset = np.where(usable, slope, 0) / np.where(usable, 2 * bend, 1)
-    return (winners.candidate_px + offset.clip(-0.5, 0.5)).astype(np.float32)
+    between: Float32 = (winners.candidate_px + offset.clip(-0.5, 0.5)).astype(np.float32)
+    return between
 
 
 @kernel(parallel=True)
@@ -92,7 +92,6 @@ def _compete(
     below: Float32,
     above: Float32,
     last: Float32,
-    highest: Float32,
 ) -> None:
     count, height, width = slices.shape
     for row in numba.prange(height):
@@ -108,6 +107,4 @@ def _compete(
                     above[row, column] = np.inf
                     candidate[row, column] = shift
                     cost[row, column] = now
-                if now > highest[row, column]:
-                    highest[row, column] = now
                 last[row, column] = now
