@@ -16,9 +16,9 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.assembly import OutputSettings, assemble, fits, mirrored_pair, nothing
 from barsight.stereo.census_transform import census_codes, census_cost
-from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.cross_regions import CrossRegions, cross_filter, cross_regions
 from barsight.stereo.evidence import has_texture
+from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.outliers import region_vote
 from barsight.stereo.sgbm import image_noise
 from barsight.stereo.winner import Winners, sweep

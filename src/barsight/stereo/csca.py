@@ -24,10 +24,10 @@ from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.assembly import OutputSettings, assemble, fits, mirrored_pair, nothing
-from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.evidence import has_texture
 from barsight.stereo.gradient_cost import CostImages, GradientCostSettings, cost_images, gradient_cost
 from barsight.stereo.guided import guided_filter
+from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.spanning_tree import spanning_tree, tree_filter
 from barsight.stereo.winner import Winners, sweep
 

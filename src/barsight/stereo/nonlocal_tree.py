@@ -18,9 +18,9 @@ from barsight.core.arrays import Bool, Float32, Int32, kernel
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.assembly import OutputSettings, assemble, fits, mirrored_pair, nothing
-from barsight.stereo.left_right import agreement
 from barsight.stereo.evidence import has_texture
 from barsight.stereo.gradient_cost import GradientCostSettings, cost_images, gradient_cost
+from barsight.stereo.left_right import agreement
 from barsight.stereo.spanning_tree import SpanningTree, spanning_tree, tree_filter
 from barsight.stereo.winner import Winners, sweep
 
