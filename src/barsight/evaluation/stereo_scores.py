@@ -15,9 +15,9 @@ class StereoScore:
     """Percentages are of the pixels with known truth, a missing disparity counts as bad.
 
     bad05, bad1, bad2: wrong by more than 0.5, 1 and 2 px, all known pixels. nonocc_bad05, nonocc_bad1,
-    nonocc_bad2: of those that both images see. average_px: mean absolute error and median_px: median, over the known pixels
-    that have a disparity. coverage_pct, nonocc_coverage_pct: pixels that have one. within1_pct, within2_pct:
-    of the non-occluded that have one, those within 1 and 2 of their sigma.
+    nonocc_bad2: of those that both images see. average_px: mean absolute error and median_px: median, over
+    the known pixels that have a disparity. coverage_pct, nonocc_coverage_pct: pixels that have one.
+    within1_pct, within2_pct: of the non-occluded that have one, those within 1 and 2 of their sigma.
     """
 
     bad05_pct: float

@@ -1,25 +1,63 @@
-"""Barsight's own dense stereo: a semi-global start, then direct refinement along the bars on both images."""
+"""Barsight's own dense stereo: semi-global start, consistency, direct refinement along the bars, sharp edges.
+
+What only one image sees stays NaN; with `fill_occlusions` it is guessed and given a large sigma.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from barsight.core.arrays import Float32
+from barsight.core.arrays import Bool, Float32
+from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.consistency import agrees, without_islands
+from barsight.stereo.edges import sharpen_edges
+from barsight.stereo.filling import fill
 from barsight.stereo.refinement import RefinementSettings, refine
+from barsight.stereo.semiglobal import SemiGlobalSettings, match
 from barsight.stereo.sgbm import Sgbm, SgbmSettings, image_noise
+
+_NAN = np.float32(np.nan)
+_FAST_STEPS = 2
+_JUMP_PX = 1.0
+_FURTHEST_FROM_START_PX = 2.0
 
 
 @dataclass(frozen=True)
 class BarsightSettings:
     """Barsight's own stereo."""
 
-    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    preset: Literal["best", "fast"] = "best"
+    """`fast` starts from OpenCV's 3-way SGBM, refines in two steps and leaves the edges as they are."""
+    fill_occlusions: bool = False
+    """Guess what only one image sees (sigma of 1 px or more) instead of leaving NaN."""
+    consistency_px: float = 1.0
+    """Left and right disparities must agree to this."""
+    island_px: int = 40
+    """Connected patches smaller than this many pixels are dropped."""
     model_sigma_px: float = 0.03
-    """The part of the error that image noise doesn't explain."""
+    """The part of the error that the images' residual doesn't explain."""
+    max_sigma_px: float = 1.0
+    """A match less sure than this is none."""
+    semiglobal: SemiGlobalSettings = field(default_factory=SemiGlobalSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+
+    def __post_init__(self) -> None:
+        if min(self.consistency_px, self.max_sigma_px) <= 0 or min(self.model_sigma_px, self.island_px) < 0:
+            raise ConfigError(
+                "consistency_px and max_sigma_px must be positive, model_sigma_px and island_px not negative"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """left_px: (H, W), NaN where nothing is believed. right_px: (H, W), of the right image."""
+
+    left_px: Float32
+    right_px: Float32
 
 
 @dataclass(frozen=True)
@@ -30,19 +68,70 @@ class BarsightStereo:
     uses_all_cores: ClassVar[bool] = True
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`."""
-        start = Sgbm(replace(SgbmSettings(), mode="3way"))(pair, candidates).disparity_px
-        matched = np.isfinite(start)
-        refined = refine(pair.left, pair.right, _without_holes(start), matched, self.settings.refinement)
-        noise = np.hypot(image_noise(pair.left), image_noise(pair.right))
-        sigma = np.sqrt(
-            noise * noise / np.maximum(refined.information, 1e-3) + self.settings.model_sigma_px**2
-        )
-        kept = matched & (np.abs(refined.disparity_px - start) < 2)
-        disparity = np.where(kept, refined.disparity_px, np.float32(np.nan))
-        return Disparity(
-            disparity.astype(np.float32), np.where(kept, sigma, np.float32(np.nan)).astype(np.float32)
-        )
+        """See `StereoMethod`. Candidates beyond the image's width are left out.
+
+        Memory: the semi-global stripes (about 130 MB per thread) and some thirty float32 images.
+        """
+        settings = self.settings
+        noise = float(np.hypot(image_noise(pair.left), image_noise(pair.right)))
+        candidates = _inside(candidates, pair.camera.width)
+        start = self._start(pair, candidates)
+        believed = start.left_px
+        matched = np.isfinite(believed)
+        refinement = settings.refinement
+        if settings.preset == "fast":
+            refinement = replace(refinement, steps=min(refinement.steps, _FAST_STEPS), short_px=0.0)
+        refined = refine(pair.left, pair.right, _without_holes(believed), matched, noise, refinement)
+        sigma = np.sqrt(refined.variance_px2 + np.float32(settings.model_sigma_px**2))
+        kept = matched & (np.abs(refined.disparity_px - believed) < _FURTHEST_FROM_START_PX)
+        kept &= sigma <= settings.max_sigma_px
+        disparity = np.where(kept, refined.disparity_px, _NAN)
+        sigma = np.where(kept, sigma, _NAN)
+        if settings.preset == "best":
+            disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
+        if settings.fill_occlusions:
+            disparity, guessed = fill(
+                disparity,
+                pair.left,
+                start.right_px,
+                float(candidates.lowest_px),
+                float(candidates.highest_px),
+            )
+            sigma = np.where(np.isfinite(guessed), guessed, sigma)
+            if settings.preset == "best":
+                disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
+        return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
+
+    def _start(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
+        settings = self.settings
+        if settings.preset == "fast":
+            left_px = Sgbm(SgbmSettings(mode="3way", speckle_px=settings.island_px))(
+                pair, candidates
+            ).disparity_px
+            return _Start(left_px, np.full_like(left_px, np.inf))
+        found = match(pair.left, pair.right, candidates.lowest_px, candidates.count, settings.semiglobal)
+        believed = agrees(found.left_px, found.right_px, settings.consistency_px) & pair.left_valid
+        believed &= _lands_on(pair.right_valid, found.left_px)
+        left_px = np.where(believed, found.left_px, _NAN)
+        return _Start(without_islands(left_px, settings.island_px, 1.0), found.right_px)
+
+
+def _inside(candidates: DisparityRange, width: int) -> DisparityRange:
+    lowest = min(max(candidates.lowest_px, -width), width - 1)
+    return DisparityRange(lowest, max(min(candidates.highest_px, width), lowest + 1))
+
+
+def _lands_on(valid: Bool, disparity: Float32) -> Bool:
+    width = disparity.shape[1]
+    column = np.rint(np.arange(width, dtype=np.float32)[None, :] - disparity).astype(np.int32)
+    landed: Bool = np.take_along_axis(valid, column.clip(0, width - 1), axis=1)
+    return landed
+
+
+def _with_sharp_edges(disparity: Float32, sigma: Float32, pair: RectifiedPair) -> tuple[Float32, Float32]:
+    """Edges sharpened; half of what a pixel was moved by counts as one sigma more."""
+    sharp = sharpen_edges(disparity, pair.left, _JUMP_PX)
+    return sharp, np.hypot(sigma, np.float32(0.5) * (sharp - disparity))
 
 
 def _without_holes(disparity: Float32) -> Float32:

@@ -109,14 +109,14 @@ def _kitti_bytes(target: Path, values: Float32) -> bytes:
     encoded, data = cv2.imencode(".png", steps.astype(np.uint16))
     if not encoded:
         raise OutputError(f"{target}: the PNG could not be encoded")
-    return data.tobytes()
+    return bytes(data.tobytes())
 
 
 def _parse_kitti(path: Path, data: bytes) -> Float32:
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None or image.dtype != np.uint16 or image.ndim != 2:
         raise InputError(path, "is no 16-bit gray PNG", "KITTI's disparities are d * 256 in 16 bits")
-    values = image.astype(np.float32) / _KITTI_STEPS
+    values: Float32 = (image / _KITTI_STEPS).astype(np.float32)
     values[image == 0] = np.nan
     return values
 

@@ -18,72 +18,89 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.errors import ConfigError
 from barsight.stereo.spline import row_coefficients, value_and_slope
-from barsight.stereo.supports import axis_means, fit_planes, tile_axes
+from barsight.stereo.supports import SupportShape, axis_means, fit_planes, tile_axes
 
 _BLUR_PX = 0.5
 _LONGEST_STEP_PX = 0.7
+_CONTRAST_FLOOR = np.float32(4)
+_SLACK = np.float32(1.5)
+_BLEND_WINDOW_PX = 9
+_LONG_STEP_PX = 5
+_HOLD = np.float32(0.3)
+_HOLD_UNMATCHED = np.float32(0.02)
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
     """Direct refinement on both images."""
 
-    steps: int = 4
+    steps: int = 3
     """Gauss-Newton steps."""
     along_px: float = 16.0
-    """Support along the axis, one sigma."""
+    """The long support along the axis, one sigma."""
     across_px: float = 1.5
-    """Support across the axis, one sigma; a bar's curvature limits it."""
+    """The long support across the axis, one sigma; a bar's curvature limits it."""
+    short_px: float = 3.0
+    """The short support along the axis, for surfaces that the long one can't follow; 0 does without."""
+    short_across_px: float = 2.0
+    """The short support across the axis."""
     gloss_px: float = 8.0
-    """Length along the axis over which what is constant counts as gloss, one sigma."""
-    gloss_trust: float = 0.1
+    """Length along the axis over which what is constant counts as gloss, one sigma; 0 trusts everything."""
+    gloss_trust: float = 0.05
     """Weight of the evidence that is constant along the axis, where noise explains its residual."""
     outlier_grey: float = 8.0
     """Residual at which a pixel's weight is halved, grey levels."""
     same_surface_px: float = 1.0
     """Disparities further apart belong to different surfaces."""
-    window_px: int = 25
+    window_px: int = 21
     """Window in which gain and offset are taken off, odd."""
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise ConfigError(f"refinement steps can't be negative, {self.steps} is")
+        if min(self.along_px, self.across_px, self.outlier_grey, self.same_surface_px) <= 0:
+            raise ConfigError("the long support, outlier_grey and same_surface_px must be positive")
+        if min(self.short_px, self.gloss_px, self.gloss_trust) < 0 or self.short_across_px <= 0:
+            raise ConfigError("the short support and the gloss settings can't be negative")
+        if self.window_px < 3 or self.window_px % 2 == 0:
+            raise ConfigError(f"window_px must be odd and at least 3, not {self.window_px}")
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """disparity_px: (H, W), no NaN. information: (H, W), grey levels^2 per px^2 of the support.
-
-    residual: (H, W), left minus gain-corrected right where they are matched, grey levels.
-    """
+    """disparity_px: (H, W), no NaN. variance_px2: (H, W), what the residual in each support explains."""
 
     disparity_px: Float32
-    information: Float32
-    residual: Float32
+    variance_px2: Float32
 
 
-def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
-    """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
+def refine(
+    left: UInt8, right: UInt8, start: Float32, matched: Bool, noise_grey: float, settings: RefinementSettings
+) -> Refined:
+    """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow.
+
+    noise_grey: sigma of the difference of both images where they agree.
+    """
     left_grey, right_grey = _smooth(left), _smooth(right)
     left_slope = _own_slope(row_coefficients(left_grey))
     right_coefficients = row_coefficients(right_grey)
     axes = tile_axes(left_grey)
     usable = matched.astype(np.float32)
-    disparity = start
-    information = residual = np.zeros_like(start)
+    disparity, variance = start, np.full_like(start, np.inf)
     for _ in range(settings.steps):
         warped, right_slope = value_and_slope(right_coefficients, disparity)
         slope = (left_slope + right_slope) * np.float32(0.5)
         residual = _residual(left_grey, warped, usable, settings.window_px)
         trust = usable / (1 + np.square(residual / np.float32(settings.outlier_grey)))
+        power = _weighted_mean(residual * residual, trust, settings.window_px)
+        power = np.maximum(power, np.float32(noise_grey * noise_grey))
         weight, pull = _evidence(residual, slope, trust, axes, settings)
-        weight += _HOLD * (usable + np.float32(0.02))
-        fitted, information = fit_planes(
-            disparity, weight, pull, axes, settings.along_px, settings.across_px, 2, settings.same_surface_px
-        )
+        weight += _HOLD * (usable + _HOLD_UNMATCHED)
+        fitted, variance = _fit(disparity, weight, pull, power, usable, axes, settings)
         disparity = disparity + np.clip(fitted - disparity, -_LONGEST_STEP_PX, _LONGEST_STEP_PX)
-    return Refined(disparity, information, residual)
-
-
-_HOLD = np.float32(0.3)
-"""Weight with which a pixel keeps its disparity where the images say nothing."""
+    return Refined(disparity, variance)
 
 
 def _smooth(image: UInt8) -> Float32:
@@ -96,18 +113,24 @@ def _own_slope(coefficients: Float32) -> Float32:
     return slope
 
 
-def _residual(left: Float32, warped: Float32, usable: Float32, window: int) -> Float32:
+def _mean(image: Float32, side: int) -> Float32:
+    averaged: Float32 = cv2.boxFilter(image, -1, (side, side))
+    return averaged
+
+
+def _weighted_mean(image: Float32, weight: Float32, side: int) -> Float32:
+    return _mean(weight * image, side) / (_mean(weight, side) + np.float32(1e-6))
+
+
+def _residual(left: Float32, warped: Float32, usable: Float32, side: int) -> Float32:
     """Left minus right after their means and contrasts in a window are made equal."""
-
-    def mean(image: Float32) -> Float32:
-        averaged: Float32 = cv2.boxFilter(image, -1, (window, window))
-        return averaged
-
-    share = mean(usable) + np.float32(1e-6)
-    left_mean, right_mean = mean(usable * left) / share, mean(usable * warped) / share
-    left_power = mean(usable * left * left) / share - left_mean * left_mean
-    right_power = mean(usable * warped * warped) / share - right_mean * right_mean
-    gain = np.sqrt((np.maximum(left_power, 0) + 4) / (np.maximum(right_power, 0) + 4))
+    share = _mean(usable, side) + np.float32(1e-6)
+    left_mean, right_mean = _mean(usable * left, side) / share, _mean(usable * warped, side) / share
+    left_power = _mean(usable * left * left, side) / share - left_mean * left_mean
+    right_power = _mean(usable * warped * warped, side) / share - right_mean * right_mean
+    gain = np.sqrt(
+        (np.maximum(left_power, 0) + _CONTRAST_FLOOR) / (np.maximum(right_power, 0) + _CONTRAST_FLOOR)
+    )
     residual: Float32 = (left - left_mean) - gain * (warped - right_mean)
     return residual
 
@@ -116,14 +139,49 @@ def _evidence(
     residual: Float32, slope: Float32, trust: Float32, axes: Float32, settings: RefinementSettings
 ) -> tuple[Float32, Float32]:
     """Each pixel's weight and pull, with what is constant along the axis weighed by how well it agrees."""
+    if settings.gloss_px == 0:
+        return trust * slope * slope, -trust * slope * residual
     residual_mean, slope_mean = axis_means(residual, slope, trust, axes, settings.gloss_px)
     residual_detail, slope_detail = residual - residual_mean, slope - slope_mean
-    window = (settings.window_px, settings.window_px)
-    detail_power = cv2.boxFilter(trust * residual_detail * residual_detail, -1, window)
-    mean_power = cv2.boxFilter(trust * residual_mean * residual_mean, -1, window)
-    independent = np.float32(2 * np.sqrt(np.pi) * settings.gloss_px)
-    agreement = (detail_power + np.float32(1e-3)) / (independent * mean_power + np.float32(1e-3))
+    detail_power = _mean(trust * residual_detail * residual_detail, settings.window_px)
+    mean_power = _mean(trust * residual_mean * residual_mean, settings.window_px)
+    # So many independent samples stand behind a Gaussian mean: noise leaves that much less power in it.
+    samples = np.float32(2 * np.sqrt(np.pi) * settings.gloss_px)
+    agreement = (detail_power + np.float32(1e-3)) / (samples * mean_power + np.float32(1e-3))
     share = np.minimum(np.float32(1), np.float32(settings.gloss_trust) * agreement)
     weight: Float32 = trust * (slope_detail * slope_detail + share * slope_mean * slope_mean)
     pull: Float32 = -trust * (slope_detail * residual_detail + share * slope_mean * residual_mean)
     return weight, pull
+
+
+def _fit(
+    disparity: Float32,
+    weight: Float32,
+    pull: Float32,
+    power: Float32,
+    usable: Float32,
+    axes: Float32,
+    settings: RefinementSettings,
+) -> tuple[Float32, Float32]:
+    """The fitted disparity and its variance: of the long support, and of the short one as far as both differ
+    by more than the short one's noise: there the surface is no plane over the long one.
+    """
+    long_shape = SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX)
+    long, long_information = fit_planes(disparity, weight, pull, axes, long_shape, settings.same_surface_px)
+    long_variance = _SUPPORT * power / np.maximum(long_information, _LEAST_INFORMATION)
+    if settings.short_px == 0:
+        return long, long_variance
+    short_shape = SupportShape(settings.short_px, settings.short_across_px)
+    short, short_information = fit_planes(
+        disparity, weight, pull, axes, short_shape, settings.same_surface_px
+    )
+    short_variance = _SUPPORT * power / np.maximum(short_information, _LEAST_INFORMATION)
+    gap = long - short
+    excess = np.maximum(_weighted_mean(gap * gap - _SLACK * short_variance, usable, _BLEND_WINDOW_PX), 0)
+    share = short_variance / (short_variance + excess + np.float32(1e-9))
+    return short + share * gap, long_variance + (1 - share) * (short_variance - long_variance)
+
+
+_SUPPORT = np.float32(0.5)
+"""Sum of squared weights over their sum for a Gaussian support in the plane."""
+_LEAST_INFORMATION = np.float32(0.5)

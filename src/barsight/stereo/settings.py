@@ -7,7 +7,10 @@ from typing import Literal
 
 from barsight.core.errors import ConfigError
 from barsight.stereo.barsight import BarsightSettings, BarsightStereo
+from barsight.stereo.census import Census, CensusSettings
+from barsight.stereo.csca import Csca, CscaSettings
 from barsight.stereo.method import StereoMethod
+from barsight.stereo.nonlocal_tree import Nonlocal, NonlocalSettings
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 
@@ -15,7 +18,7 @@ from barsight.stereo.sgbm import Sgbm, SgbmSettings
 class StereoSettings:
     """Dense stereo."""
 
-    method: Literal["sgbm", "barsight"] = "barsight"
+    method: Literal["sgbm", "csca", "nonlocal", "census", "barsight"] = "barsight"
     """Which method matches the pairs."""
     lowest_disparity_px: int | None = None
     """First candidate; found from the images when not given."""
@@ -28,6 +31,10 @@ class StereoSettings:
     gap_darkness: float = 0.55
     """Places darker than this share of their surroundings are gaps between bars: unknown; 0 keeps them."""
     sgbm: SgbmSettings = field(default_factory=SgbmSettings)
+    csca: CscaSettings = field(default_factory=CscaSettings)
+    nonlocal_tree: NonlocalSettings = field(default_factory=NonlocalSettings)
+    """The method `nonlocal`."""
+    census: CensusSettings = field(default_factory=CensusSettings)
     barsight: BarsightSettings = field(default_factory=BarsightSettings)
 
     def __post_init__(self) -> None:
@@ -42,6 +49,14 @@ class StereoSettings:
 
 def make_method(settings: StereoSettings) -> StereoMethod:
     """The method that the settings name."""
-    if settings.method == "barsight":
-        return BarsightStereo(settings.barsight)
-    return Sgbm(settings.sgbm)
+    match settings.method:
+        case "barsight":
+            return BarsightStereo(settings.barsight)
+        case "csca":
+            return Csca(settings.csca)
+        case "nonlocal":
+            return Nonlocal(settings.nonlocal_tree)
+        case "census":
+            return Census(settings.census)
+        case "sgbm":
+            return Sgbm(settings.sgbm)

@@ -1,0 +1,38 @@
+"""What a pair's images carry: texture at all, and the limit that their noise sets."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.types import RectifiedPair
+from barsight.stereo.sgbm import image_noise
+
+_VISIBLE_STEP = 4
+_LEAST_SHARE = 1e-3
+
+
+def has_texture(pair: RectifiedPair) -> bool:
+    """Whether in either image at least one pixel in a thousand differs from its neighbour but one by more
+    than 4 gray levels: a black, a burnt out or an all gray image has none.
+    """
+    return _is_textured(pair.left, pair.left_valid) and _is_textured(pair.right, pair.right_valid)
+
+
+def noise_sigma(image: UInt8, radius_px: int) -> Float32:
+    """(H, W) float32 px, the Cramer-Rao bound of a match over a window of 2 r + 1: sqrt(2) image sigma over
+    the root of the window's summed squared gradients; 1 px at most.
+    """
+    gradient = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    side = 2 * radius_px + 1
+    energy = cv2.boxFilter(gradient * gradient, -1, (side, side), normalize=False)
+    noise = image_noise(image)
+    sigma: Float32 = np.sqrt(2 * noise * noise / np.maximum(energy, 1e-3), dtype=np.float32).clip(max=1)
+    return sigma
+
+
+def _is_textured(image: UInt8, valid: Bool) -> bool:
+    steps = np.abs(image[:, 2:].astype(np.int16) - image[:, :-2]) > _VISIBLE_STEP
+    usable = valid[:, 2:] & valid[:, :-2]
+    return int(np.count_nonzero(steps & usable)) > _LEAST_SHARE * image.size

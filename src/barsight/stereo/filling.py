@@ -1,0 +1,154 @@
+"""Filling: what only one image sees is guessed from the surfaces around it, and said to be a guess.
+
+From a hole, rays go out in 16 directions to the first matched pixel; the plane through the surface there is
+continued into the hole. The guess is a weighted quantile of these candidates: near and alike in grey counts
+more. What one image hides lies behind what hides it, so a low quantile is taken; beside the image's border
+nothing hides it, and the median is taken.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numba import prange
+
+from barsight.core.arrays import Float32, UInt8, kernel
+
+_RAYS = 16
+_REACH_PX = 200
+_PLANE_RADIUS_PX = 15
+_SAME_SURFACE_PX = 1.0
+_SLOPE_LENGTH_PX = 50.0
+_GREY = 12.0
+_HIDDEN_QUANTILE = 0.3
+_SEEN_SHARE = 0.3
+
+
+def fill(
+    disparity: Float32, grey: UInt8, right_px: Float32, lowest_px: float, highest_px: float
+) -> tuple[Float32, Float32]:
+    """`disparity` (H, W) with its NaN filled, as far as any ray finds a match, and the guesses' sigma (px; NaN
+    where nothing was guessed): the spread of the candidates, at least 1 px. Inputs stay as they are.
+
+    right_px: (H, W) the right image's disparity: a guess that would be seen there in front of what is there is
+    less likely. Guesses stay within lowest_px...highest_px.
+    """
+    slope_x, slope_y = np.zeros_like(disparity), np.zeros_like(disparity)
+    _slopes_beside_holes(disparity, _PLANE_RADIUS_PX, _SAME_SURFACE_PX, slope_x, slope_y)
+    filled = disparity.copy()
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    angle = 2 * np.pi * np.arange(_RAYS) / _RAYS
+    rays = np.column_stack([np.cos(angle), np.sin(angle)])
+    rays /= np.abs(rays).max(axis=1, keepdims=True)
+    sigma = np.full_like(disparity, np.nan)
+    _fill(disparity, smooth, slope_x, slope_y, right_px, rays, lowest_px, highest_px, filled, sigma)
+    return filled, sigma
+
+
+@kernel(parallel=True)
+def _slopes_beside_holes(
+    disparity: Float32, radius: int, same_surface_px: float, slope_x: Float32, slope_y: Float32
+) -> None:
+    """Slopes (px per px) of the plane around each matched pixel that touches a hole: three rounds of least
+    squares, each on the pixels near the plane before, held to zero slope where there are few."""
+    height, width = disparity.shape
+    for y in prange(height):
+        for x in range(width):
+            centre = disparity[y, x]
+            if np.isnan(centre):
+                continue
+            beside = False
+            for yy in range(max(0, y - 1), min(height, y + 2)):
+                for xx in range(max(0, x - 1), min(width, x + 2)):
+                    beside = beside or np.isnan(disparity[yy, xx])
+            if not beside:
+                continue
+            p = q = 0.0
+            for attempt in range(3):
+                slack = 0.05 if attempt == 0 else 0.0
+                n = su = sv = suu = suv = svv = r = ru = rv = 0.0
+                for yy in range(max(0, y - radius), min(height, y + radius + 1)):
+                    for xx in range(max(0, x - radius), min(width, x + radius + 1)):
+                        u, v = float(xx - x), float(yy - y)
+                        d = float(disparity[yy, xx] - centre)
+                        # A NaN fails the comparison, so holes stay out.
+                        if abs(d - p * u - q * v) < same_surface_px + slack * (abs(u) + abs(v)):
+                            n += 1.0
+                            su += u
+                            sv += v
+                            suu += u * u
+                            suv += u * v
+                            svv += v * v
+                            r += d
+                            ru += u * d
+                            rv += v * d
+                if n == 0.0:
+                    break
+                a, b, c = suu - su * su / n + 20.0, suv - su * sv / n, svv - sv * sv / n + 20.0
+                right_u, right_v = ru - su * r / n, rv - sv * r / n
+                determinant = a * c - b * b
+                p = (right_u * c - right_v * b) / determinant
+                q = (right_v * a - right_u * b) / determinant
+            slope_x[y, x], slope_y[y, x] = p, q
+
+
+@kernel(parallel=True)
+def _fill(
+    disparity: Float32,
+    grey: Float32,
+    slope_x: Float32,
+    slope_y: Float32,
+    right_px: Float32,
+    rays: Float32,
+    lowest: float,
+    highest: float,
+    filled: Float32,
+    sigma: Float32,
+) -> None:
+    height, width = disparity.shape
+    for y in prange(height):
+        values, weights = np.empty(_RAYS), np.empty(_RAYS)
+        for x in range(width):
+            if not np.isnan(disparity[y, x]):
+                continue
+            found = 0
+            beyond_border = True
+            for ray in range(_RAYS):
+                way_x, way_y = rays[ray, 0], rays[ray, 1]
+                pixel = math.hypot(way_x, way_y)
+                for j in range(1, _REACH_PX):
+                    xx, yy = round(x + j * way_x), round(y + j * way_y)
+                    if xx < 0 or xx >= width or yy < 0 or yy >= height:
+                        break
+                    there = disparity[yy, xx]
+                    if np.isnan(there):
+                        continue
+                    distance = j * pixel
+                    # The plane's slope fades out with the distance: far off it says nothing.
+                    fade = _SLOPE_LENGTH_PX * (1.0 - math.exp(-distance / _SLOPE_LENGTH_PX)) / distance
+                    value = there + fade * (slope_x[yy, xx] * (x - xx) + slope_y[yy, xx] * (y - yy))
+                    value = min(max(value, lowest), highest)
+                    weight = math.exp(-abs(grey[yy, xx] - grey[y, x]) / _GREY) / (distance + 2.0)
+                    column = round(x - value)
+                    if column >= 0:
+                        beyond_border = False
+                        if right_px[y, min(column, width - 1)] < value:
+                            weight *= _SEEN_SHARE
+                    values[found], weights[found] = value, weight
+                    found += 1
+                    break
+            if found == 0:
+                continue
+            wanted = weights[:found].sum() * (0.5 if beyond_border else _HIDDEN_QUANTILE)
+            passed = 0.0
+            for i in np.argsort(values[:found]):
+                passed += weights[i]
+                if passed >= wanted:
+                    filled[y, x] = values[i]
+                    break
+            spread = 0.0
+            for i in range(found):
+                spread += weights[i] * (values[i] - filled[y, x]) ** 2
+            sigma[y, x] = math.sqrt(1.0 + spread / weights[:found].sum())

@@ -1,0 +1,142 @@
+"""Truncated differences of gray value and of horizontal gradient as a matching cost [Hosni 2013, Zhang 2014].
+
+Costs are laid out candidate by candidate, (K, H, W) float32: aggregation works slice by slice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, kernel
+from barsight.core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class GradientCostSettings:
+    """The cost of one pixel against another."""
+
+    gray_share: float = 0.11
+    """Weight of the gray difference; the rest is the gradient's."""
+    gray_limit: float = 7.0
+    """Gray differences count up to this."""
+    gradient_limit: float = 2.0
+    """Differences of the gradient, next pixel minus previous, count up to this."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.gray_share <= 1:
+            raise ConfigError(f"gray_share must lie in 0...1, not {self.gray_share}")
+        if self.gray_limit <= 0 or self.gradient_limit <= 0:
+            raise ConfigError("gray_limit and gradient_limit must be positive")
+
+    @property
+    def worst(self) -> float:
+        """The cost where both differences are truncated, or nothing can be compared."""
+        return self.gray_share * self.gray_limit + (1 - self.gray_share) * self.gradient_limit
+
+
+@dataclass(frozen=True, eq=False)
+class CostImages:
+    """What the cost compares, of one pair: gray and gradient (H, W) float32, valid (H, W) bool."""
+
+    left: Float32
+    right: Float32
+    left_gradient: Float32
+    right_gradient: Float32
+    left_valid: Bool
+    right_valid: Bool
+
+
+def cost_images(left: Float32, right: Float32, left_valid: Bool, right_valid: Bool) -> CostImages:
+    """left, right: (H, W) float32 gray values 0...255."""
+    return CostImages(
+        left, right, horizontal_gradient(left), horizontal_gradient(right), left_valid, right_valid
+    )
+
+
+def horizontal_gradient(image: Float32) -> Float32:
+    """(H, W) next pixel minus previous; zero in the first and last column."""
+    gradient = np.zeros_like(image)
+    gradient[:, 1:-1] = image[:, 2:] - image[:, :-2]
+    return gradient
+
+
+def gradient_cost(
+    images: CostImages, lowest_px: int, settings: GradientCostSettings, slices: Float32
+) -> None:
+    """Fill (K, H, W) slices with the costs of the candidates lowest_px...; `settings.worst` where either
+    pixel is invalid or outside.
+    """
+    _fill(
+        images.left,
+        images.right,
+        images.left_gradient,
+        images.right_gradient,
+        images.left_valid,
+        images.right_valid,
+        lowest_px,
+        np.float32(settings.gray_share),
+        np.float32(settings.gray_limit),
+        np.float32(settings.gradient_limit),
+        slices,
+    )
+
+
+@kernel(parallel=True)
+def _fill(
+    left: Float32,
+    right: Float32,
+    left_gradient: Float32,
+    right_gradient: Float32,
+    left_valid: Bool,
+    right_valid: Bool,
+    lowest: int,
+    share: np.float32,
+    gray_limit: np.float32,
+    gradient_limit: np.float32,
+    slices: Float32,
+) -> None:
+    count, height, width = slices.shape
+    rest = np.float32(1) - share
+    worst = share * gray_limit + rest * gradient_limit
+    for row in numba.prange(height):
+        for index in range(count):
+            shift = lowest + index
+            first, end = max(0, shift), min(width, width + shift)
+            slices[index, row, :] = worst
+            if end > first:
+                _compare(
+                    left[row, first:end],
+                    right[row, first - shift : end - shift],
+                    left_gradient[row, first:end],
+                    right_gradient[row, first - shift : end - shift],
+                    left_valid[row, first:end],
+                    right_valid[row, first - shift : end - shift],
+                    share,
+                    gray_limit,
+                    gradient_limit,
+                    slices[index, row, first:end],
+                )
+
+
+@kernel()
+def _compare(
+    left: Float32,
+    right: Float32,
+    left_gradient: Float32,
+    right_gradient: Float32,
+    left_valid: Bool,
+    right_valid: Bool,
+    share: np.float32,
+    gray_limit: np.float32,
+    gradient_limit: np.float32,
+    costs: Float32,
+) -> None:
+    rest = np.float32(1) - share
+    worst = share * gray_limit + rest * gradient_limit
+    for x in range(costs.shape[0]):
+        gray = min(abs(left[x] - right[x]), gray_limit)
+        steep = min(abs(left_gradient[x] - right_gradient[x]), gradient_limit)
+        costs[x] = share * gray + rest * steep if left_valid[x] & right_valid[x] else worst

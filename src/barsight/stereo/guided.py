@@ -1,0 +1,197 @@
+"""The guided filter on slices of costs [He 2010], gray guide: a local linear model of the cost in the image.
+
+Each slice is filtered in one sweep over its rows with ring buffers of 2 r + 1 rows, which stay in the cache.
+Windows are cut off at the border and divided by what is left of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, kernel
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedFilter:
+    """Call it on (K, H, W) float32 slices; they come back filtered, in place.
+
+    guide: (H, W) float32. mean: its window means. inverse: 1 / (window variance + epsilon).
+    """
+
+    guide: Float32
+    mean: Float32
+    inverse: Float32
+    radius_px: int
+
+    def __call__(self, slices: Float32) -> Float32:
+        """Filter `slices` in place and return them."""
+        _filter(slices, self.guide, self.mean, self.inverse, self.radius_px)
+        return slices
+
+
+def guided_filter(guide: Float32, radius_px: int, epsilon: float) -> GuidedFilter:
+    """The filter for one image. epsilon: in the guide's units squared; smaller keeps weaker edges."""
+    mean = box_mean(guide, radius_px)
+    variance = box_mean(guide * guide, radius_px) - mean * mean
+    inverse = 1 / (variance.clip(0, None) + epsilon)
+    return GuidedFilter(guide, mean.astype(np.float32), inverse.astype(np.float32), radius_px)
+
+
+def box_mean(image: Float32, radius_px: int) -> Float64:
+    """(H, W) float64 means over the windows of 2 r + 1, cut off at the border."""
+    total = np.zeros((image.shape[0] + 1, image.shape[1] + 1))
+    total[1:, 1:] = image.astype(np.float64).cumsum(0).cumsum(1)
+    ends = [np.arange(length) for length in image.shape]
+    low = [(end - radius_px).clip(0, None) for end in ends]
+    high = [(end + radius_px + 1).clip(None, length) for end, length in zip(ends, image.shape, strict=True)]
+    window = (
+        total[np.ix_(high[0], high[1])]
+        - total[np.ix_(low[0], high[1])]
+        - total[np.ix_(high[0], low[1])]
+        + total[np.ix_(low[0], low[1])]
+    )
+    mean: Float64 = window / np.outer(high[0] - low[0], high[1] - low[1])
+    return mean
+
+
+@kernel(parallel=True, fastmath=True)
+def _filter(slices: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
+    for index in numba.prange(slices.shape[0]):
+        _filter_slice(slices[index], guide, mean, inverse, radius)
+
+
+@kernel(fastmath=True)
+def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
+    """Row by row: the window sums of cost and guide * cost give the model of the row `radius` above; the
+    window sums of the models give the filtered row `radius` above that, which the ring remembers as long as
+    it is needed.
+    """
+    height, width = cost.shape
+    ring = 2 * radius + 1
+    rings = np.zeros((3, ring, width), dtype=np.float32)
+    costs, slopes, offsets = rings[0], rings[1], rings[2]
+    padded = np.zeros((4, width + 2 * radius), dtype=np.float32)
+    sums = padded[:, radius : radius + width]
+    windows = np.zeros((2, width), dtype=np.float32)
+    scratch = np.zeros((2, width + 2 * radius), dtype=np.float32)
+    share = np.empty(width, dtype=np.float32)
+    for x in range(width):
+        share[x] = np.float32(1) / np.float32(min(x + radius, width - 1) - max(x - radius, 0) + 1)
+    for enters in range(height + 2 * radius):
+        leaves, place = enters - ring, enters % ring
+        if 0 <= leaves < height:
+            _leave(sums[0], sums[1], costs[place], guide[leaves])
+        if enters < height:
+            _enter(sums[0], sums[1], cost[enters], costs[place], guide[enters])
+        middle = enters - radius
+        slot = middle % ring
+        if middle >= ring:
+            _subtract(sums[2], slopes[slot])
+            _subtract(sums[3], offsets[slot])
+        if 0 <= middle < height:
+            rows = np.float32(min(middle + radius, height - 1) - max(middle - radius, 0) + 1)
+            _window_sums(padded[0], windows[0], radius, scratch)
+            _window_sums(padded[1], windows[1], radius, scratch)
+            _models(windows, share, rows, mean[middle], inverse[middle], slopes[slot], offsets[slot])
+            _add(sums[2], slopes[slot])
+            _add(sums[3], offsets[slot])
+        out = middle - radius
+        if 0 <= out < height:
+            rows = np.float32(min(out + radius, height - 1) - max(out - radius, 0) + 1)
+            _window_sums(padded[2], windows[0], radius, scratch)
+            _window_sums(padded[3], windows[1], radius, scratch)
+            _apply(windows, share, rows, guide[out], cost[out])
+
+
+@kernel(fastmath=True)
+def _enter(sum_cost: Float32, sum_product: Float32, cost: Float32, kept: Float32, guide: Float32) -> None:
+    for x in range(cost.shape[0]):
+        kept[x] = cost[x]
+        sum_cost[x] += cost[x]
+        sum_product[x] += cost[x] * guide[x]
+
+
+@kernel(fastmath=True)
+def _leave(sum_cost: Float32, sum_product: Float32, cost: Float32, guide: Float32) -> None:
+    for x in range(cost.shape[0]):
+        sum_cost[x] -= cost[x]
+        sum_product[x] -= cost[x] * guide[x]
+
+
+@kernel(fastmath=True)
+def _models(
+    windows: Float32,
+    share: Float32,
+    rows: np.float32,
+    mean: Float32,
+    inverse: Float32,
+    slope: Float32,
+    offset: Float32,
+) -> None:
+    costs, products = windows[0], windows[1]
+    per_row = np.float32(1) / rows
+    for x in range(share.shape[0]):
+        weight = share[x] * per_row
+        mean_cost = costs[x] * weight
+        steep = (products[x] * weight - mean[x] * mean_cost) * inverse[x]
+        slope[x] = steep
+        offset[x] = mean_cost - steep * mean[x]
+
+
+@kernel(fastmath=True)
+def _apply(windows: Float32, share: Float32, rows: np.float32, guide: Float32, out: Float32) -> None:
+    slopes, offsets = windows[0], windows[1]
+    per_row = np.float32(1) / rows
+    for x in range(share.shape[0]):
+        out[x] = (slopes[x] * guide[x] + offsets[x]) * share[x] * per_row
+
+
+@kernel(fastmath=True)
+def _add(total: Float32, row: Float32) -> None:
+    for x in range(row.shape[0]):
+        total[x] += row[x]
+
+
+@kernel(fastmath=True)
+def _subtract(total: Float32, row: Float32) -> None:
+    for x in range(row.shape[0]):
+        total[x] -= row[x]
+
+
+@kernel(fastmath=True)
+def _copy(values: Float32, out: Float32) -> None:
+    for x in range(out.shape[0]):
+        out[x] = values[x]
+
+
+@kernel(fastmath=True)
+def _pairs(values: Float32, size: int, sums: Float32) -> None:
+    shifted = values[size:]
+    for x in range(shifted.shape[0]):
+        sums[x] = values[x] + shifted[x]
+
+
+@kernel(fastmath=True)
+def _window_sums(padded: Float32, sums: Float32, radius: int, scratch: Float32) -> None:
+    """Sums over 2 r + 1 neighbours of `padded`, which has r zeros at both ends: out of sums over 1, 2, 4...
+    neighbours, so that the adds are few and none waits for the one before, as in a running sum.
+    """
+    width = sums.shape[0]
+    window = 2 * radius + 1
+    _copy(padded, sums)
+    if window == 1:
+        return
+    _pairs(padded, 1, scratch[0])
+    done, size, turn, length = 1, 2, 0, padded.shape[0] - 1
+    while size <= window:
+        if window & size:
+            _add(sums, scratch[turn, done : done + width])
+            done += size
+        if 2 * size <= window:
+            _pairs(scratch[turn, :length], size, scratch[1 - turn])
+            length -= size
+            turn = 1 - turn
+        size *= 2

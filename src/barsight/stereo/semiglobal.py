@@ -1,0 +1,274 @@
+"""Semi-global matching [Hirschmueller 2008] on a cost that neither gain nor single bright pixels upset.
+
+Cost of a candidate: Hamming distance of the 5x5 census [Zabih 1994], plus truncated differences of the x
+gradient and of the grey value. Eight paths; the penalty of a jump falls where the image has an edge. The image
+is worked through in stripes of rows, each with its own cost volume, so memory doesn't grow with the height.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from barsight.core.arrays import Float32, UInt8, kernel
+from barsight.core.errors import ConfigError
+
+Int16 = NDArray[np.int16]
+UInt32 = NDArray[np.uint32]
+
+_OVERLAP_ROWS = 20
+_STRIPE_BYTES = 128 * 2**20
+_UNKNOWN_COST = 60
+_EDGE_GREY = 8
+_BORDER = np.int16(10000)
+_FAR = np.float32(-1e6)
+
+
+@dataclass(frozen=True)
+class SemiGlobalSettings:
+    """Semi-global matching."""
+
+    small_jump: int = 22
+    """Penalty of a change by one candidate between neighbours."""
+    large_jump: int = 150
+    """Penalty of a larger change where the image is flat; an edge of 8 grey levels halves it."""
+    least_jump: int = 28
+    """Penalty of a larger change across a strong image edge."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.small_jump <= self.least_jump <= self.large_jump <= 2000:
+            raise ConfigError("the penalties must be 0 < small_jump <= least_jump <= large_jump <= 2000")
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Disparities of both images, (H, W) float32: left_px to a fraction, right_px in whole pixels.
+
+    right_px is -1e6 where no candidate falls into the left image.
+    """
+
+    left_px: Float32
+    right_px: Float32
+
+
+def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiGlobalSettings) -> Match:
+    """The best of `count` candidates from lowest_px on for every pixel, by semi-global matching.
+
+    Memory: at most about 130 MB per thread, or 40 rows' cost volume if that is more.
+    """
+    height, width = left.shape
+    left_px, right_px = np.empty((2, height, width), dtype=np.float32)
+    threads = numba.get_num_threads()
+    affordable = max(_STRIPE_BYTES // (3 * width * count) - 2 * _OVERLAP_ROWS, 16)
+    stripes = threads * -(-height // (threads * min(affordable, 256)))
+    _match_stripes(
+        _census(left), _reversed(_census(right)), _gradient(left), _reversed(_gradient(right)),
+        left.astype(np.int16), _reversed(right.astype(np.int16)), lowest_px, count,
+        settings.small_jump, settings.large_jump, settings.least_jump, -(-height // stripes), left_px, right_px,
+    )  # fmt: skip
+    return Match(left_px, right_px)
+
+
+def _census(image: UInt8) -> UInt32:
+    codes = np.zeros(image.shape, dtype=np.uint32)
+    _write_census(cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_REPLICATE), codes)
+    return codes
+
+
+def _gradient(image: UInt8) -> Int16:
+    gradient: Int16 = cv2.filter2D(image, cv2.CV_16S, np.array([[-1, 0, 1]], dtype=np.float32))
+    return gradient
+
+
+def _reversed(image: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+@kernel(parallel=True)
+def _write_census(framed: UInt8, codes: UInt32) -> None:
+    """Bit k is set where neighbour k is brighter than the centre. framed: (H + 4, W + 4)."""
+    height, width = codes.shape
+    one = np.uint32(1)
+    for y in prange(height):
+        row = codes[y]
+        centre = framed[y + 2, 2 : 2 + width]
+        for dy in range(5):
+            for dx in range(5):
+                if dy == 2 and dx == 2:
+                    continue
+                there = framed[y + dy, dx : dx + width]
+                for x in range(width):
+                    row[x] = (row[x] << one) | np.uint32(there[x] > centre[x])
+
+
+@kernel()
+def _row_costs(
+    left_code: UInt32,
+    right_code: UInt32,
+    left_slope: Int16,
+    right_slope: Int16,
+    left_grey: Int16,
+    right_grey: Int16,
+    lowest: int,
+    cost: UInt8,
+) -> None:
+    """(W, count) costs of one row. The right row is reversed, so that candidates lie in memory's order."""
+    width, count = cost.shape
+    for x in range(width):
+        base = width - 1 - x + lowest
+        first, end = max(0, -base), min(count, width - base)
+        here = cost[x]
+        if end <= first:
+            here[:] = _UNKNOWN_COST
+            continue
+        code, slope, grey = left_code[x], left_slope[x], left_grey[x]
+        codes = right_code[base + first : base + end]
+        slopes = right_slope[base + first : base + end]
+        greys = right_grey[base + first : base + end]
+        inside = here[first:end]
+        for k in range(end - first):
+            bits = np.uint32(code ^ codes[k])
+            bits = np.uint32(bits - ((bits >> np.uint32(1)) & np.uint32(0x55555555)))
+            bits = np.uint32(
+                (bits & np.uint32(0x33333333)) + ((bits >> np.uint32(2)) & np.uint32(0x33333333))
+            )
+            bits = np.uint32((bits + (bits >> np.uint32(4))) & np.uint32(0x0F0F0F0F))
+            hamming = np.uint32(np.uint32(bits * np.uint32(0x01010101)) >> np.uint32(24))
+            steep = min(np.int16(abs(np.int16(slope - slopes[k]))), np.int16(20))
+            bright = min(np.int16(abs(np.int16(grey - greys[k]))), np.int16(20))
+            inside[k] = np.uint8(np.uint8(hamming) + np.uint8(np.int16(steep + bright) >> np.int16(1)))
+        here[:first] = here[first]
+        here[end:] = here[end - 1]
+
+
+@kernel()
+def _extend_path(
+    cost: UInt8, before: Int16, least_before: int, small: int, jump: int, path: Int16, total: Int16
+) -> int:
+    """One pixel further along a path [Hirschmueller 2008, Eq. 13]; the path's least cost there."""
+    least = np.int16(32000)
+    ceiling = np.int16(least_before + jump)
+    step, base = np.int16(small), np.int16(least_before)
+    count = cost.shape[0]
+    below, same, above = before[0:count], before[1 : count + 1], before[2 : count + 2]
+    here = path[1 : count + 1]
+    for d in range(count):
+        best = np.int16(min(below[d], above[d]) + step)
+        best = min(min(best, same[d]), ceiling)
+        value = np.int16(np.int16(best - base) + np.int16(cost[d]))
+        here[d] = value
+        total[d] = np.int16(total[d] + value)
+        least = min(least, value)
+    return least
+
+
+@kernel()
+def _sweep(
+    cost: UInt8, total: Int16, grey: Int16, small: int, large: int, least_jump: int, upwards: bool
+) -> None:
+    """Adds four of the eight paths: along the row and from the three neighbours in the row before."""
+    height, width, count = cost.shape
+    paths = np.full((2, 3, width, count + 2), _BORDER, dtype=np.int16)
+    leasts = np.zeros((2, 3, width), dtype=np.int16)
+    along = np.full((2, count + 2), _BORDER, dtype=np.int16)
+    fresh = np.zeros(count + 2, dtype=np.int16)
+    fresh[0] = _BORDER
+    fresh[count + 1] = _BORDER
+    for i in range(height):
+        y = height - 1 - i if upwards else i
+        y_before = y + 1 if upwards else y - 1
+        new, old = i & 1, 1 - (i & 1)
+        least_along = 0
+        for j in range(width):
+            x = width - 1 - j if upwards else j
+            here = np.int32(grey[y, x])
+            if j == 0:
+                least_along = _extend_path(cost[y, x], fresh, 0, small, large, along[0], total[y, x])
+            else:
+                contrast = abs(here - np.int32(grey[y, x + 1 if upwards else x - 1]))
+                jump = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least_jump)
+                least_along = _extend_path(
+                    cost[y, x], along[1 - (j & 1)], least_along, small, jump, along[j & 1], total[y, x]
+                )
+            for r in range(3):
+                x_before = x + r - 1
+                if i == 0 or x_before < 0 or x_before >= width:
+                    leasts[new, r, x] = _extend_path(
+                        cost[y, x], fresh, 0, small, large, paths[new, r, x], total[y, x]
+                    )
+                    continue
+                contrast = abs(here - np.int32(grey[y_before, x_before]))
+                jump = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least_jump)
+                leasts[new, r, x] = _extend_path(
+                    cost[y, x], paths[old, r, x_before], leasts[old, r, x_before], small, jump,
+                    paths[new, r, x], total[y, x],
+                )  # fmt: skip
+
+
+@kernel()
+def _choose(total: Int16, lowest: int, left_px: Float32, right_px: Float32) -> None:
+    """Winners of one row for both images; the left one to a fraction with the equiangular line fit, which
+    suits a cost that rises linearly [Shimizu 2002]."""
+    width, count = total.shape
+    for x in range(width):
+        sums = total[x]
+        least = np.int16(32000)
+        for d in range(count):
+            least = min(least, sums[d])
+        winner = 0
+        while sums[winner] != least:
+            winner += 1
+        fraction = np.float32(0)
+        if 0 < winner < count - 1:
+            below, above = np.float32(sums[winner - 1] - least), np.float32(sums[winner + 1] - least)
+            steeper = max(below, above)
+            if steeper > 0:
+                fraction = np.float32(0.5) * (below - above) / steeper
+        left_px[x] = np.float32(winner + lowest) + fraction
+    for x in range(width):
+        least, winner = np.int16(32000), -1
+        for d in range(max(0, -x - lowest), min(count, width - x - lowest)):
+            if total[x + d + lowest, d] < least:
+                least, winner = total[x + d + lowest, d], d
+        right_px[x] = np.float32(winner + lowest) if winner >= 0 else _FAR
+
+
+@kernel(parallel=True)
+def _match_stripes(
+    left_code: UInt32,
+    right_code: UInt32,
+    left_slope: Int16,
+    right_slope: Int16,
+    left_grey: Int16,
+    right_grey: Int16,
+    lowest: int,
+    count: int,
+    small: int,
+    large: int,
+    least_jump: int,
+    stripe_rows: int,
+    left_px: Float32,
+    right_px: Float32,
+) -> None:
+    height, width = left_px.shape
+    for stripe in prange((height + stripe_rows - 1) // stripe_rows):
+        start, end = stripe * stripe_rows, min(height, stripe * stripe_rows + stripe_rows)
+        above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
+        cost = np.empty((below - above, width, count), dtype=np.uint8)
+        total = np.zeros((below - above, width, count), dtype=np.int16)
+        for y in range(above, below):
+            _row_costs(
+                left_code[y], right_code[y], left_slope[y], right_slope[y], left_grey[y], right_grey[y],
+                lowest, cost[y - above],
+            )  # fmt: skip
+        grey = left_grey[above:below]
+        _sweep(cost, total, grey, small, large, least_jump, False)
+        _sweep(cost, total, grey, small, large, least_jump, True)
+        for y in range(start, end):
+            _choose(total[y - above], lowest, left_px[y], right_px[y])

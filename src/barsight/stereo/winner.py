@@ -1,0 +1,110 @@
+"""Winner takes all over slices of costs, as they come, and the parabola below a pixel [paper Eq. 4].
+
+Only the best cost, its neighbours and the last slice are kept, so that no cost volume has to be: memory is
+five float32 images whatever the number of candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from barsight.core.arrays import Float32, Int32, kernel
+from barsight.core.types import DisparityRange
+
+_BLOCK = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Winners:
+    """The best candidate of each pixel so far, all (H, W); `take_slices` writes into it.
+
+    candidate_px: int32, whole. cost, below, above: its cost and those of the candidates one lower and one
+    higher, inf where there was none. last: the costs of the last candidate seen.
+    """
+
+    candidate_px: Int32
+    cost: Float32
+    below: Float32
+    above: Float32
+    last: Float32
+
+
+def no_winners(height: int, width: int) -> Winners:
+    """Before the first slice."""
+    shape = (height, width)
+    cost, below, above, last = (np.full(shape, np.inf, dtype=np.float32) for _ in range(4))
+    return Winners(np.zeros(shape, dtype=np.int32), cost, below, above, last)
+
+
+def take_slices(winners: Winners, slices: Float32, lowest_px: int) -> None:
+    """Let (K, H, W) slices of the candidates lowest_px... compete; they follow those before without a gap."""
+    _compete(
+        slices,
+        lowest_px,
+        winners.candidate_px,
+        winners.cost,
+        winners.below,
+        winners.above,
+        winners.last,
+    )
+
+
+def sweep(
+    shape: tuple[int, ...], candidates: DisparityRange, fill: Callable[[int, Float32], None]
+) -> Winners:
+    """The winners of all candidates; `fill(lowest_px, slices)` writes the costs of the next K of them.
+
+    shape: of the image, (H, W). K is 16 at most: the memory of the sweep is 21 float32 images.
+    """
+    height, width = shape
+    winners = no_winners(height, width)
+    block = np.empty((min(_BLOCK, candidates.count), height, width), dtype=np.float32)
+    for first in range(candidates.lowest_px, candidates.highest_px, _BLOCK):
+        slices = block[: min(_BLOCK, candidates.highest_px - first)]
+        fill(first, slices)
+        take_slices(winners, slices, first)
+    return winners
+
+
+def between_candidates(winners: Winners) -> Float32:
+    """(H, W) float32: the winners below a pixel by the parabola through three costs [paper Eq. 4].
+
+    Whole where a neighbour is missing or the costs don't curve upwards; never further than half a pixel.
+    """
+    bend = winners.below + winners.above - 2 * winners.cost
+    slope = winners.below - winners.above
+    usable = np.isfinite(bend) & (bend > 0)
+    offset = np.where(usable, slope, 0) / np.where(usable, 2 * bend, 1)
+    between: Float32 = (winners.candidate_px + offset.clip(-0.5, 0.5)).astype(np.float32)
+    return between
+
+
+@kernel(parallel=True)
+def _compete(
+    slices: Float32,
+    lowest: int,
+    candidate: Int32,
+    cost: Float32,
+    below: Float32,
+    above: Float32,
+    last: Float32,
+) -> None:
+    count, height, width = slices.shape
+    for row in numba.prange(height):
+        for index in range(count):
+            shift = np.int32(lowest + index)
+            for column in range(width):
+                now = slices[index, row, column]
+                won = now < cost[row, column]
+                if candidate[row, column] == shift - 1:
+                    above[row, column] = now
+                if won:
+                    below[row, column] = last[row, column]
+                    above[row, column] = np.inf
+                    candidate[row, column] = shift
+                    cost[row, column] = now
+                last[row, column] = now
