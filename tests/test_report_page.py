@@ -75,7 +75,16 @@ def figures(page: Page) -> dict[str, Any]:
 
 
 def test_the_page_names_the_key_figures(page: Page) -> None:
-    for text in ("12 of 14", "2 refused", "2.75\u00a0m", "6.0\u00a0mm", "1\u202f512\u00a0MiB", "SIMULATED"):
+    for text in (
+        "12 of 14",
+        "2 refused",
+        "2.75\u00a0m",
+        "6.0\u00a0mm",
+        "median 3.0\u00a0mm",
+        "median 2.0\u00a0mm",
+        "1\u202f512\u00a0MiB",
+        "SIMULATED",
+    ):
         assert text in page.text
     assert "frames-refused" in page.text
     assert "cam1: <png> is cut short" in page.text

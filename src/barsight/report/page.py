@@ -17,7 +17,14 @@ from barsight.core.files import atomic_path
 from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_path import path_plots
 from barsight.report.pictures import preview_uri, read_raster
-from barsight.report.plots import Plot, compare, contour_plot, histogram_plot, limits_plot
+from barsight.report.plots import (
+    Plot,
+    compare,
+    contour_plot,
+    histogram_plot,
+    limits_plot,
+    median_errors_mm,
+)
 from barsight.result_folder import read_contours, read_laser, read_path, read_summary
 
 NONE = "–"
@@ -48,6 +55,7 @@ def render_page(out_dir: Path) -> str:
     result = read_summary(out_dir)
     laser = read_laser(out_dir)
     compared = compare(read_contours(out_dir), laser)
+    medians = median_errors_mm(compared)
     path = read_path(out_dir)
     height = out_dir / "height.tif"
     maps: tuple[MapFigure, ...] = map_figures(read_raster(height), laser) if height.is_file() else ()
@@ -61,7 +69,8 @@ def render_page(out_dir: Path) -> str:
     template = _environment().get_template("page.html.jinja")
     return template.render(
         result=result,
-        figures=key_figures(result),
+        figures=key_figures(result, medians),
+        medians=medians,
         maps=maps,
         contours=contours,
         agreement_plots=agreement,
@@ -79,8 +88,8 @@ def render_page(out_dir: Path) -> str:
     )
 
 
-def key_figures(result: dict[str, Any]) -> list[Figure]:
-    """What an operator looks at first."""
+def key_figures(result: dict[str, Any], medians_mm: dict[int, float]) -> list[Figure]:
+    """What an operator looks at first. medians_mm: median absolute difference to the laser by profile."""
     frames = result.get("frames") or {}
     trajectory = result.get("trajectory") or {}
     surface = result.get("map") or {}
@@ -94,9 +103,8 @@ def key_figures(result: dict[str, Any]) -> list[Figure]:
         ),
     ]
     for row in result.get("agreement") or []:
-        note = (
-            f"bias {number(row.get('bias_mm'), 1, 'mm')}, coverage {number(row.get('coverage_pct'), 1, '%')}"
-        )
+        median = number(medians_mm.get(row.get("profile", -1)), 1, "mm")
+        note = f"median {median}, coverage {number(row.get('coverage_pct'), 1, '%')}"
         label = f"MAE to laser, profile {row.get('profile')}"
         figures.append(Figure(label, number(row.get("mae_mm"), 1, "mm"), note))
     cells = {key: surface.get(f"cells_{key}") or 0 for key in ("seen", "filled", "unknown")}
