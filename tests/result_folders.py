@@ -159,7 +159,9 @@ def summary() -> dict[str, Any]:
                 "samples": 266,
                 "coverage_pct": 95.0,
                 "bias_mm": bias,
+                "median_mm": abs(bias),
                 "mae_mm": abs(bias),
+                "smooth_mae_mm": abs(bias),
                 "rmse_mm": abs(bias),
                 "p95_mm": abs(bias),
                 "max_mm": abs(bias),
@@ -168,6 +170,7 @@ def summary() -> dict[str, Any]:
             }
             for profile, (y, bias) in enumerate(zip(PROFILE_Y_M, BIAS_MM, strict=True))
         ],
+        "seconds": 12.5,
         "truth": {"smooth": {"median_mm": 6.25, "coverage_pct": 97.0}},
         "warnings": [{"code": "frames-refused", "message": "2 of 14 frames were refused"}],
         "vetoes": [],

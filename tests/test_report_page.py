@@ -80,8 +80,8 @@ def test_the_page_names_the_key_figures(page: Page) -> None:
         "2 refused",
         "2.75\u00a0m",
         "6.0\u00a0mm",
-        "median 3.0\u00a0mm",
-        "median 2.0\u00a0mm",
+        "3.0\u00a0mm with steps and gullies",
+        "2.0\u00a0mm with steps and gullies",
         "1\u202f512\u00a0MiB",
         "SIMULATED",
     ):

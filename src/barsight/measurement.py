@@ -46,7 +46,10 @@ class Preview:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A measured recording; `surface` reads its tiles from a scratch folder that must still be there."""
+    """A measured recording; `surface` reads its tiles from a scratch folder that must still be there.
+
+    seconds: by the clock on the wall; the stages' own seconds overlap.
+    """
 
     recording_path: Path
     recording_format: str
@@ -66,5 +69,6 @@ class Measurement:
     agreements: tuple[Agreement, ...]
     stages: tuple[StageTime, ...]
     warnings: tuple[Notice, ...]
+    seconds: float
     peak_memory_mib: float
     preview: Preview | None

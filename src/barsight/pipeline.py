@@ -11,6 +11,7 @@ import json
 import math
 import resource
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
@@ -80,6 +81,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     """
     source = SelectedSensors(recording, settings.use)
     watch = Stopwatch()
+    start = time.perf_counter()
     with watch("look"):
         rectifier = Rectifier(source.rig)
         first = first_look(source, rectifier)
@@ -150,6 +152,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         agreements=tuple(a for a in agreed if isinstance(a, Agreement)),
         stages=tuple(StageTime(*entry) for entry in watch.entries()),
         warnings=tuple(warnings),
+        seconds=time.perf_counter() - start,
         peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         preview=preview,
     )

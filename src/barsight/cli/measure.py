@@ -114,14 +114,13 @@ def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -
 
 
 def _agreement_table(agreements: list[dict[str, Any]]) -> Table:
-    table = Table(
-        "profile", "y m", "coverage %", "bias", "MAE", "RMSE", "P95", "max", title="Vision minus laser, mm"
-    )
+    names = ("bias", "median", "smooth_mae", "mae", "p95", "max")
+    heads = ("bias", "median", "MAE, smooth places", "MAE", "P95", "max")
+    table = Table("profile", "y m", "coverage %", *heads, title="Vision minus laser, mm")
     for a in agreements:
-        numbers = (a[f"{name}_mm"] for name in ("bias", "mae", "rmse", "p95", "max"))
-        table.add_row(
-            str(a["profile"]), f"{a['y_m']:.2f}", f"{a['coverage_pct']:.1f}", *(f"{n:.2f}" for n in numbers)
-        )
+        numbers = (a[f"{name}_mm"] for name in names)
+        cells = ("-" if n is None else f"{n:.2f}" for n in numbers)
+        table.add_row(str(a["profile"]), f"{a['y_m']:.2f}", f"{a['coverage_pct']:.1f}", *cells)
     return table
 
 

@@ -233,7 +233,9 @@ class Agreement:
     """How a contour agrees with a reference profile; all in mm but for the coverage.
 
     samples: compared points. coverage_pct: share of the reference's points that vision measured.
-    bias is vision minus reference; loa_low, loa_high are Bland-Altman's 95 % limits of agreement.
+    bias is vision minus reference; loa_low, loa_high are Bland-Altman's 95 % limits of agreement. median and
+    mae are of the absolute differences; smooth_mae is taken where the reference has no step over 30 mm within
+    20 mm (NaN where it has steps everywhere): at a step the two methods may look past each other.
     """
 
     profile: int
@@ -241,7 +243,9 @@ class Agreement:
     samples: int
     coverage_pct: float
     bias_mm: float
+    median_mm: float
     mae_mm: float
+    smooth_mae_mm: float
     rmse_mm: float
     p95_mm: float
     max_mm: float

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.types import Agreement, Contour, LaserProfile, Source
+
+JUMP_M = 0.03
 
 
 def difference(contour: Contour, laser: LaserProfile) -> Float64:
@@ -26,8 +28,18 @@ def difference(contour: Contour, laser: LaserProfile) -> Float64:
     return np.where(inside, z, np.nan) - laser.z_m
 
 
+def smooth_places(z_m: Float64, reach: int = 2) -> Bool:
+    """True along the last axis where no neighbour within `reach` samples lies over 30 mm higher or lower."""
+    broken = np.zeros(z_m.shape, dtype=np.bool_)
+    for k in range(1, reach + 1):
+        jump = np.abs(z_m[..., k:] - z_m[..., :-k]) > JUMP_M
+        broken[..., k:] |= jump
+        broken[..., :-k] |= jump
+    return ~broken
+
+
 def agree(contour: Contour, laser: LaserProfile) -> Agreement | Failed:
-    """Bias, limits of agreement [Bland 1986], MAE, RMSE, P95 and max in mm; coverage of the laser's points.
+    """Bias, limits of agreement [Bland 1986], median, MAE, RMSE, P95 and max; coverage of the laser's points.
 
     Failed `no-overlap` where fewer than two points can be compared.
     """
@@ -40,13 +52,16 @@ def agree(contour: Contour, laser: LaserProfile) -> Agreement | Failed:
         )
     bias, spread = float(compared.mean()), float(compared.std(ddof=1))
     size = np.abs(compared)
+    smooth = np.abs(error[np.isfinite(error) & smooth_places(laser.z_m)]) * 1e3
     return Agreement(
         profile=laser.profile,
         y_m=float(np.median(laser.y_m)),
         samples=int(compared.size),
         coverage_pct=100 * compared.size / error.size,
         bias_mm=bias,
+        median_mm=float(np.median(size)),
         mae_mm=float(size.mean()),
+        smooth_mae_mm=float(smooth.mean()) if smooth.size else float("nan"),
         rmse_mm=float(np.sqrt((compared**2).mean())),
         p95_mm=float(np.percentile(size, 95)),
         max_mm=float(size.max()),

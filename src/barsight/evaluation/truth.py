@@ -11,8 +11,8 @@ import tifffile
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
 from barsight.core.types import Source
+from barsight.evaluation.agreement import smooth_places
 
-JUMP_M = 0.03
 _SPACING_M = 0.01
 
 Figures = dict[str, float]
@@ -32,16 +32,6 @@ def score(recording: Path, out: Path) -> dict[str, Figures]:
     with np.load(truth_file) as truth:
         content = {name: truth[name] for name in truth.files}
     return {**_score_contours(content, out), **_score_height(content, out)}
-
-
-def smooth_places(z: Float64, reach: int = 2) -> Bool:
-    """True along the last axis where no neighbour within `reach` samples lies over 30 mm higher or lower."""
-    broken = np.zeros(z.shape, dtype=np.bool_)
-    for k in range(1, reach + 1):
-        jump = np.abs(z[..., k:] - z[..., :-k]) > JUMP_M
-        broken[..., k:] |= jump
-        broken[..., :-k] |= jump
-    return ~broken
 
 
 def _score_contours(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:

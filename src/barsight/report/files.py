@@ -198,6 +198,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
             "duration_s": float(stamps[-1] - stamps[0]) / NS_PER_S if stamps.size else 0.0,
         },
         "stages": [asdict(stage) for stage in measurement.stages],
+        "seconds": measurement.seconds,
         "peak_memory_mib": measurement.peak_memory_mib,
         "map": {
             "cell_m": cell,

@@ -23,7 +23,6 @@ from barsight.report.plots import (
     contour_plot,
     histogram_plot,
     limits_plot,
-    median_errors_mm,
 )
 from barsight.result_folder import read_contours, read_laser, read_path, read_summary
 
@@ -55,7 +54,6 @@ def render_page(out_dir: Path) -> str:
     result = read_summary(out_dir)
     laser = read_laser(out_dir)
     compared = compare(read_contours(out_dir), laser)
-    medians = median_errors_mm(compared)
     path = read_path(out_dir)
     height = out_dir / "height.tif"
     maps: tuple[MapFigure, ...] = map_figures(read_raster(height), laser) if height.is_file() else ()
@@ -69,8 +67,7 @@ def render_page(out_dir: Path) -> str:
     template = _environment().get_template("page.html.jinja")
     return template.render(
         result=result,
-        figures=key_figures(result, medians),
-        medians=medians,
+        figures=key_figures(result),
         maps=maps,
         contours=contours,
         agreement_plots=agreement,
@@ -88,8 +85,8 @@ def render_page(out_dir: Path) -> str:
     )
 
 
-def key_figures(result: dict[str, Any], medians_mm: dict[int, float]) -> list[Figure]:
-    """What an operator looks at first. medians_mm: median absolute difference to the laser by profile."""
+def key_figures(result: dict[str, Any]) -> list[Figure]:
+    """What an operator looks at first."""
     frames = result.get("frames") or {}
     trajectory = result.get("trajectory") or {}
     surface = result.get("map") or {}
@@ -103,10 +100,10 @@ def key_figures(result: dict[str, Any], medians_mm: dict[int, float]) -> list[Fi
         ),
     ]
     for row in result.get("agreement") or []:
-        median = number(medians_mm.get(row.get("profile", -1)), 1, "mm")
-        note = f"median {median}, coverage {number(row.get('coverage_pct'), 1, '%')}"
-        label = f"MAE to laser, profile {row.get('profile')}"
-        figures.append(Figure(label, number(row.get("mae_mm"), 1, "mm"), note))
+        everywhere = f"{number(row.get('mae_mm'), 1, 'mm')} with steps and gullies"
+        note = f"{everywhere}, coverage {number(row.get('coverage_pct'), 1, '%')}"
+        label = f"MAE to laser, smooth places, profile {row.get('profile')}"
+        figures.append(Figure(label, number(row.get("smooth_mae_mm"), 1, "mm"), note))
     cells = {key: surface.get(f"cells_{key}") or 0 for key in ("seen", "filled", "unknown")}
     total = sum(cells.values())
     share = {key: 100 * count / total if total else math.nan for key, count in cells.items()}
@@ -121,8 +118,8 @@ def key_figures(result: dict[str, Any], medians_mm: dict[int, float]) -> list[Fi
             f"cells of {number(None if cell is None else cell * 1e3, 0, 'mm')}",
         )
     )
-    seconds = sum(stage.get("seconds") or 0.0 for stage in result.get("stages") or [])
-    figures.append(Figure("Time in stages", number(seconds, 1, "s"), "summed over threads"))
+    each = f"{number((result.get('seconds') or 0.0) / max(frames.get('used') or 1, 1), 2, 's')} per frame"
+    figures.append(Figure("Time to measure", number(result.get("seconds"), 1, "s"), each))
     figures.append(Figure("Peak memory", number(result.get("peak_memory_mib"), 0, "MiB")))
     return figures
 

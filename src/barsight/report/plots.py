@@ -52,12 +52,6 @@ def compare(contours: tuple[Contour, ...], laser: tuple[LaserProfile, ...]) -> t
     )
 
 
-def median_errors_mm(compared: tuple[Compared, ...]) -> dict[int, float]:
-    """By profile the median of the absolute differences, which steps and gullies hardly move."""
-    sizes = {item.contour.profile: np.abs(item.error_m[np.isfinite(item.error_m)]) for item in compared}
-    return {profile: float(np.median(size)) * 1e3 for profile, size in sizes.items() if size.size}
-
-
 def numbers(values: Float64, decimals: int) -> list[float | None]:
     """Rounded for the page; None, which breaks a line, where not finite."""
     return [float(v) if np.isfinite(v) else None for v in np.round(values, decimals)]
