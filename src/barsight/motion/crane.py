@@ -17,6 +17,8 @@ from barsight.core.types import CraneSamples, PosedFrame, RefusedFrame, Trajecto
 from barsight.motion.sway import sway_at, turned_angle
 from barsight.recording.base import Recording
 
+CAUCHY_SIGMAS = 3.0
+
 
 @dataclass(frozen=True)
 class CraneSettings:
@@ -85,13 +87,14 @@ class CraneTrajectory:
 def fit_position(crane: CraneSamples, stamp_ns: int, window_ns: int) -> tuple[Float64, Float64] | Failed:
     """The crane point at `stamp_ns` (3,) in `yard`, and its covariance (3, 3).
 
-    A parabola through the readings within the window, by least squares with Huber's weights so that single
-    wild readings don't pull. Failed `no-encoder` where the readings don't enclose the stamp.
+    A parabola through the readings within the window (a line where they are fewer than six), by least
+    squares with Cauchy's weights, so that single wild readings don't pull however far off they are. Failed
+    `no-encoder` where the readings don't enclose the stamp.
     """
     first, last = np.searchsorted(crane.stamp_ns, (stamp_ns - window_ns, stamp_ns + window_ns))
     stamps: Int64 = crane.stamp_ns[first:last]
     if stamps.size < 4 or stamps[0] > stamp_ns or stamps[-1] < stamp_ns:
-        away = np.abs(crane.stamp_ns - stamp_ns).min() / NS_PER_S
+        away = np.abs(crane.stamp_ns - stamp_ns).min(initial=np.iinfo(np.int64).max) / NS_PER_S
         return Failed(
             "no-encoder", f"{stamps.size} encoder readings around the frame (the nearest {away:.2f} s away)"
         )
@@ -100,10 +103,10 @@ def fit_position(crane: CraneSamples, stamp_ns: int, window_ns: int) -> tuple[Fl
     design = np.vander(time, degree + 1, increasing=True)
     values = crane.position_m[first:last]
     weights = np.ones(stamps.size)
-    for _ in range(4):
+    for _ in range(10):
         coefficients, *_ = np.linalg.lstsq(design * weights[:, None], values * weights[:, None], rcond=None)
         residual = np.linalg.norm(values - design @ coefficients, axis=1) / (3**0.5 * crane.position_std_m)
-        weights = np.sqrt(np.minimum(1.0, 1.5 / np.maximum(residual, 1e-9)))
+        weights = 1 / np.sqrt(1 + (residual / CAUCHY_SIGMAS) ** 2)
     information = (design * weights[:, None] ** 2).T @ design
     variance = np.linalg.inv(information)[0, 0] * crane.position_std_m**2
     return coefficients[0], np.eye(3) * variance

@@ -23,7 +23,7 @@ class Level:
 
 
 def level_attitude(recording: Recording) -> Level:
-    """Gravity from the IMU's first second after the first frame, else cam0's rows taken as level.
+    """Gravity from the IMU, 0.5 s before to 1 s after the first frame, else cam0's rows taken as level.
 
     Without motion the accelerometer shows the reaction to gravity: its mean points up. World's X is cam0's
     viewing direction, or its x axis where the camera looks straight down, made level.

@@ -96,6 +96,7 @@ class StereoOdometry:
         for frame in recording.frames():
             advance()
             if isinstance(frame, RefusedFrame):
+                refused.append(frame)
                 continue
             view = self._look(rectifier(frame))
             if isinstance(view, Failed):
@@ -113,9 +114,12 @@ class StereoOdometry:
             old_from_new = Pose("rect0", "rect0", step.rotation, step.translation).inverse()
             old = placed[-1]
             world_from_old = old.reference_from_body @ body_from_rect0
-            pose = world_from_old @ old_from_new @ body_from_rect0.inverse()
-            noise = noise + _in_world(step.covariance, world_from_old.rotation)
+            world_from_new = world_from_old @ old_from_new
+            pose = world_from_new @ body_from_rect0.inverse()
             way = pose.translation - old.reference_from_body.translation
+            lever = pose.translation - world_from_new.translation
+            added = _carried(_in_world(step.covariance, world_from_new.rotation), lever)
+            noise = _carried(noise, way) + added
             stretch = stretch + step.scale_sigma * way
             covariance = noise.copy()
             covariance[3:, 3:] += np.outer(stretch, stretch)
@@ -153,13 +157,13 @@ class StereoOdometry:
         pairs, found, disparity = pairs[kept], found[kept], disparity[kept]
         if len(pairs) < settings.least_inliers:
             return Failed("no-matches", f"only {len(pairs)} features can be followed from the frame before")
-        points, sigma = old.points[pairs[:, 0]], _depth_sigma(old.points[pairs[:, 0]], camera, settings)
+        points = old.points[pairs[:, 0]]
         ransac = _ransac(points, found, camera, settings)
         if isinstance(ransac, Failed):
             return ransac
         rotation, translation = ransac
         target = np.column_stack([found, found[:, 0] - disparity]).astype(np.float64)
-        return _refine(points, sigma, target, rotation, translation, camera, settings)
+        return _refine(points, target, rotation, translation, camera, settings)
 
 
 def _across(
@@ -180,10 +184,14 @@ def _triangulated(pixels: Float32, disparity: Float32, camera: RectifiedCamera) 
     return np.column_stack([x, y, depth])
 
 
-def _depth_sigma(points: Float64, camera: RectifiedCamera, settings: OdometrySettings) -> Float64:
-    per_px = points[:, 2] ** 2 / (camera.focal_px * camera.baseline_m)
-    sigma: Float64 = per_px * settings.pixel_sigma_px * 2**0.5
-    return sigma
+def _by_old_places(points: Float64, camera: RectifiedCamera) -> Float64:
+    """(N, 3, 3) how triangulated points move with the u, v and u_right that they were seen at, m per px."""
+    depth = points[:, 2]
+    along_ray = points * (depth / (camera.focal_px * camera.baseline_m))[:, None]
+    by_places = np.stack([-along_ray, np.zeros_like(points), along_ray], axis=2)
+    by_places[:, 0, 0] += depth / camera.focal_px
+    by_places[:, 1, 1] += depth / camera.focal_px
+    return by_places
 
 
 def _ransac(
@@ -212,7 +220,6 @@ def _ransac(
 
 def _refine(
     points: Float64,
-    depth_sigma: Float64,
     target: Float64,
     rotation: Float64,
     translation: Float64,
@@ -221,11 +228,13 @@ def _refine(
 ) -> _Step | Failed:
     """Gauss-Newton on u, v and u_right of the new pair, each residual whitened by its own covariance.
 
-    The old point's uncertainty lies along its ray; projected into the new pair it widens the residual's
-    covariance in that one direction. Huber's weights; outliers beyond 4 sigma leave.
+    The noise of the three places that the old point was triangulated from, most of it along its ray, is
+    projected into the new pair and widens the residual's covariance. Huber's weights; outliers beyond 5
+    sigma leave. The step's covariance is that of a small motion that follows it, in the new frame's axes.
     """
     focal, base = camera.focal_px, camera.focal_px * camera.baseline_m
     variance = settings.pixel_sigma_px**2
+    by_old_places = _by_old_places(points, camera)
     kept: Bool = np.ones(len(points), dtype=np.bool_)
     normal = np.eye(6)
     for _ in range(10):
@@ -246,9 +255,8 @@ def _refine(
         )
         by_turn = -by_point @ _cross(moved)
         jacobian = np.concatenate([by_turn, by_point], axis=2)
-        ray = points / points[:, 2:3] @ rotation.T
-        spread = np.einsum("nij,nj->ni", by_point, ray) * depth_sigma[:, None]
-        covariance = spread[:, :, None] * spread[:, None, :] + np.eye(3) * variance
+        spread = by_point @ rotation @ by_old_places
+        covariance = variance * (spread @ spread.transpose(0, 2, 1) + np.eye(3))
         information = np.linalg.inv(covariance)
         distance = np.sqrt(np.einsum("ni,nij,nj->n", residual, information, residual))
         kept = (distance < 5.0) & in_front
@@ -274,6 +282,16 @@ def _cross(vectors: Float64) -> Float64:
     zero = np.zeros_like(x)
     rows = [np.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return np.stack(rows, axis=1)
+
+
+def _carried(covariance: Float64, way: Float64) -> Float64:
+    """(6, 6) of a pose, rotation then translation in the reference's axes, for a point `way` (m) further on
+    that is fixed to it: what the attitude is off by swings the point.
+    """
+    further = np.eye(6)
+    further[3:, :3] = -_cross(way[None])[0]
+    result: Float64 = further @ covariance @ further.T
+    return result
 
 
 def _in_world(covariance: Float64, rotation: Float64) -> Float64:

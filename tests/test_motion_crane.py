@@ -1,0 +1,172 @@
+"""The crane's encoders: exact where the truth is a parabola, honest about noise, deaf to wild readings."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position
+from barsight.motion.settings import MotionSettings, make_estimator
+from barsight.motion.sway import sway_at, turned_angle
+from motion_recordings import MemoryRecording, ideal_rig
+
+START_NS = 1_700_000_000_603_500_001
+STD_M = 0.002
+WINDOW_NS = 350_000_000
+NOMINAL = np.diag([1.0, -1, -1])
+MOUNT = np.array([0.35, -0.2, -0.55])
+
+
+def place(time_s: np.ndarray) -> np.ndarray:
+    """A parabola in each axis, by time since START_NS."""
+    t = np.asarray(time_s)[..., None]
+    return np.array([1.0, 2, 8]) + t * [0.5, -0.1, 0.02] + t**2 * [-0.2, 0.1, 0.05]
+
+
+def readings(count: int = 40, noise: float = 0.0, rng: np.random.Generator | None = None) -> CraneSamples:
+    """Readings every 50 ms, with some jitter of the stamps."""
+    rng = rng or np.random.default_rng(0)
+    stamps = START_NS + np.arange(count) * 50_000_000 + rng.integers(-5_000_000, 5_000_000, count)
+    position = place((stamps - START_NS) / 1e9) + rng.normal(0, noise, (count, 3))
+    return CraneSamples(stamps, position, MOUNT, NOMINAL, STD_M)
+
+
+def test_a_parabola_is_met_exactly() -> None:
+    crane = readings()
+    for stamp in (START_NS + 500_000_007, START_NS + 1_234_567_891):
+        position, covariance = fit_position(crane, stamp, WINDOW_NS)
+        np.testing.assert_allclose(position, place((stamp - START_NS) / 1e9), atol=1e-10)
+        assert 0 < covariance[0, 0] < STD_M**2
+
+
+@pytest.mark.parametrize("count", [5, 8, 15])
+def test_the_covariance_is_right(count: int) -> None:
+    rng = np.random.default_rng(1)
+    truth = place(np.array(0.025 * count))
+    nees = []
+    for _ in range(400):
+        crane = readings(count, STD_M, rng)
+        position, covariance = fit_position(crane, START_NS + 25_000_000 * count, WINDOW_NS)
+        nees.append((position - truth) @ np.linalg.solve(covariance, position - truth) / 3)
+    # For five readings the line's bias (0.2 m/s^2 over 0.1 s) adds to the noise.
+    assert 0.8 < np.mean(nees) < (1.5 if count == 5 else 1.2)
+
+
+@pytest.mark.parametrize("size_m", [0.05, 1.0, 100.0])
+@pytest.mark.parametrize("wild", [[5], [4, 9]])
+def test_wild_readings_dont_pull(size_m: float, wild: list[int]) -> None:
+    rng = np.random.default_rng(2)
+    truth = place(np.array(0.35))
+    errors, sigmas = [], []
+    for _ in range(100):
+        crane = readings(15, STD_M, rng)
+        crane.position_m[wild, 0] += size_m
+        position, covariance = fit_position(crane, START_NS + 350_000_000, WINDOW_NS)
+        errors.append(position - truth)
+        sigmas.append(np.sqrt(covariance[0, 0]))
+    assert np.sqrt(np.mean(np.square(errors))) < 1.3 * np.mean(sigmas)
+    assert np.mean(sigmas) < 0.6 * STD_M
+
+
+def test_without_readings_around_it_a_frame_is_refused() -> None:
+    crane = readings(40)
+    stamps = crane.stamp_ns
+    gap = np.r_[0:10, 30:40]
+    holed = CraneSamples(stamps[gap], crane.position_m[gap], MOUNT, NOMINAL, STD_M)
+    none = CraneSamples(stamps[:0], crane.position_m[:0], MOUNT, NOMINAL, STD_M)
+    for samples, stamp in (
+        (crane, int(stamps[0]) - 1),
+        (crane, int(stamps[-1]) + 1),
+        (holed, START_NS + 1_000_000_000),
+        (none, START_NS),
+    ):
+        failed = fit_position(samples, stamp, WINDOW_NS)
+        assert isinstance(failed, Failed)
+        assert failed.code == "no-encoder"
+
+
+def recording(shift_ns: int = 0, **sensors: object) -> MemoryRecording:
+    return MemoryRecording(ideal_rig(shift_ns=shift_ns), **sensors)
+
+
+def test_the_trajectory_is_the_crane_points_plus_the_mount() -> None:
+    """Stamps are the cameras'; the encoders' clock is the IMU's, t_imu = t_cam + shift."""
+    stamps = tuple(START_NS + k * 400_000_000 for k in range(6))
+    crane = readings()
+    source = recording(30_000_000, stamps_ns=stamps, crane_samples=crane)
+    told = []
+    settings = CraneSettings(attitude_std_deg=0.2)
+    trajectory = CraneTrajectory(settings)(source, Rectifier(source.rig), lambda: told.append(1))
+    assert trajectory.reference == "yard"
+    assert trajectory.sensors == ("crane",)
+    assert [f.stamp_ns for f in trajectory.frames] == list(stamps[:5])
+    assert [f.stamp_ns for f in trajectory.refused] == [stamps[5]]
+    assert len(told) == 6
+    for frame in trajectory.frames:
+        pose = frame.reference_from_body
+        assert (pose.target, pose.source) == ("yard", "body")
+        expected = place((frame.stamp_ns + 30_000_000 - START_NS) / 1e9) + MOUNT
+        np.testing.assert_allclose(pose.translation, expected, atol=1e-9)
+        np.testing.assert_array_equal(pose.rotation, NOMINAL)
+        np.testing.assert_allclose(np.diag(frame.covariance)[:3], np.deg2rad(0.2) ** 2)
+
+
+def test_without_encoders_it_says_so() -> None:
+    with pytest.raises(MeasurementError, match="memory: no crane encoders; measure without them"):
+        CraneTrajectory(CraneSettings())(recording(), Rectifier(ideal_rig()), lambda: None)
+
+
+def swaying(bias: float) -> tuple[ImuSamples, np.ndarray]:
+    """20 s of a body that swings 0.3 degrees about its own axes, its gyro biased."""
+    time = np.arange(0, 20, 0.005)
+    angle = np.deg2rad(0.3) * np.column_stack([np.sin(2.4 * time), np.cos(1.7 * time), np.sin(3.1 * time)])
+    rate = np.gradient(angle, time, axis=0) + bias
+    stamps = START_NS + (time * 1e9).round().astype(np.int64)
+    return ImuSamples(stamps, rate, np.tile([0, 0, 9.81], (time.size, 1))), angle
+
+
+def test_the_gyro_measures_the_sway() -> None:
+    imu, truth = swaying(bias=0.002)
+    for index in (1600, 2000, 2400):
+        sway = sway_at(imu, turned_angle(imu), int(imu.stamp_ns[index]), 8.0)
+        np.testing.assert_allclose(sway, truth[index], atol=np.deg2rad(0.06))
+
+
+def test_the_sway_turns_the_attitude() -> None:
+    imu, truth = swaying(bias=0.001)
+    stamp = int(imu.stamp_ns[2000])
+    crane = readings(400)
+    source = recording(stamps_ns=(stamp,), crane_samples=crane, imu_samples=imu)
+    trajectory = CraneTrajectory(CraneSettings())(source, Rectifier(source.rig), lambda: None)
+    assert trajectory.sensors == ("crane", "imu")
+    expected = NOMINAL @ Rotation.from_rotvec(truth[2000]).as_matrix()
+    found = trajectory.frames[0].reference_from_body.rotation
+    assert Rotation.from_matrix(found.T @ expected).magnitude() < np.deg2rad(0.08)
+    assert Rotation.from_matrix(NOMINAL.T @ expected).magnitude() > np.deg2rad(0.2)
+
+
+def test_an_imu_that_doesnt_cover_the_frame() -> None:
+    imu, _ = swaying(bias=0.0)
+    late = int(imu.stamp_ns[-1]) + 1
+    failed = sway_at(imu, turned_angle(imu), late, 8.0)
+    assert isinstance(failed, Failed)
+    kept = np.abs(imu.stamp_ns - imu.stamp_ns[2000]) > 150_000_000
+    holed = ImuSamples(imu.stamp_ns[kept], imu.gyro_radps[kept], imu.accel_mps2[kept])
+    failed = sway_at(holed, turned_angle(holed), int(imu.stamp_ns[2000]), 8.0)
+    assert isinstance(failed, Failed)
+    assert "gap" in failed.reason
+    crane = readings(40)
+    source = recording(stamps_ns=(START_NS + 900_000_000,), crane_samples=crane, imu_samples=holed)
+    source.imu_samples = ImuSamples(imu.stamp_ns + 10**12, imu.gyro_radps, imu.accel_mps2)
+    trajectory = CraneTrajectory(CraneSettings())(source, Rectifier(source.rig), lambda: None)
+    assert trajectory.sensors == ("crane",)
+    assert trajectory.warnings == ("the IMU doesn't cover 1 frames: nominal attitude",)
+
+
+def test_settings() -> None:
+    assert isinstance(make_estimator(MotionSettings(), has_crane=True), CraneTrajectory)
+    for setting in ({"window_s": 0.0}, {"attitude_std_deg": -1.0}):
+        with pytest.raises(ConfigError, match=next(iter(setting))):
+            CraneSettings(**setting)
