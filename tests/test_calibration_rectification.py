@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig import StereoRig
+from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import StereoFrame
 
@@ -148,8 +149,8 @@ def test_an_equidistant_lens_of_zeros_is_rectified() -> None:
 def test_an_image_of_another_size_is_refused() -> None:
     good, small = np.zeros((480, 640), np.uint8), np.zeros((48, 64), np.uint8)
     rectifier = Rectifier(rig())
-    with pytest.raises(ValueError, match="the right image is 64x48, the calibration is for 640x480"):
-        rectifier(StereoFrame(1, good, small))
+    refused = rectifier(StereoFrame(1, good, small))
+    assert refused == Failed("wrong-size", "the right image is 64x48, the calibration is for 640x480")
 
 
 @pytest.mark.parametrize(

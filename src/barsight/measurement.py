@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
@@ -72,3 +76,19 @@ class Measurement:
     seconds: float
     peak_memory_mib: float
     preview: Preview | None
+
+
+def plain(value: Any) -> Any:
+    """Settings and calibrations as JSON knows them."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return str(value) if isinstance(value, Path) else value
+
+
+def digest(value: Any) -> str:
+    """SHA-256 of a value that JSON knows, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

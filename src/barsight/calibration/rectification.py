@@ -14,6 +14,7 @@ import numpy as np
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.rig import StereoRig
 from barsight.core.arrays import Bool, Float32, Float64, UInt8
+from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera, RectifiedPair, StereoFrame
 
@@ -66,16 +67,17 @@ class Rectifier:
         self._warps = (left, right)
         self._left_valid, self._right_valid = left.valid, right.valid
 
-    def __call__(self, frame: StereoFrame) -> RectifiedPair:
-        """Raises ValueError where the images don't have the calibration's size."""
+    def __call__(self, frame: StereoFrame) -> RectifiedPair | Failed:
+        """The rectified pair; Failed `wrong-size` where the images don't have the calibration's size."""
         for name, image, size in (
             ("left", frame.left, self._size),
             ("right", frame.right, self._right_size),
         ):
             if image.shape != size:
-                raise ValueError(
+                return Failed(
+                    "wrong-size",
                     f"the {name} image is {image.shape[1]}x{image.shape[0]}, "
-                    f"the calibration is for {size[1]}x{size[0]}"
+                    f"the calibration is for {size[1]}x{size[0]}",
                 )
         left, right = frame.left, frame.right
         if self._warps is not None:

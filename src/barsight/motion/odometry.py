@@ -98,7 +98,8 @@ class StereoOdometry:
             if isinstance(frame, RefusedFrame):
                 refused.append(frame)
                 continue
-            view = self._look(rectifier(frame))
+            pair = rectifier(frame)
+            view = pair if isinstance(pair, Failed) else self._look(pair)
             if isinstance(view, Failed):
                 refused.append(RefusedFrame(frame.stamp_ns, view.reason))
                 continue

@@ -1,0 +1,69 @@
+"""The first look at a recording: can it be matched at all, and how fine can its map be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.errors import Failed, InputError, MeasurementError
+from barsight.core.types import DisparityRange, RefusedFrame
+from barsight.recording.base import Recording
+from barsight.stereo.disparity_range import find_range
+
+CELL_SIDES_M = (0.01, 0.02, 0.05, 0.1, 0.2)
+_MOST_POINTS_PER_PIXEL = 4
+
+
+@dataclass(frozen=True, eq=False)
+class FirstLook:
+    """The first usable pair's disparity range and the size of its pixels on the surface (median, m)."""
+
+    candidates: DisparityRange
+    pixel_on_surface_m: float
+
+
+def first_look(source: Recording, rectifier: Rectifier) -> FirstLook:
+    """Look for the first frame that can be matched.
+
+    Raises InputError where left and right are swapped, MeasurementError where no frame can be used.
+    """
+    reasons: list[str] = []
+    swapped = 0
+    for frame in source.frames():
+        if isinstance(frame, RefusedFrame):
+            reasons.append(frame.reason)
+            continue
+        pair = rectifier(frame)
+        found = pair if isinstance(pair, Failed) else find_range(pair)
+        if isinstance(found, DisparityRange):
+            camera = rectifier.camera
+            middle = (found.lowest_px + found.highest_px) / 2 + camera.doffs_px
+            return FirstLook(found, camera.baseline_m / max(middle, 1.0))
+        reasons.append(found.reason)
+        swapped += found.code == "swapped"
+        if swapped >= 2:
+            break
+    if swapped:
+        raise InputError(
+            source.path, reasons[-1], "exchange the folders or topics of cam0 (left) and cam1 (right)"
+        )
+    if not reasons:
+        raise InputError(source.path, "no stereo pair at all", "check the cameras' time stamps")
+    raise MeasurementError(
+        f"{source.path}: none of the {len(reasons)} frames can be used; first: {reasons[0]}"
+    )
+
+
+def choose_cell(first: FirstLook, *, has_crane: bool) -> float:
+    """10 mm in the yard; elsewhere the first round size that holds one and a half pixels."""
+    if has_crane:
+        return CELL_SIDES_M[0]
+    wanted = 1.5 * first.pixel_on_surface_m
+    return next((side for side in CELL_SIDES_M if side >= wanted), CELL_SIDES_M[-1])
+
+
+def points_per_pixel(first: FirstLook, cell_m: float) -> int:
+    """Points along each axis of a pixel so that no cell between two pixels stays empty."""
+    wanted = math.ceil(first.pixel_on_surface_m / (0.9 * cell_m))
+    return min(max(1, wanted), _MOST_POINTS_PER_PIXEL)

@@ -1,0 +1,86 @@
+"""One frame's way: rectified pair, disparity, points, and what they say of the map's cells."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float32, UInt8
+from barsight.core.errors import Failed
+from barsight.core.timing import Stopwatch
+from barsight.core.types import DisparityRange, PosedFrame, RectifiedPair, StereoFrame
+from barsight.mapping.observation import CellObservations, observe
+from barsight.stereo.disparity_range import find_range
+from barsight.stereo.gaps import without_gaps
+from barsight.stereo.method import StereoMethod
+from barsight.stereo.points import triangulate
+from barsight.stereo.settings import StereoSettings
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """cells: what the frame says of the map. left, disparity_px: (H, W), for people to look at."""
+
+    cells: CellObservations
+    left: UInt8
+    disparity_px: Float32
+
+
+@dataclass(frozen=True, eq=False)
+class Viewer:
+    """From a frame and its pose to a `View`: without state, so that frames run side by side.
+
+    turn: held while matching, where the method uses all cores itself. per_pixel, max_sigma_m: see
+    `triangulate`.
+    """
+
+    stereo: StereoSettings
+    method: StereoMethod
+    turn: AbstractContextManager[object]
+    rectifier: Rectifier
+    cell_m: float
+    per_pixel: int
+    max_sigma_m: float
+    watch: Stopwatch
+
+    def __call__(self, frame: StereoFrame, posed: PosedFrame) -> View | Failed:
+        """Failed where the images have the wrong size, are swapped or have no texture."""
+        with self.watch("rectify", 1):
+            pair = self.rectifier(frame)
+        if isinstance(pair, Failed):
+            return pair
+        candidates = disparity_range(pair, self.stereo)
+        if isinstance(candidates, Failed):
+            return candidates
+        with self.turn, self.watch("stereo", 1):
+            matched = self.method(pair, candidates)
+            disparity = without_gaps(matched, pair.left, self.stereo.gap_darkness)
+        with self.watch("points", 1):
+            points = triangulate(
+                pair,
+                disparity,
+                self.stereo.calibration_sigma_px,
+                self.stereo.max_depth_m,
+                self.max_sigma_m,
+                self.per_pixel,
+            )
+            body = posed.reference_from_body
+            reference_from_rect0 = body @ self.rectifier.body_from_rect0
+            cells = observe(points, reference_from_rect0, body.translation, posed.covariance, self.cell_m)
+        return View(cells, pair.left, disparity.disparity_px)
+
+
+def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:
+    """The settings' range, its open ends found from the images."""
+    low, high = stereo.lowest_disparity_px, stereo.highest_disparity_px
+    if low is not None and high is not None:
+        return DisparityRange(low, high)
+    found = find_range(pair)
+    if isinstance(found, Failed):
+        return found
+    low = found.lowest_px if low is None else low
+    high = found.highest_px if high is None else high
+    if high <= low:
+        return Failed("empty-range", f"the disparity range {low}:{high} is empty")
+    return DisparityRange(low, high)
