@@ -87,6 +87,7 @@ class Surface:
 
 def finish(store: TileStore, folder: Path, cell_m: float, min_views: int, settings: MapSettings) -> Surface:
     """Elect each tile's surface, fill narrow gaps across tile borders, and write the tiles into `folder`."""
+    _read_tile.cache_clear()
     keys = store.keys()
     seen = 0
     for key in keys:

@@ -1,0 +1,141 @@
+"""The finished surface: windows over tile borders, filled gaps, the cloud."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.core.types import Source
+from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface import Layers, fill_gaps
+from mapping_views import block, fused, view
+
+
+def height_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A height that tells every cell from its neighbours."""
+    return 1 + 0.001 * (x % 50) + 0.0001 * (y % 40)
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "columns", "rows"),
+    [(-300, -280, 620, 600), (-10, -10, 20, 20), (250, 250, 12, 12), (-256, 0, 256, 1), (100, 100, 1, 1)],
+)
+def test_windows_over_tile_borders(tmp_path: Path, column: int, row: int, columns: int, rows: int) -> None:
+    x, y = block(560, 540, -280, -270)
+    surface = fused([view(x, y, height_at(x, y))], tmp_path)
+    assert (surface.columns, surface.rows, surface.shape) == ((-280, 280), (-270, 270), (540, 560))
+    assert surface.seen == x.size
+    layers = surface.window(column, row, columns, rows)
+    x, y = block(columns, rows, column, row)
+    inside = (x >= -280) & (x < 280) & (y >= -270) & (y < 270)
+    np.testing.assert_allclose(layers.z_m[inside], height_at(x, y)[inside], atol=1e-6)
+    assert np.isnan(layers.z_m[~inside]).all()
+    np.testing.assert_array_equal(layers.source, np.where(inside, Source.VISION, Source.UNKNOWN))
+    np.testing.assert_array_equal(layers.views, inside)
+
+
+def test_a_folder_used_again_shows_the_new_surface(tmp_path: Path) -> None:
+    x, y = block(5, 5)
+    first = fused([view(x, y, 1.0)], tmp_path)
+    assert first.window(0, 0, 1, 1).z_m[0, 0] == 1
+    assert fused([view(x, y, 2.0)], tmp_path).window(0, 0, 1, 1).z_m[0, 0] == 2
+
+
+def layers_of(z: np.ndarray, sigma: float = 0.01) -> Layers:
+    """NaN is unknown, all else seen."""
+    seen = np.isfinite(z)
+    return Layers(
+        z.astype(np.float32),
+        np.where(seen, sigma, np.nan).astype(np.float32),
+        seen.astype(np.float32),
+        np.where(seen, Source.VISION, Source.UNKNOWN).astype(np.uint8),
+    )
+
+
+def filled_slowly(z: np.ndarray, sigma: float, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Each unknown cell looks both ways along x and y; the narrower gap wins, that along x where both tie."""
+    height, spread = np.full(z.shape, np.nan), np.full(z.shape, np.nan)
+    for i, j in zip(*np.nonzero(np.isnan(z)), strict=True):
+        best = None
+        for di, dj in ((0, 1), (1, 0)):
+            ends = []
+            for way in (-1, 1):
+                for k in range(1, reach + 1):
+                    a, b = i + way * k * di, j + way * k * dj
+                    if not (0 <= a < z.shape[0] and 0 <= b < z.shape[1]):
+                        break
+                    if np.isfinite(z[a, b]):
+                        ends.append((k, z[a, b]))
+                        break
+            if len(ends) == 2 and (best is None or ends[0][0] + ends[1][0] < best[0][0] + best[1][0]):
+                best = ends
+        if best:
+            (near, before), (far, after) = best
+            height[i, j] = before + (after - before) * near / (near + far)
+            spread[i, j] = np.hypot(sigma, abs(after - before) / 2)
+    return height, spread
+
+
+@pytest.mark.parametrize("reach", [1, 3])
+def test_gaps_are_filled_between_two_seen_cells_only(reach: int) -> None:
+    rng = np.random.default_rng(reach)
+    z = np.where(rng.random((40, 50)) < 0.45, rng.uniform(0, 1, (40, 50)).astype(np.float32), np.nan)
+    layers = layers_of(z)
+    fill_gaps(layers, reach)
+    height, spread = filled_slowly(z, 0.01, reach)
+    filled = layers.source == Source.FILLED
+    np.testing.assert_array_equal(filled, np.isfinite(height))
+    assert 100 < filled.sum() < np.isnan(z).sum()
+    np.testing.assert_allclose(layers.z_m[filled], height[filled], atol=1e-6)
+    np.testing.assert_allclose(layers.sigma_m[filled], spread[filled], atol=1e-6)
+    seen = np.isfinite(z)
+    np.testing.assert_array_equal(layers.z_m[seen], z[seen].astype(np.float32))
+    assert (layers.source[seen] == Source.VISION).all()
+    unknown = ~seen & ~filled
+    assert np.isnan(layers.z_m[unknown]).all()
+    assert (layers.source[unknown] == Source.UNKNOWN).all()
+    assert (layers.views[~seen] == 0).all()
+
+
+def test_nothing_is_extrapolated() -> None:
+    z = np.full((9, 9), np.nan)
+    z[3:6, 3:6] = 1.0
+    layers = layers_of(z)
+    fill_gaps(layers, 3)
+    np.testing.assert_array_equal(layers.source == Source.VISION, np.isfinite(z))
+    assert (layers.source != Source.FILLED).all()
+
+
+def test_gaps_are_filled_across_tile_borders(tmp_path: Path) -> None:
+    """A gap of 3 cells at the border of two tiles, and one of 7, which is too wide for 30 mm."""
+    x, y = block(60, 10, 226, 0)
+    gap = ((x >= 255) & (x < 258)) | ((x >= 270) & (x < 277))
+    surface = fused(
+        [view(x[~gap], y[~gap], 1 + 0.01 * x[~gap])], tmp_path, MapSettings(min_views=1, fill_m=0.03)
+    )
+    layers = surface.window(226, 0, 60, 10)
+    narrow = (x >= 255) & (x < 258)
+    assert (layers.source[narrow] == Source.FILLED).all()
+    np.testing.assert_allclose(layers.z_m[narrow], 1 + 0.01 * x[narrow], atol=1e-5)
+    assert (layers.sigma_m[narrow] > 0.019).all()
+    wide = (x >= 270) & (x < 277)
+    assert (layers.source[wide] == Source.UNKNOWN).all()
+    assert (surface.seen, surface.filled) == ((~gap).sum(), narrow.sum())
+    unfilled = fused([view(x[~gap], y[~gap], 1.0)], tmp_path / "b", MapSettings(min_views=1, fill_m=0.0))
+    assert unfilled.filled == 0
+
+
+def test_the_cloud_holds_every_supported_height(tmp_path: Path) -> None:
+    """A floor under an overhang, both seen twice, and a single wrong height."""
+    x, y = block(3, 2, -2, 255)
+    views = [view(x, y, z) for z in (0.0, 0.0, 1.0, 1.0, 3.0)]
+    surface = fused(views, tmp_path, MapSettings(min_views=2), cell_m=0.02)
+    parts = list(surface.cloud())
+    xyz = np.concatenate([part.xyz_m for part in parts])
+    expected = [(0.02 * a, 0.02 * b, z) for z in (0, 1) for a, b in zip(x.ravel(), y.ravel(), strict=True)]
+    order = np.lexsort(xyz.round(4).T[[1, 0, 2]])
+    np.testing.assert_allclose(xyz[order], expected, atol=1e-6)
+    assert all((part.views == 2).all() and (part.intensity == 100).all() for part in parts)
+    sigma = np.concatenate([part.sigma_z_m for part in parts])
+    np.testing.assert_allclose(sigma, np.sqrt(0.01**2 / 2 * 4 / 5), rtol=1e-3)
+    np.testing.assert_allclose(surface.window(-2, 255, 3, 2).z_m, 1)
