@@ -18,6 +18,7 @@ COMMANDS = {
     "view": "Show a measured yard in 3D in the browser",
     "info": "Say what is in a recording: sensors, rates, gaps, calibration",
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
+    "disparity": "Match one pair of pictures",
     "simulate": "Render a recording of a bar yard with exact truth",
     "score": "Compare a measured yard with the truth of its recording",
     "report": "Write report.html anew from a measured yard's files",
@@ -65,7 +66,7 @@ def _refuse(line: str, code: int) -> int:
 
 
 def _print_help() -> None:
-    lines = "\n".join(f"  {name:<10}{summary}" for name, summary in COMMANDS.items())
+    lines = "\n".join(f"  {name:<11}{summary}" for name, summary in COMMANDS.items())
     sys.stdout.write(
         f"barsight {barsight.__version__}: measure a yard of steel bars from a travelling crane\n\n"
         f"usage: barsight COMMAND ...\n\ncommands:\n{lines}\n\n"

@@ -1,0 +1,139 @@
+"""`barsight disparity LEFT RIGHT -o FILE`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from barsight.calibration.euroc import read_rig
+from barsight.calibration.kalibr import read_camchain
+from barsight.calibration.rectification import Rectifier
+from barsight.cli.arguments import call
+from barsight.core.arrays import UInt8
+from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, OutputError
+from barsight.core.types import Disparity, DisparityRange, RectifiedCamera, RectifiedPair, StereoFrame
+from barsight.mapping.view import disparity_range
+from barsight.measurement import Preview
+from barsight.recording.images import TornImageError, decode_gray
+from barsight.report.files import write_preview
+from barsight.stereo.disparity_files import write_disparity
+from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
+from barsight.stereo.settings import StereoSettings, make_method
+
+SUFFIXES = (".pfm", ".png", ".tif", ".tiff")
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and match."""
+
+    def command(
+        left: tyro.conf.Positional[Path],
+        right: tyro.conf.Positional[Path],
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        rig: Path | None = None,
+        range: str | None = None,
+        preview: Path | None = None,
+        settings: Annotated[StereoSettings, tyro.conf.arg(name="")] = StereoSettings(),  # noqa: B008
+    ) -> None:
+        """Match one pair: the left picture's disparity, in pixels, with a sigma per pixel in a .tif.
+
+        Args:
+            left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to grey.
+            right: The right picture.
+            out: The file to write: .pfm, .png (16 bits, disparity times 256) or .tif (disparity and sigma).
+            rig: Kalibr camchain or folder of an EuRoC recording: the pictures are raw and get rectified.
+            range: Candidates A:B in px; found from the pictures when not given.
+            preview: PNG to write with the left picture beside the disparity in colours.
+            settings: The method and its settings.
+        """
+        console = Console(stderr=True)
+        if out.suffix.lower() not in SUFFIXES:
+            raise OutputError(f"{out}: disparities are written as {', '.join(SUFFIXES)}")
+        if range is not None:
+            low, high = _parsed_range(range)
+            settings = replace(settings, lowest_disparity_px=low, highest_disparity_px=high)
+        pair = _pair(left, right, rig)
+        candidates = disparity_range(pair, settings)
+        if isinstance(candidates, Failed) and candidates.code != "no-texture":
+            raise InputError(left, candidates.reason, "exchange the two pictures or give --range A:B")
+        if isinstance(candidates, Failed):
+            console.print(f"[yellow]{candidates.reason}[/yellow]", soft_wrap=True)
+            unknown = np.full(pair.left.shape, np.nan, np.float32)
+            disparity = Disparity(unknown, unknown.copy())
+        else:
+            _expect_inside(candidates, pair)
+            disparity = make_method(settings)(pair, candidates)
+        write_disparity(out, disparity)
+        if preview is not None:
+            write_preview(Preview(pair.left, disparity.disparity_px), preview)
+        console.print(_summary(out, disparity), soft_wrap=True, highlight=False)
+
+    call(command, "disparity", arguments)
+
+
+def _summary(out: Path, disparity: Disparity) -> str:
+    found = disparity.disparity_px[np.isfinite(disparity.disparity_px)]
+    if found.size == 0:
+        return f"[yellow]{escape(str(out))}: no pixel has a match[/yellow]"
+    return (
+        f"{escape(str(out))}: {100 * disparity.coverage:.1f} % of the pixels, {found.min():.2f} to "
+        f"{found.max():.2f} px, median sigma {np.nanmedian(disparity.sigma_px):.3f} px"
+    )
+
+
+def _pair(left: Path, right: Path, rig: Path | None) -> RectifiedPair:
+    """The rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
+    frame = StereoFrame(0, _read(left), _read(right))
+    if rig is not None:
+        read = read_rig(rig / "mav0" if (rig / "mav0").is_dir() else rig) if rig.is_dir() else None
+        pair = Rectifier(read or read_camchain(rig).rig)(frame)
+        if isinstance(pair, Failed):
+            raise CalibrationError(rig, pair.reason, "give the rig of these pictures")
+    else:
+        if frame.left.shape != frame.right.shape:
+            sizes = " and ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (frame.left, frame.right))
+            raise InputError(right, f"the pictures' sizes differ ({sizes})", "give two pictures of one pair")
+        height, width = frame.left.shape
+        whole = np.ones((height, width), np.bool_)
+        camera = RectifiedCamera(float(width), (width - 1) / 2, (height - 1) / 2, 1.0, 0.0, width, height)
+        pair = RectifiedPair(0, frame.left, frame.right, whole, whole, camera)
+    offset = vertical_offset(pair.left, pair.right)
+    if not isinstance(offset, Failed) and offset > MOST_OFFSET_PX:
+        remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their --rig"
+        raise InputError(
+            left, f"the pair is not rectified: matches lie {offset:.1f} px off their rows", remedy
+        )
+    return pair
+
+
+def _read(path: Path) -> UInt8:
+    try:
+        return decode_gray(path.read_bytes())
+    except OSError as error:
+        raise InputError(path, f"can't be read ({error.strerror})", "check the name") from error
+    except TornImageError as error:
+        raise InputError(path, str(error), "give another picture") from error
+
+
+def _parsed_range(text: str) -> tuple[int, int]:
+    try:
+        low, high = (int(part) for part in text.split(":"))
+    except ValueError as error:
+        raise ConfigError(f"--range takes A:B in whole pixels, not {text!r}") from error
+    return low, high
+
+
+def _expect_inside(candidates: DisparityRange, pair: RectifiedPair) -> None:
+    """Raises ConfigError where no candidate, or more than the picture's width of them, can be."""
+    width = pair.camera.width
+    if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
+        raise ConfigError(
+            f"the range {candidates.lowest_px}:{candidates.highest_px} doesn't fit a picture {width} px wide"
+        )

@@ -1,0 +1,83 @@
+"""`barsight disparity`: one pair in, one file out, mistakes in one line."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barsight.cli.main import run
+from barsight.stereo.disparity_files import read_disparity
+
+SHIFT_PX = 12
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> tuple[Path, Path]:
+    """A textured wall 12 px away."""
+    noise = np.random.default_rng(5).integers(0, 255, (150, 260 + SHIFT_PX)).astype(np.uint8)
+    wall = cv2.GaussianBlur(noise, (0, 0), 1.2)
+    left, right = tmp_path / "left [bold].png", tmp_path / "right.png"
+    cv2.imwrite(str(left), wall[:, :-SHIFT_PX])
+    cv2.imwrite(str(right), wall[:, SHIFT_PX:])
+    return left, right
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str], *words: str) -> None:
+    assert run(["disparity", *arguments]) in (2, 3, 4)
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize("name", ["d.pfm", "d.png", "d.tif"])
+def test_a_wall_has_one_disparity(pair: tuple[Path, Path], tmp_path: Path, name: str) -> None:
+    out = tmp_path / name
+    preview = tmp_path / "preview.png"
+    assert run(["disparity", *map(str, pair), "-o", str(out), "--preview", str(preview)]) == 0
+    found = read_disparity(out).disparity_px
+    known = np.isfinite(found)
+    assert known[:, SHIFT_PX + 8 :].mean() > 0.95
+    assert abs(np.median(found[known]) - SHIFT_PX) < 0.05
+    assert cv2.imread(str(preview)).shape == (150, 520, 3)
+
+
+def test_colour_and_16_bits_are_turned_to_grey(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    left, right = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pair)
+    colour, deep = tmp_path / "colour.png", tmp_path / "deep.png"
+    cv2.imwrite(str(colour), cv2.cvtColor(left, cv2.COLOR_GRAY2BGR))
+    cv2.imwrite(str(deep), right.astype(np.uint16) * 257)
+    plain, mixed = tmp_path / "plain.pfm", tmp_path / "mixed.pfm"
+    assert run(["disparity", *map(str, pair), "-o", str(plain)]) == 0
+    assert run(["disparity", str(colour), str(deep), "-o", str(mixed)]) == 0
+    assert plain.read_bytes() == mixed.read_bytes()
+
+
+def test_a_black_pair_has_no_match(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    black = tmp_path / "black.png"
+    cv2.imwrite(str(black), np.zeros((120, 160), np.uint8))
+    out = tmp_path / "d.tif"
+    assert run(["disparity", str(black), str(black), "-o", str(out)]) == 0
+    assert "no pixel has a match" in capsys.readouterr().err
+    assert np.isnan(read_disparity(out).disparity_px).all()
+
+
+def test_what_is_refused(pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left, right = map(str, pair)
+    out = ["-o", str(tmp_path / "d.pfm")]
+    smaller, lower, torn = tmp_path / "small.png", tmp_path / "low.png", tmp_path / "torn.png"
+    picture = cv2.imread(right, cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(smaller), picture[:-10])
+    cv2.imwrite(str(lower), np.roll(picture, 4, axis=0))
+    torn.write_bytes(pair[1].read_bytes()[:500])
+    refused([left, str(smaller), *out], capsys, "260x150 and 260x140")
+    refused([left, str(lower), *out], capsys, "not rectified", "4.")
+    refused([left, str(torn), *out], capsys, "torn.png")
+    refused([left, str(tmp_path / "none.png"), *out], capsys, "none.png")
+    refused([right, left, *out], capsys, "swapped", "exchange")
+    refused([left, right, *out, "--range", "30:30"], capsys, "30:30", "empty")
+    refused([left, right, *out, "--range", "0:900"], capsys, "0:900", "260 px wide")
+    refused([left, right, *out, "--range", "many"], capsys, "many")
+    refused([left, right, "-o", str(tmp_path / "d.jpg")], capsys, "d.jpg", ".pfm")
+    assert not any(tmp_path.glob("d.*"))
