@@ -133,7 +133,7 @@ def test_the_cloud_holds_every_supported_height(tmp_path: Path) -> None:
     parts = list(surface.cloud())
     xyz = np.concatenate([part.xyz_m for part in parts])
     expected = [(0.02 * a, 0.02 * b, z) for z in (0, 1) for a, b in zip(x.ravel(), y.ravel(), strict=True)]
-    order = np.lexsort(xyz.round(4).T[[1, 0, 2]])
+    order = np.lexsort(xyz.round(4).T)
     np.testing.assert_allclose(xyz[order], expected, atol=1e-6)
     assert all((part.views == 2).all() and (part.intensity == 100).all() for part in parts)
     sigma = np.concatenate([part.sigma_z_m for part in parts])

@@ -22,9 +22,9 @@ def difference(contour: Contour, laser: LaserProfile) -> Float64:
     share = np.clip(place - before, 0, 1)
     inside = (before >= 0) & (before < measured.size)
     k = before.clip(0, measured.size - 1)
-    following = (k + 1).clip(0, measured.size - 1)
+    following = np.append(measured[1:], np.nan)
     on_sample = share < 2e-3
-    z = np.where(on_sample, measured[k], measured[k] * (1 - share) + measured[following] * share)
+    z = np.where(on_sample, measured[k], measured[k] * (1 - share) + following[k] * share)
     return np.where(inside, z, np.nan) - laser.z_m
 
 

@@ -21,8 +21,9 @@ Figures = dict[str, float]
 def score(recording: Path, out: Path) -> dict[str, Figures]:
     """Contours and heights in mm against `truth/height.npz` of the recording.
 
-    `smooth` places have no step over 30 mm within 20 mm; `seen by two` are those that at least two frames see
-    in both cameras. coverage is the share of those that vision claims; within_95 the share of smooth errors
+    `smooth` places have no step over 30 mm within two samples, in the height map along x and along y;
+    `seen by two` are those that at least two frames see in both cameras. coverage is the share of those that
+    vision claims; within_95 the share of smooth errors
     inside 1.96 stated sigma. Raises InputError where either side has no such file.
     """
     truth_file = recording / "truth" / "height.npz"
@@ -78,7 +79,7 @@ def _score_height(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
     seen = inside & (source[row, column] == Source.VISION)
     error = np.where(seen, z[row, column] - z_true, np.nan)
     spread = np.where(seen, sigma[row, column], np.nan)
-    level = smooth_places(z_true) & smooth_places(z_true.T, reach=1).T
+    level = smooth_places(z_true) & smooth_places(z_true.T).T
     visible = truth["visible"] >= 2
     stack = level & (z_true > 0.2)
     return {

@@ -1,0 +1,84 @@
+"""Agreement with a laser profile, against a calculation by hand."""
+
+import numpy as np
+import pytest
+
+from barsight.core.errors import Failed
+from barsight.core.types import Agreement, Contour, LaserProfile, Source
+from barsight.evaluation.agreement import agree, difference, smooth_places
+
+X = np.round(5 + 0.01 * np.arange(8), 4)
+
+
+def contour(z: list[float], source: list[int] | None = None, shift: float = 0.0) -> Contour:
+    heights = np.array(z)
+    codes = np.where(np.isfinite(heights), Source.VISION, Source.UNKNOWN) if source is None else source
+    x = X[: heights.size] + shift
+    return Contour(2, x, x * 0 + 0.7, heights, heights * 0 + 0.01, np.array(codes, dtype=np.uint8))
+
+
+def laser(z: list[float], shift: float = 0.0) -> LaserProfile:
+    heights = np.array(z)
+    x = X[: heights.size] + shift
+    return LaserProfile(2, x, x * 0 + 0.7, heights, 0.001)
+
+
+def test_the_figures_by_hand() -> None:
+    """Differences of 1, -2, 3 and 6 mm; two of six laser points have no vision (unknown, filled)."""
+    seen = contour(
+        [1.001, 0.998, np.nan, 1.003, 1.5, 1.106],
+        [Source.VISION, Source.VISION, Source.UNKNOWN, Source.VISION, Source.FILLED, Source.VISION],
+    )
+    figures = agree(seen, laser([1.0, 1.0, 1.0, 1.0, 1.0, 1.1]))
+    assert isinstance(figures, Agreement)
+    assert (figures.profile, figures.y_m, figures.samples) == (2, 0.7, 4)
+    assert figures.coverage_pct == pytest.approx(100 * 4 / 6)
+    assert figures.bias_mm == pytest.approx(2.0)
+    assert figures.mae_mm == pytest.approx(3.0)
+    assert figures.median_mm == pytest.approx(2.5)
+    assert figures.rmse_mm == pytest.approx(np.sqrt((1 + 4 + 9 + 36) / 4))
+    assert figures.max_mm == pytest.approx(6.0)
+    assert figures.p95_mm == pytest.approx(3 + 3 * 0.85)
+    spread = np.sqrt((1 + 16 + 1 + 16) / 3)
+    assert figures.loa_low_mm == pytest.approx(2 - 1.96 * spread)
+    assert figures.loa_high_mm == pytest.approx(2 + 1.96 * spread)
+    # The step to 1.1 m stands at the last laser point: the two before it and it itself aren't smooth.
+    assert figures.smooth_mae_mm == pytest.approx(1.5)
+
+
+def test_vision_is_interpolated_to_the_lasers_places() -> None:
+    seen = contour([1.0, 1.1, 1.2, np.nan, 1.4, 1.5])
+    between = difference(seen, laser([1.0] * 6, shift=0.0025))
+    np.testing.assert_allclose(between, [0.025, 0.125, np.nan, np.nan, 0.425, np.nan], atol=1e-9)
+    before = difference(seen, laser([1.0] * 6, shift=-0.0025))
+    np.testing.assert_allclose(before, [np.nan, 0.075, 0.175, np.nan, np.nan, 0.475], atol=1e-9)
+
+
+@pytest.mark.parametrize("shift", [1e-7, -1e-7])
+def test_samples_on_the_lasers_grid_need_no_neighbours(shift: float) -> None:
+    """Beside a gap a sample still counts where both grids agree but for rounding."""
+    seen = contour([1.0, np.nan, 1.2, np.nan, 1.4], shift=shift)
+    np.testing.assert_allclose(difference(seen, laser([1.0] * 5)), [0, np.nan, 0.2, np.nan, 0.4], atol=1e-4)
+
+
+def test_without_overlap_it_fails() -> None:
+    one = contour([1.0, np.nan, np.nan])
+    for seen in (
+        one,
+        contour([]),
+        contour([1.0, 1.0, 1.0], shift=7.0),
+        contour([1.0] * 3, [Source.FILLED] * 3),
+    ):
+        failed = agree(seen, laser([1.0, 1.0, 1.0]))
+        assert isinstance(failed, Failed)
+        assert failed.code == "no-overlap"
+        assert "profile 2" in failed.reason
+        assert "of 3 laser points" in failed.reason
+
+
+def test_smooth_places() -> None:
+    step = np.array([0, 0, 0, 0, 0.031, 0.031, 0.031, 0.031])
+    np.testing.assert_array_equal(smooth_places(step), [True, True, *[False] * 4, True, True])
+    slope = smooth_places(np.array([0, 0.02, 0.04, 0.04, 0.04]))
+    np.testing.assert_array_equal(slope, [False, True, False, True, True])
+    assert smooth_places(np.array([0, 0.029, 0, 0.029])).all()

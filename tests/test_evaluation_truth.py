@@ -1,0 +1,126 @@
+"""Scores against a fabricated truth: zero for an exact map, the right figures for known errors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.core.errors import InputError
+from barsight.core.types import Contour, Source
+from barsight.evaluation.truth import score
+from barsight.mapping.settings import MapSettings
+from barsight.report.files import write_contours, write_height
+from mapping_views import block, fused, view
+
+X = np.round(1 + 0.01 * np.arange(120), 4)
+Y = np.round(-0.4 + 0.02 * np.arange(40), 4)
+
+
+def heights(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A floor, a stack with a round top, a step along x at 1.6 m and one along y at 0 m."""
+    stack = 0.8 + 0.1 * np.sin(9 * x) + 0.02 * y
+    return np.where(x < 1.6, stack, np.where(y < 0, 0.02, 0.5 + 0.05 * y))
+
+
+TRUTH = heights(X[:, None], Y[None, :])
+
+
+def smooth(z: np.ndarray, axis: int) -> np.ndarray:
+    """No step over 30 mm to a neighbour at most two samples away: point by point, along one axis."""
+    z = np.moveaxis(z, axis, -1)
+    result = np.ones(z.shape, dtype=np.bool_)
+    for i in range(z.shape[-1]):
+        for j in range(max(i - 2, 0), min(i + 3, z.shape[-1])):
+            result[..., i] &= np.abs(z[..., i] - z[..., j]) <= 0.03
+    return np.moveaxis(result, -1, axis)
+
+
+SMOOTH = smooth(TRUTH, 0) & smooth(TRUTH, 1)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Cells of the last 20 columns and the profile's first 10 places are seen by one frame only."""
+    visible = np.where(np.arange(120)[:, None] < 100, 3, 1) * np.ones(40, dtype=int)
+    (tmp_path / "truth").mkdir()
+    np.savez(
+        tmp_path / "truth" / "height.npz",
+        x=X,
+        y=Y,
+        z=TRUTH.astype(np.float32),
+        visible=visible,
+        profile_x=X,
+        profile_ys=np.array([0.1]),
+        profile_y0=heights(X, np.array(0.1)),
+        profile_visible0=np.where(np.arange(120) < 10, 1, 2),
+    )
+    return tmp_path
+
+
+def written(out: Path, error_mm: float = 0.0, sigma_m: float = 0.005, hole: slice | None = None) -> Path:
+    """A measured folder off by error_mm everywhere; hole: profile samples and columns left unknown."""
+    out.mkdir(parents=True)
+    x, y = block(140, 90, 90, -45)
+    z = heights(x * 0.01, y * 0.01) + error_mm / 1e3
+    kept = np.ones(x.shape, dtype=np.bool_)
+    profile = heights(X, np.array(0.1)) + error_mm / 1e3
+    if hole is not None:
+        kept &= ~np.isin(x, np.round(X[hole] * 100).astype(int))
+        profile[hole] = np.nan
+    surface = fused([view(x[kept], y[kept], z[kept], sigma_m)], out / "s", MapSettings(min_views=1, fill_m=0))
+    write_height(surface, out / "height.tif")
+    source = np.where(np.isfinite(profile), Source.VISION, Source.UNKNOWN).astype(np.uint8)
+    contour = Contour(0, X, X * 0 + 0.1, profile, profile * 0 + sigma_m, source)
+    write_contours((contour,), out / "contour.csv")
+    return out
+
+
+def test_an_exact_map_has_no_error(recording: Path, tmp_path: Path) -> None:
+    figures = score(recording, written(tmp_path / "out"))
+    assert set(figures) == {
+        "contour, smooth places",
+        "contour, everywhere",
+        "height, smooth stack",
+        "height, seen by two",
+    }
+    for name, group in figures.items():
+        # contour.csv has hundredths of a millimetre.
+        assert group["max_mm"] <= 0.006, name
+        assert group["within_95_pct"] == 100, name
+        assert group.get("coverage_pct", 100) == 100, name
+    assert figures["height, smooth stack"]["samples"] == (SMOOTH & (TRUTH > 0.2)).sum()
+    assert figures["height, seen by two"]["samples"] == 100 * 40
+    profile = heights(X, np.array(0.1))
+    assert figures["contour, smooth places"]["samples"] == smooth(profile, 0).sum()
+    assert figures["contour, everywhere"]["samples"] == 120
+
+
+@pytest.mark.parametrize(("error_mm", "within"), [(4.0, 100.0), (-12.0, 0.0)])
+def test_a_shifted_map(recording: Path, tmp_path: Path, error_mm: float, within: float) -> None:
+    """The stated sigma of 5 mm covers 9.8 mm."""
+    for group in score(recording, written(tmp_path / "out", error_mm)).values():
+        assert group["bias_mm"] == pytest.approx(error_mm, abs=0.01)
+        for name in ("median_mm", "mae_mm", "p95_mm", "max_mm"):
+            assert group[name] == pytest.approx(abs(error_mm), abs=0.01)
+        assert group["within_95_pct"] == within
+
+
+def test_coverage_counts_what_two_frames_see(recording: Path, tmp_path: Path) -> None:
+    """The hole's 40 samples: all are counted in the height map; the profile's first 10 are not."""
+    figures = score(recording, written(tmp_path / "out", hole=slice(0, 40)))
+    assert figures["height, seen by two"]["coverage_pct"] == pytest.approx(60, abs=1e-3)
+    profile = smooth(heights(X, np.array(0.1)), 0) & (np.arange(120) >= 10)
+    expected = 100 * profile[40:].sum() / profile.sum()
+    assert figures["contour, smooth places"]["coverage_pct"] == pytest.approx(expected, abs=1e-3)
+    stack = SMOOTH & (TRUTH > 0.2)
+    expected = 100 * stack[40:100].sum() / stack[:100].sum()
+    assert figures["height, smooth stack"]["coverage_pct"] == pytest.approx(expected, abs=1e-3)
+    assert figures["contour, everywhere"]["samples"] == 80
+
+
+def test_missing_files_are_named(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"contour.csv: no such file"):
+        score(recording, tmp_path / "nowhere")
+    out = written(tmp_path / "out")
+    with pytest.raises(InputError, match=r"height.npz: no such file; give a simulated recording"):
+        score(out, out)
