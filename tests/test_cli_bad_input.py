@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from barsight.cli.main import run
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
@@ -171,6 +172,15 @@ def test_wrong_size_of_picture(recording: Path, capsys: pytest.CaptureFixture[st
         lambda rows: [row.replace("320", "322") for row in rows],
     )
     refused(recording, capsys, "320x256")
+
+
+def test_a_calibration_that_does_not_fit_is_said(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording / "mav0" / "cam1" / "sensor.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["intrinsics"][3] += 4
+    path.write_text(yaml.safe_dump(document))
+    code, text = measure(recording, capsys)
+    assert code == 0 and "px off their rows" in " ".join(text.split())
 
 
 def test_out_under_a_file(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -125,6 +125,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
 
     warnings = [Notice("assumed", text) for text in source.notes]
     warnings += [Notice("imu", text) for text in hints]
+    warnings += [Notice("calibration", text) for text in first.warnings]
     warnings += [Notice("trajectory", text) for text in trajectory.warnings]
     warnings += [Notice(a.code, a.reason) for a in agreed if isinstance(a, Failed)]
     if refusals:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import Failed, InputError, MeasurementError
-from barsight.core.types import DisparityRange, RefusedFrame
+from barsight.core.types import DisparityRange, RectifiedPair, RefusedFrame
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import find_range
+from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
 
 CELL_SIDES_M = (0.01, 0.02, 0.05, 0.1, 0.2)
 _MOST_POINTS_PER_PIXEL = 4
@@ -17,10 +18,24 @@ _MOST_POINTS_PER_PIXEL = 4
 
 @dataclass(frozen=True, eq=False)
 class FirstLook:
-    """The first usable pair's disparity range and the size of its pixels on the surface (median, m)."""
+    """The first usable pair: disparity range and the size of its pixels on the surface (median, m).
+
+    off_rows_px: how far matches lie off their rows (see `vertical_offset`), NaN where it can't be told.
+    """
 
     candidates: DisparityRange
     pixel_on_surface_m: float
+    off_rows_px: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with the calibration, as far as one pair shows it."""
+        if not self.off_rows_px > MOST_OFFSET_PX:
+            return ()
+        return (
+            f"matches lie {self.off_rows_px:.1f} px off their rows in the first pair: "
+            "the calibration doesn't fit these pictures, calibrate anew",
+        )
 
 
 def first_look(source: Recording, rectifier: Rectifier) -> FirstLook:
@@ -36,10 +51,13 @@ def first_look(source: Recording, rectifier: Rectifier) -> FirstLook:
             continue
         pair = rectifier(frame)
         found = pair if isinstance(pair, Failed) else find_range(pair)
-        if isinstance(found, DisparityRange):
+        if isinstance(pair, RectifiedPair) and isinstance(found, DisparityRange):
             camera = rectifier.camera
             middle = (found.lowest_px + found.highest_px) / 2 + camera.doffs_px
-            return FirstLook(found, camera.baseline_m / max(middle, 1.0))
+            offset = vertical_offset(pair.left, pair.right)
+            off_rows = math.nan if isinstance(offset, Failed) else offset
+            return FirstLook(found, camera.baseline_m / max(middle, 1.0), off_rows)
+        assert isinstance(found, Failed)
         reasons.append(found.reason)
         swapped += found.code == "swapped"
         if swapped >= 2:
