@@ -200,6 +200,17 @@ def test_out_not_empty(recording: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert [path.name for path in out.iterdir()] == ["mine.txt"]
 
 
+def test_overwriting_leaves_no_file_of_the_earlier_run(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = recording.parent / "out"
+    assert measure(recording, capsys)[0] == 0 and (out / "laser.csv").exists()
+    (out / "mine.txt").write_text("keep")
+    shutil.rmtree(recording / "mav0" / "laser0")
+    assert measure(recording, capsys, "--overwrite")[0] == 0
+    assert not (out / "laser.csv").exists() and (out / "mine.txt").read_text() == "keep"
+
+
 def test_out_inside_the_recording(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["measure", str(recording), "-o", str(recording / "out"), *FAST]) == 4
     assert "in the recording" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from barsight.core.files import atomic_directory
 from barsight.evaluation.truth import score
 from barsight.pipeline import MeasureSettings, measure
 from barsight.recording.open import open_recording
-from barsight.report.files import summary, write_results, write_summary
+from barsight.report.files import RESULT_FILES, summary, write_results, write_summary
 from barsight.report.page import write_report
 
 
@@ -73,7 +73,7 @@ def measure_into(
     if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     recording = open_recording(path, settings.recording)
-    with atomic_directory(out, replace=overwrite) as staging:
+    with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
         with stages(console) as advance:

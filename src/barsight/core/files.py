@@ -32,11 +32,12 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def atomic_directory(target: Path, *, replace: bool = False) -> Iterator[Path]:
+def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, ...] = ()) -> Iterator[Path]:
     """Yield a fresh folder beside `target`; its files become `target`'s on success, are gone on failure.
 
-    Where `target` exists, `replace` moves the new files over its own of the same names and leaves others
-    alone; without it an existing non-empty `target` is an `OutputError`.
+    Where `target` exists, `replace` moves the new files over its own of the same names, removes those of the
+    names in `owned` that have no successor and leaves others alone; without it an existing non-empty
+    `target` is an `OutputError`.
     """
     target = target.absolute()
     if target.exists() and not target.is_dir():
@@ -51,7 +52,10 @@ def atomic_directory(target: Path, *, replace: bool = False) -> Iterator[Path]:
             staging.chmod(0o777 & ~_umask())
             yield staging
             if target.is_dir():
-                for path in sorted(staging.iterdir()):
+                fresh = sorted(staging.iterdir())
+                for name in set(owned) - {path.name for path in fresh}:
+                    (target / name).unlink(missing_ok=True)
+                for path in fresh:
                     _replace(path, target / path.name)
             else:
                 staging.replace(target)

@@ -21,6 +21,11 @@ from barsight.mapping.surface import Layers, Surface
 from barsight.measurement import Measurement, Preview
 
 SCHEMA_VERSION = 1
+RESULT_FILES = (
+    "trajectory.tum", "cloud.ply", "height.tif", "contour.csv", "laser.csv", "preview.png", "result.json",
+    "report.html",
+)  # fmt: skip
+"""Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
 _TILE = 256
 _CLOUD_POINT = np.dtype(
