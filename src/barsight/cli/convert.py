@@ -37,7 +37,8 @@ def run(arguments: Sequence[str]) -> None:
         source = open_recording(recording, settings)
         with stages(console) as advance:
             done = convert(source, out, to, lambda n, total: advance("pictures", n, total))
-        console.print(f"{done.images} pictures written to {done.out}", soft_wrap=True, highlight=False)
+        text = f"{done.images} pictures written to {done.out}"
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
         if done.left_out:
             console.print(f"[yellow]{done.left_out} pictures were missing or torn and are left out[/yellow]")
 

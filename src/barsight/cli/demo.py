@@ -38,7 +38,7 @@ def run(arguments: Sequence[str]) -> None:
         console.print("Measuring it ...")
         content = measure_into(recording, result, MeasureSettings(), console, truth_of=recording)
         print_outcome(content, console, verbose=False)
-        console.print(f"report: {result / 'report.html'}", soft_wrap=True, highlight=False)
-        console.print(f"in 3D:  barsight view {result}", soft_wrap=True, highlight=False)
+        console.print(f"report: {result / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"in 3D:  barsight view {result}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "demo", arguments)

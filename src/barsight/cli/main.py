@@ -53,6 +53,10 @@ def run(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        if error.filename is None or error.errno is None:
+            raise
+        return _refuse(f"{_short(str(error.filename))}: {os.strerror(error.errno).lower()}", 1)
     return 0
 
 
@@ -63,6 +67,10 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def _refuse(line: str, code: int) -> int:
     sys.stderr.write(f"barsight: {' '.join(line.split())}\n")
     return code
+
+
+def _short(path: str) -> str:
+    return path if len(path) <= 300 else f"{path[:100]} ... {path[-100:]}"
 
 
 def _print_help() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -52,7 +53,7 @@ def run(arguments: Sequence[str]) -> None:
         console = Console(stderr=True)
         measured = measure_into(recording, out, settings, console, overwrite=overwrite)
         print_outcome(measured, console, verbose=verbose)
-        console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False)
+        console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "measure", arguments)
 
@@ -114,18 +115,29 @@ def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -
 
 
 def _agreement_table(agreements: list[dict[str, Any]]) -> Table:
-    names = ("bias", "median", "smooth_mae", "mae", "p95", "max")
-    heads = ("bias", "median", "MAE, smooth places", "MAE", "P95", "max")
-    table = Table("profile", "y m", "coverage %", *heads, title="Vision minus laser, mm")
+    heads = {
+        "bias": "bias", "median": "median", "smooth_mae": "smooth MAE", "mae": "MAE", "p95": "P95", "max": "max",
+    }  # fmt: skip
+    table = Table(title="Vision minus laser, mm", box=SIMPLE_HEAD)
+    for head in ("profile", "y m", "seen %", *heads.values()):
+        table.add_column(head, justify="right", no_wrap=True)
     for a in agreements:
-        numbers = (a[f"{name}_mm"] for name in names)
-        cells = ("-" if n is None else f"{n:.2f}" for n in numbers)
+        numbers = (a[f"{name}_mm"] for name in heads)
+        cells = ("-" if n is None else f"{n:.1f}" for n in numbers)
         table.add_row(str(a["profile"]), f"{a['y_m']:.2f}", f"{a['coverage_pct']:.1f}", *cells)
     return table
 
 
 def _truth_table(truth: dict[str, dict[str, float]]) -> Table:
-    table = Table("compared", "figures", title="Against truth")
+    heads = {
+        "coverage_pct": "seen %", "bias_mm": "bias", "median_mm": "median", "mae_mm": "MAE", "p95_mm": "P95",
+        "within_95_pct": "in 95 %",
+    }  # fmt: skip
+    table = Table(title="Vision minus truth, mm", box=SIMPLE_HEAD)
+    table.add_column("places", no_wrap=True)
+    for head in heads.values():
+        table.add_column(head, justify="right", no_wrap=True)
     for name, figures in truth.items():
-        table.add_row(name, ", ".join(f"{key} {value:g}" for key, value in figures.items()))
+        cells = (f"{figures[key]:.1f}" if key in figures else "-" for key in heads)
+        table.add_row(name, *cells)
     return table

@@ -21,7 +21,8 @@ def run(arguments: Sequence[str]) -> None:
         Args:
             out: A folder written by barsight measure.
         """
-        write_report(out, out / "report.html")
-        Console(stderr=True).print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False)
+        path = out / "report.html"
+        write_report(out, path)
+        Console(stderr=True).print(f"report: {path}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "report", arguments)

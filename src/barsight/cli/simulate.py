@@ -34,6 +34,6 @@ def run(arguments: Sequence[str]) -> None:
         console = Console(stderr=True)
         with stages(console) as advance:
             simulate(out, settings, lambda done, total: advance("render", done, total))
-        console.print(f"simulated recording: {out}", soft_wrap=True, highlight=False)
+        console.print(f"simulated recording: {out}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "simulate", arguments)
