@@ -116,10 +116,11 @@ def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -
 
 def _agreement_table(agreements: list[dict[str, Any]]) -> Table:
     heads = {
-        "bias": "bias", "median": "median", "smooth_mae": "smooth MAE", "mae": "MAE", "p95": "P95", "max": "max",
+        "bias": "bias", "median": "median", "smooth_mae": "smooth MAE",
+        "mae": "MAE", "p95": "P95", "max": "max",
     }  # fmt: skip
     table = Table(title="Vision minus laser, mm", box=SIMPLE_HEAD)
-    for head in ("profile", "y m", "seen %", *heads.values()):
+    for head in ("prof.", "y m", "seen %", *heads.values()):
         table.add_column(head, justify="right", no_wrap=True)
     for a in agreements:
         numbers = (a[f"{name}_mm"] for name in heads)
