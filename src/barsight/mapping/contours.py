@@ -9,6 +9,7 @@ from barsight.core.types import Contour, LaserProfile, Source
 from barsight.mapping.surface import Surface
 
 SPACING_M = 0.01
+SAME_Y_M = 0.001
 _JUMP_M = 0.03
 
 
@@ -17,13 +18,17 @@ def cut_contours(
 ) -> tuple[Contour, ...]:
     """A contour at each y asked for; without any at each laser profile; without a laser in the middle.
 
-    At a laser profile the samples fall on the laser's own x grid, continued over the whole surface.
+    At a laser profile the samples fall on the laser's own x grid, continued over the whole surface, and the
+    contour has the laser's number; others are numbered on after the laser's.
     """
+    places = [(p.profile, float(np.median(p.y_m)), float(p.x_m[0])) for p in laser]
     if profile_y_m:
-        places = [(number, y, 0.0) for number, y in enumerate(profile_y_m)]
-    elif laser:
-        places = [(p.profile, float(np.median(p.y_m)), float(p.x_m[0])) for p in laser]
-    else:
+        unused = max((p.profile + 1 for p in laser), default=0)
+        places = [
+            next((place for place in places if abs(place[1] - y) < SAME_Y_M), (unused + number, y, 0.0))
+            for number, y in enumerate(dict.fromkeys(profile_y_m))
+        ]
+    elif not laser:
         places = [(0, (surface.rows[0] + surface.rows[1] - 1) / 2 * surface.cell_m, 0.0)]
     return tuple(cut(surface, number, y, phase) for number, y, phase in places)
 

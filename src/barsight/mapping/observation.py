@@ -130,6 +130,21 @@ def _by_cell(flat: Int64, cells: int) -> tuple[Int64, Int64]:
 
 
 @kernel()
+def _highest_first(members: Int64, z: Float32) -> None:
+    """Order the few points of a cell in place; many (a wall seen from the side) by a real sort."""
+    if members.size > 32:
+        members[:] = members[np.argsort(-z[members])]
+        return
+    for i in range(1, members.size):
+        m = members[i]
+        j = i
+        while j > 0 and z[members[j - 1]] < z[m]:
+            members[j] = members[j - 1]
+            j -= 1
+        members[j] = m
+
+
+@kernel()
 def _gather(
     order: Int64,
     starts: Int64,
@@ -150,8 +165,7 @@ def _gather(
         if first == last:
             continue
         members = order[first:last]
-        if last - first > 1:
-            members = members[np.argsort(-z[members])]
+        _highest_first(members, z)
         i = 0
         while i < members.size:
             top = members[i]
