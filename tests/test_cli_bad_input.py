@@ -319,3 +319,76 @@ def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixtur
     assert len(result["hashes"]["calibration"]) == 64
     rows = np.loadtxt(recording.parent / "out" / "trajectory.tum")
     assert rows.shape == (4, 8)
+
+
+def test_a_stamp_that_no_clock_has(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording / "mav0" / "cam0" / "data.csv"
+    edit(path, lambda rows: [*rows[:-1], "9" * 20 + "," + rows[-1].split(",")[1]])
+    refused(recording, capsys, "cam0/data.csv", "line 5", "9" * 20)
+
+
+def test_names_too_long(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    long = recording.parent / ("a" * 300)
+    assert run(["measure", str(long), "-o", str(recording.parent / "out"), *FAST]) == 1
+    assert "too long" in capsys.readouterr().err
+    assert run(["measure", str(recording), "-o", str(long), *FAST]) == 4
+    assert "too long" in capsys.readouterr().err
+
+
+def test_a_disk_that_fills_up_under_numpy(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NumPy's writer drops the system's error number."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError("4096 requested and 0 written")
+
+    monkeypatch.setattr("numpy.save", full)
+    refused(recording, capsys, "could not be written whole", "out")
+
+
+def test_folders_made_for_a_run_that_failed_are_gone(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(recording.parent.iterdir())
+    out = recording.parent / "new" / "newer" / "out"
+    assert run(["measure", str(recording), "-o", str(out), *FAST, "--map.min-views", "99"]) == 5
+    assert sorted(recording.parent.iterdir()) == before
+
+
+def test_another_run_was_first(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = recording.parent / "out"
+
+    def meanwhile(*_: object) -> None:
+        out.mkdir()
+        (out / "result.json").write_text("theirs")
+
+    monkeypatch.setattr("barsight.cli.measure.write_report", meanwhile)
+    assert run(["measure", str(recording), "-o", str(out), *FAST]) == 4
+    assert "not empty" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["result.json"]
+    assert (out / "result.json").read_text() == "theirs"
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--map.profile-y-m", "nan"),
+        ("--map.fill-m", "inf"),
+        ("--stereo.sgbm.subpixel-sigma-px", "nan"),
+        ("--motion.odometry.features", "1000000000"),
+        ("--use", "imu"),
+    ],
+)
+def test_settings_that_are_no_numbers(
+    recording: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...]
+) -> None:
+    refused(recording, capsys, flags[0].rpartition(".")[2].lstrip("-").replace("-", "_"), flags=flags)
+
+
+def test_nothing_sure_enough(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(recording, capsys, "max_depth_m", flags=("--stereo.max-depth-m", "1"))
+    code, _ = measure(recording, capsys, "--stereo.highest-disparity-px", "1000000")
+    assert code == 0

@@ -6,6 +6,7 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 
 from __future__ import annotations
 
+import math
 import resource
 import threading
 import time
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
@@ -55,6 +56,7 @@ class MeasureSettings:
     def __post_init__(self) -> None:
         if "stereo" not in self.use:
             raise ConfigError("stereo can't be left out of --use: it is what measures")
+        _expect_finite(asdict(self))
 
 
 def measure(recording: Recording, settings: MeasureSettings, scratch: Path, advance: Advance) -> Measurement:
@@ -118,7 +120,9 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")
     with watch("contours"):
-        laser = source.laser()
+        whole_laser = source.laser()
+        # Laser profiles are places in the yard: a map in a frame of its own can't be held against them.
+        laser = whole_laser if trajectory.reference == "yard" else ()
         contours = cut_contours(surface, laser, settings.map.profile_y_m)
         by_number = {contour.profile: contour for contour in contours}
         agreed = [agree(by_number[p.profile], p) for p in laser if p.profile in by_number]
@@ -128,8 +132,15 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     warnings += [Notice("calibration", text) for text in first.warnings]
     warnings += [Notice("trajectory", text) for text in trajectory.warnings]
     warnings += [Notice(a.code, a.reason) for a in agreed if isinstance(a, Failed)]
+    if len(laser) < len(whole_laser):
+        warnings.append(
+            Notice("laser-frame", "without a crane the map isn't in the laser's yard: no agreement")
+        )
+    if used == 1:
+        warnings.append(Notice("one-view", "one frame made the map: no height is confirmed by another"))
+    frames_total = total + len(source.index.unpaired)
     if refusals:
-        warnings.append(Notice("frames-refused", f"{len(refusals)} of {total} frames were refused"))
+        warnings.append(Notice("frames-refused", f"{len(refusals)} of {frames_total} frames were refused"))
     configuration = plain(asdict(settings))
     return Measurement(
         recording_path=source.path,
@@ -140,7 +151,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         input_hashes=source.digests(),
         configuration=configuration,
         trajectory=trajectory,
-        frames_total=total + len(source.index.unpaired),
+        frames_total=frames_total,
         frames_used=used,
         refusals=tuple(refusals),
         sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors))),
@@ -154,6 +165,16 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         preview=preview,
     )
+
+
+def _expect_finite(settings: dict[str, Any], prefix: str = "") -> None:
+    """Raise ConfigError naming a setting that is NaN or infinite."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            _expect_finite(value, f"{prefix}{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise ConfigError(f"{prefix}{name} is {number}; give a number")
 
 
 def _placed(

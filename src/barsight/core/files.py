@@ -40,17 +40,21 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
     `target` is an `OutputError`.
     """
     target = target.absolute()
-    if target.exists() and not target.is_dir():
-        raise OutputError(f"{target}: is a file; name a folder")
-    if not replace and target.is_dir() and any(target.iterdir()):
-        raise OutputError(f"{target}: exists and is not empty; name another folder or remove it")
     with translated_os_errors(target):
+        if not replace:
+            _expect_empty(target)
+        elif target.exists() and not target.is_dir():
+            raise OutputError(f"{target}: is a file; name a folder")
+        made = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
+        staging = Path(tempfile.mkdtemp(prefix=f".{target.name[:40]}.", suffix=".part", dir=target.parent))
     try:
         with translated_os_errors(target):
             staging.chmod(0o777 & ~_umask())
             yield staging
+            if not replace:
+                # Another run may have written there in the meantime.
+                _expect_empty(target)
             if target.is_dir():
                 fresh = sorted(staging.iterdir())
                 for name in set(owned) - {path.name for path in fresh}:
@@ -61,6 +65,10 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
                 staging.replace(target)
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+        if not target.exists():
+            for folder in made:
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
 
 
 @contextlib.contextmanager
@@ -79,10 +87,21 @@ def translated_os_errors(target: Path) -> Iterator[None]:
             errno.EEXIST: "a part of the path is a file; name another folder",
             errno.EISDIR: "is a folder; name a file",
             errno.EFBIG: "the file grew past the size limit; free some space or raise the limit",
+            errno.ENAMETOOLONG: "the name is too long; name another folder",
         }.get(error.errno or 0)
+        if error.errno is None and "written" in str(error):
+            # NumPy's writer says how many items it wrote and drops the system's reason.
+            advice = "a file could not be written whole; free some space or name another folder"
         if advice is None:
             raise
         raise OutputError(f"{target}: {advice}") from error
+
+
+def _expect_empty(target: Path) -> None:
+    if target.exists() and not target.is_dir():
+        raise OutputError(f"{target}: is a file; name a folder")
+    if target.is_dir() and any(target.iterdir()):
+        raise OutputError(f"{target}: exists and is not empty; name another folder or remove it")
 
 
 def _replace(source: Path, target: Path) -> None:

@@ -24,10 +24,11 @@ def cut_contours(
     places = [(p.profile, float(np.median(p.y_m)), float(p.x_m[0])) for p in laser]
     if profile_y_m:
         unused = max((p.profile + 1 for p in laser), default=0)
-        places = [
+        asked = (
             next((place for place in places if abs(place[1] - y) < SAME_Y_M), (unused + number, y, 0.0))
             for number, y in enumerate(dict.fromkeys(profile_y_m))
-        ]
+        )
+        places = list(dict.fromkeys(asked))
     elif not laser:
         places = [(0, (surface.rows[0] + surface.rows[1] - 1) / 2 * surface.cell_m, 0.0)]
     return tuple(cut(surface, number, y, phase) for number, y, phase in places)

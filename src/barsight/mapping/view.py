@@ -45,7 +45,7 @@ class Viewer:
     watch: Stopwatch
 
     def __call__(self, frame: StereoFrame, posed: PosedFrame) -> View | Failed:
-        """Failed where the images have the wrong size, are swapped or have no texture."""
+        """Failed where the images have the wrong size, are swapped, have no texture or show no depth."""
         with self.watch("rectify", 1):
             pair = self.rectifier(frame)
         if isinstance(pair, Failed):
@@ -68,19 +68,21 @@ class Viewer:
             body = posed.reference_from_body
             reference_from_rect0 = body @ self.rectifier.body_from_rect0
             cells = observe(points, reference_from_rect0, body.translation, posed.covariance, self.cell_m)
+        if cells.z_m.size == 0:
+            return Failed("no-depth", "no pixel has a depth within max_depth_m and max_sigma_m")
         return View(cells, pair.left, disparity.disparity_px)
 
 
 def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:
-    """The settings' range, its open ends found from the images."""
+    """The settings' range, its open ends found from the images, no wider than the images."""
     low, high = stereo.lowest_disparity_px, stereo.highest_disparity_px
-    if low is not None and high is not None:
-        return DisparityRange(low, high)
-    found = find_range(pair)
-    if isinstance(found, Failed):
-        return found
-    low = found.lowest_px if low is None else low
-    high = found.highest_px if high is None else high
+    if low is None or high is None:
+        found = find_range(pair)
+        if isinstance(found, Failed):
+            return found
+        low = found.lowest_px if low is None else low
+        high = found.highest_px if high is None else high
+    low, high = max(low, -pair.camera.width), min(high, pair.camera.width)
     if high <= low:
         return Failed("empty-range", f"the disparity range {low}:{high} is empty")
     return DisparityRange(low, high)

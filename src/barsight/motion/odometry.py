@@ -47,8 +47,8 @@ class OdometrySettings:
     """Points further off than this are outliers."""
 
     def __post_init__(self) -> None:
-        if self.features < 100 or self.least_inliers < 6:
-            raise ConfigError("features must be at least 100 and least_inliers at least 6")
+        if not 100 <= self.features <= 100_000 or self.least_inliers < 6:
+            raise ConfigError("features must lie in 100...100000, least_inliers be at least 6")
         if min(self.nearest_m, self.farthest_baselines, self.pixel_sigma_px, self.ransac_px) <= 0:
             raise ConfigError("the odometry's distances and tolerances must be positive")
 

@@ -83,12 +83,11 @@ def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
         fields = [field.strip() for field in text.split(",")]
         if len(fields) != 2 or not fields[1]:
             raise InputError(path, f"line {number}: expected `stamp,filename`, got {text!r}", _REMEDY)
-        try:
-            stamps.append(int(fields[0]))
-        except ValueError:
+        if not _is_int64(fields[0]):
             raise InputError(
                 path, f"line {number}: the stamp {fields[0]!r} is not a whole number of ns", _REMEDY
-            ) from None
+            )
+        stamps.append(int(fields[0]))
         names.append(fields[1])
         lines.append(number)
     if not stamps:

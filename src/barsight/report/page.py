@@ -46,7 +46,8 @@ def write_report(out_dir: Path, target: Path) -> None:
     """
     page = render_page(out_dir)
     with atomic_path(target) as path:
-        path.write_text(page, encoding="utf-8")
+        # A path may hold bytes that are no text; the page shows a question mark there.
+        path.write_text(page, encoding="utf-8", errors="replace")
 
 
 def render_page(out_dir: Path) -> str:

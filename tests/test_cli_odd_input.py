@@ -1,0 +1,118 @@
+"""Odd recordings, odd names and odd surroundings that are nobody's mistake: `barsight` copes with them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.cli.main import run
+from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.simulate import simulate
+
+TINY = SimulationSettings(
+    length_m=1.5,
+    frames=4,
+    seed=3,
+    camera=CameraSettings(width_px=320, height_px=256, focal_px=312.5),
+    yard=YardSettings(max_layers=2),
+)
+FAST = ("--stereo.method", "sgbm", "--map.cell-m", "0.05")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("simulated") / "recording"
+    simulate(path, TINY)
+    return path
+
+
+@pytest.fixture
+def recording(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "recording"))
+
+
+def measured(recording: Path, *flags: str) -> tuple[Path, dict]:
+    out = recording.parent / "out"
+    assert run(["measure", str(recording), "-o", str(out), *FAST, *flags]) == 0
+    return out, json.loads((out / "result.json").read_text())
+
+
+def keep_rows(recording: Path, count: int, *sensors: str) -> None:
+    for sensor in sensors:
+        path = recording / "mav0" / sensor / "data.csv"
+        path.write_text("\n".join(path.read_text().splitlines()[: count + 1]) + "\n")
+
+
+def contour_table(out: Path) -> np.ndarray:
+    return np.genfromtxt(out / "contour.csv", delimiter=",", names=True)
+
+
+def codes(result: dict) -> set[str]:
+    return {warning["code"] for warning in result["warnings"]}
+
+
+@pytest.mark.parametrize("name", ["sp ace ü [bold] x", "a[/y]z", "100 % {a} $x"])
+def test_names_with_brackets_spaces_and_other_letters(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    folder = tmp_path / name
+    folder.mkdir(parents=True)
+    recording = Path(shutil.copytree(whole, folder / "recording"))
+    out, _ = measured(recording)
+    assert f"report: {out / 'report.html'}" in capsys.readouterr().err
+    assert run(["report", str(out)]) == 0
+    assert f"report: {out / 'report.html'}" in capsys.readouterr().err
+    assert run(["convert", str(recording), "-o", str(folder / "bag"), "--to", "ros2-mcap"]) == 0
+    assert str(folder / "bag") in capsys.readouterr().err
+    assert run(["info", str(recording)]) == 0
+
+
+def test_a_name_that_is_no_text(recording: Path) -> None:
+    out, result = measured(recording)
+    result["recording"]["path"] = "no\udcfftext"
+    (out / "result.json").write_text(json.dumps(result))
+    assert run(["report", str(out)]) == 0
+    assert "no?text" in (out / "report.html").read_text()
+
+
+def test_a_single_frame_says_that_nothing_confirms_it(recording: Path) -> None:
+    keep_rows(recording, 1, "cam0", "cam1")
+    out, result = measured(recording)
+    assert result["frames"]["used"] == result["frames"]["total"] == 1
+    assert "one-view" in codes(result)
+    assert len((out / "trajectory.tum").read_text().splitlines()) == 2
+
+
+def test_unpaired_pictures_count_as_frames(recording: Path) -> None:
+    keep_rows(recording, 3, "cam1")
+    _, result = measured(recording)
+    assert result["frames"]["total"] == 4 and result["frames"]["used"] == 3
+    assert "1 of 4 frames were refused" in [w["message"] for w in result["warnings"]]
+
+
+def test_the_laser_is_compared_in_the_yard_only(recording: Path) -> None:
+    shutil.rmtree(recording / "mav0" / "crane0")
+    out, result = measured(recording)
+    assert result["reference"] == "world"
+    assert result["agreement"] == [] and "laser-frame" in codes(result)
+    assert not (out / "laser.csv").exists()
+    assert np.unique(contour_table(out)["profile"]).size == 1
+
+
+def test_contours_elsewhere_are_not_held_against_the_laser(recording: Path) -> None:
+    _, whole_result = measured(recording)
+    out, result = measured(recording, "--overwrite", "--map.profile-y-m", "0.2", "-1.15", "40")
+    y = dict(zip(*(contour_table(out)[k] for k in ("profile", "y_m")), strict=True))
+    assert y == {2: 0.2, 1: -1.15, 4: 40.0}
+    assert [row["profile"] for row in result["agreement"]] == [1]
+    assert result["agreement"][0] == whole_result["agreement"][1]
+    table = contour_table(out)
+    assert np.isnan(table["z_m"][table["profile"] == 4]).all()
+
+
+def test_a_laser_of_one_point(recording: Path) -> None:
+    keep_rows(recording, 1, "laser0")
+    _, result = measured(recording)
+    assert result["agreement"] == [] and "no-overlap" in codes(result)
