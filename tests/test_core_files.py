@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from barsight.core.errors import OutputError
+from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_directory, atomic_path
 
 FAILURES = [RuntimeError("bug"), KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")]
@@ -131,3 +131,12 @@ def test_a_missing_parent_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="there is no folder"), atomic_path(tmp_path / "no" / "x") as path:
         path.write_text("x")
     assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("inside", ["out", "out/part", ".out.x1.part/part", "."])
+def test_a_refusal_names_the_side_that_it_is_about(tmp_path: Path, inside: str) -> None:
+    target = tmp_path / "out"
+    with pytest.raises(OutputError, match=r"out: no permission to write"), atomic_directory(target):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / inside))
+    with pytest.raises(InputError, match=r"data.csv: no permission to read"), atomic_directory(target):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "recording" / "data.csv"))

@@ -54,9 +54,10 @@ def run(arguments: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        if error.filename is None or error.errno is None:
+        if error.errno is None:
             raise
-        return _refuse(f"{_short(str(error.filename))}: {os.strerror(error.errno).lower()}", 1)
+        what = "reading or writing failed" if error.filename is None else _short(str(error.filename))
+        return _refuse(f"{what}: {os.strerror(error.errno).lower()}", 1)
     return 0
 
 

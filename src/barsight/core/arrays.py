@@ -23,10 +23,19 @@ F = TypeVar("F", bound=Callable[..., Any])
 def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[F], F]:
     """Compile a function with Numba, cached on disk so that a second run starts at once.
 
+    Where no folder may be written (a read-only installation and home), every run compiles anew.
     `fastmath` lets the compiler reorder sums; never set it where NaN marks the invalid.
     """
-    decorate: Any = numba.njit(cache=True, parallel=parallel, fastmath=fastmath, nogil=True)
-    return cast(Callable[[F], F], decorate)
+
+    def decorate(function: F) -> F:
+        compiled: Any
+        try:
+            compiled = numba.njit(cache=True, parallel=parallel, fastmath=fastmath, nogil=True)(function)
+        except RuntimeError:
+            compiled = numba.njit(parallel=parallel, fastmath=fastmath, nogil=True)(function)
+        return cast(F, compiled)
+
+    return decorate
 
 
 def expect_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...]) -> None:

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from barsight.core.errors import OutputError
+from barsight.core.errors import InputError, OutputError
 
 
 @contextlib.contextmanager
@@ -73,10 +73,17 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
 
 @contextlib.contextmanager
 def translated_os_errors(target: Path) -> Iterator[None]:
-    """Turn the operating system's refusals (full disk, no permission) into one `OutputError` line."""
+    """Turn the operating system's refusals (full disk, no permission) into one `OutputError` line.
+
+    `InputError` where it is a file elsewhere that may not be read.
+    """
     try:
         yield
     except OSError as error:
+        if isinstance(error, PermissionError) and not _belongs(error.filename, target):
+            raise InputError(
+                error.filename, "no permission to read it", "ask its owner or copy it"
+            ) from error
         advice = {
             errno.ENOSPC: "the disk is full; free some space or name another folder",
             errno.EDQUOT: "the disk quota is used up; free some space or name another folder",
@@ -91,10 +98,23 @@ def translated_os_errors(target: Path) -> Iterator[None]:
         }.get(error.errno or 0)
         if error.errno is None and "written" in str(error):
             # NumPy's writer says how many items it wrote and drops the system's reason.
-            advice = "a file could not be written whole; free some space or name another folder"
+            advice = (
+                "the disk is full or a limit is reached: a file could not be written whole; free some space"
+            )
         if advice is None:
             raise
         raise OutputError(f"{target}: {advice}") from error
+
+
+def _belongs(name: object, target: Path) -> bool:
+    """Whether the file is `target`, lies in it or above it, or is one of ours that waits beside it."""
+    if not isinstance(name, str):
+        return True
+    path, target = Path(name).absolute(), target.absolute()
+    if target.is_relative_to(path) or path.is_relative_to(target):
+        return True
+    beside = path.is_relative_to(target.parent)
+    return beside and path.relative_to(target.parent).parts[0].startswith(f".{target.name[:40]}.")
 
 
 def _expect_empty(target: Path) -> None:
