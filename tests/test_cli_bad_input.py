@@ -235,6 +235,8 @@ def test_disk_full_in_the_middle(
         ("[stereo]\nmax_dept_m = 3.0\n", ("max_dept_m",)),
         ("[map]\ncell_m = -1.0\n", ("cell_m",)),
         ("[map\n", ("TOML",)),
+        ("\ufeff[map]\ncell_m = 99\n", ("cell_m must lie",)),
+        ("mp = 1\n", ("(mp);",)),
     ],
 )
 def test_bad_configuration(
@@ -263,7 +265,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupted_in_the_middle(recording: Path, sent: signal.Signals) -> None:
     """Many copies of one frame keep the run busy; the signal comes once it has begun to write."""
     mav0 = recording / "mav0"
@@ -379,6 +381,7 @@ def test_another_run_was_first(
         ("--map.fill-m", "inf"),
         ("--stereo.sgbm.subpixel-sigma-px", "nan"),
         ("--motion.odometry.features", "1000000000"),
+        ("--map.min-views", "9" * 20),
         ("--use", "imu"),
     ],
 )
@@ -392,3 +395,9 @@ def test_nothing_sure_enough(recording: Path, capsys: pytest.CaptureFixture[str]
     refused(recording, capsys, "max_depth_m", flags=("--stereo.max-depth-m", "1"))
     code, _ = measure(recording, capsys, "--stereo.highest-disparity-px", "1000000")
     assert code == 0
+
+
+def test_a_simulation_of_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["simulate", str(tmp_path / "out"), "--camera.heading-deg", "nan"]) == 2
+    assert "camera.heading_deg is nan" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())

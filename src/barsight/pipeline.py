@@ -6,7 +6,6 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 
 from __future__ import annotations
 
-import math
 import resource
 import threading
 import time
@@ -14,11 +13,12 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.parallel import ordered_map
+from barsight.core.settings import expect_numbers
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame
 from barsight.evaluation.agreement import agree
@@ -56,7 +56,7 @@ class MeasureSettings:
     def __post_init__(self) -> None:
         if "stereo" not in self.use:
             raise ConfigError("stereo can't be left out of --use: it is what measures")
-        _expect_finite(asdict(self))
+        expect_numbers(asdict(self))
 
 
 def measure(recording: Recording, settings: MeasureSettings, scratch: Path, advance: Advance) -> Measurement:
@@ -165,16 +165,6 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         preview=preview,
     )
-
-
-def _expect_finite(settings: dict[str, Any], prefix: str = "") -> None:
-    """Raise ConfigError naming a setting that is NaN or infinite."""
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            _expect_finite(value, f"{prefix}{name}.")
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, float) and not math.isfinite(number):
-                raise ConfigError(f"{prefix}{name} is {number}; give a number")
 
 
 def _placed(

@@ -38,7 +38,7 @@ def load_settings(path: Path | None, kind: type[Settings]) -> Settings:
     if path is None:
         return kind()
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise InputError(path, "no such file", "check the path given to --config") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -52,7 +52,7 @@ def load_settings(path: Path | None, kind: type[Settings]) -> Settings:
         if own is not None:
             raise ConfigError(f"{path}: {own}") from error
         if isinstance(error, cattrs.BaseValidationError):
-            first = cattrs.transform_error(error)[0].replace(" @ $", " at ").replace("at .", "at ")
+            first = cattrs.transform_error(error)[0].removesuffix(" @ $").replace(" @ $.", " at ")
             raise ConfigError(f"{path}: {first}; barsight measure --help lists the settings") from error
         raise
 

@@ -44,6 +44,8 @@ def run(arguments: Sequence[str]) -> int:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
     try:
         signal.signal(signal.SIGTERM, _interrupt)
+        if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
+            signal.signal(signal.SIGHUP, _interrupt)
         module = importlib.import_module(f"barsight.cli.{name}")
         module.run(rest)
     except BarsightError as error:

@@ -1,0 +1,23 @@
+"""What holds for every setting, whichever stage it belongs to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from barsight.core.errors import ConfigError
+
+MOST = 2**31 - 1
+
+
+def expect_numbers(settings: Mapping[str, Any], prefix: str = "") -> None:
+    """Raise ConfigError naming a setting (of nested ones as `asdict` gives them) that is NaN or too large."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            expect_numbers(value, f"{prefix}{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise ConfigError(f"{prefix}{name} is {number}; give a number")
+            if isinstance(number, int) and abs(number) > MOST:
+                raise ConfigError(f"{prefix}{name} is {number}; the most is {MOST}")
