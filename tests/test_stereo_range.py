@@ -64,3 +64,23 @@ def test_coarse_disparity() -> None:
     error = coarse - truth[2::4, 2::4]
     assert np.isfinite(error).mean() > 0.75
     assert np.nanpercentile(np.abs(error), 95) < 2
+
+
+@pytest.mark.parametrize("start_px", [180.0, 200.0, 230.0])
+def test_a_surface_nearer_than_usual(start_px: float) -> None:
+    """Disparities about and over 40 % of the width, where the search ends at first."""
+    pair, truth = slanted_pair(480, 320, start_px, (0.02, 0.05))
+    found = find_range(pair)
+    assert isinstance(found, DisparityRange)
+    assert found.lowest_px <= np.percentile(truth, 5)
+    assert np.percentile(truth, 95) < found.highest_px
+
+
+def test_saturated_images_are_not_taken_for_swapped() -> None:
+    pair, truth = slanted_pair(480, 320, 40.0)
+    left, right = pair.left.copy(), pair.right.copy()
+    left[:, 140:], right[:, 100:] = 255, 255
+    found = find_range(replace(pair, left=left, right=right))
+    assert isinstance(found, DisparityRange)
+    assert found.lowest_px <= truth.min() and truth.max() < found.highest_px
+    assert np.isnan(coarse_disparity(left, right)[:, 40:]).all()

@@ -10,12 +10,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Float32, UInt8
+from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import Failed
 from barsight.core.types import DisparityRange, RectifiedPair
 
 _SCALE = 4
-_WIDEST_SHARE = 0.4
+_USUAL_SHARE = 0.4
+_WIDEST_SHARE = 0.8
+_TOP_PX = 16
+_POOR = 0.6
 _MARGIN_SHARE = 0.12
 _MARGIN_PX = 6
 _LEAST_CONSISTENT = 0.03
@@ -29,7 +32,15 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
     doffs = pair.camera.doffs_px
     disparity = coarse_disparity(pair.left, pair.right, doffs)
     share = _finite_share(disparity)
-    if share < 0.6:
+    top = _USUAL_SHARE * pair.camera.width - doffs - _TOP_PX
+    ends_at_top = share > 0 and np.nanpercentile(disparity, 99) > top
+    if ends_at_top or share < _POOR:
+        # The surface may be nearer than the usual search reaches.
+        wider = coarse_disparity(pair.left, pair.right, doffs, _WIDEST_SHARE)
+        found = _finite_share(wider)
+        if found >= (share if ends_at_top else max(1.4 * share, 0.1)):
+            disparity, share = wider, found
+    if share < _POOR:
         exchanged = _finite_share(coarse_disparity(pair.right, pair.left, -doffs))
         if exchanged > 1.5 * share and exchanged > 0.1:
             return Failed(
@@ -47,16 +58,18 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
     return DisparityRange(lowest, lowest + max(16, -(-(highest - lowest) // 16) * 16))
 
 
-def coarse_disparity(left: UInt8, right: UInt8, doffs_px: float = 0.0) -> Float32:
-    """Left-right consistent disparities of a quarter-size match, else NaN.
+def coarse_disparity(
+    left: UInt8, right: UInt8, doffs_px: float = 0.0, width_share: float = _USUAL_SHARE
+) -> Float32:
+    """Left-right consistent disparities of a quarter-size match, else NaN, also where nothing changes.
 
-    From 1 px above -doffs_px, which is infinitely far, over 40 % of the width.
+    From 1 px above -doffs_px, which is infinitely far, over `width_share` of the width.
     Returns (H / 4, W / 4) float32 in full-size px.
     """
     size = (max(left.shape[1] // _SCALE, 32), max(left.shape[0] // _SCALE, 32))
     small_left = cv2.resize(left, size, interpolation=cv2.INTER_AREA)
     small_right = cv2.resize(right, size, interpolation=cv2.INTER_AREA)
-    count = max(16, int(size[0] * _WIDEST_SHARE) // 16 * 16)
+    count = max(16, int(size[0] * width_share) // 16 * 16)
     scale = left.shape[1] / size[0]
     infinity = -doffs_px / scale
     lowest = int(np.floor(infinity))
@@ -68,6 +81,7 @@ def coarse_disparity(left: UInt8, right: UInt8, doffs_px: float = 0.0) -> Float3
     inside = (forward > infinity + 1 / scale) & (target >= 0) & (target < size[0])
     there = np.take_along_axis(backward, target.clip(0, size[0] - 1), axis=1)
     consistent = inside & (np.abs(there - forward) <= 1)
+    consistent &= _changes(small_left)
     return np.where(consistent, forward * np.float32(scale), np.float32(np.nan))
 
 
@@ -88,6 +102,13 @@ def _match(left: UInt8, right: UInt8, lowest: int, count: int) -> Float32:
     matched = matcher.compute(*padded)[:, before : before + left.shape[1]]
     disparity: Float32 = matched.astype(np.float32) / 16
     return disparity
+
+
+def _changes(image: UInt8) -> Bool:
+    """(H, W): whether there is any gradient along the row in a 5 x 5 block; blank places match anything."""
+    steps = cv2.convertScaleAbs(cv2.Sobel(image, cv2.CV_16S, 1, 0, ksize=3))
+    changes: Bool = cv2.dilate(steps, np.ones((5, 5), np.uint8)) > 0
+    return changes
 
 
 def _finite_share(disparity: Float32) -> float:
