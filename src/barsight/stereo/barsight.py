@@ -10,20 +10,22 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32
+from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.confidence import bend_around, vertical_error_px
 from barsight.stereo.consistency import agrees, without_islands
 from barsight.stereo.edges import sharpen_edges
 from barsight.stereo.filling import fill
-from barsight.stereo.refinement import RefinementSettings, refine
+from barsight.stereo.refinement import Refined, RefinementSettings, refine
 from barsight.stereo.semiglobal import SemiGlobalSettings, match
-from barsight.stereo.sgbm import Sgbm, SgbmSettings, image_noise
+from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 _NAN = np.float32(np.nan)
 _FAST_STEPS = 2
 _JUMP_PX = 1.0
 _FURTHEST_FROM_START_PX = 2.0
+_LEAST_CONTRAST_GREY = 0.5
 
 
 @dataclass(frozen=True)
@@ -38,18 +40,25 @@ class BarsightSettings:
     """Left and right disparities must agree to this."""
     island_px: int = 40
     """Connected patches smaller than this many pixels are dropped."""
-    model_sigma_px: float = 0.03
-    """The part of the error that the images' residual doesn't explain."""
+    model_sigma_px: float = 0.005
+    """The least error of the method itself (1 sigma)."""
+    vertical_share: float = 1.5
+    """Error of the disparity per vertical error that the images show: parallax adds its own."""
+    edge_share: float = 0.9
+    """Error per pixel by which the disparity bends within 3 px."""
+    widest_edge_px: float = 0.5
+    """A bend or an edge counts as no more than this."""
     max_sigma_px: float = 1.0
     """A match less sure than this is none."""
     semiglobal: SemiGlobalSettings = field(default_factory=SemiGlobalSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
 
     def __post_init__(self) -> None:
-        if min(self.consistency_px, self.max_sigma_px) <= 0 or min(self.model_sigma_px, self.island_px) < 0:
-            raise ConfigError(
-                "consistency_px and max_sigma_px must be positive, model_sigma_px and island_px not negative"
-            )
+        if min(self.consistency_px, self.max_sigma_px) <= 0:
+            raise ConfigError("consistency_px and max_sigma_px must be positive")
+        shares = (self.vertical_share, self.edge_share, self.widest_edge_px)
+        if min(self.model_sigma_px, self.island_px, *shares) < 0:
+            raise ConfigError("model_sigma_px, island_px and the shares of sigma can't be negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,34 +82,39 @@ class BarsightStereo:
         Memory: the semi-global stripes (about 130 MB per thread) and some thirty float32 images.
         """
         settings = self.settings
-        noise = float(np.hypot(image_noise(pair.left), image_noise(pair.right)))
         candidates = _inside(candidates, pair.camera.width)
+        if min(_contrast(pair.left), _contrast(pair.right)) < _LEAST_CONTRAST_GREY:
+            nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
+            return Disparity(nothing, nothing.copy())
         start = self._start(pair, candidates)
-        believed = start.left_px
-        matched = np.isfinite(believed)
+        matched = np.isfinite(start.left_px)
         refinement = settings.refinement
         if settings.preset == "fast":
             refinement = replace(refinement, steps=min(refinement.steps, _FAST_STEPS), short_px=0.0)
-        refined = refine(pair.left, pair.right, _without_holes(believed), matched, noise, refinement)
-        sigma = np.sqrt(refined.variance_px2 + np.float32(settings.model_sigma_px**2))
-        kept = matched & (np.abs(refined.disparity_px - believed) < _FURTHEST_FROM_START_PX)
-        kept &= sigma <= settings.max_sigma_px
-        disparity = np.where(kept, refined.disparity_px, _NAN)
-        sigma = np.where(kept, sigma, _NAN)
+        refined = refine(pair.left, pair.right, _without_holes(start.left_px), matched, refinement)
+        sigma = self._sigma(pair, refined, matched)
+        kept = matched & (np.abs(refined.disparity_px - start.left_px) < _FURTHEST_FROM_START_PX)
+        if not settings.fill_occlusions:
+            kept &= sigma <= settings.max_sigma_px
+        disparity, sigma = np.where(kept, refined.disparity_px, _NAN), np.where(kept, sigma, _NAN)
+        if settings.fill_occlusions:
+            limits = float(candidates.lowest_px), float(candidates.highest_px)
+            disparity, guessed = fill(disparity, pair.left, start.right_px, *limits)
+            sigma = np.where(np.isfinite(guessed), guessed, sigma)
         if settings.preset == "best":
             disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
-        if settings.fill_occlusions:
-            disparity, guessed = fill(
-                disparity,
-                pair.left,
-                start.right_px,
-                float(candidates.lowest_px),
-                float(candidates.highest_px),
-            )
-            sigma = np.where(np.isfinite(guessed), guessed, sigma)
-            if settings.preset == "best":
-                disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
         return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
+
+    def _sigma(self, pair: RectifiedPair, refined: Refined, matched: Bool) -> Float32:
+        """Noise, what noise doesn't explain, and what a bend or an edge costs."""
+        settings = self.settings
+        vertical_px = vertical_error_px(pair.left, pair.right, refined.disparity_px, matched)
+        unexplained = settings.model_sigma_px**2 + (settings.vertical_share * vertical_px) ** 2
+        bend = bend_around(refined.disparity_px, settings.widest_edge_px)
+        bent = np.maximum(bend * bend - refined.variance_px2, 0)
+        variance = refined.variance_px2 + np.float32(unexplained) + np.float32(settings.edge_share**2) * bent
+        sigma: Float32 = np.sqrt(variance, dtype=np.float32)
+        return sigma
 
     def _start(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         settings = self.settings
@@ -114,6 +128,11 @@ class BarsightStereo:
         believed &= _lands_on(pair.right_valid, found.left_px)
         left_px = np.where(believed, found.left_px, _NAN)
         return _Start(without_islands(left_px, settings.island_px, 1.0), found.right_px)
+
+
+def _contrast(image: UInt8) -> float:
+    """Standard deviation of the grey values; a black or a blown-out image has none."""
+    return float(image[::2, ::2].std())
 
 
 def _inside(candidates: DisparityRange, width: int) -> DisparityRange:

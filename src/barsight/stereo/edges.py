@@ -39,7 +39,7 @@ def _beside_jumps(disparity: Float32, jump_px: float) -> Bool:
 
 
 @kernel(fastmath=True)
-def _weight_below(values: Float32, weights: Float32, count: int, level: float) -> float:
+def _weight_below(values: Float32, weights: Float32, count: int, level: np.float32) -> np.float32:
     total = np.float32(0)
     for i in range(count):
         total += weights[i] if values[i] <= level else np.float32(0)
@@ -73,7 +73,7 @@ def _weighted_medians(
                     found += 1
             lowest -= np.float32(_EXACT_PX)
             while highest - lowest > np.float32(_EXACT_PX):
-                middle = np.float32(0.5) * (lowest + highest)
+                middle = np.float32(np.float32(0.5) * (lowest + highest))
                 if _weight_below(values, weights, found, middle) >= np.float32(0.5) * total:
                     highest = middle
                 else:

@@ -29,11 +29,11 @@ _SEEN_SHARE = 0.3
 def fill(
     disparity: Float32, grey: UInt8, right_px: Float32, lowest_px: float, highest_px: float
 ) -> tuple[Float32, Float32]:
-    """`disparity` (H, W) with its NaN filled, as far as any ray finds a match, and the guesses' sigma (px; NaN
-    where nothing was guessed): the spread of the candidates, at least 1 px. Inputs stay as they are.
+    """`disparity` (H, W) with its NaN filled, as far as any ray finds a match, and the guesses' sigma (px;
+    NaN where nothing was guessed): the spread of the candidates, at least 1 px. Inputs stay as they are.
 
-    right_px: (H, W) the right image's disparity: a guess that would be seen there in front of what is there is
-    less likely. Guesses stay within lowest_px...highest_px.
+    right_px: (H, W) the right image's disparity: a guess that would be seen there in front of what is there
+    is less likely. Guesses stay within lowest_px...highest_px.
     """
     slope_x, slope_y = np.zeros_like(disparity), np.zeros_like(disparity)
     _slopes_beside_holes(disparity, _PLANE_RADIUS_PX, _SAME_SURFACE_PX, slope_x, slope_y)

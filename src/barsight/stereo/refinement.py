@@ -12,6 +12,7 @@ residual that is there.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -25,11 +26,16 @@ from barsight.stereo.supports import SupportShape, axis_means, fit_planes, tile_
 _BLUR_PX = 0.5
 _LONGEST_STEP_PX = 0.7
 _CONTRAST_FLOOR = np.float32(4)
-_SLACK = np.float32(1.5)
+_SLACK = np.float32(0.7)
 _BLEND_WINDOW_PX = 9
 _LONG_STEP_PX = 5
+_BLOCK_PX = 3
 _HOLD = np.float32(0.3)
 _HOLD_UNMATCHED = np.float32(0.02)
+_SUPPORT = np.float32(0.5 * 2.0)
+"""Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
+and the noise in the gradients cost: measured on rendered planes, not on the scenes that check sigma."""
+_LEAST_INFORMATION = np.float32(0.5)
 
 
 @dataclass(frozen=True)
@@ -76,13 +82,8 @@ class Refined:
     variance_px2: Float32
 
 
-def refine(
-    left: UInt8, right: UInt8, start: Float32, matched: Bool, noise_grey: float, settings: RefinementSettings
-) -> Refined:
-    """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow.
-
-    noise_grey: sigma of the difference of both images where they agree.
-    """
+def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
+    """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
     left_grey, right_grey = _smooth(left), _smooth(right)
     left_slope = _own_slope(row_coefficients(left_grey))
     right_coefficients = row_coefficients(right_grey)
@@ -94,9 +95,8 @@ def refine(
         slope = (left_slope + right_slope) * np.float32(0.5)
         residual = _residual(left_grey, warped, usable, settings.window_px)
         trust = usable / (1 + np.square(residual / np.float32(settings.outlier_grey)))
-        power = _weighted_mean(residual * residual, trust, settings.window_px)
-        power = np.maximum(power, np.float32(noise_grey * noise_grey))
         weight, pull = _evidence(residual, slope, trust, axes, settings)
+        power = _power(weight, pull, usable, settings.window_px)
         weight += _HOLD * (usable + _HOLD_UNMATCHED)
         fitted, variance = _fit(disparity, weight, pull, power, usable, axes, settings)
         disparity = disparity + np.clip(fitted - disparity, -_LONGEST_STEP_PX, _LONGEST_STEP_PX)
@@ -146,12 +146,25 @@ def _evidence(
     detail_power = _mean(trust * residual_detail * residual_detail, settings.window_px)
     mean_power = _mean(trust * residual_mean * residual_mean, settings.window_px)
     # So many independent samples stand behind a Gaussian mean: noise leaves that much less power in it.
-    samples = np.float32(2 * np.sqrt(np.pi) * settings.gloss_px)
+    samples = np.float32(2 * math.sqrt(math.pi) * settings.gloss_px)
     agreement = (detail_power + np.float32(1e-3)) / (samples * mean_power + np.float32(1e-3))
     share = np.minimum(np.float32(1), np.float32(settings.gloss_trust) * agreement)
     weight: Float32 = trust * (slope_detail * slope_detail + share * slope_mean * slope_mean)
     pull: Float32 = -trust * (slope_detail * residual_detail + share * slope_mean * residual_mean)
     return weight, pull
+
+
+def _power(weight: Float32, pull: Float32, usable: Float32, side: int) -> Float32:
+    """The noise power (grey levels^2) that the pulls show, per unit of what holds a disparity in place: from
+    their sums over blocks, so that neighbours which err alike count as what they are. Where the images say
+    little the plain hold takes their place and the power grows.
+    """
+    blocks = cv2.boxFilter(pull, -1, (_BLOCK_PX, _BLOCK_PX), normalize=False)
+    block_power = _mean(usable * blocks * blocks, side) / np.float32(_BLOCK_PX * _BLOCK_PX)
+    mean_weight = _mean(weight, side) + np.float32(1e-3)
+    seen = _mean(usable, side) + np.float32(1e-6)
+    power: Float32 = block_power / mean_weight * (mean_weight + _HOLD * seen) / mean_weight
+    return power
 
 
 def _fit(
@@ -168,20 +181,19 @@ def _fit(
     """
     long_shape = SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX)
     long, long_information = fit_planes(disparity, weight, pull, axes, long_shape, settings.same_surface_px)
-    long_variance = _SUPPORT * power / np.maximum(long_information, _LEAST_INFORMATION)
+    long_variance = _variance(power, long_information)
     if settings.short_px == 0:
         return long, long_variance
     short_shape = SupportShape(settings.short_px, settings.short_across_px)
     short, short_information = fit_planes(
         disparity, weight, pull, axes, short_shape, settings.same_surface_px
     )
-    short_variance = _SUPPORT * power / np.maximum(short_information, _LEAST_INFORMATION)
+    short_variance = _variance(power, short_information)
     gap = long - short
     excess = np.maximum(_weighted_mean(gap * gap - _SLACK * short_variance, usable, _BLEND_WINDOW_PX), 0)
     share = short_variance / (short_variance + excess + np.float32(1e-9))
     return short + share * gap, long_variance + (1 - share) * (short_variance - long_variance)
 
 
-_SUPPORT = np.float32(0.5)
-"""Sum of squared weights over their sum for a Gaussian support in the plane."""
-_LEAST_INFORMATION = np.float32(0.5)
+def _variance(power: Float32, information: Float32) -> Float32:
+    return np.asarray(_SUPPORT * power / np.maximum(information, _LEAST_INFORMATION), dtype=np.float32)

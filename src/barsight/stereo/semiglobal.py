@@ -1,8 +1,9 @@
 """Semi-global matching [Hirschmueller 2008] on a cost that neither gain nor single bright pixels upset.
 
 Cost of a candidate: Hamming distance of the 5x5 census [Zabih 1994], plus truncated differences of the x
-gradient and of the grey value. Eight paths; the penalty of a jump falls where the image has an edge. The image
-is worked through in stripes of rows, each with its own cost volume, so memory doesn't grow with the height.
+gradient and of the grey value. Eight paths; the penalty of a jump falls where the image has an edge. The
+image is worked through in stripes of rows, each with its own cost volume, so memory doesn't grow with the
+height.
 """
 
 from __future__ import annotations
@@ -70,7 +71,8 @@ def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiG
     _match_stripes(
         _census(left), _reversed(_census(right)), _gradient(left), _reversed(_gradient(right)),
         left.astype(np.int16), _reversed(right.astype(np.int16)), lowest_px, count,
-        settings.small_jump, settings.large_jump, settings.least_jump, -(-height // stripes), left_px, right_px,
+        settings.small_jump, settings.large_jump, settings.least_jump, -(-height // stripes),
+        left_px, right_px,
     )  # fmt: skip
     return Match(left_px, right_px)
 
@@ -149,8 +151,8 @@ def _row_costs(
 
 @kernel()
 def _extend_path(
-    cost: UInt8, before: Int16, least_before: int, small: int, jump: int, path: Int16, total: Int16
-) -> int:
+    cost: UInt8, before: Int16, least_before: Any, small: int, jump: Any, path: Int16, total: Int16
+) -> np.int16:
     """One pixel further along a path [Hirschmueller 2008, Eq. 13]; the path's least cost there."""
     least = np.int16(32000)
     ceiling = np.int16(least_before + jump)
@@ -184,7 +186,7 @@ def _sweep(
         y = height - 1 - i if upwards else i
         y_before = y + 1 if upwards else y - 1
         new, old = i & 1, 1 - (i & 1)
-        least_along = 0
+        least_along = np.int16(0)
         for j in range(width):
             x = width - 1 - j if upwards else j
             here = np.int32(grey[y, x])

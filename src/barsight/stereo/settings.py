@@ -11,6 +11,7 @@ from barsight.stereo.census import Census, CensusSettings
 from barsight.stereo.csca import Csca, CscaSettings
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.nonlocal_tree import Nonlocal, NonlocalSettings
+from barsight.stereo.paper import Paper, PaperSettings
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 
@@ -18,7 +19,7 @@ from barsight.stereo.sgbm import Sgbm, SgbmSettings
 class StereoSettings:
     """Dense stereo."""
 
-    method: Literal["sgbm", "csca", "nonlocal", "census", "barsight"] = "barsight"
+    method: Literal["sgbm", "csca", "nonlocal", "census", "paper", "barsight"] = "barsight"
     """Which method matches the pairs."""
     lowest_disparity_px: int | None = None
     """First candidate; found from the images when not given."""
@@ -35,6 +36,7 @@ class StereoSettings:
     nonlocal_tree: NonlocalSettings = field(default_factory=NonlocalSettings)
     """The method `nonlocal`."""
     census: CensusSettings = field(default_factory=CensusSettings)
+    paper: PaperSettings = field(default_factory=PaperSettings)
     barsight: BarsightSettings = field(default_factory=BarsightSettings)
 
     def __post_init__(self) -> None:
@@ -58,5 +60,7 @@ def make_method(settings: StereoSettings) -> StereoMethod:
             return Nonlocal(settings.nonlocal_tree)
         case "census":
             return Census(settings.census)
+        case "paper":
+            return Paper(settings.paper)
         case "sgbm":
             return Sgbm(settings.sgbm)

@@ -1,8 +1,8 @@
 """Supports that follow a bar: tiles with an axis, means along it, and planes fitted along it.
 
-The image is cut into tiles; each has one axis, the direction in which the image changes least. A support is a
-fixed pattern of whole-pixel offsets turned to that axis, so the innermost loop runs along a row of the tile and
-the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`with_margin`).
+The image is cut into tiles; each has one axis, the direction in which the image changes least. A support is
+a fixed pattern of whole-pixel offsets turned to that axis, so the innermost loop runs along a row of the tile
+and the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`with_margin`).
 """
 
 from __future__ import annotations
