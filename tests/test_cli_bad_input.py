@@ -401,3 +401,14 @@ def test_a_simulation_of_no_number(tmp_path: Path, capsys: pytest.CaptureFixture
     assert run(["simulate", str(tmp_path / "out"), "--camera.heading-deg", "nan"]) == 2
     assert "camera.heading_deg is nan" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
+
+
+def test_stamps_that_a_bag_cannot_hold(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(recording / "mav0" / "imu0")
+    shutil.rmtree(recording / "mav0" / "crane0")
+    for camera in ("cam0", "cam1"):
+        path = recording / "mav0" / camera / "data.csv"
+        edit(path, lambda rows: [rows[0], *(f"-{row}" for row in reversed(rows[1:]))])
+    assert run(["convert", str(recording), "-o", str(recording.parent / "bag"), "--to", "ros2-mcap"]) == 3
+    assert "can't be held by a ROS bag" in capsys.readouterr().err
+    assert [path.name for path in recording.parent.iterdir()] == ["recording"]

@@ -17,7 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from barsight.calibration.documents import write_document
 from barsight.calibration.kalibr import write_camchain, write_imu_file
-from barsight.core.errors import OutputError
+from barsight.core.arrays import Int64
+from barsight.core.errors import InputError, OutputError
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.bag_file import CLOUD_TYPE, COMPRESSED_TYPE, IMU_TYPE, POINT_TYPE
@@ -34,6 +35,7 @@ from barsight.recording.write_euroc import (
 CAMERA_TOPICS = ("/cam0/image_raw", "/cam1/image_raw")
 IMU_TOPIC = "/imu0"
 FLOAT64 = 8
+MOST_NS = 2**31 * NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,13 @@ def write_bag(
     """Write the bag `name` and its calibration into `folder`; returns the number of pictures written.
 
     Messages come in time's order, so that a reader need not hold more than a chunk.
+    Raises `InputError` for stamps that ROS can't hold.
     """
     messages = _Messages(ros1=flavour.storage is None)
     imu, crane, laser = recording.imu(), recording.crane(), recording.laser()
+    cameras = recording.camera_stamps
+    for stamps in (cameras.left_ns, cameras.right_ns, *(s.stamp_ns for s in (imu, crane) if s is not None)):
+        _expect_ros_times(recording.path, stamps)
     streams = [messages.images(recording)]
     if imu is not None:
         streams.append(messages.imu(imu))
@@ -76,6 +82,15 @@ def write_bag(
     _write_descriptions(recording, folder)
     copy_truth(recording, folder)
     return written
+
+
+def _expect_ros_times(path: Path, stamps: Int64) -> None:
+    """Increasing stamps (N,); ROS has unsigned times whose seconds end at 2^31."""
+    for stamp in (int(stamps[0]), int(stamps[-1])):
+        if not 0 <= stamp < MOST_NS:
+            raise InputError(
+                path, f"the stamp {stamp} ns can't be held by a ROS bag", "shift all stamps to after 1970"
+            )
 
 
 def _write_descriptions(recording: Source, folder: Path) -> None:

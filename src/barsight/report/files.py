@@ -85,7 +85,10 @@ def write_height(surface: Surface, target: Path) -> None:
     cell = surface.cell_m
     left = (surface.columns[0] - 0.5) * cell
     top = (surface.rows[1] - 0.5) * cell
-    bands = "".join(f'<Item name="DESCRIPTION" sample="{i}">{name}</Item>' for i, name in enumerate(BANDS))
+    bands = "".join(
+        f'<Item name="DESCRIPTION" sample="{i}" role="description">{name}</Item>'
+        for i, name in enumerate(BANDS)
+    )
     # GeoKeys: a projected system of its own (32767), pixels as areas, metres.
     keys = (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32767, 3076, 0, 1, 9001)
     with atomic_path(target) as path:
