@@ -7,73 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
 from barsight.cli.main import run
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
-from barsight.simulation.simulate import simulate
-
-TINY = SimulationSettings(
-    length_m=1.5,
-    frames=4,
-    seed=3,
-    camera=CameraSettings(width_px=320, height_px=256, focal_px=312.5),
-    yard=YardSettings(max_layers=2),
-)
-FAST = ("--stereo.method", "sgbm", "--map.cell-m", "0.05")
-
-
-@pytest.fixture(scope="session")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("simulated") / "recording"
-    simulate(path, TINY)
-    return path
-
-
-@pytest.fixture
-def recording(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "recording"))
-
-
-def measure(recording: Path, capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
-    """Exit code and standard error of measuring into a fresh folder beside the recording."""
-    out = recording.parent / "out"
-    before = sorted(recording.parent.iterdir())
-    code = run(["measure", str(recording), "-o", str(out), *FAST, *flags])
-    if code:
-        left = sorted(path for path in recording.parent.iterdir() if path not in before)
-        assert left == [], "a failed run leaves nothing"
-    return code, capsys.readouterr().err
-
-
-def refused(
-    recording: Path, capsys: pytest.CaptureFixture[str], *words: str, flags: tuple[str, ...] = ()
-) -> str:
-    """Measuring fails with one line that holds all the words."""
-    code, text = measure(recording, capsys, *flags)
-    assert code in (2, 3, 4, 5)
-    assert text.count("\n") == 1 and text.startswith("barsight: ")
-    for word in words:
-        assert word in text
-    return text
-
-
-def edit(path: Path, change: Callable[[list[str]], list[str]]) -> None:
-    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
-
-
-def pictures(recording: Path, camera: str) -> list[Path]:
-    return sorted((recording / "mav0" / camera / "data").glob("*.png"))
-
-
-def cut_short(path: Path) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
+from cli_runs import FAST, cut_short, edit, measure, pictures, refused
 
 
 def test_a_whole_recording_measures(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -228,43 +168,6 @@ def test_disk_full_in_the_middle(
     refused(recording, capsys, "disk is full", "out")
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[stereo]\nmethod = 'magic'\n", ("stereo", "magic")),
-        ("[stereo]\nmax_dept_m = 3.0\n", ("max_dept_m",)),
-        ("[map]\ncell_m = -1.0\n", ("cell_m",)),
-        ("[map\n", ("TOML",)),
-        ("\ufeff[map]\ncell_m = 99\n", ("cell_m must lie",)),
-        ("mp = 1\n", ("(mp);",)),
-    ],
-)
-def test_bad_configuration(
-    recording: Path, capsys: pytest.CaptureFixture[str], text: str, words: tuple[str, ...]
-) -> None:
-    path = recording.parent / "settings.toml"
-    path.write_text(text)
-    refused(recording, capsys, "settings.toml", *words, flags=("--config", str(path)))
-
-
-def test_impossible_flag(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    refused(recording, capsys, "min_views", flags=("--map.min-views", "0"))
-
-
-def test_flags_go_before_the_configuration(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = recording.parent / "settings.toml"
-    path.write_text("[map]\nmin_views = 99\n[stereo.sgbm]\nblock_px = 7\n")
-    refused(recording, capsys, "99 frames", flags=("--config", str(path)))
-    code, _ = measure(recording, capsys, "--config", str(path), "--map.min-views", "2")
-    assert code == 0
-    assert '"block_px": 7' in (recording.parent / "out" / "result.json").read_text()
-
-
-def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["mesure"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupted_in_the_middle(recording: Path, sent: signal.Signals) -> None:
     """Many copies of one frame keep the run busy; the signal comes once it has begun to write."""
@@ -309,32 +212,10 @@ def test_a_bag_measures_to_the_same_bytes(recording: Path, capsys: pytest.Captur
         assert (recording.parent / "out" / name).read_bytes() == (from_bag / name).read_bytes(), name
 
 
-def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import json
-
-    measure(recording, capsys, "--use", "stereo", "imu")
-    result = json.loads((recording.parent / "out" / "result.json").read_text())
-    assert result["is_simulated"] is True
-    assert result["reference"] == "world"
-    assert result["sensors_used"] == ["stereo", "imu"]
-    assert result["frames"]["total"] == result["frames"]["used"] == 4
-    assert len(result["hashes"]["calibration"]) == 64
-    rows = np.loadtxt(recording.parent / "out" / "trajectory.tum")
-    assert rows.shape == (4, 8)
-
-
 def test_a_stamp_that_no_clock_has(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = recording / "mav0" / "cam0" / "data.csv"
     edit(path, lambda rows: [*rows[:-1], "9" * 20 + "," + rows[-1].split(",")[1]])
     refused(recording, capsys, "cam0/data.csv", "line 5", "9" * 20)
-
-
-def test_names_too_long(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    long = recording.parent / ("a" * 300)
-    assert run(["measure", str(long), "-o", str(recording.parent / "out"), *FAST]) == 1
-    assert "too long" in capsys.readouterr().err
-    assert run(["measure", str(recording), "-o", str(long), *FAST]) == 4
-    assert "too long" in capsys.readouterr().err
 
 
 def test_a_disk_that_fills_up_under_numpy(
@@ -372,35 +253,6 @@ def test_another_run_was_first(
     assert "not empty" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["result.json"]
     assert (out / "result.json").read_text() == "theirs"
-
-
-@pytest.mark.parametrize(
-    "flags",
-    [
-        ("--map.profile-y-m", "nan"),
-        ("--map.fill-m", "inf"),
-        ("--stereo.sgbm.subpixel-sigma-px", "nan"),
-        ("--motion.odometry.features", "1000000000"),
-        ("--map.min-views", "9" * 20),
-        ("--use", "imu"),
-    ],
-)
-def test_settings_that_are_no_numbers(
-    recording: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...]
-) -> None:
-    refused(recording, capsys, flags[0].rpartition(".")[2].lstrip("-").replace("-", "_"), flags=flags)
-
-
-def test_nothing_sure_enough(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    refused(recording, capsys, "max_depth_m", flags=("--stereo.max-depth-m", "1"))
-    code, _ = measure(recording, capsys, "--stereo.highest-disparity-px", "1000000")
-    assert code == 0
-
-
-def test_a_simulation_of_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["simulate", str(tmp_path / "out"), "--camera.heading-deg", "nan"]) == 2
-    assert "camera.heading_deg is nan" in capsys.readouterr().err
-    assert not any(tmp_path.iterdir())
 
 
 def test_stamps_that_a_bag_cannot_hold(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

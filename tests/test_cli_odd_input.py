@@ -8,29 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.cli.main import run
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
-from barsight.simulation.simulate import simulate
-
-TINY = SimulationSettings(
-    length_m=1.5,
-    frames=4,
-    seed=3,
-    camera=CameraSettings(width_px=320, height_px=256, focal_px=312.5),
-    yard=YardSettings(max_layers=2),
-)
-FAST = ("--stereo.method", "sgbm", "--map.cell-m", "0.05")
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("simulated") / "recording"
-    simulate(path, TINY)
-    return path
-
-
-@pytest.fixture
-def recording(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "recording"))
+from cli_runs import FAST
 
 
 def measured(recording: Path, *flags: str) -> tuple[Path, dict]:

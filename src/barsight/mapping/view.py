@@ -53,6 +53,10 @@ class Viewer:
         candidates = disparity_range(pair, self.stereo)
         if isinstance(candidates, Failed):
             return candidates
+        width = pair.camera.width
+        if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
+            asked = f"{candidates.lowest_px}:{candidates.highest_px}"
+            return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.turn, self.watch("stereo", 1):
             matched = self.method(pair, candidates)
             disparity = without_gaps(matched, pair.left, self.stereo.gap_darkness)
@@ -74,7 +78,7 @@ class Viewer:
 
 
 def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:
-    """The settings' range, its open ends found from the images, no wider than the images."""
+    """The settings' range, its open ends found from the images."""
     low, high = stereo.lowest_disparity_px, stereo.highest_disparity_px
     if low is None or high is None:
         found = find_range(pair)
@@ -82,7 +86,6 @@ def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRan
             return found
         low = found.lowest_px if low is None else low
         high = found.highest_px if high is None else high
-    low, high = max(low, -pair.camera.width), min(high, pair.camera.width)
     if high <= low:
         return Failed("empty-range", f"the disparity range {low}:{high} is empty")
     return DisparityRange(low, high)

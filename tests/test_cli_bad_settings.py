@@ -1,0 +1,95 @@
+"""Settings that can't be, in files and flags: one line, an exit code, and nothing left behind."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.cli.main import run
+from cli_runs import FAST, measure, refused
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[stereo]\nmethod = 'magic'\n", ("stereo", "magic")),
+        ("[stereo]\nmax_dept_m = 3.0\n", ("max_dept_m",)),
+        ("[map]\ncell_m = -1.0\n", ("cell_m",)),
+        ("[map\n", ("TOML",)),
+        ("\ufeff[map]\ncell_m = 99\n", ("cell_m must lie",)),
+        ("mp = 1\n", ("(mp);",)),
+    ],
+)
+def test_bad_configuration(
+    recording: Path, capsys: pytest.CaptureFixture[str], text: str, words: tuple[str, ...]
+) -> None:
+    path = recording.parent / "settings.toml"
+    path.write_text(text)
+    refused(recording, capsys, "settings.toml", *words, flags=("--config", str(path)))
+
+
+def test_impossible_flag(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(recording, capsys, "min_views", flags=("--map.min-views", "0"))
+
+
+def test_flags_go_before_the_configuration(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording.parent / "settings.toml"
+    path.write_text("[map]\nmin_views = 99\n[stereo.sgbm]\nblock_px = 7\n")
+    refused(recording, capsys, "99 frames", flags=("--config", str(path)))
+    code, _ = measure(recording, capsys, "--config", str(path), "--map.min-views", "2")
+    assert code == 0
+    assert '"block_px": 7' in (recording.parent / "out" / "result.json").read_text()
+
+
+def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["mesure"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    measure(recording, capsys, "--use", "stereo", "imu")
+    result = json.loads((recording.parent / "out" / "result.json").read_text())
+    assert result["is_simulated"] is True
+    assert result["reference"] == "world"
+    assert result["sensors_used"] == ["stereo", "imu"]
+    assert result["frames"]["total"] == result["frames"]["used"] == 4
+    assert len(result["hashes"]["calibration"]) == 64
+    rows = np.loadtxt(recording.parent / "out" / "trajectory.tum")
+    assert rows.shape == (4, 8)
+
+
+def test_names_too_long(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    long = recording.parent / ("a" * 300)
+    assert run(["measure", str(long), "-o", str(recording.parent / "out"), *FAST]) == 1
+    assert "too long" in capsys.readouterr().err
+    assert run(["measure", str(recording), "-o", str(long), *FAST]) == 4
+    assert "too long" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--map.profile-y-m", "nan"),
+        ("--map.fill-m", "inf"),
+        ("--stereo.sgbm.subpixel-sigma-px", "nan"),
+        ("--motion.odometry.features", "1000000000"),
+        ("--map.min-views", "9" * 20),
+        ("--use", "imu"),
+    ],
+)
+def test_settings_that_are_no_numbers(
+    recording: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...]
+) -> None:
+    refused(recording, capsys, flags[0].rpartition(".")[2].lstrip("-").replace("-", "_"), flags=flags)
+
+
+def test_nothing_sure_enough(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused(recording, capsys, "max_depth_m", flags=("--stereo.max-depth-m", "1"))
+    refused(recording, capsys, "320 px wide", flags=("--stereo.highest-disparity-px", "1000000"))
+
+
+def test_a_simulation_of_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["simulate", str(tmp_path / "out"), "--camera.heading-deg", "nan"]) == 2
+    assert "camera.heading_deg is nan" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
