@@ -12,7 +12,7 @@ from barsight.core.timing import Stopwatch
 from barsight.core.types import DisparityRange, PosedFrame, RectifiedPair, StereoFrame
 from barsight.mapping.observation import CellObservations, observe
 from barsight.stereo.disparity_range import find_range
-from barsight.stereo.gaps import without_gaps
+from barsight.stereo.gaps import surer_than, without_gaps
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.points import triangulate
 from barsight.stereo.settings import StereoSettings
@@ -59,7 +59,8 @@ class Viewer:
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.turn, self.watch("stereo", 1):
             matched = self.method(pair, candidates)
-            disparity = without_gaps(matched, pair.left, self.stereo.gap_darkness)
+            sure = surer_than(matched, self.stereo.max_sigma_px)
+            disparity = without_gaps(sure, pair.left, self.stereo.gap_darkness)
         with self.watch("points", 1):
             points = triangulate(
                 pair,

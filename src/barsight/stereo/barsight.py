@@ -34,8 +34,8 @@ class BarsightSettings:
 
     preset: Literal["best", "fast"] = "best"
     """`fast` starts from OpenCV's 3-way SGBM, refines in two steps and leaves the edges as they are."""
-    fill_occlusions: bool = False
-    """Guess what only one image sees (sigma of 1 px or more) instead of leaving NaN."""
+    fill_occlusions: bool = True
+    """Guess what only one image sees (sigma of 1 px or more, which no map takes) instead of leaving NaN."""
     consistency_px: float = 1.0
     """Left and right disparities must agree to this."""
     island_px: int = 40

@@ -1,4 +1,4 @@
-"""Gaps between bars: narrow places so dark against their surroundings that no match of their own is there.
+"""What no map takes: guesses, and gaps between bars, so dark that nothing in them is matched itself.
 
 A gully whose floor neither camera sees is a black stripe between two edges of the same surface. It matches
 perfectly at that surface's disparity, since both edges do, but nothing lies there.
@@ -29,10 +29,18 @@ def without_gaps(disparity: Disparity, image: UInt8, darkness: float) -> Dispari
     """The disparity with gaps made unknown; darkness 0 leaves it as it is."""
     if darkness <= 0:
         return disparity
-    gap = in_gap(image, darkness)
+    return _kept(disparity, ~in_gap(image, darkness))
+
+
+def surer_than(disparity: Disparity, max_sigma_px: float) -> Disparity:
+    """The disparity without what is less sure than this, guesses among it."""
+    return _kept(disparity, disparity.sigma_px <= max_sigma_px)
+
+
+def _kept(disparity: Disparity, kept: Bool) -> Disparity:
     nan = np.float32(np.nan)
     return replace(
         disparity,
-        disparity_px=np.where(gap, nan, disparity.disparity_px),
-        sigma_px=np.where(gap, nan, disparity.sigma_px),
+        disparity_px=np.where(kept, disparity.disparity_px, nan),
+        sigma_px=np.where(kept, disparity.sigma_px, nan),
     )

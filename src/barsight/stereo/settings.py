@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from barsight.core.errors import ConfigError
 from barsight.stereo.barsight import BarsightSettings, BarsightStereo
@@ -14,12 +14,15 @@ from barsight.stereo.nonlocal_tree import Nonlocal, NonlocalSettings
 from barsight.stereo.paper import Paper, PaperSettings
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
+MethodName = Literal["sgbm", "csca", "nonlocal", "census", "paper", "barsight"]
+METHODS: tuple[MethodName, ...] = get_args(MethodName)
+
 
 @dataclass(frozen=True)
 class StereoSettings:
     """Dense stereo."""
 
-    method: Literal["sgbm", "csca", "nonlocal", "census", "paper", "barsight"] = "barsight"
+    method: MethodName = "barsight"
     """Which method matches the pairs."""
     lowest_disparity_px: int | None = None
     """First candidate; found from the images when not given."""
@@ -29,6 +32,8 @@ class StereoSettings:
     """Disparity error that the calibration may cause everywhere alike (1 sigma)."""
     max_depth_m: float = 40.0
     """Points further away are left out."""
+    max_sigma_px: float = 0.99
+    """A map takes no disparity less sure than this; what a method guesses says 1 px or more."""
     gap_darkness: float = 0.55
     """Places darker than this share of their surroundings are gaps between bars: unknown; 0 keeps them."""
     sgbm: SgbmSettings = field(default_factory=SgbmSettings)
@@ -45,6 +50,8 @@ class StereoSettings:
             raise ConfigError(f"the disparity range {low}:{high} is empty")
         if self.calibration_sigma_px < 0 or self.max_depth_m <= 0:
             raise ConfigError("calibration_sigma_px can't be negative, max_depth_m must be positive")
+        if self.max_sigma_px <= 0:
+            raise ConfigError(f"max_sigma_px must be positive, not {self.max_sigma_px}")
         if not 0 <= self.gap_darkness < 1:
             raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
 
