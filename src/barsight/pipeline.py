@@ -83,7 +83,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     poses = {frame.stamp_ns: frame for frame in trajectory.frames}
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
-    method = make_method(settings.stereo)
+    method = make_method(settings.stereo.for_map())
     turn = threading.Lock() if method.uses_all_cores else nullcontext()
     per_pixel = points_per_pixel(first, cell_m)
     viewer = Viewer(

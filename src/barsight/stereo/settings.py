@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from barsight.core.errors import ConfigError
@@ -54,6 +54,10 @@ class StereoSettings:
             raise ConfigError(f"max_sigma_px must be positive, not {self.max_sigma_px}")
         if not 0 <= self.gap_darkness < 1:
             raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
+
+    def for_map(self) -> StereoSettings:
+        """The same without the time that guesses take, since no map takes them."""
+        return replace(self, barsight=replace(self.barsight, fill_occlusions=False))
 
 
 def make_method(settings: StereoSettings) -> StereoMethod:
