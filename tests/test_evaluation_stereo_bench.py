@@ -11,7 +11,8 @@ import pytest
 
 from barsight.core.errors import InputError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
-from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table, write_stereo_json
+from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table
+from barsight.evaluation.stereo_provenance import write_json
 from barsight.evaluation.stereo_scenes import load_scene, load_scenes, visible_in_both
 from barsight.evaluation.stereo_scores import score_disparity
 from barsight.stereo.disparity_files import write_disparity
@@ -117,7 +118,7 @@ def test_the_bench_prints_tables_and_writes_json(tmp_path: Path) -> None:
         result.per_megapixel.fastest_ms <= result.per_megapixel.median_ms <= result.per_megapixel.slowest_ms
     )
     assert stereo_table(bench).row_count == 1 and scene_table(bench).row_count == 2
-    write_stereo_json(tmp_path / "out.json", bench)
+    write_json(tmp_path / "out.json", bench)
     stored = json.loads((tmp_path / "out.json").read_text())
     assert stored["methods"][0]["mean"]["bad1_pct"] == 50
     assert stored["provenance"]["commit"] and stored["provenance"]["cores"] >= 1

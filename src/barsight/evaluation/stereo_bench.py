@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from barsight.core.files import atomic_path
 from barsight.evaluation.stereo_provenance import LEAST_REPEATS, Provenance, Timing, provenance, timed, timing
 from barsight.evaluation.stereo_scenes import StereoScene, load_scenes
 from barsight.evaluation.stereo_scores import StereoScore, score_disparity
@@ -102,14 +100,6 @@ def scene_table(bench: StereoBench) -> Table:
     return table
 
 
-def write_stereo_json(target: Path, bench: StereoBench) -> None:
-    """All figures with commit and machine; NaN becomes null."""
-    with atomic_path(target) as temporary:
-        temporary.write_text(
-            json.dumps(_without_nan(dataclasses.asdict(bench)), indent=1) + "\n", encoding="utf-8"
-        )
-
-
 def _bench_method(
     name: str, method: StereoMethod, scenes: tuple[StereoScene, ...], repeats: int
 ) -> MethodResult:
@@ -142,13 +132,3 @@ def _cells(score: StereoScore, time: Timing) -> tuple[str, ...]:
         f"{score.average_px:.3f}",
         f"{time.median_ms:.0f} ({time.fastest_ms:.0f}-{time.slowest_ms:.0f})",
     )
-
-
-def _without_nan(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _without_nan(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_nan(one) for one in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

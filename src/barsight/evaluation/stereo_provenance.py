@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 import platform
 import subprocess
@@ -9,9 +11,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+
+from barsight.core.files import atomic_path
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 T = TypeVar("T")
 LEAST_REPEATS = 5
@@ -60,6 +67,23 @@ def timing(seconds: list[float]) -> Timing:
     """The summary of `timed`'s seconds."""
     ms = 1e3 * np.array(seconds)
     return Timing(float(np.median(ms)), float(ms.min()), float(ms.max()), len(seconds))
+
+
+def write_json(target: Path, record: DataclassInstance) -> None:
+    """A frozen record as JSON, whole or not at all; NaN and infinity become null."""
+    text = json.dumps(_without_nan(dataclasses.asdict(record)), indent=1) + "\n"
+    with atomic_path(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _without_nan(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _without_nan(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(one) for one in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
 
 
 def _commit() -> str:

@@ -47,8 +47,9 @@ class PaperSettings:
     settled_px: float = 0.05
     """It has settled when 95 % of the disparities change by less than this."""
     output: OutputSettings = field(
-        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.3, filled_sigma_px=2.0)
+        default_factory=lambda: OutputSettings(fill=False, subpixel_sigma_px=0.3, filled_sigma_px=2.0)
     )
+    """The loop doesn't know what lies behind an edge: it fills what is hidden with what is near."""
 
     def __post_init__(self) -> None:
         if self.eta <= 0 or self.sigma_px <= 0 or self.sigma_gray <= 0 or self.settled_px <= 0:

@@ -29,6 +29,7 @@ _CONTRAST_FLOOR = np.float32(4)
 _SLACK = np.float32(0.7)
 _BLEND_WINDOW_PX = 9
 _LONG_STEP_PX = 5
+_SHORT_STEP_PX = 3
 _BLOCK_PX = 3
 _HOLD = np.float32(0.3)
 _HOLD_UNMATCHED = np.float32(0.02)
@@ -184,7 +185,7 @@ def _fit(
     long_variance = _variance(power, long_information)
     if settings.short_px == 0:
         return long, long_variance
-    short_shape = SupportShape(settings.short_px, settings.short_across_px)
+    short_shape = SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX)
     short, short_information = fit_planes(
         disparity, weight, pull, axes, short_shape, settings.same_surface_px
     )

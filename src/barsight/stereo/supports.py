@@ -19,7 +19,7 @@ from barsight.core.arrays import Float32, kernel
 TILE_ROWS = 16
 TILE_COLUMNS = 32
 MARGIN = 48
-_LEAST_COHERENCE = 0.2
+_LEAST_COHERENCE = 0.35
 _REACH = 2.0
 
 
@@ -38,14 +38,17 @@ def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
     From the structure tensor [Foerstner 1987] averaged over scale_px. Where no direction stands out it is the
     column's, across the baseline: there a mean along the axis costs the match least.
     """
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.2)
+    # Half the size is fine enough for a direction, and a quarter of the work.
+    smooth = cv2.resize(
+        cv2.GaussianBlur(image, (0, 0), 1.2), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
+    )
     slope_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
     slope_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
     height, width = image.shape
-    rows = np.minimum(np.arange(-(-height // TILE_ROWS)) * TILE_ROWS + TILE_ROWS // 2, height - 1)
-    columns = np.minimum(np.arange(-(-width // TILE_COLUMNS)) * TILE_COLUMNS + TILE_COLUMNS // 2, width - 1)
+    rows = np.minimum(np.arange(-(-height // TILE_ROWS)) * TILE_ROWS + TILE_ROWS // 2, height - 2)
+    columns = np.minimum(np.arange(-(-width // TILE_COLUMNS)) * TILE_COLUMNS + TILE_COLUMNS // 2, width - 2)
     xx, xy, yy = (
-        cv2.GaussianBlur(product, (0, 0), scale_px)[np.ix_(rows, columns)]
+        cv2.GaussianBlur(product, (0, 0), scale_px / 2)[np.ix_(rows // 2, columns // 2)]
         for product in (slope_x * slope_x, slope_x * slope_y, slope_y * slope_y)
     )
     across = 0.5 * np.arctan2(2 * xy, xx - yy)

@@ -1,0 +1,246 @@
+"""The diameter of a bar out of a disparity map: one cylinder over one floor, fitted to the whole map at once.
+
+The floor is a plane, whose disparity is linear in the image; it is fitted away from the bar. Then a cylinder
+(place, direction, radius) in front of it predicts each pixel's disparity near the bar: the bar's points hold
+its place and curvature, and where the map changes from bar to floor, its edges hold its width. Residuals are
+divided by the method's own sigma, scaled so that they suit one another, and count through Cauchy's robust
+loss. Nothing but the map is used; the images aren't looked at.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import fmin
+
+from barsight.core.arrays import Bool, Float64, kernel
+from barsight.core.errors import Failed
+from barsight.core.types import Disparity, RectifiedCamera
+
+_ROUNDS = 3
+_FEWEST_PIXELS = 200
+_REACH_RADII = 2.0
+_CLEAR_RADII = 1.6
+_CAUCHY_SIGMAS = 2.4
+
+
+_Problem = tuple[Float64, float, Float64, Float64, float, float, Float64, Float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BarGuess:
+    """Where the bar lies about, in `rect0`: a point of its axis, its direction, its radius."""
+
+    centre_m: Float64
+    axis: Float64
+    radius_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class BarFit:
+    """The cylinder found. residual_px: the map's median absolute residual near the bar."""
+
+    centre_m: Float64
+    axis: Float64
+    radius_m: float
+    residual_px: float
+
+
+def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> BarFit | Failed:
+    """Fit the cylinder from a guess that is good to about a quarter of the radius.
+
+    Failed `no-floor`, `no-bar` where too few pixels have a disparity, `diverged` where the radius leaves
+    0.3...3 times the guess.
+    """
+    beside = _beside_the_axis(camera, guess)
+    near = np.abs(beside) < _REACH_RADII * guess.radius_m
+    known = np.isfinite(disparity.disparity_px) & (disparity.sigma_px > 0)
+    floor = _fit_floor(disparity, known & (np.abs(beside) > _CLEAR_RADII * guess.radius_m))
+    if floor is None:
+        return Failed("no-floor", "too few pixels of the floor have a disparity")
+    rows, columns = np.nonzero(near & known)
+    if rows.size < _FEWEST_PIXELS:
+        return Failed("no-bar", f"only {rows.size} pixels near the bar have a disparity")
+    rays = np.column_stack([(columns - camera.cx_px), (rows - camera.cy_px)]) / camera.focal_px
+    behind = floor[0] * columns + floor[1] * rows + floor[2]
+    found = disparity.disparity_px[rows, columns].astype(np.float64)
+    sigma = disparity.sigma_px[rows, columns].astype(np.float64)
+    frame = _frame(guess)
+    scale_px = camera.focal_px * camera.baseline_m
+    place = np.zeros(5)
+    kappa = 1.0
+    residual = np.abs(found - _predict(place, frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px))
+    for _ in range(_ROUNDS):
+        kappa = max(1.4826 * float(np.median(residual / sigma)), 1e-3)
+        weight = 1 / (_CAUCHY_SIGMAS * kappa * sigma)
+        place = _descend(
+            place, (frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px, found, weight)
+        )
+        residual = np.abs(
+            found - _predict(place, frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px)
+        )
+    centre, axis, radius = _placed(place, frame, guess.radius_m)
+    if not 0.3 < radius / guess.radius_m < 3:
+        return Failed("diverged", f"the fit ends at a radius of {1000 * radius:.1f} mm")
+    return BarFit(centre, axis, radius, float(np.median(residual)))
+
+
+def _beside_the_axis(camera: RectifiedCamera, guess: BarGuess) -> Float64:
+    """(H, W) metres: how far each pixel's ray passes beside the guessed axis, at its depth; signed."""
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack(
+        [
+            (columns - camera.cx_px) / camera.focal_px,
+            (rows - camera.cy_px) / camera.focal_px,
+            np.ones(columns.shape),
+        ],
+        axis=-1,
+    )
+    normal = np.cross(guess.centre_m, guess.axis)
+    normal = normal / np.linalg.norm(normal)
+    beside: Float64 = (rays @ normal) * guess.centre_m[2]
+    return beside
+
+
+def _fit_floor(disparity: Disparity, where: Bool) -> Float64 | None:
+    """(3,) the disparity as a * column + b * row + c, by reweighted least squares; None where too few."""
+    rows, columns = np.nonzero(where)
+    if rows.size < _FEWEST_PIXELS:
+        return None
+    design = np.column_stack([columns, rows, np.ones(rows.size)]).astype(np.float64)
+    values = disparity.disparity_px[rows, columns].astype(np.float64)
+    sigma = disparity.sigma_px[rows, columns].astype(np.float64)
+    # The start must stand a good share of wrong values: the median of the residual from a constant slope.
+    plane = np.array([0.0, 0.0, float(np.median(values))])
+    for step in range(15):
+        residual = np.abs(values - design @ plane) / sigma
+        kappa = max(1.4826 * float(np.median(residual)), 1e-3) * (4 if step < 5 else _CAUCHY_SIGMAS)
+        root = 1 / (sigma * np.sqrt(1 + (residual / kappa) ** 2))
+        plane = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
+    return plane
+
+
+def _frame(guess: BarGuess) -> Float64:
+    """(4, 3): the guess's centre, axis, and the two directions across it: sideways and towards the camera."""
+    sideways = np.cross(guess.axis, guess.centre_m)
+    sideways = sideways / np.linalg.norm(sideways)
+    return np.array([guess.centre_m, guess.axis, sideways, np.cross(sideways, guess.axis)])
+
+
+def _placed(place: Float64, frame: Float64, radius_m: float) -> tuple[Float64, Float64, float]:
+    """place: (5,) shifts sideways and towards the camera, turns likewise, growth: in radii of the guess."""
+    centre = frame[0] + radius_m * (place[0] * frame[2] + place[1] * frame[3])
+    axis = frame[1] + radius_m * (place[2] * frame[2] + place[3] * frame[3])
+    return centre, axis / np.linalg.norm(axis), radius_m * math.exp(place[4])
+
+
+def _descend(start: Float64, problem: _Problem) -> Float64:
+    """Nelder and Mead's simplex: the loss has small steps where pixels change from floor to bar."""
+    simplex = np.vstack([start, start + 0.1 * np.eye(5)])
+    best: Float64 = fmin(
+        _loss,
+        start,
+        args=problem,
+        xtol=1e-4,
+        ftol=1e-7,
+        maxiter=1200,
+        maxfun=1500,
+        disp=False,
+        initial_simplex=simplex,
+    )
+    return best
+
+
+def _loss(
+    place: Float64,
+    frame: Float64,
+    radius_m: float,
+    rays: Float64,
+    behind: Float64,
+    scale_px: float,
+    doffs_px: float,
+    found: Float64,
+    weight: Float64,
+) -> float:
+    centre, axis, radius = _placed(place, frame, radius_m)
+    return _cauchy(centre, axis, radius, rays, behind, scale_px, doffs_px, found, weight)
+
+
+def _predict(
+    place: Float64,
+    frame: Float64,
+    radius_m: float,
+    rays: Float64,
+    behind: Float64,
+    scale_px: float,
+    doffs_px: float,
+) -> Float64:
+    centre, axis, radius = _placed(place, frame, radius_m)
+    predicted = np.empty(len(rays))
+    _disparities(centre, axis, radius, rays, behind, scale_px, doffs_px, predicted)
+    return predicted
+
+
+@kernel()
+def _disparity_of_ray(
+    centre: Float64,
+    axis: Float64,
+    radius: float,
+    x: float,
+    y: float,
+    behind: float,
+    scale: float,
+    doffs: float,
+) -> float:
+    """The nearer of the cylinder (where the ray (x, y, 1) hits it) and the floor behind."""
+    slide = axis[0] * x + axis[1] * y + axis[2]
+    lift = axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]
+    ex, ey, ez = x - slide * axis[0], y - slide * axis[1], 1 - slide * axis[2]
+    px, py, pz = centre[0] - lift * axis[0], centre[1] - lift * axis[1], centre[2] - lift * axis[2]
+    a = ex * ex + ey * ey + ez * ez
+    b = ex * px + ey * py + ez * pz
+    root = b * b - a * (px * px + py * py + pz * pz - radius * radius)
+    if root <= 0:
+        return behind
+    return float(max(behind, scale * a / (b - math.sqrt(root)) - doffs))
+
+
+@kernel()
+def _cauchy(
+    centre: Float64,
+    axis: Float64,
+    radius: float,
+    rays: Float64,
+    behind: Float64,
+    scale: float,
+    doffs: float,
+    found: Float64,
+    weight: Float64,
+) -> float:
+    total = 0.0
+    for index in range(rays.shape[0]):
+        predicted = _disparity_of_ray(
+            centre, axis, radius, rays[index, 0], rays[index, 1], behind[index], scale, doffs
+        )
+        away = (found[index] - predicted) * weight[index]
+        total += math.log1p(away * away)
+    return float(total / rays.shape[0])
+
+
+@kernel()
+def _disparities(
+    centre: Float64,
+    axis: Float64,
+    radius: float,
+    rays: Float64,
+    behind: Float64,
+    scale: float,
+    doffs: float,
+    predicted: Float64,
+) -> None:
+    for index in range(rays.shape[0]):
+        predicted[index] = _disparity_of_ray(
+            centre, axis, radius, rays[index, 0], rays[index, 1], behind[index], scale, doffs
+        )
