@@ -1,0 +1,47 @@
+"""`barsight bench`: tables and JSON from the command line; mistakes in one line."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barsight.cli.main import run
+from barsight.core.types import Disparity
+from barsight.stereo.disparity_files import write_disparity
+
+
+@pytest.fixture
+def scenes(tmp_path: Path) -> Path:
+    folder = tmp_path / "data" / "wall"
+    folder.mkdir(parents=True)
+    noise = np.random.default_rng(2).integers(0, 255, (120, 220)).astype(np.uint8)
+    wall = cv2.GaussianBlur(noise, (0, 0), 1.1)
+    cv2.imwrite(str(folder / "left.png"), wall[:, :-10])
+    cv2.imwrite(str(folder / "right.png"), wall[:, 10:])
+    truth = np.full((120, 210), 10, np.float32)
+    write_disparity(folder / "disp.pfm", Disparity(truth, truth))
+    return tmp_path / "data"
+
+
+def test_stereo_methods_side_by_side(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    saved = tmp_path / "bench.json"
+    arguments = ["bench", "stereo", str(scenes), "--methods", "sgbm", "barsight", "--json", str(saved)]
+    assert run([*arguments, "--repeats", "5"]) == 0
+    printed = capsys.readouterr().out
+    assert "sgbm" in printed and "barsight" in printed and "wall" in printed
+    methods = {method["method"]: method for method in json.loads(saved.read_text())["methods"]}
+    assert set(methods) == {"sgbm", "barsight"}
+    assert methods["barsight"]["scenes"][0]["scene"] == "wall"
+
+
+def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["bench", "everything"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert run(["bench", "stereo", str(tmp_path)]) == 3
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1 and str(tmp_path) in text
