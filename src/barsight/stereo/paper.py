@@ -47,7 +47,7 @@ class PaperSettings:
     settled_px: float = 0.05
     """It has settled when 95 % of the disparities change by less than this."""
     output: OutputSettings = field(
-        default_factory=lambda: OutputSettings(fill=False, subpixel_sigma_px=0.3, filled_sigma_px=2.0)
+        default_factory=lambda: OutputSettings(fill=False, subpixel_sigma_px=0.28, filled_sigma_px=9.0)
     )
     """The loop doesn't know what lies behind an edge: it fills what is hidden with what is near."""
 
