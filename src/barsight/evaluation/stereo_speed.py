@@ -1,4 +1,4 @@
-"""`bench speed`: wall time of every method on one 1280x1024 pair with 96 candidates, against OpenCV's SGBM."""
+"""`bench speed`: wall time of every method on a 1280x1024 pair with 96 candidates, against OpenCV's SGBM."""
 
 from __future__ import annotations
 
