@@ -15,6 +15,7 @@ from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_t
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.evaluation.stereo_scenes import load_scene, load_scenes, visible_in_both
 from barsight.evaluation.stereo_scores import score_disparity
+from barsight.evaluation.stereo_speed import bench_speed, speed_table
 from barsight.stereo.disparity_files import write_disparity
 
 
@@ -122,3 +123,16 @@ def test_the_bench_prints_tables_and_writes_json(tmp_path: Path) -> None:
     stored = json.loads((tmp_path / "out.json").read_text())
     assert stored["methods"][0]["mean"]["bad1_pct"] == 50
     assert stored["provenance"]["commit"] and stored["provenance"]["cores"] >= 1
+
+
+def test_bench_speed_times_methods_against_sgbm(tmp_path: Path) -> None:
+    def instant(pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        assert pair.left.shape == (1024, 1280) and candidates.count == 96
+        return _disparity(np.zeros((1, 1)))
+
+    bench = bench_speed({"instant": instant}, repeats=5)
+    assert bench.reference.median_ms > 20 and bench.reference.repeats == 5
+    assert bench.methods[0].ratio < 0.1
+    assert speed_table(bench).row_count == 2
+    write_json(tmp_path / "out.json", bench)
+    assert json.loads((tmp_path / "out.json").read_text())["methods"][0]["method"] == "instant"

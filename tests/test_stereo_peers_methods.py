@@ -86,6 +86,22 @@ def test_a_range_beyond_the_image_has_no_match(name: str) -> None:
 
 
 @every_method
+@pytest.mark.parametrize("shape", [(1, 40), (2, 2), (5, 7), (60, 9), (33, 70)])
+def test_small_images_and_odd_ranges_give_disparities_in_range_or_none(
+    name: str, shape: tuple[int, int]
+) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    pair = pair_from_images(image, np.roll(image, -3, 1))
+    for lowest, highest in ((0, 16), (-20, 5), (3, 4), (0, 300), (-300, -290)):
+        found = METHODS[name](pair, DisparityRange(lowest, highest))
+        known = np.isfinite(found.disparity_px)
+        assert found.disparity_px.shape == found.sigma_px.shape == shape
+        assert (known == np.isfinite(found.sigma_px)).all()
+        inside = (found.disparity_px >= lowest - 0.51) & (found.disparity_px <= highest - 0.49)
+        assert inside[known].all()
+
+
+@every_method
 def test_invalid_pixels_of_the_left_image_stay_empty(name: str) -> None:
     pair = _pair(np.full((60, 110), 5.0))
     invalid = np.zeros((60, 110), dtype=bool)

@@ -17,7 +17,10 @@ _LEAST_RELIABLE = 0.01
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What comes out of a method, and how sure it says to be."""
+    """What comes out of a method, and how sure it says to be.
+
+    Each method has its own sigmas, measured on Middlebury's motorcycle as what 68 % of the errors stay below.
+    """
 
     fill: bool = True
     """Give pixels that only one image sees a guess from their surroundings, as the methods' authors do;

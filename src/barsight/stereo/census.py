@@ -53,7 +53,7 @@ class CensusSettings:
     vote_rounds: int = 5
     """Rounds of voting."""
     output: OutputSettings = field(
-        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.3, filled_sigma_px=2.0)
+        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.26, filled_sigma_px=2.7)
     )
 
     def __post_init__(self) -> None:

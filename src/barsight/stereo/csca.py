@@ -59,7 +59,7 @@ class CscaSettings:
     median_sigma_gray: float = 14.7
     """How fast its weights fall with the gray difference (the authors' 0.1 over three colours)."""
     output: OutputSettings = field(
-        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.3, filled_sigma_px=2.0)
+        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.27, filled_sigma_px=1.0)
     )
 
     def __post_init__(self) -> None:

@@ -11,12 +11,15 @@ from barsight.stereo.sgbm import image_noise
 
 _VISIBLE_STEP = 4
 _LEAST_SHARE = 1e-3
+_FEWEST_ROWS = 3
 
 
 def has_texture(pair: RectifiedPair) -> bool:
     """Whether in either image at least one pixel in a thousand differs from its neighbour but one by more
-    than 4 gray levels: a black, a burnt out or an all gray image has none.
+    than 4 gray levels: a black, a burnt out or an all gray image has none, nor one of fewer than 3 rows.
     """
+    if pair.left.shape[0] < _FEWEST_ROWS:
+        return False
     return _is_textured(pair.left, pair.left_valid) and _is_textured(pair.right, pair.right_valid)
 
 

@@ -40,7 +40,7 @@ class NonlocalSettings:
     sigma: float = 0.1
     """How fast support falls along the tree, as a share of 255 gray levels; the refinement takes half."""
     output: OutputSettings = field(
-        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.4, filled_sigma_px=2.0)
+        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.32, filled_sigma_px=1.6)
     )
 
     def __post_init__(self) -> None:

@@ -24,6 +24,7 @@ from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 _SUPPORT_RADIUS_PX = 4
 _SETTLED_SHARE = 0.95
+_NARROWEST_PX = 16  # OpenCV rounds the candidates up to so many.
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class PaperSettings:
     settled_px: float = 0.05
     """It has settled when 95 % of the disparities change by less than this."""
     output: OutputSettings = field(
-        default_factory=lambda: OutputSettings(fill=False, subpixel_sigma_px=0.3, filled_sigma_px=2.0)
+        default_factory=lambda: OutputSettings(fill=False, subpixel_sigma_px=0.28, filled_sigma_px=9.0)
     )
     """The loop doesn't know what lies behind an edge: it fills what is hidden with what is near."""
 
@@ -68,7 +69,9 @@ class Paper:
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`. Without `output.fill`, NaN where the initial disparity has none."""
         settings = self.settings
-        if not has_texture(pair) or not fits(candidates, pair.left.shape[1]):
+        width = pair.left.shape[1]
+        too_narrow = width + min(candidates.lowest_px, 0) <= _NARROWEST_PX
+        if not has_texture(pair) or not fits(candidates, width) or too_narrow:
             return nothing(pair)
         start: Sgbm | Census = Sgbm(settings.sgbm) if settings.initial == "sgbm" else Census(settings.census)
         initial = start(pair, candidates)
@@ -97,7 +100,7 @@ def settle(
             values, pair.left, candidates, limit, settings.radius_px, settings.sigma_px, settings.sigma_gray
         )
         known = np.isfinite(before)
-        moved = np.abs(values[known] - before[known]) >= settings.settled_px
-        if moved.mean() <= 1 - _SETTLED_SHARE:
+        still = np.abs(values[known] - before[known]) < settings.settled_px
+        if np.count_nonzero(still) >= _SETTLED_SHARE * still.size:
             break
     return values

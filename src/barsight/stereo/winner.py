@@ -75,10 +75,11 @@ def between_candidates(winners: Winners) -> Float32:
 
     Whole where a neighbour is missing or the costs don't curve upwards; never further than half a pixel.
     """
-    bend = winners.below + winners.above - 2 * winners.cost
-    slope = winners.below - winners.above
-    usable = np.isfinite(bend) & (bend > 0)
-    offset = np.where(usable, slope, 0) / np.where(usable, 2 * bend, 1)
+    complete = np.isfinite(winners.below) & np.isfinite(winners.above)
+    below, above = (np.where(complete, one, 0) for one in (winners.below, winners.above))
+    bend = below + above - 2 * winners.cost
+    usable = complete & (bend > 0)
+    offset = np.where(usable, below - above, 0) / np.where(usable, 2 * bend, 1)
     between: Float32 = (winners.candidate_px + offset.clip(-0.5, 0.5)).astype(np.float32)
     return between
 
