@@ -11,6 +11,7 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 
 MOST_PER_SIDE = 100
+LARGEST_M = 2.0
 BOARD_FORMS = (
     "checkerboard:9x6:0.025 (inner corners, square in m), charuco:11x8:0.03:0.022[:DICT_5X5_250] (squares, "
     "square and marker in m) or aprilgrid:6x6:0.088:0.3 (tags, tag in m, gap as a share of the tag)"
@@ -47,7 +48,7 @@ class Board:
         least = {BoardKind.CHECKERBOARD: 3, BoardKind.CHARUCO: 3, BoardKind.APRILGRID: 1}[self.kind]
         if not (least <= self.columns <= MOST_PER_SIDE and least <= self.rows <= MOST_PER_SIDE):
             raise ConfigError(f"a {self.kind} of {self.columns}x{self.rows} can't be; {BOARD_FORMS}")
-        if not 0 < self.size_m < 100:
+        if not 0 < self.size_m <= LARGEST_M:
             raise ConfigError(f"a size of {self.size_m} m can't be; sizes are in metres: {BOARD_FORMS}")
         if self.kind is BoardKind.CHARUCO and not 0 < self.marker_m < self.size_m:
             raise ConfigError(f"a marker of {self.marker_m} m doesn't fit a square of {self.size_m} m")

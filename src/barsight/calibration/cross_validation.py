@@ -17,7 +17,7 @@ from barsight.calibration.calibration_uncertainty import (
     turn_free,
 )
 from barsight.calibration.lens_model import project
-from barsight.calibration.stereo_calibration import StereoCalibration, rig_of, scaled_inverse
+from barsight.calibration.stereo_calibration import StereoCalibration, rig_of
 from barsight.calibration.views import BoardView
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
@@ -30,9 +30,9 @@ MOST_BLOCKS = 16
 class CrossValidation:
     """Differences between the halves, root mean square over the covered cells (px) or the points (mm).
 
-    difference_px, predicted_px: per camera. ratio: the largest of all measured over predicted values.
+    difference_px, predicted_px: per camera.
     ranges_m, depth_mm, depth_predicted_mm: (R,) the depth difference of the same pixel pairs.
-    baseline_mm, baseline_predicted_mm: of the baseline.
+    baseline_mm, baseline_predicted_mm: of the baseline, for information.
     """
 
     difference_px: tuple[float, float]
@@ -45,10 +45,9 @@ class CrossValidation:
 
     @property
     def ratio(self) -> float:
-        """How many times its predicted sigma the worst difference is."""
+        """How many times its predicted sigma the worst difference of projections or depths is."""
         pairs = [*zip(self.difference_px, self.predicted_px, strict=True)]
         pairs += [*zip(self.depth_mm, self.depth_predicted_mm, strict=True)]
-        pairs.append((self.baseline_mm, self.baseline_predicted_mm))
         return max(measured / predicted for measured, predicted in pairs if predicted > 0)
 
 
@@ -81,12 +80,27 @@ def _solve_half(calibration: StereoCalibration, half: list[BoardView]) -> Solved
 
 
 def _half_covariance(calibration: StereoCalibration, half: Solved) -> Float64:
-    """The half's covariance if its views scatter as all do: its share of the whole's sandwich."""
-    share = float(np.trace(half.reduced @ scaled_inverse(calibration.information))) / len(half.reduced)
-    filling = calibration.information @ calibration.covariance @ calibration.information
-    inverse = scaled_inverse(half.reduced)
-    covariance: Float64 = share * inverse @ filling @ inverse
+    """The half's covariance, widened by its views' correlation as the whole's is.
+
+    With S and S_h the whole's and the half's information: S_h^-1/2 (S^1/2 C S^1/2) S_h^-1/2, which is sigma^2
+    S_h^-1 where C is sigma^2 S^-1.
+    """
+    scale = 1 / np.sqrt(np.diag(calibration.information))
+    unit = scale[:, None] * scale
+    root = _power(calibration.information * unit, 0.5)
+    widening = root @ (calibration.covariance / unit) @ root
+    inverse_root = _power(half.reduced * unit, -0.5)
+    covariance: Float64 = inverse_root @ widening @ inverse_root * unit
     return covariance
+
+
+def _power(matrix: Float64, exponent: float) -> Float64:
+    """A symmetric positive matrix to a power. Raises LinAlgError where a direction is not determined."""
+    values, vectors = np.linalg.eigh(matrix)
+    if values[0] < 1e-13 * values[-1]:
+        raise np.linalg.LinAlgError("undetermined")
+    powered: Float64 = (vectors * values**exponent) @ vectors.T
+    return powered
 
 
 def _compare(

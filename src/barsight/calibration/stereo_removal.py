@@ -144,7 +144,7 @@ def _cause(view: BoardView, state: State, cameras: tuple[Camera, Camera], points
     size = float(np.linalg.norm(shift))
     aligned = size > 0 and np.linalg.norm(shift / size - state.translation_m / length) < SAME_SHIFT
     if _near(turn, state.rotation) and aligned and abs(length / size - 1) > 0.02:
-        return f"shows another board, {length / size:.2f} times as large"
+        return f"shows another board, about {length / size:.1f} times as large"
     if not _near(turn, state.rotation) or np.linalg.norm(shift - state.translation_m) > SAME_SHIFT * length:
         return "left and right don't show the same board at the same moment"
     return "doesn't fit (board bent, moving, or badly found)"
