@@ -63,11 +63,14 @@ class ImuNoiseFit:
 
     @property
     def noise(self) -> ImuNoise:
-        """Kalibr's four numbers: of the three axes the noisiest, so that no axis is trusted too far."""
+        """Kalibr's four numbers: of the three axes the noisiest, so that no axis is trusted too far.
+
+        A walk that the log doesn't show is given its sigma, the least that would show, not 0.
+        """
         gyro, accel = self.axes[:3], self.axes[3:]
         return ImuNoise(
-            max(a.density for a in gyro), max(a.walk for a in gyro),
-            max(a.density for a in accel), max(a.walk for a in accel), self.rate_hz,
+            max(a.density for a in gyro), max(max(a.walk, a.walk_sigma) for a in gyro),
+            max(a.density for a in accel), max(max(a.walk, a.walk_sigma) for a in accel), self.rate_hz,
         )  # fmt: skip
 
 
@@ -83,7 +86,7 @@ def fit_imu_noise(samples: ImuSamples) -> ImuNoiseFit | Failed:
     if lengths.max() < FEWEST_SAMPLES:
         return Failed(
             "too-short",
-            f"the longest stretch without a gap has {int(lengths.max())} samples, {FEWEST_SAMPLES} are needed",
+            f"the longest stretch without a gap has {lengths.max()} samples, {FEWEST_SAMPLES} are needed",
         )
     kept = [slice(a, b) for a, b in itertools.pairwise(bounds) if b - a >= FEWEST_SAMPLES // 4]
     moving = _moving(samples, kept, step)

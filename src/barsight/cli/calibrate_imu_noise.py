@@ -27,8 +27,8 @@ def run(arguments: Sequence[str]) -> None:
     def command(
         log: tyro.conf.Positional[Path],
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
-        gyro_unit: GyroUnit = GyroUnit.AUTO,
-        accel_unit: AccelUnit = AccelUnit.AUTO,
+        gyro_unit: tyro.conf.EnumChoicesFromValues[GyroUnit] = GyroUnit.AUTO,
+        accel_unit: tyro.conf.EnumChoicesFromValues[AccelUnit] = AccelUnit.AUTO,
         topic: str = "/imu0",
     ) -> None:
         """Noise densities, random walks and bias instability of an IMU at rest, in Kalibr's imu.yaml.

@@ -41,7 +41,7 @@ def run(arguments: Sequence[str]) -> None:
         pictures: tyro.conf.Positional[Path],
         board: str,
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
-        lens: Lens = Lens.RADTAN4,
+        lens: tyro.conf.EnumChoicesFromValues[Lens] = Lens.RADTAN4,
         range_m: float = 7.0,
         most_views: int = 150,
         resolution: str | None = None,
