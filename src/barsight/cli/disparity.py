@@ -12,8 +12,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from barsight.calibration.euroc import read_rig
-from barsight.calibration.kalibr import read_camchain
+from barsight.calibration.any_rig_file import read_rig_file
 from barsight.calibration.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.core.arrays import UInt8
@@ -48,7 +47,7 @@ def run(arguments: Sequence[str]) -> None:
             left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to grey.
             right: The right picture.
             out: The file to write: .pfm, .png (16 bits, disparity times 256) or .tif (disparity and sigma).
-            rig: Kalibr camchain or folder of an EuRoC recording: the pictures are raw and get rectified.
+            rig: Rig file (ours, Kalibr's, OpenCV's, or an EuRoC folder): the pictures are raw and get rectified.
             range: Candidates A:B in px; found from the pictures when not given.
             preview: PNG to write with the left picture beside the disparity in colours.
             settings: The method and its settings.
@@ -92,8 +91,7 @@ def _pair(left: Path, right: Path, rig: Path | None) -> RectifiedPair:
     """The rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
     frame = StereoFrame(0, _read(left), _read(right))
     if rig is not None:
-        read = read_rig(rig / "mav0" if (rig / "mav0").is_dir() else rig) if rig.is_dir() else None
-        pair = Rectifier(read or read_camchain(rig).rig)(frame)
+        pair = Rectifier(read_rig_file(rig))(frame)
         if isinstance(pair, Failed):
             raise CalibrationError(rig, pair.reason, "give the rig of these pictures")
     else:

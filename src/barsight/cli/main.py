@@ -20,6 +20,7 @@ COMMANDS = {
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
     "disparity": "Match one pair of pictures",
     "bench": "Compare the stereo methods: stereo, subpixel, target-size",
+    "calibrate": "Calibrate two cameras from pictures of a board, or an IMU's noise, with a verdict",
     "simulate": "Render a recording of a bar yard with exact truth",
     "score": "Compare a measured yard with the truth of its recording",
     "report": "Write report.html anew from a measured yard's files",

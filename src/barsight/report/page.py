@@ -65,7 +65,7 @@ def render_page(out_dir: Path) -> str:
         if found is not None
     ]
     ways = path_plots(path, str(result.get("reference", "world"))) if path else ()
-    template = _environment().get_template("page.html.jinja")
+    template = environment().get_template("page.html.jinja")
     return template.render(
         result=result,
         figures=key_figures(result),
@@ -73,7 +73,7 @@ def render_page(out_dir: Path) -> str:
         contours=contours,
         agreement_plots=agreement,
         ways=ways,
-        plot_data=_plot_json([*contours, *agreement, *ways]),
+        plot_data=plot_json([*contours, *agreement, *ways]),
         has_laser=bool(laser),
         stages=_stages(result),
         refused_by_stage=_refused_by_stage(result),
@@ -81,8 +81,8 @@ def render_page(out_dir: Path) -> str:
         truth=list(flatten(result.get("truth") or {})),
         preview=preview_uri(out_dir / "preview.png"),
         plotly_js=get_plotlyjs(),
-        css=_resource("page.css"),
-        script=_resource("page_script.js.jinja"),
+        css=resource("page.css"),
+        script=resource("page_script.js.jinja"),
     )
 
 
@@ -171,15 +171,16 @@ def _refused_by_stage(result: dict[str, Any]) -> dict[str, int]:
     return counts
 
 
-def _plot_json(plots: list[Plot]) -> str:
+def plot_json(plots: list[Plot]) -> str:
     """All figures for the script; `<` is escaped so that no text can end the element that carries it."""
     figures = {plot.name: {"data": plot.traces, "layout": plot.layout} for plot in plots}
     return json.dumps(figures, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def _environment() -> jinja2.Environment:
+def environment() -> jinja2.Environment:
+    """What fills the pages' templates: escaping, the package's own files, numbers for people."""
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_resource),
+        loader=jinja2.FunctionLoader(resource),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -190,5 +191,6 @@ def _environment() -> jinja2.Environment:
     return environment
 
 
-def _resource(name: str) -> str:
+def resource(name: str) -> str:
+    """The text of one of this package's files."""
     return resources.files("barsight.report").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,64 @@
+"""One door for every file that holds a rig: ours, Kalibr's camchain, OpenCV's, an EuRoC folder."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+
+from barsight.calibration.documents import read_document
+from barsight.calibration.euroc import read_rig, write_rig
+from barsight.calibration.kalibr import read_camchain, write_camchain
+from barsight.calibration.opencv_file import read_opencv_rig, write_opencv_rig
+from barsight.calibration.rig import StereoRig
+from barsight.calibration.rig_file import VERSION_KEY, read_own_rig, write_rig_file
+from barsight.core.errors import CalibrationError
+from barsight.core.files import atomic_directory, atomic_path
+
+OPENCV_MARK = "!!opencv-matrix"
+TOPICS = ("/cam0/image_raw", "/cam1/image_raw")
+KNOWN = "a rig.yaml of barsight, Kalibr's camchain, OpenCV's YAML or XML, or an EuRoC folder"
+
+
+class RigFormat(StrEnum):
+    """What a rig can be written as. EUROC is a folder, the others are files."""
+
+    BARSIGHT = "barsight"
+    KALIBR = "kalibr"
+    OPENCV = "opencv"
+    EUROC = "euroc"
+
+
+def read_rig_file(path: Path) -> StereoRig:
+    """The rig at `path`, of whichever format. Raises `CalibrationError`."""
+    if path.is_dir():
+        return read_rig(path / "mav0" if (path / "mav0").is_dir() else path)
+    if path.suffix.lower() == ".xml" or _is_opencv(path):
+        return read_opencv_rig(path)
+    document = read_document(path)
+    if VERSION_KEY in document.values:
+        return read_own_rig(document)
+    if "cam0" in document.values:
+        return read_camchain(path).rig
+    raise CalibrationError(path, "holds no stereo rig", f"give {KNOWN}")
+
+
+def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> None:
+    """Write a rig whole or not at all; an OpenCV file's suffix says YAML or XML."""
+    if form is RigFormat.EUROC:
+        with atomic_directory(path) as folder:
+            write_rig(folder / "mav0", rig, 0.0)
+        return
+    with atomic_path(path) as temporary:
+        if form is RigFormat.KALIBR:
+            write_camchain(temporary, rig, TOPICS)
+        elif form is RigFormat.OPENCV:
+            write_opencv_rig(temporary, rig, xml=path.suffix.lower() == ".xml")
+        else:
+            write_rig_file(temporary, rig)
+
+
+def _is_opencv(path: Path) -> bool:
+    try:
+        return OPENCV_MARK in path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError):
+        return False

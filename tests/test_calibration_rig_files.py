@@ -1,0 +1,109 @@
+"""Rig files of every format: back bit for bit or to rounding, and mistakes named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.calibration.any_rig_file import RigFormat, read_rig_file, write_any_rig
+from barsight.calibration.camera import Camera, Distortion
+from barsight.calibration.documents import canonical_pose
+from barsight.calibration.lens_model import Lens
+from barsight.calibration.rig import StereoRig
+from barsight.calibration.rig_file import read_covariance, write_rig_file
+from barsight.calibration.stereo_calibration import calibrate_stereo
+from barsight.cli.main import run
+from barsight.core.errors import CalibrationError
+from barsight.core.pose import Pose
+from calibration_views import BOARD, CAM0, CAM1, ROTATION, SIZE, TRANSLATION_M, simulated
+
+
+def rig(distortion: Distortion = Distortion.RADTAN) -> StereoRig:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = ROTATION, TRANSLATION_M
+    cameras = [
+        Camera(c.width, c.height, c.fx_px, c.fy_px, c.cx_px, c.cy_px, distortion, c.coefficients)
+        for c in (CAM0, CAM1)
+    ]
+    right = canonical_pose("body", "cam1", matrix, inverted=True)
+    return StereoRig(cameras[0], cameras[1], Pose.identity("body", "cam0"), right)
+
+
+@pytest.mark.parametrize("distortion", [Distortion.RADTAN, Distortion.EQUIDISTANT])
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [(RigFormat.BARSIGHT, "rig.yaml"), (RigFormat.KALIBR, "camchain.yaml"), (RigFormat.OPENCV, "rig.yml"),
+     (RigFormat.OPENCV, "rig.xml"), (RigFormat.EUROC, "euroc")],
+)  # fmt: skip
+def test_every_format_reads_back(tmp_path: Path, form: RigFormat, name: str, distortion: Distortion) -> None:
+    original = rig(distortion)
+    write_any_rig(tmp_path / name, original, form)
+    read = read_rig_file(tmp_path / name)
+    assert (read.cam0, read.cam1) == (original.cam0, original.cam1)
+    assert np.abs(read.cam0_from_cam1.matrix - original.cam0_from_cam1.matrix).max() < 1e-12
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_a_calibrations_covariance_comes_back(tmp_path: Path) -> None:
+    calibration = calibrate_stereo(simulated(4), BOARD, Lens.RADTAN5, (SIZE, SIZE), Path("simulated"))
+    write_rig_file(tmp_path / "rig.yaml", calibration.rig, calibration)
+    found = read_covariance(tmp_path / "rig.yaml")
+    assert found is not None
+    assert found[0] == calibration.parameter_names
+    assert np.array_equal(found[1], calibration.covariance)
+    write_rig_file(tmp_path / "plain.yaml", calibration.rig)
+    assert read_covariance(tmp_path / "plain.yaml") is None
+
+
+def test_opencvs_two_files_are_read_together(tmp_path: Path) -> None:
+    write_any_rig(tmp_path / "whole.yml", rig(), RigFormat.OPENCV)
+    text = (tmp_path / "whole.yml").read_text()
+    place = text.index("\nR:")
+    (tmp_path / "intrinsics.yml").write_text(text[: place + 1])
+    with pytest.raises(CalibrationError, match="R is missing"):
+        read_rig_file(tmp_path / "intrinsics.yml")
+    (tmp_path / "extrinsics.yml").write_text("%YAML:1.0\n---" + text[place:])
+    assert read_rig_file(tmp_path / "intrinsics.yml").baseline_m == pytest.approx(rig().baseline_m)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [(("image_width", "image_wide"), "the pictures' size"),
+     (("M2:", "M9:"), "M2 or K2 or cameraMatrix2 is missing"),
+     (("[ -0.2000", "[ -200.2000"), "probably in mm")],
+)  # fmt: skip
+def test_mistakes_in_opencvs_files_are_named(tmp_path: Path, change: tuple[str, str], expected: str) -> None:
+    path = tmp_path / "rig.yml"
+    write_any_rig(path, rig(), RigFormat.OPENCV)
+    text = path.read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change))
+    with pytest.raises(CalibrationError, match=expected):
+        read_rig_file(path)
+
+
+def test_what_is_no_rig_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("barsight_rig: 7\n")
+    with pytest.raises(CalibrationError, match="version 7 is not known"):
+        read_rig_file(path)
+    path.write_text("a: 1\n")
+    with pytest.raises(CalibrationError, match="holds no stereo rig"):
+        read_rig_file(path)
+    with pytest.raises(CalibrationError, match="no such file"):
+        read_rig_file(tmp_path / "none.xml")
+    (tmp_path / "torn.xml").write_text("<a")
+    with pytest.raises(CalibrationError, match="no file that OpenCV reads"):
+        read_rig_file(tmp_path / "torn.xml")
+
+
+def test_export_command(tmp_path: Path) -> None:
+    write_any_rig(tmp_path / "rig.yaml", rig(), RigFormat.BARSIGHT)
+    for form, name in (("kalibr", "chain.yaml"), ("opencv", "cv.xml"), ("euroc", "folder")):
+        out = tmp_path / name
+        assert run(["calibrate", "export", str(tmp_path / "rig.yaml"), "-o", str(out), "--to", form]) == 0
+        assert read_rig_file(out).baseline_m == pytest.approx(rig().baseline_m)
+    assert (
+        run(["calibrate", "export", str(tmp_path / "no.yaml"), "-o", str(tmp_path / "x"), "--to", "euroc"])
+        == 3
+    )

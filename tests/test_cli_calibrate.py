@@ -1,0 +1,81 @@
+"""`barsight calibrate` on real pictures: what must come out, and mistakes in one line."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barsight.calibration.rig_file import read_covariance
+from barsight.cli.main import run
+
+
+def calibrate(pictures: Path, out: Path, board: str) -> dict:
+    assert run(["calibrate", "stereo", str(pictures), "--board", board, "-o", str(out)]) == 0
+    assert out.with_suffix(".html").read_text().count("plotly") > 10
+    return json.loads(out.with_suffix(".json").read_text())
+
+
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
+    assert run(arguments) in (2, 3, 4)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_bouguets_rig(data: Path, tmp_path: Path) -> None:
+    report = calibrate(data / "checkerboard_bouguet", tmp_path / "rig.yaml", "checkerboard:9x6:0.03")
+    assert report["rms_px"] <= 0.22
+    assert abs(report["baseline_mm"] - 99.85) <= 0.5
+    assert report["cross_validation"]["ratio"] <= 2
+    assert len(report["views"]) == 13
+    found = read_covariance(tmp_path / "rig.yaml")
+    assert found is not None
+    assert found[1].shape == (len(found[0]), len(found[0]))
+    assert np.linalg.eigvalsh(found[1]).min() > 0
+
+
+def test_sourishgs_rig(data: Path, tmp_path: Path) -> None:
+    report = calibrate(data / "checkerboard_sourishg", tmp_path / "rig.yaml", "checkerboard:9x6:0.02423")
+    assert report["rms_px"] <= 0.25
+    assert report["cross_validation"]["ratio"] <= 2
+    assert abs(report["baseline_mm"] - 94.0) < 0.5
+
+
+def test_a_blurred_view_and_one_of_another_board_are_left_out(data: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    shutil.copytree(data / "checkerboard_bouguet", folder, copy_function=shutil.copyfile)
+    folder.chmod(0o755)
+    blurred = cv2.imread(str(folder / "left04.jpg"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(folder / "left04.jpg"), cv2.GaussianBlur(blurred, (0, 0), 2.5))
+    for side in ("left", "right"):
+        other = cv2.imread(str(data / "checkerboard_sourishg" / f"{side}5.jpg"), cv2.IMREAD_GRAYSCALE)
+        framed = cv2.copyMakeBorder(other, 60, 60, 0, 0, cv2.BORDER_REPLICATE)
+        cv2.imwrite(str(folder / f"{side}06.jpg"), framed)
+    report = calibrate(folder, tmp_path / "rig.yaml", "checkerboard:9x6:0.03")
+    reasons = {(r["view"], r["camera"]): r["reason"] for r in report["removed"]}
+    assert "blurred" in reasons["04", "cam0"]
+    assert "another board" in reasons["06", "both"]
+    assert abs(report["baseline_mm"] - 99.85) <= 0.5
+
+
+def test_swapped_folders_and_wrong_sizes_are_said(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures = data / "checkerboard_bouguet"
+    for side, other in (("left", "right"), ("right", "left")):
+        (tmp_path / "swapped" / other).mkdir(parents=True)
+        for file in pictures.glob(f"{side}*.jpg"):
+            shutil.copyfile(file, tmp_path / "swapped" / other / file.name.replace(side, other))
+    out = ["-o", str(tmp_path / "rig.yaml")]
+    board = ["--board", "checkerboard:9x6:0.03"]
+    line = refused(capsys, ["calibrate", "stereo", str(tmp_path / "swapped"), *board, *out])
+    assert "left and right are swapped" in line
+    line = refused(capsys, ["calibrate", "stereo", str(pictures), "--board", "checkerboard:8x6:0.03", *out])
+    assert "no 8x6 checkerboard found; the picture shows one of 9x6 inner corners" in line
+    assert "no such folder" in refused(capsys, ["calibrate", "stereo", str(tmp_path / "no"), *board, *out])
+    assert "holds no pairs" in refused(capsys, ["calibrate", "stereo", str(tmp_path), *board, *out])
+    assert "known are" in refused(capsys, ["calibrate", "lidar"])
+    assert not list(tmp_path.glob("rig*"))
