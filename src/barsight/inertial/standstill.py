@@ -51,6 +51,7 @@ def stands_still(imu: ImuSamples, noise: ImuNoise) -> Bool:
         return np.zeros(count, dtype=np.bool_)
     rate_hz = NS_PER_S / float(np.median(np.diff(imu.stamp_ns)))
     size = max(8, round(WINDOW_S * rate_hz))
+    index = np.arange(count)
     still: Bool = np.ones(count, dtype=np.bool_)
     for values, density in ((imu.gyro_radps, noise.gyro_density), (imu.accel_mps2, noise.accel_density)):
         sigma = density * np.sqrt(rate_hz)
@@ -58,11 +59,13 @@ def stands_still(imu: ImuSamples, noise: ImuNoise) -> Bool:
         square = uniform_filter1d((values - mean) ** 2, size, axis=0, mode="nearest")
         still &= np.sqrt(square.mean(axis=1)) < MOST_EXCESS * sigma
         half = uniform_filter1d(values, size // 2, axis=0, mode="nearest")
-        drift = np.abs(np.roll(half, size // 4, axis=0) - np.roll(half, -size // 4, axis=0)).max(axis=1)
-        still &= drift < MOST_DRIFT_SIGMAS * sigma * np.sqrt(4 / size)
-    return np.asarray(binary_opening(np.pad(still, size, mode="edge"), np.ones(round(LEAST_S * rate_hz))))[
-        size:-size
-    ]
+        drift = np.abs(
+            half[np.minimum(index + size // 4, count - 1)] - half[np.maximum(index - size // 4, 0)]
+        )
+        still &= drift.max(axis=1) < MOST_DRIFT_SIGMAS * sigma * np.sqrt(4 / size)
+    least = np.ones(round(LEAST_S * rate_hz), dtype=np.bool_)
+    opened: Bool = binary_opening(np.pad(still, size, mode="edge"), least)[size:-size]
+    return opened
 
 
 def standing_start(imu: ImuSamples, first_ns: int, last_ns: int, noise: ImuNoise) -> StandingStart | Failed:
