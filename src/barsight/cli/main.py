@@ -19,6 +19,7 @@ COMMANDS = {
     "info": "Say what is in a recording: sensors, rates, gaps, calibration",
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
     "disparity": "Match one pair of pictures",
+    "odometry": "Estimate the trajectory and compare it with truth where there is any",
     "simulate": "Render a recording of a bar yard with exact truth",
     "score": "Compare a measured yard with the truth of its recording",
     "report": "Write report.html anew from a measured yard's files",
