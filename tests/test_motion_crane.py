@@ -8,7 +8,6 @@ from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position
-from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.motion.sway import sway_at, turned_angle
 from motion_recordings import MemoryRecording, ideal_rig
 
@@ -166,7 +165,6 @@ def test_an_imu_that_doesnt_cover_the_frame() -> None:
 
 
 def test_settings() -> None:
-    assert isinstance(make_estimator(MotionSettings(), has_crane=True), CraneTrajectory)
     for setting in ({"window_s": 0.0}, {"attitude_std_deg": -1.0}):
         with pytest.raises(ConfigError, match=next(iter(setting))):
             CraneSettings(**setting)

@@ -13,15 +13,14 @@ from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame, Trajectory
 from barsight.motion.odometry import (
     OdometrySettings,
+    Step,
     StereoOdometry,
     _by_old_places,
     _carried,
     _in_world,
-    _refine,
-    _Step,
     _triangulated,
+    refine,
 )
-from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.open import open_recording
 from barsight.recording.truth import read_ground_truth
 from motion_recordings import MemoryRecording, ideal_rig
@@ -47,7 +46,7 @@ def triangulated(places: np.ndarray, camera: RectifiedCamera) -> np.ndarray:
 
 def refined(
     rng: np.random.Generator, camera: RectifiedCamera, depth_m: tuple[float, float], count: int, wild: int = 0
-) -> tuple[_Step, np.ndarray]:
+) -> tuple[Step, np.ndarray]:
     """A step from points seen with noise in all four pictures, and its error (6,)."""
     z = rng.uniform(*depth_m, count)
     u, v = rng.uniform(30, camera.width - 30, count), rng.uniform(30, camera.height - 30, count)
@@ -59,8 +58,8 @@ def refined(
     target[:wild] += rng.uniform(-30, 30, (wild, 3))
     old = triangulated(seen(points, camera) + noise[0], camera)
     start = Rotation.from_rotvec(TURN + 2e-4).as_matrix()
-    step = _refine(old, target, start, MOVE + 0.002, camera, SETTINGS)
-    assert isinstance(step, _Step)
+    step = refine(old, target, start, MOVE + 0.002, camera, SETTINGS)
+    assert isinstance(step, Step)
     turn = Rotation.from_matrix(step.rotation @ rotation.T)
     return step, np.r_[turn.as_rotvec(), step.translation - turn.apply(MOVE)]
 
@@ -95,7 +94,7 @@ def test_a_step_without_agreement_fails() -> None:
     rng = np.random.default_rng(2)
     places = rng.uniform(50, 300, (60, 3))
     places[:, 2] = places[:, 0] - rng.uniform(20, 40, 60)
-    failed = _refine(triangulated(places, STREET), places[::-1], np.eye(3), np.zeros(3), STREET, SETTINGS)
+    failed = refine(triangulated(places, STREET), places[::-1], np.eye(3), np.zeros(3), STREET, SETTINGS)
     assert isinstance(failed, Failed)
     assert failed.code == "no-consensus"
 
@@ -202,7 +201,6 @@ def test_nothing_that_can_be_followed() -> None:
 
 
 def test_settings() -> None:
-    assert isinstance(make_estimator(MotionSettings(), has_crane=False), StereoOdometry)
     for setting in ({"features": 10}, {"least_inliers": 3}, {"pixel_sigma_px": 0.0}, {"ransac_px": -1.0}):
         with pytest.raises(ConfigError):
             OdometrySettings(**setting)

@@ -77,7 +77,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     total = len(source.index.stamps_ns)
 
     with watch("trajectory", total):
-        estimate = make_estimator(settings.motion, has_crane=source.crane() is not None)
+        estimate = make_estimator(settings.motion)
         trajectory = estimate(source, rectifier, _counter("trajectory", total, advance))
 
     poses = {frame.stamp_ns: frame for frame in trajectory.frames}

@@ -21,6 +21,7 @@ COMMANDS = {
     "disparity": "Match one pair of pictures",
     "bench": "Compare the stereo methods: stereo, subpixel, target-size",
     "calibrate": "Calibrate two cameras from pictures of a board, or an IMU's noise, with a verdict",
+    "odometry": "Estimate the trajectory and compare it with truth where there is any",
     "simulate": "Render a recording of a bar yard with exact truth",
     "score": "Compare a measured yard with the truth of its recording",
     "report": "Write report.html anew from a measured yard's files",

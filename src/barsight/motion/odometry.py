@@ -54,7 +54,7 @@ class OdometrySettings:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class View:
     """One frame's features with a stereo disparity. points: (N, 3) in `rect0`."""
 
     pair: RectifiedPair
@@ -64,16 +64,18 @@ class _View:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class Step:
     """new_from_old: pose of the old `rect0` in the new one, and its covariance (6, 6).
 
     scale_sigma: relative error of the step's length that the calibration may cause; it doesn't average out.
+    kept: (N,) which points agree.
     """
 
     rotation: Float64
     translation: Float64
     covariance: Float64
     scale_sigma: float
+    kept: Bool
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class StereoOdometry:
         body_from_rect0 = rectifier.body_from_rect0
         placed: list[PosedFrame] = []
         refused: list[RefusedFrame] = []
-        last: _View | None = None
+        last: View | None = None
         noise, stretch = np.diag([1e-12] * 6), np.zeros(3)
         for frame in recording.frames():
             advance()
@@ -99,7 +101,7 @@ class StereoOdometry:
                 refused.append(frame)
                 continue
             pair = rectifier(frame)
-            view = pair if isinstance(pair, Failed) else self._look(pair)
+            view = pair if isinstance(pair, Failed) else self.look(pair)
             if isinstance(view, Failed):
                 refused.append(RefusedFrame(frame.stamp_ns, view.reason))
                 continue
@@ -108,7 +110,7 @@ class StereoOdometry:
                 placed.append(PosedFrame(frame.stamp_ns, pose, noise))
                 last = view
                 continue
-            step = self._move(last, view, rectifier.camera)
+            step = self.move(last, view, rectifier.camera)
             if isinstance(step, Failed):
                 refused.append(RefusedFrame(frame.stamp_ns, step.reason))
                 continue
@@ -129,7 +131,7 @@ class StereoOdometry:
         sensors = ("stereo", "imu") if level.from_imu else ("stereo",)
         return Trajectory("world", tuple(placed), tuple(refused), sensors, level.warnings)
 
-    def _look(self, pair: RectifiedPair) -> _View | Failed:
+    def look(self, pair: RectifiedPair) -> View | Failed:
         camera, settings = pair.camera, self.settings
         features = detect_orb(pair.left, settings.features)
         coarse = coarse_disparity(pair.left, pair.right, camera.doffs_px)
@@ -144,9 +146,9 @@ class StereoOdometry:
         if kept.sum() < settings.least_inliers:
             return Failed("no-features", f"only {int(kept.sum())} features have a depth")
         features, disparity = features.chosen(kept), disparity[kept]
-        return _View(pair, features, disparity, _triangulated(features.pixels, disparity, camera))
+        return View(pair, features, disparity, _triangulated(features.pixels, disparity, camera))
 
-    def _move(self, old: _View, new: _View, camera: RectifiedCamera) -> _Step | Failed:
+    def move(self, old: View, new: View, camera: RectifiedCamera) -> Step | Failed:
         settings = self.settings
         pairs = match_mutual(old.features, new.features)
         if len(pairs) < settings.least_inliers:
@@ -159,12 +161,12 @@ class StereoOdometry:
         if len(pairs) < settings.least_inliers:
             return Failed("no-matches", f"only {len(pairs)} features can be followed from the frame before")
         points = old.points[pairs[:, 0]]
-        ransac = _ransac(points, found, camera, settings)
-        if isinstance(ransac, Failed):
-            return ransac
-        rotation, translation = ransac
+        start = ransac(points, found, camera, settings)
+        if isinstance(start, Failed):
+            return start
+        rotation, translation = start
         target = np.column_stack([found, found[:, 0] - disparity]).astype(np.float64)
-        return _refine(points, target, rotation, translation, camera, settings)
+        return refine(points, target, rotation, translation, camera, settings)
 
 
 def _across(
@@ -195,7 +197,7 @@ def _by_old_places(points: Float64, camera: RectifiedCamera) -> Float64:
     return by_places
 
 
-def _ransac(
+def ransac(
     points: Float64,
     pixels: Float32,
     camera: RectifiedCamera,
@@ -219,14 +221,14 @@ def _ransac(
     return Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel()
 
 
-def _refine(
+def refine(
     points: Float64,
     target: Float64,
     rotation: Float64,
     translation: Float64,
     camera: RectifiedCamera,
     settings: OdometrySettings,
-) -> _Step | Failed:
+) -> Step | Failed:
     """Gauss-Newton on u, v and u_right of the new pair, each residual whitened by its own covariance.
 
     The noise of the three places that the old point was triangulated from, most of it along its ray, is
@@ -274,7 +276,7 @@ def _refine(
             break
     depth = float(np.median(points[kept, 2]))
     scale_sigma = settings.calibration_sigma_px * depth / base
-    return _Step(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma)
+    return Step(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
 
 
 def _cross(vectors: Float64) -> Float64:

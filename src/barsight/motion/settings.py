@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from barsight.motion.crane import CraneSettings, CraneTrajectory
+from barsight.motion.crane import CraneSettings
 from barsight.motion.estimator import TrajectoryEstimator
-from barsight.motion.odometry import OdometrySettings, StereoOdometry
+from barsight.motion.fusion import FusedTrajectory, FusionSettings
 
 
 @dataclass(frozen=True)
 class MotionSettings:
     """The trajectory."""
 
+    fusion: FusionSettings = field(default_factory=FusionSettings)
     crane: CraneSettings = field(default_factory=CraneSettings)
-    odometry: OdometrySettings = field(default_factory=OdometrySettings)
 
 
-def make_estimator(settings: MotionSettings, *, has_crane: bool) -> TrajectoryEstimator:
-    """The crane's encoders where there are any, else stereo odometry."""
-    return CraneTrajectory(settings.crane) if has_crane else StereoOdometry(settings.odometry)
+def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
+    """One estimate from the sensors that the recording has and `fusion.use` names."""
+    return FusedTrajectory(settings.fusion, settings.crane)

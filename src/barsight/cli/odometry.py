@@ -1,0 +1,90 @@
+"""`barsight odometry RECORDING -o OUT`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from barsight.calibration.rectification import Rectifier
+from barsight.cli.arguments import call
+from barsight.core.errors import MeasurementError
+from barsight.core.types import Trajectory
+from barsight.evaluation.drift import Drift, compare
+from barsight.motion.settings import MotionSettings, make_estimator
+from barsight.recording.base import Recording, RecordingSettings
+from barsight.recording.open import open_recording
+from barsight.recording.truth import find_ground_truth, read_ground_truth
+from barsight.report.files import write_trajectory
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, estimate, write and compare."""
+
+    def command(
+        recording: tyro.conf.Positional[Path],
+        out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
+        reading: RecordingSettings = RecordingSettings(),  # noqa: B008
+        settings: Annotated[MotionSettings, tyro.conf.arg(name="")] = MotionSettings(),  # noqa: B008
+    ) -> None:
+        """Estimate the trajectory from cameras, IMU and encoders, and say how far it is from truth.
+
+        Args:
+            recording: The recording.
+            out: Folder for trajectory.tum; nothing is written where it is not given.
+            reading: How to read the recording.
+            settings: The estimate's settings; --fusion.use names the sensors.
+        """
+        console = Console()
+        source = open_recording(recording, reading)
+        trajectory = make_estimator(settings)(source, Rectifier(source.rig), lambda: None)
+        if not trajectory.frames:
+            why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"
+            raise MeasurementError(f"{recording}: no frame could be placed: {why}")
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            write_trajectory(trajectory, out / "trajectory.tum")
+        for line in _summary(trajectory) + _against_truth(source, trajectory):
+            console.print(escape(line), soft_wrap=True, highlight=False)
+
+    call(command, "odometry", arguments)
+
+
+def _summary(trajectory: Trajectory) -> list[str]:
+    sigma = np.sqrt(np.mean([np.diag(frame.covariance) for frame in trajectory.frames], axis=0))
+    lines = [
+        f"{len(trajectory.frames)} frames placed in {trajectory.reference} over {trajectory.length_m:.2f} m "
+        f"from {', '.join(trajectory.sensors)}",
+        f"stated sigma: {1e3 * np.linalg.norm(sigma[3:]):.2f} mm, "
+        f"{np.degrees(np.linalg.norm(sigma[:3])):.4f} deg",
+    ]
+    lines += [f"warning: {warning}" for warning in trajectory.warnings]
+    lines += [f"refused {frame.stamp_ns}: {frame.reason}" for frame in trajectory.refused]
+    return lines
+
+
+def _against_truth(source: Recording, trajectory: Trajectory) -> list[str]:
+    if find_ground_truth(source.path) is None:
+        return []
+    stamps = np.array(source.index.stamps_ns, np.int64)
+    truth = read_ground_truth(source.path, stamps)
+    drift = compare(trajectory, truth, source.rig.timeshift_cam_imu_ns)
+    return ["truth overlaps fewer than 3 frames"] if drift is None else _drift_lines(drift)
+
+
+def _drift_lines(drift: Drift) -> list[str]:
+    lines = [f"aligned to truth: {drift.aligned_rmse_mm:.2f} mm, {drift.aligned_rmse_deg:.4f} deg RMSE"]
+    if not math.isnan(drift.reference_rmse_mm):
+        lines.append(
+            f"in the yard: {drift.reference_rmse_mm:.2f} mm, {drift.reference_rmse_deg:.4f} deg RMSE; NEES "
+            f"{drift.nees_position:.2f} position, {drift.nees_attitude:.2f} attitude"
+        )
+    if not math.isnan(drift.drift_percent):
+        lines.append(f"drift over {drift.least_way_m:.0f} m and more: {drift.drift_percent:.3f} %")
+    return lines

@@ -1,0 +1,145 @@
+"""Matching by the predicted motion: a known 3D point is looked for only where it must be.
+
+Bars all look alike: two matches one bar further agree with each other as well as the true ones. So each
+point is carried by the predicted motion, and only what lies in its predicted ellipse is a match.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.features.matching import track
+
+GATE_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedMotion:
+    """new_from_old: rotation (3, 3) and translation (3,) of `rect0`. covariance: (6, 6), rotation then
+    translation, of a small motion that follows it, in the new frame's axes.
+    """
+
+    rotation: Float64
+    translation: Float64
+    covariance: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Where N points must be in the new pair. stereo: (N, 3) u, v and right u, px, NaN behind the camera.
+
+    covariance: (N, 3, 3) px^2 of the prediction. inside: (N,) whether both pictures show it.
+    """
+
+    stereo: Float64
+    covariance: Float64
+    inside: Bool
+
+    @property
+    def reach_px(self) -> Float64:
+        """(N,) one sigma of the predicted place along the ellipse's longer axis."""
+        result: Float64 = np.sqrt(np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, 1])
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedMatches:
+    """stereo: (N, 3) u, v, right u where found. found: (N,). ambiguous: (N,) refused since the ellipse is not
+    clearly finer than the pattern repeats.
+    """
+
+    stereo: Float64
+    found: Bool
+    ambiguous: Bool
+
+
+def project_stereo(points: Float64, camera: RectifiedCamera) -> Float64:
+    """(N, 3) points in `rect0` to (N, 3) u, v and right u, px; NaN behind the camera."""
+    x, y, z = points.T
+    depth = np.where(z > 0.05, z, np.nan)
+    u, v = camera.focal_px * x / depth + camera.cx_px, camera.focal_px * y / depth + camera.cy_px
+    return np.column_stack([u, v, u - camera.focal_px * camera.baseline_m / depth + camera.doffs_px])
+
+
+def triangulate(stereo: Float64, camera: RectifiedCamera) -> Float64:
+    """The inverse of `project_stereo`: (N, 3) m, NaN where the disparity is not positive."""
+    disparity = stereo[:, 0] - stereo[:, 2] + camera.doffs_px
+    depth = camera.focal_px * camera.baseline_m / np.where(disparity > 1e-3, disparity, np.nan)
+    x = (stereo[:, 0] - camera.cx_px) / camera.focal_px * depth
+    y = (stereo[:, 1] - camera.cy_px) / camera.focal_px * depth
+    return np.column_stack([x, y, depth])
+
+
+def stereo_jacobian(points: Float64, camera: RectifiedCamera) -> Float64:
+    """(N, 3, 3) how `project_stereo` moves with the points, px per m."""
+    x, y, z = points.T
+    f, zero = camera.focal_px, np.zeros(len(points))
+    by_u = np.stack([f / z, zero, -f * x / z**2], axis=1)
+    by_v = np.stack([zero, f / z, -f * y / z**2], axis=1)
+    by_right = by_u + np.stack([zero, zero, f * camera.baseline_m / z**2], axis=1)
+    return np.stack([by_u, by_v, by_right], axis=1)
+
+
+def predict_places(
+    points: Float64, sigma_px: float, motion: PredictedMotion, camera: RectifiedCamera, margin_px: float = 12
+) -> Predicted:
+    """points: (N, 3) in the old `rect0`, seen there with `sigma_px` in u, v and right u."""
+    moved = points @ motion.rotation.T + motion.translation
+    stereo = project_stereo(moved, camera)
+    safe = np.where(np.isfinite(stereo[:, :1]), moved, [0.0, 0.0, 1.0])
+    by_point = stereo_jacobian(safe, camera)
+    x, y, z = safe.T
+    zero = np.zeros(len(points))
+    cross = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    by_motion = np.concatenate([by_point @ -cross, by_point], axis=2)
+    covariance = by_motion @ motion.covariance @ by_motion.transpose(0, 2, 1)
+    old = by_point @ motion.rotation @ np.linalg.inv(stereo_jacobian(points, camera))
+    covariance += sigma_px**2 * (old @ old.transpose(0, 2, 1))
+    with np.errstate(invalid="ignore"):
+        inside: Bool = (stereo[:, [0, 2]] > margin_px).all(1) & (stereo[:, 1] > margin_px)
+        inside &= (stereo[:, [0, 2]] < camera.width - margin_px).all(1)
+        inside &= stereo[:, 1] < camera.height - margin_px
+    return Predicted(stereo, covariance, inside)
+
+
+def match_guided(
+    source: RectifiedPair, places: Float32, pair: RectifiedPair, predicted: Predicted,
+    sigma_px: float, repeat_px: Float64 | None = None,
+) -> GuidedMatches:  # fmt: skip
+    """Looks for patches of `source`'s left picture at `places` (N, 2) in both pictures of `pair`.
+
+    Lucas-Kanade from the predicted place, there and back, then across to the right picture. repeat_px: (N,)
+    how far off each patch's likeness is (the bars' pitch); an ellipse of 2 sigma that reaches a quarter of
+    it is ambiguous.
+    """
+    count = len(places)
+    ambiguous = np.zeros(count, dtype=np.bool_)
+    if repeat_px is not None:
+        ambiguous = predicted.inside & (2 * predicted.reach_px > repeat_px / 4)
+    stereo, found = np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_)
+    tried = np.flatnonzero(predicted.inside & ~ambiguous)
+    if tried.size == 0:
+        return GuidedMatches(stereo, found, ambiguous)
+    guess = predicted.stereo[tried, :2].astype(np.float32)
+    left, kept = track(source.left, pair.left, places[tried], guess)
+    across = guess.copy()
+    across[:, 0] = left[:, 0] - (predicted.stereo[tried, 0] - predicted.stereo[tried, 2])
+    across[:, 1] = left[:, 1]
+    right, on_row = match_across(pair, left, across)
+    stereo[tried] = np.column_stack([left, right])
+    off = stereo[tried] - predicted.stereo[tried]
+    spread = predicted.covariance[tried] + sigma_px**2 * np.eye(3)
+    distance2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
+    found[tried] = kept & on_row & (distance2 < GATE_SIGMAS**2)
+    return GuidedMatches(stereo, found, ambiguous)
+
+
+def match_across(pair: RectifiedPair, left: Float32, guess: Float32) -> tuple[Float32, Bool]:
+    """Right u (N,) of left places (N, 2) from guesses (N, 2), and which are on their row and came back."""
+    right, kept = track(pair.left, pair.right, left, guess)
+    kept &= np.abs(right[:, 1] - left[:, 1]) < 1.0
+    return right[:, 0], kept

@@ -1,0 +1,190 @@
+"""One estimate from cameras, IMU and encoders, whichever there are: the trajectory of a whole recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.pose import Pose
+from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
+from barsight.inertial.model import ORDINARY_NOISE, ImuBias
+from barsight.motion.crane import CraneSettings, fit_position
+from barsight.motion.gravity import Level, level_attitude
+from barsight.motion.nodes import Nodes, make_nodes, start_poses, tied_by_imu
+from barsight.motion.prediction import CranePredictor
+from barsight.motion.sightings import FrontEndSettings, Sighting, follow
+from barsight.recording.base import Recording
+
+SENSORS = ("stereo", "imu", "crane")
+PLACE_SPACING_S = 0.4
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """The estimate from all sensors together."""
+
+    use: str = "stereo,imu,crane"
+    """Sensors to use where the recording has them: any of stereo, imu, crane, with commas."""
+    front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
+    calibration_sigma_px: float = 0.1
+    """How far the disparity may be off as calibrated (1 sigma); it is estimated too. 0 takes it as exact."""
+
+    systematic_attitude_deg: float = 0.012
+    """Attitude error (1 sigma, each axis) that more pictures don't average out: highlights that wander over
+    round bars, and the cameras' mounting on the body."""
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.sensors if name not in SENSORS]
+        if unknown or not ({"stereo", "crane"} & set(self.sensors)):
+            raise ConfigError(f"use is {self.use!r}; name stereo or crane, and imu if wanted, with commas")
+        if self.calibration_sigma_px < 0 or self.systematic_attitude_deg < 0:
+            raise ConfigError("calibration_sigma_px and systematic_attitude_deg can't be negative")
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors named."""
+        return tuple(name.strip() for name in self.use.split(",") if name.strip())
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    crane: CraneSamples | None
+    imu: ImuSamples | None
+    sightings: tuple[Sighting, ...]
+    refused: tuple[RefusedFrame, ...]
+    level: Level | None
+
+
+@dataclass(frozen=True)
+class FusedTrajectory:
+    """`TrajectoryEstimator` for any recording; the reference is `yard` with encoders, else `world`."""
+
+    settings: FusionSettings
+    crane: CraneSettings
+
+    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
+        """Frames that neither pictures nor encoders place are refused. Raises MeasurementError where no
+        sensor that places the body is left to use.
+        """
+        inputs = self._gather(recording, rectifier, advance)
+        shift = recording.rig.timeshift_cam_imu_ns
+        frames = np.array([s.stamp_ns for s in inputs.sightings], np.int64)
+        refused = list(inputs.refused)
+        if inputs.crane is not None:
+            frames, gone = _placed_frames(recording, inputs.crane, frames, shift)
+            left = set(frames.tolist())
+            refused = gone + [r for r in refused if r.stamp_ns not in left]
+            refused = list({r.stamp_ns: r for r in refused}.values())
+        warnings = inputs.level.warnings if inputs.level else ()
+        if len(frames) < 2:
+            return Trajectory(self._reference(inputs), (), tuple(refused), (), warnings)
+        nodes = make_nodes(frames + shift, inputs.imu)
+        estimate_poses, covariance = self._solve(recording, rectifier, inputs, nodes, shift)
+        placed = tuple(
+            PosedFrame(int(stamp), estimate_poses[k], covariance[k])
+            for stamp, k in zip(frames, nodes.frame, strict=True)
+        )
+        names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
+        sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
+        return Trajectory(self._reference(inputs), placed, tuple(refused), sensors, warnings)
+
+    def _reference(self, inputs: _Inputs) -> str:
+        return "world" if inputs.crane is None else "yard"
+
+    def _gather(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> _Inputs:
+        use = self.settings.sensors
+        crane = recording.crane() if "crane" in use else None
+        imu = recording.imu() if "imu" in use else None
+        if crane is None and "stereo" not in use:
+            raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
+        sightings: tuple[Sighting, ...] = ()
+        refused: tuple[RefusedFrame, ...] = ()
+        if "stereo" in use:
+            shift = recording.rig.timeshift_cam_imu_ns
+            bias = np.zeros(3) if imu is None else imu.gyro_radps.mean(axis=0)
+            predictor = CranePredictor(crane, imu, bias, rectifier, shift) if crane else lambda a, b: None
+            sightings, refused = follow(recording, rectifier, predictor, self.settings.front_end, advance)
+        else:
+            for _ in recording.index.stamps_ns:
+                advance()
+        level = None if crane else level_attitude(recording)
+        return _Inputs(crane, imu, sightings, refused, level)
+
+    def _solve(
+        self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
+    ) -> tuple[tuple[Pose, ...], Float64]:
+        # GTSAM is loaded where it is needed: its import takes a quarter of a second.
+        from barsight.motion.graph import Attitude, Placed, Problem, StereoSightings, solve
+
+        start = start_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
+        noise = recording.imu_noise() or ORDINARY_NOISE
+        ties = tied_by_imu(nodes, start, inputs.imu, noise)
+        placed: list[Placed] = []
+        attitudes: list[Attitude] = []
+        if inputs.crane is not None:
+            chosen = _apart(nodes.stamp_ns, seconds_to_ns(PLACE_SPACING_S))
+            for k in chosen:
+                fit = fit_position(
+                    inputs.crane, int(nodes.stamp_ns[k]), seconds_to_ns(PLACE_SPACING_S / 2 + 0.01)
+                )
+                if not isinstance(fit, Failed):
+                    sigma = float(np.sqrt(fit[1][0, 0]))
+                    placed.append(Placed(k, fit[0] + inputs.crane.crane_to_body_m, sigma))
+            nominal = inputs.crane.yard_from_body_nominal
+            still = [k for k in chosen if k in ties.still]
+            for k in chosen:
+                # Sway turns round within a second or so: nodes nearer than that aren't independent.
+                sigma = self.crane.attitude_std_deg * 1.6
+                if k in still:
+                    sigma = self.crane.sway_std_deg * len(still) ** 0.5
+                attitudes.append(Attitude(k, nominal, np.full(3, np.deg2rad(sigma))))
+        seen = None
+        if inputs.sightings:
+            at = {int(nodes.stamp_ns[k]) - shift: int(k) for k in nodes.frame}
+            seen = StereoSightings(
+                np.concatenate([np.full(len(s.track), at[s.stamp_ns]) for s in inputs.sightings]),
+                np.concatenate([s.track for s in inputs.sightings]),
+                np.vstack([s.stereo for s in inputs.sightings]),
+                rectifier.camera, rectifier.body_from_rect0, self.settings.front_end.tracks.sigma_px,
+            )  # fmt: skip
+        problem = Problem(
+            start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, tuple(placed),
+            tuple(attitudes), ties.still, ImuBias(ties.gyro_bias_radps, np.zeros(3)),
+            offset_prior_px=self.settings.calibration_sigma_px,
+        )  # fmt: skip
+        estimate = solve(problem)
+        shared = np.zeros((6, 6))
+        if inputs.sightings:
+            shared[:3, :3] = np.eye(3) * np.deg2rad(self.settings.systematic_attitude_deg) ** 2
+        return estimate.poses, estimate.covariance + shared
+
+
+def _placed_frames(
+    recording: Recording, crane: CraneSamples, sighted: Int64, shift: int
+) -> tuple[Int64, list[RefusedFrame]]:
+    """Stamps of all frames that the encoders or the pictures place, and the refused ones."""
+    known = set(sighted.tolist())
+    frames: list[int] = []
+    refused: list[RefusedFrame] = []
+    for stamp in recording.index.stamps_ns:
+        fit = fit_position(crane, stamp + shift, seconds_to_ns(0.35))
+        if isinstance(fit, Failed) and stamp not in known:
+            refused.append(RefusedFrame(stamp, fit.reason))
+        else:
+            frames.append(stamp)
+    return np.array(frames, np.int64), refused
+
+
+def _apart(stamp_ns: Int64, least_ns: int) -> list[int]:
+    """Indices of stamps at least so far apart, from the first on."""
+    chosen = [0]
+    for k in range(1, len(stamp_ns)):
+        if stamp_ns[k] - stamp_ns[chosen[-1]] >= 0.97 * least_ns:
+            chosen.append(k)
+    return chosen

@@ -1,0 +1,132 @@
+"""The instants at which the body is estimated: the frames, and where an IMU ties them some between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from barsight.calibration.documents import ImuNoise
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import Failed
+from barsight.core.pose import Pose
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.inertial.model import ImuBias
+from barsight.inertial.standstill import stands_still
+from barsight.motion.crane import fit_position
+from barsight.motion.gravity import Level
+from barsight.motion.sightings import Sighting
+
+if TYPE_CHECKING:
+    from barsight.inertial.preintegration import Preintegrated
+
+MOST_SPACING_S = 0.4
+LEAD_S = 3.0
+"""The IMU's samples this long before the first frame are used too: a crane starts from standing."""
+MOST_STILL_M = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """stamp_ns: (M,) the IMU's clock, increasing. frame: (F,) which node each frame is."""
+
+    stamp_ns: Int64
+    frame: Int64
+
+
+@dataclass(frozen=True, eq=False)
+class ImuTies:
+    """preintegrated: between nodes k and k + 1 or None. still: nodes at rest. gyro_bias_radps: (3,)."""
+
+    preintegrated: tuple[Preintegrated | None, ...]
+    still: tuple[int, ...]
+    gyro_bias_radps: Float64
+
+
+def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
+    """The frames' stamps (IMU clock), with an IMU also between them and before the first."""
+    if imu is None or imu.stamp_ns.size < 2:
+        return Nodes(frames_ns, np.arange(len(frames_ns)))
+    edges = frames_ns.tolist()
+    lead = max(int(imu.stamp_ns[0]), edges[0] - seconds_to_ns(LEAD_S))
+    if edges[0] - lead > seconds_to_ns(0.1):
+        edges.insert(0, lead)
+    stamps = [edges[0]]
+    for first, last in pairwise(edges):
+        parts = max(1, int(np.ceil((last - first) / seconds_to_ns(MOST_SPACING_S) - 0.05)))
+        stamps += [first + (last - first) * part // parts for part in range(1, parts + 1)]
+    stamp_ns = np.array(stamps, np.int64)
+    return Nodes(stamp_ns, np.searchsorted(stamp_ns, frames_ns))
+
+
+def start_poses(
+    nodes: Nodes, crane: CraneSamples | None, sightings: tuple[Sighting, ...], shift_ns: int,
+    rectifier: Rectifier, level: Level | None,
+) -> tuple[Pose, ...]:  # fmt: skip
+    """Where the solver begins: the encoders' places with the nominal attitude, else the frames' chain."""
+    if crane is not None:
+        stamps, places = [], []
+        for stamp in nodes.stamp_ns.tolist():
+            fit = fit_position(crane, stamp, seconds_to_ns(0.35))
+            if not isinstance(fit, Failed):
+                stamps.append(stamp)
+                places.append(fit[0] + crane.crane_to_body_m)
+        turns = Rotation.from_matrix(np.repeat(crane.yard_from_body_nominal[None], len(stamps), axis=0))
+        return _between("yard", nodes.stamp_ns, np.array(stamps), np.array(places), turns)
+    assert level is not None
+    body_from_rect0 = rectifier.body_from_rect0
+    poses = [level.world_from_body]
+    for sighting in sightings[1:]:
+        assert sighting.motion is not None
+        moved = Pose("rect0", "rect0", sighting.motion.rotation, sighting.motion.translation).inverse()
+        poses.append(poses[-1] @ body_from_rect0 @ moved @ body_from_rect0.inverse())
+    known = np.array([sighting.stamp_ns + shift_ns for sighting in sightings])
+    turns = Rotation.from_matrix([pose.rotation for pose in poses])
+    return _between("world", nodes.stamp_ns, known, np.array([p.translation for p in poses]), turns)
+
+
+def _between(
+    target: str, stamp_ns: Int64, known_ns: Int64, places: Float64, turns: Rotation
+) -> tuple[Pose, ...]:
+    """Poses at the nodes by interpolation; the nearest known one beyond the ends."""
+    time = (np.clip(stamp_ns, known_ns[0], known_ns[-1]) - known_ns[0]) / NS_PER_S
+    known = (known_ns - known_ns[0]) / NS_PER_S
+    place = np.column_stack([np.interp(time, known, places[:, axis]) for axis in range(3)])
+    rotation = Slerp(known, turns)(time).as_matrix() if len(known) > 1 else turns.as_matrix()
+    return tuple(Pose(target, "body", r, p) for r, p in zip(rotation, place, strict=True))
+
+
+def tied_by_imu(nodes: Nodes, start: tuple[Pose, ...], imu: ImuSamples | None, noise: ImuNoise) -> ImuTies:
+    """Preintegrated motions between neighbours, and the nodes at which the body rests.
+
+    Rest needs both: an IMU that shows nothing but noise, as it does at constant speed, and a place that
+    doesn't change over the neighbours.
+    """
+    count = len(nodes.stamp_ns)
+    if imu is None:
+        return ImuTies((None,) * (count - 1), (), np.zeros(3))
+    from barsight.inertial.preintegration import Preintegrator
+
+    quiet = stands_still(imu, noise)
+    nearest = np.clip(np.searchsorted(imu.stamp_ns, nodes.stamp_ns), 0, imu.stamp_ns.size - 1)
+    place = np.array([pose.translation for pose in start])
+    still = []
+    for k in range(count):
+        first, last = max(0, k - 1), min(count - 1, k + 1)
+        if quiet[nearest[k]] and np.linalg.norm(place[last] - place[first]) < MOST_STILL_M:
+            still.append(k)
+    resting = np.zeros(imu.stamp_ns.size, np.bool_)
+    for k in still:
+        resting |= np.abs(imu.stamp_ns - nodes.stamp_ns[k]) < seconds_to_ns(0.2)
+    bias = imu.gyro_radps[resting & quiet].mean(axis=0) if (resting & quiet).sum() > 20 else np.zeros(3)
+    integrator = Preintegrator(imu, noise)
+    parts = []
+    for first_ns, last_ns in zip(nodes.stamp_ns[:-1], nodes.stamp_ns[1:], strict=True):
+        part = integrator.between(int(first_ns), int(last_ns), ImuBias(bias, np.zeros(3)))
+        parts.append(None if isinstance(part, Failed) else part)
+    return ImuTies(tuple(parts), tuple(still), bias)

@@ -1,0 +1,67 @@
+"""How the left camera moves between two frames as encoders and gyro know it, for the front end."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.core.pose import Pose
+from barsight.core.stamps import interpolate_at, seconds_to_ns
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.features.guided import PredictedMotion
+from barsight.motion.crane import fit_position
+from barsight.motion.sway import turned_angle
+
+WINDOW_S = 0.3
+SWAY_RAD = float(np.deg2rad(0.15))
+GYRO_BIAS_SIGMA_RADPS = 5e-4
+SLEW_SIGMA_S = 0.01
+"""What isn't known of the encoders' latency, s: it matters while the speed changes only."""
+
+
+class CranePredictor:
+    """A `Predictor` from the encoders' travel and the gyro's turn; the attitude is nominal but for the turn.
+
+    gyro_bias_radps: (3,), from standing still. shift_ns: `timeshift_cam_imu`.
+    """
+
+    def __init__(
+        self, crane: CraneSamples, imu: ImuSamples | None, gyro_bias_radps: Float64, rectifier: Rectifier,
+        shift_ns: int,
+    ) -> None:  # fmt: skip
+        self._crane, self._imu, self._bias, self._shift_ns = crane, imu, gyro_bias_radps, shift_ns
+        self._angle = np.empty((0, 3)) if imu is None else turned_angle(imu)
+        self._body_from_rect0 = rectifier.body_from_rect0
+
+    def __call__(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
+        """None where the encoders don't cover both frames."""
+        window = seconds_to_ns(WINDOW_S)
+        old = fit_position(self._crane, old_ns + self._shift_ns, window)
+        new = fit_position(self._crane, new_ns + self._shift_ns, window)
+        if isinstance(old, Failed) or isinstance(new, Failed):
+            return None
+        turn, turn_sigma = self._turn(old_ns, new_ns)
+        nominal = self._crane.yard_from_body_nominal
+        yard_from_old = Pose("yard", "body", nominal, old[0]) @ self._body_from_rect0
+        attitude = nominal @ Rotation.from_rotvec(turn).as_matrix()
+        yard_from_new = Pose("yard", "body", attitude, new[0]) @ self._body_from_rect0
+        motion = yard_from_new.inverse() @ yard_from_old
+        travel = float(np.linalg.norm(new[0] - old[0]))
+        covariance = np.eye(6) * turn_sigma**2
+        swing = (SWAY_RAD * travel) ** 2 + (2e-3) ** 2
+        covariance[3:, 3:] = motion.rotation @ (old[1] + new[1]) @ motion.rotation.T + np.eye(3) * swing
+        return PredictedMotion(motion.rotation, motion.translation, covariance)
+
+    def _turn(self, old_ns: int, new_ns: int) -> tuple[Float64, float]:
+        """(3,) rotation vector old body from new body, and its sigma (rad)."""
+        seconds = (new_ns - old_ns) / 1e9
+        if self._imu is not None:
+            stamps = np.array([old_ns, new_ns]) + self._shift_ns
+            angle = interpolate_at(stamps, self._imu.stamp_ns, self._angle)
+            if np.isfinite(angle).all():
+                sigma = GYRO_BIAS_SIGMA_RADPS * seconds + 2e-4
+                return angle[1] - angle[0] - self._bias * seconds, sigma
+        return np.zeros(3), SWAY_RAD * 2**0.5

@@ -1,0 +1,154 @@
+"""The front end: points followed through a recording's pairs, each frame's motion checked by consensus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.errors import Failed
+from barsight.core.types import RectifiedPair, RefusedFrame
+from barsight.features.guided import PredictedMotion, triangulate
+from barsight.features.tracks import Tracks, TrackSettings, carry_on, find_again
+from barsight.motion.odometry import OdometrySettings, Step, StereoOdometry, View, ransac, refine
+from barsight.recording.base import Recording
+from barsight.stereo.disparity_range import coarse_disparity
+
+Predictor = Callable[[int, int], PredictedMotion | None]
+"""From two frames' stamps to the motion of `rect0` between them as the other sensors know it, or None."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What one frame shows. track: (N,) names of points; stereo: (N, 3) u, v and right u, px.
+
+    motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
+    one before. ambiguous: how many points were refused since the prediction was too coarse for the bars.
+    """
+
+    stamp_ns: int
+    track: Int64
+    stereo: Float64
+    motion: PredictedMotion | None
+    ambiguous: int
+
+
+@dataclass(frozen=True)
+class FrontEndSettings:
+    """How points are followed."""
+
+    tracks: TrackSettings = field(default_factory=TrackSettings)
+    rough: OdometrySettings = field(default_factory=lambda: OdometrySettings(features=1200))
+    """The motion from ORB features where no other sensor predicts it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """tracks: None to begin anew with unused names from next_track on."""
+
+    tracks: Tracks | None
+    next_track: int
+    stamp_ns: int
+    view: View | None
+
+
+def follow(
+    recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
+    advance: Callable[[], None],
+) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:  # fmt: skip
+    """Sightings of all frames that show enough; the others are refused with a reason."""
+    sightings: list[Sighting] = []
+    refused: list[RefusedFrame] = []
+    state: _State | None = None
+    for frame in recording.frames():
+        advance()
+        if isinstance(frame, RefusedFrame):
+            refused.append(frame)
+            continue
+        pair = rectifier(frame)
+        if isinstance(pair, Failed):
+            refused.append(RefusedFrame(frame.stamp_ns, pair.reason))
+            continue
+        prediction = predictor(state.stamp_ns, frame.stamp_ns) if state else None
+        result = _see(state, pair, prediction, settings)
+        if isinstance(result, Failed) and state is not None and prediction is not None:
+            # The other sensors tie the frame to the ones before; pictures begin anew.
+            result = _see(replace(state, tracks=None), pair, prediction, settings)
+        if isinstance(result, Failed):
+            refused.append(RefusedFrame(frame.stamp_ns, result.reason))
+            continue
+        state, sighting = result
+        sightings.append(sighting)
+    return tuple(sightings), tuple(refused)
+
+
+def _see(
+    state: _State | None, pair: RectifiedPair, prediction: PredictedMotion | None, settings: FrontEndSettings
+) -> tuple[_State, Sighting] | Failed:
+    view: View | None = None
+    if state is None or state.tracks is None:
+        kept, stereo = np.zeros(0, np.bool_), np.empty((0, 3))
+        tracks = Tracks(next_track=0 if state is None else state.next_track)
+        motion, ambiguous = None, 0
+        if prediction is None:
+            rough = StereoOdometry(settings.rough).look(pair)
+            view = None if isinstance(rough, Failed) else rough
+    else:
+        tracks = state.tracks
+        found = None if prediction is None else _consensus(tracks, pair, prediction, settings)
+        if found is None or isinstance(found, Failed):
+            rough_motion = _rough(state, tracks, pair, settings)
+            if isinstance(rough_motion, Failed):
+                return rough_motion
+            step, view = rough_motion
+            prediction = PredictedMotion(step.rotation, step.translation, 4 * step.covariance)
+            found = _consensus(tracks, pair, prediction, settings)
+            if isinstance(found, Failed):
+                return found
+        kept, stereo, motion, ambiguous = found
+    coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px)
+    tracks = carry_on(tracks, pair, stereo, kept, coarse, settings.tracks)
+    if len(tracks.track) < settings.rough.least_inliers:
+        return Failed("no-features", f"only {len(tracks.track)} points have a depth")
+    sighting = Sighting(pair.stamp_ns, tracks.track, tracks.stereo, motion, ambiguous)
+    return _State(tracks, tracks.next_track, pair.stamp_ns, view), sighting
+
+
+def _rough(
+    state: _State, tracks: Tracks, pair: RectifiedPair, settings: FrontEndSettings
+) -> tuple[Step, View] | Failed:
+    """The motion by ORB features of both pairs, without any prediction."""
+    odometry = StereoOdometry(settings.rough)
+    old = state.view or odometry.look(tracks.views[-1])
+    new = odometry.look(pair)
+    if isinstance(old, Failed):
+        return old
+    if isinstance(new, Failed):
+        return new
+    step = odometry.move(old, new, pair.camera)
+    return step if isinstance(step, Failed) else (step, new)
+
+
+def _consensus(
+    tracks: Tracks, pair: RectifiedPair, prediction: PredictedMotion, settings: FrontEndSettings
+) -> tuple[Bool, Float64, PredictedMotion, int] | Failed:
+    """Points found again in their ellipses that agree on one motion in 3D, and that motion."""
+    matches = find_again(tracks, pair, prediction, settings.tracks)
+    ambiguous = int(matches.ambiguous.sum())
+    index = np.flatnonzero(matches.found)
+    least = settings.rough.least_inliers
+    if index.size < least:
+        return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again")
+    points, target = triangulate(tracks.stereo[index], pair.camera), matches.stereo[index]
+    start = ransac(points, target[:, :2].astype(np.float32), pair.camera, settings.rough)
+    if isinstance(start, Failed):
+        return start
+    step = refine(points, target, *start, pair.camera, settings.rough)
+    if isinstance(step, Failed):
+        return step
+    kept = np.zeros(len(tracks.track), np.bool_)
+    kept[index[step.kept]] = True
+    return kept, matches.stereo, PredictedMotion(step.rotation, step.translation, step.covariance), ambiguous

@@ -1,0 +1,150 @@
+"""Preintegration against a slow integration of the equations, its covariance by Monte Carlo, EuRoC."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.documents import ImuNoise
+from barsight.core.errors import Failed
+from barsight.core.types import ImuSamples
+from barsight.inertial.model import BodyState, ImuBias, corrected, integrate_slowly
+from barsight.inertial.preintegration import Preintegrated, Preintegrator
+from barsight.recording.truth import read_ground_truth
+
+NOISE = ImuNoise(2e-4, 2e-5, 2e-3, 1e-3, 200.0)
+EUROC_NOISE = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3, 200.0)
+START = 1_700_000_000_000_000_000
+BIAS = ImuBias(np.array([0.01, -0.02, 0.005]), np.array([0.1, -0.05, 0.08]))
+STATE = BodyState(
+    Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), np.array([1.0, 2, 3]), np.array([0.5, -0.2, 0.1])
+)
+
+
+def lively(count: int = 401, bias: ImuBias = BIAS) -> ImuSamples:
+    """2 s of turning and shaking, sampled at 200 Hz."""
+    t = np.arange(count) * 0.005
+    gyro = 0.6 * np.column_stack([np.sin(3 * t), np.cos(2 * t), np.sin(5 * t + 1)])
+    force = np.column_stack([np.sin(7 * t), 2 * np.cos(4 * t), 9.8 + np.sin(2 * t)])
+    stamps = START + np.arange(count, dtype=np.int64) * 5_000_000
+    return ImuSamples(stamps, gyro + bias.gyro_radps, force + bias.accel_mps2)
+
+
+def between(imu: ImuSamples, first: int, last: int, bias: ImuBias = BIAS) -> Preintegrated:
+    result = Preintegrator(imu, NOISE).between(first, last, bias)
+    assert isinstance(result, Preintegrated)
+    return result
+
+
+def error(found: BodyState, truth: BodyState) -> np.ndarray:
+    """(9,) rotation, position, velocity in the true body's axes."""
+    turn = Rotation.from_matrix(truth.rotation.T @ found.rotation).as_rotvec()
+    move = truth.rotation.T @ (found.position_m - truth.position_m)
+    return np.concatenate([turn, move, truth.rotation.T @ (found.velocity_mps - truth.velocity_mps)])
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 1_000_000_000), (3_700_001, 1_501_200_007)])
+def test_it_agrees_with_a_slow_integration(first: int, last: int) -> None:
+    imu = lively()
+    slow = integrate_slowly(imu, START + first, START + last, STATE, BIAS)
+    fast = between(imu, START + first, START + last).predict(STATE)
+    np.testing.assert_allclose(error(fast, slow), 0, atol=8e-4)
+
+
+def test_the_slow_one_is_exact_for_a_fall() -> None:
+    stamps = START + np.arange(11, dtype=np.int64) * 100_000_000
+    imu = ImuSamples(stamps, np.tile(BIAS.gyro_radps, (11, 1)), np.tile(BIAS.accel_mps2, (11, 1)))
+    end = integrate_slowly(imu, START, START + 1_000_000_000, STATE, BIAS)
+    np.testing.assert_allclose(end.position_m, STATE.position_m + STATE.velocity_mps - [0, 0, 9.80665 / 2])
+    np.testing.assert_allclose(end.rotation, STATE.rotation, atol=1e-12)
+    assert np.abs(corrected(imu, BIAS).accel_mps2).max() == 0
+
+
+def test_the_bias_jacobian_is_the_difference_quotient() -> None:
+    imu, end = lively(), START + 1_000_000_000
+    whole = between(imu, START, end)
+    jacobian = whole.by_bias(STATE)
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = 1e-4
+        other = ImuBias(BIAS.gyro_radps + step[3:], BIAS.accel_mps2 + step[:3])
+        moved = error(between(imu, START, end, other).predict(STATE), whole.predict(STATE))
+        np.testing.assert_allclose(jacobian @ step, moved, atol=2e-8)
+        first_order = error(whole.predict(STATE, other), whole.predict(STATE))
+        np.testing.assert_allclose(first_order, moved, atol=2e-8)
+
+
+def test_the_covariance_is_right() -> None:
+    rng, imu, end = np.random.default_rng(3), lively(), START + 1_000_000_000
+    truth = between(imu, START, end).predict(STATE)
+    nees = []
+    for _ in range(150):
+        gyro = imu.gyro_radps + rng.normal(0, NOISE.gyro_density * 200**0.5, (401, 3))
+        accel = imu.accel_mps2 + rng.normal(0, NOISE.accel_density * 200**0.5, (401, 3))
+        noisy = between(ImuSamples(imu.stamp_ns, gyro, accel), START, end)
+        off = error(noisy.predict(STATE), truth)
+        nees.append(off @ np.linalg.solve(noisy.covariance, off) / 9)
+    assert 0.85 < np.mean(nees) < 1.15
+
+
+def test_a_gap_or_the_end_of_the_samples_fails() -> None:
+    imu = lively()
+    kept = np.r_[0:100, 140:401]
+    holed = ImuSamples(imu.stamp_ns[kept], imu.gyro_radps[kept], imu.accel_mps2[kept])
+    for samples, first, last in (
+        (holed, 0, 1_000_000_000), (imu, -1, 1_000_000_000), (imu, 0, 2_000_000_001), (imu, 5, 5),
+    ):  # fmt: skip
+        result = Preintegrator(samples, NOISE).between(START + first, START + last, BIAS)
+        assert isinstance(result, Failed)
+        assert result.code == "imu-gap"
+
+
+def euroc(data: Path, imu_name: str, truth_name: str) -> tuple[ImuSamples, np.ndarray, list[BodyState]]:
+    """The IMU, the stamps of 1 s windows' edges, and the true states there."""
+    folder = data / "euroc_imu_truth"
+    lines = [line for line in (folder / imu_name).read_text().splitlines() if line[0] != "#"]
+    table = np.array([[float(field) for field in line.split(",")] for line in lines])
+    stamps = np.array([int(line.split(",")[0]) for line in lines])
+    truth = read_ground_truth(folder / truth_name)
+    time = (truth.stamp_ns - truth.stamp_ns[0]) / 1e9
+    place = np.array([pose.translation for pose in truth.poses])
+    turns = Rotation.from_matrix([pose.rotation for pose in truth.poses])
+    edges, states = [], []
+    for k in range(10, len(time) - 210, 200):
+        near = slice(k - 6, k + 7)
+        fit = np.polynomial.polynomial.polyfit(time[near] - time[k], place[near], 3)
+        states.append(BodyState(turns[k].as_matrix(), place[k], fit[1]))
+        edges.append(truth.stamp_ns[k])
+    return ImuSamples(stamps, table[:, 1:4], table[:, 4:7]), np.array(edges), states
+
+
+def euroc_sigmas(imu: ImuSamples, edges: np.ndarray, states: list[BodyState]) -> np.ndarray:
+    """(W, 9) errors in sigmas; each window's bias is found from its neighbours, never from itself."""
+    integrator = Preintegrator(imu, EUROC_NOISE, 9.81)
+    windows, errors, jacobians = [], [], []
+    for k, state in enumerate(states[:-1]):
+        window = integrator.between(int(edges[k]), int(edges[k + 1]), ImuBias.none())
+        assert isinstance(window, Preintegrated)
+        windows.append(window)
+        errors.append(error(window.predict(state), states[k + 1]))
+        jacobians.append(window.by_bias(state))
+    ratios = []
+    for k, window in enumerate(windows):
+        near = [j for j in range(max(0, k - 4), min(len(windows), k + 5)) if j != k]
+        roots = [np.linalg.inv(np.linalg.cholesky(windows[j].covariance)) for j in near]
+        design = np.vstack([-root @ jacobians[j] for root, j in zip(roots, near, strict=True)])
+        target = np.concatenate([root @ errors[j] for root, j in zip(roots, near, strict=True)])
+        bias = np.linalg.lstsq(design, target, rcond=None)[0]
+        again = integrator.between(window.start_ns, window.end_ns, ImuBias(bias[3:], bias[:3]))
+        assert isinstance(again, Preintegrated)
+        off = error(again.predict(states[k]), states[k + 1])
+        ratios.append(off / np.sqrt(np.diag(again.covariance)))
+    return np.array(ratios)
+
+
+def test_one_second_of_turning_agrees_with_euroc(data: Path) -> None:
+    """MH_03's true attitude is smooth; its true place jumps by centimetres and says nothing of velocity."""
+    ratios = euroc_sigmas(*euroc(data, "MH03.txt", "MH_03_medium.txt"))
+    assert len(ratios) > 40
+    assert (np.abs(ratios[:, :3]) < 3).mean() >= 0.97
