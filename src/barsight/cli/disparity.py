@@ -47,7 +47,7 @@ def run(arguments: Sequence[str]) -> None:
             left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to grey.
             right: The right picture.
             out: The file to write: .pfm, .png (16 bits, disparity times 256) or .tif (disparity and sigma).
-            rig: Rig file (ours, Kalibr's, OpenCV's, or an EuRoC folder): the pictures are raw and get rectified.
+            rig: Rig file (ours, Kalibr's, OpenCV's) or EuRoC folder: the pictures are raw and get rectified.
             range: Candidates A:B in px; found from the pictures when not given.
             preview: PNG to write with the left picture beside the disparity in colours.
             settings: The method and its settings.
