@@ -38,7 +38,7 @@ def test_found_refused_and_ambiguous() -> None:
     error = matches.stereo[matches.found, 0] - places[matches.found, 0] - 7.3
     assert np.abs(error).max() < 0.1
     off = predict_places(
-        points, 0.05, PredictedMotion(np.eye(3), shift_m + [0.12, 0, 0], fine * 1e-2), CAMERA
+        points, 0.05, PredictedMotion(np.eye(3), shift_m + np.array([0.12, 0, 0]), fine * 1e-2), CAMERA
     )
     assert not match_guided(wall(0), places, wall(7.3), off, 0.2).found.any()
     repeat = match_guided(wall(0), places, wall(7.3), right, 0.2, np.full(len(points), 1.0))
