@@ -120,7 +120,8 @@ class FusedTrajectory:
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
     ) -> tuple[tuple[Pose, ...], Float64]:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
-        from barsight.motion.graph import Attitude, Placed, Problem, StereoSightings, solve
+        from barsight.motion.graph import solve
+        from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
 
         start = start_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
         noise = recording.imu_noise() or ORDINARY_NOISE

@@ -1,0 +1,149 @@
+"""The estimate from all sensors: consistent over simulated seeds, and close to truth on recordings."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.documents import ImuNoise
+from barsight.calibration.rectification import Rectifier
+from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.pose import Pose
+from barsight.core.types import CraneSamples, ImuSamples, Trajectory
+from barsight.evaluation.drift import Drift, compare
+from barsight.features.guided import project_stereo, triangulate
+from barsight.motion import fusion
+from barsight.motion.crane import CraneSettings
+from barsight.motion.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.sightings import Sighting
+from barsight.recording.base import Recording
+from barsight.recording.open import open_recording
+from barsight.recording.truth import GroundTruth, read_ground_truth
+from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
+from barsight.simulation.settings import CameraSettings, MotionSettings, SensorSettings
+from barsight.simulation.trajectory import CraneTrajectory
+from motion_recordings import MemoryRecording, ideal_rig
+
+SIGMA_PX = 0.1
+LEVER = np.array([0.35, -0.2, -0.55])
+DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+
+
+class NoisyRecording(MemoryRecording):
+    """With the simulated IMU's true noise."""
+
+    def imu_noise(self) -> ImuNoise:
+        s = SensorSettings()
+        return ImuNoise(
+            s.gyro_noise_density, s.gyro_random_walk, s.accel_noise_density, s.accel_random_walk, 200.0
+        )
+
+
+def simulated(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTruth]:
+    """A crane's way over points on a stack, without pictures: sightings with noise, IMU and encoders.
+
+    The nominal attitude and the disparity are off by as much as the settings say they may be.
+    """
+    rng = np.random.default_rng(seed)
+    way = CraneTrajectory.plan(6.0, CameraSettings(), MotionSettings(), DOWN, rng)
+    rig = ideal_rig(1280, 1024)
+    mount = Pose("body", "cam0", np.eye(3), np.array([0.06, -0.09, 0.04]))
+    rig = replace(rig, body_from_cam0=mount, body_from_cam1=mount @ rig.cam0_from_cam1)
+    camera = replace(rig.cam0, fx_px=1250, fy_px=1250)
+    rig = replace(rig, cam0=camera, cam1=camera)
+    imu = record_imu(way, SensorSettings(), rng)
+    crane_ns, place = record_encoders(way, SensorSettings(), LEVER, rng)
+    times = np.arange(0.6, way.duration_s - 0.5, 0.8)
+    stamps = EPOCH_NS + (times * 1e9).round().astype(np.int64)
+    motion = way.at(times)
+    poses = [
+        Pose("yard", "body", r, p) for r, p in zip(motion.yard_from_body, motion.position_m, strict=True)
+    ]
+    points = np.column_stack([rng.uniform(-4, 12, 1500), rng.uniform(-4, 4, 1500), rng.uniform(0, 1.5, 1500)])
+    rectifier = Rectifier(rig)
+    sightings = []
+    offset_px = rng.normal(0, FusionSettings().calibration_sigma_px)
+    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+        stereo = project_stereo((pose @ rectifier.body_from_rect0).inverse().apply(points), rectifier.camera)
+        shown = (stereo[:, [0, 2]] > 0).all(1) & (stereo[:, [0, 2]] < 1280).all(1)
+        shown &= (stereo[:, 1] > 0) & (stereo[:, 1] < 1024)
+        seen = stereo[shown] + rng.normal(0, SIGMA_PX, (shown.sum(), 3))
+        seen[:, 2] += offset_px
+        sightings.append(Sighting(stamp, np.flatnonzero(shown), seen, None, 0))
+    mounted_so = Rotation.from_rotvec(np.deg2rad(rng.normal(0, CraneSettings().sway_std_deg, 3))).as_matrix()
+    crane = CraneSamples(crane_ns, place, LEVER, mounted_so @ DOWN, 0.002)
+    samples = ImuSamples(imu.stamp_ns, imu.gyro_radps, imu.accel_mps2)
+    recording = NoisyRecording(
+        rig, stamps_ns=tuple(stamps.tolist()), imu_samples=samples, crane_samples=crane
+    )
+    return recording, tuple(sightings), GroundTruth(stamps, tuple(poses))
+
+
+def fused(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch, sightings: tuple[Sighting, ...]
+) -> Trajectory:
+    monkeypatch.setattr(fusion, "follow", lambda *_: (sightings, ()))
+    settings = FusionSettings(systematic_attitude_deg=0.0)
+    return FusedTrajectory(settings, CraneSettings())(recording, Rectifier(recording.rig), lambda: None)
+
+
+@pytest.mark.slow
+def test_the_covariance_is_right_over_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    drifts = []
+    for seed in range(20):
+        recording, sightings, truth = simulated(seed)
+        drift = compare(fused(recording, monkeypatch, sightings), truth, 0)
+        assert drift is not None
+        drifts.append(drift)
+    mean = np.mean([[d.nees_position, d.nees_attitude, d.reference_rmse_mm] for d in drifts], axis=0)
+    assert 0.6 < mean[0] < 1.4
+    assert 0.7 < mean[1] < 1.4
+    assert mean[2] < 1.0
+
+
+def measured(path: Path, use: str) -> Drift:
+    recording = open_recording(path)
+    told: list[int] = []
+    estimator = FusedTrajectory(FusionSettings(use=use), CraneSettings())
+    trajectory = estimator(recording, Rectifier(recording.rig), lambda: told.append(1))
+    stamps = np.array(recording.index.stamps_ns)
+    assert len(told) == len(trajectory.frames) == len(stamps)
+    drift = compare(trajectory, read_ground_truth(path, stamps), recording.rig.timeshift_cam_imu_ns)
+    assert drift is not None
+    return drift
+
+
+def test_a_car_drives(data: Path) -> None:
+    drift = measured(data / "kitti_odometry_a", "stereo")
+    assert drift.drift_percent < 0.7
+    assert drift.aligned_rmse_mm < 70
+
+
+def test_a_crane_over_bars(data: Path) -> None:
+    drift = measured(data / "yard_dev", "stereo,imu,crane")
+    assert drift.reference_rmse_mm < 1.0
+    assert drift.reference_rmse_deg < 0.025
+    assert drift.nees_position < 2
+
+
+def test_encoders_and_imu_without_pictures(data: Path) -> None:
+    assert measured(data / "yard_dev", "crane,imu").reference_rmse_mm < 1.1
+
+
+def test_what_cant_be() -> None:
+    for use in ("imu", "", "stereo,radar"):
+        with pytest.raises(ConfigError, match="use"):
+            FusionSettings(use=use)
+    recording = MemoryRecording(ideal_rig())
+    with pytest.raises(MeasurementError, match="no crane encoders"):
+        FusedTrajectory(FusionSettings(use="crane"), CraneSettings())(
+            recording, Rectifier(recording.rig), lambda: None
+        )
+
+
+def test_projection_and_triangulation_are_inverse() -> None:
+    camera = Rectifier(ideal_rig()).camera
+    points = np.array([[0.1, -0.2, 3.0], [1.0, 0.5, 7.0]])
+    np.testing.assert_allclose(triangulate(project_stereo(points, camera), camera), points)
