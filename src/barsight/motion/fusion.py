@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,9 +14,10 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE, ImuBias
-from barsight.motion.crane import CraneSettings, fit_position
+from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position
 from barsight.motion.gravity import Level, level_attitude
 from barsight.motion.nodes import Nodes, make_nodes, start_poses, tied_by_imu
+from barsight.motion.odometry import StereoOdometry
 from barsight.motion.prediction import CranePredictor
 from barsight.motion.sightings import FrontEndSettings, Sighting, follow
 from barsight.recording.base import Recording
@@ -83,9 +84,14 @@ class FusedTrajectory:
             refused = list({r.stamp_ns: r for r in refused}.values())
         warnings = inputs.level.warnings if inputs.level else ()
         if len(frames) < 2:
-            return Trajectory(self._reference(inputs), (), tuple(refused), (), warnings)
+            return self._simple(recording, rectifier, inputs)
         nodes = make_nodes(frames + shift, inputs.imu)
-        estimate_poses, covariance = self._solve(recording, rectifier, inputs, nodes, shift)
+        try:
+            estimate_poses, covariance = self._solve(recording, rectifier, inputs, nodes, shift)
+        except RuntimeError as error:  # GTSAM's word for a system that the measurements leave undetermined
+            simple = self._simple(recording, rectifier, inputs)
+            reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
+            return replace(simple, warnings=(*simple.warnings, f"{reason}: estimated one by one"))
         placed = tuple(
             PosedFrame(int(stamp), estimate_poses[k], covariance[k])
             for stamp, k in zip(frames, nodes.frame, strict=True)
@@ -93,6 +99,12 @@ class FusedTrajectory:
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
         return Trajectory(self._reference(inputs), placed, tuple(refused), sensors, warnings)
+
+    def _simple(self, recording: Recording, rectifier: Rectifier, inputs: _Inputs) -> Trajectory:
+        """Without a graph: the encoders' trajectory, or frame to frame."""
+        if inputs.crane is not None:
+            return CraneTrajectory(self.crane)(recording, rectifier, _silent)
+        return StereoOdometry(self.settings.front_end.rough)(recording, rectifier, _silent)
 
     def _reference(self, inputs: _Inputs) -> str:
         return "world" if inputs.crane is None else "yard"
@@ -164,6 +176,10 @@ class FusedTrajectory:
         if inputs.sightings:
             shared[:3, :3] = np.eye(3) * np.deg2rad(self.settings.systematic_attitude_deg) ** 2
         return estimate.poses, estimate.covariance + shared
+
+
+def _silent() -> None:
+    """The frames were told already."""
 
 
 def _placed_frames(

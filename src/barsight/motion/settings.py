@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-from barsight.motion.crane import CraneSettings
+from barsight.motion.crane import CraneSettings, CraneTrajectory
 from barsight.motion.estimator import TrajectoryEstimator
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.odometry import OdometrySettings, StereoOdometry
 
 
 @dataclass(frozen=True)
 class MotionSettings:
     """The trajectory."""
 
+    estimator: Literal["fused", "crane", "odometry"] = "fused"
+    """fused: all sensors in one estimate. crane: encoders, nominal attitude and the gyro's sway, no picture.
+    odometry: frame to frame from the pictures alone, for comparison."""
     fusion: FusionSettings = field(default_factory=FusionSettings)
     crane: CraneSettings = field(default_factory=CraneSettings)
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
 
 
 def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
-    """One estimate from the sensors that the recording has and `fusion.use` names."""
-    return FusedTrajectory(settings.fusion, settings.crane)
+    """The estimator that the settings name."""
+    match settings.estimator:
+        case "fused":
+            return FusedTrajectory(settings.fusion, settings.crane)
+        case "crane":
+            return CraneTrajectory(settings.crane)
+        case "odometry":
+            return StereoOdometry(settings.odometry)
