@@ -1,8 +1,11 @@
 """Direct refinement: the disparity that makes both images agree, to a few hundredths of a pixel.
 
 Each step warps the right image with the current disparity and asks every pixel how far it should move
-(Gauss-Newton with the mean gradient of both images [Lucas 1981, Malis 2004]), then fits planes to the answers
-along supports that follow the bars. Gain and offset of the images are taken off in a window.
+(Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
+offset of the images are taken off in a window. The first steps see the images a little softer and use the
+mean gradient of both [Malis 2004], which carries them further; the last one uses the left gradient alone: an
+interpolated image's noise falls with the fraction of the disparity, and its own gradient turns that into
+pixel locking.
 
 Gloss: a highlight is constant along a bar but lies behind its surface, so what is constant along the axis
 bends the match. Residual and gradient are therefore split into their mean along the axis and the detail; the
@@ -24,16 +27,17 @@ from barsight.stereo.spline import row_coefficients, value_and_slope
 from barsight.stereo.supports import SupportShape, axis_means, fit_planes, tile_axes
 
 _BLUR_PX = 0.5
-_LONGEST_STEP_PX = 0.7
+_FIRST_BLUR_PX = 0.7
+_LONGEST_STEP_PX = 1.5
 _CONTRAST_FLOOR = np.float32(4)
-_SLACK = np.float32(0.7)
+_SLACK = np.float32(0.5)
 _BLEND_WINDOW_PX = 9
 _LONG_STEP_PX = 5
 _SHORT_STEP_PX = 3
 _BLOCK_PX = 3
-_HOLD = np.float32(0.3)
+_HOLD = np.float32(0.1)
 _HOLD_UNMATCHED = np.float32(0.02)
-_SUPPORT = np.float32(0.5 * 2.0)
+_SUPPORT = np.float32(0.5 * 2.15)
 """Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
 and the noise in the gradients cost: measured on rendered planes, not on the scenes that check sigma."""
 _LEAST_INFORMATION = np.float32(0.5)
@@ -85,15 +89,17 @@ class Refined:
 
 def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
-    left_grey, right_grey = _smooth(left), _smooth(right)
-    left_slope = _own_slope(row_coefficients(left_grey))
-    right_coefficients = row_coefficients(right_grey)
-    axes = tile_axes(left_grey)
+    axes = tile_axes(left.astype(np.float32))
     usable = matched.astype(np.float32)
     disparity, variance = start, np.full_like(start, np.inf)
-    for _ in range(settings.steps):
-        warped, right_slope = value_and_slope(right_coefficients, disparity)
-        slope = (left_slope + right_slope) * np.float32(0.5)
+    for step in range(settings.steps):
+        remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
+        blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
+        left_grey, right_grey = _smooth(left, blur_px), _smooth(right, blur_px)
+        warped, right_slope = value_and_slope(row_coefficients(right_grey), disparity)
+        slope = _own_slope(row_coefficients(left_grey))
+        if remaining > 0:
+            slope = (slope + right_slope) * np.float32(0.5)
         residual = _residual(left_grey, warped, usable, settings.window_px)
         trust = usable / (1 + np.square(residual / np.float32(settings.outlier_grey)))
         weight, pull = _evidence(residual, slope, trust, axes, settings)
@@ -104,8 +110,8 @@ def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: R
     return Refined(disparity, variance)
 
 
-def _smooth(image: UInt8) -> Float32:
-    smooth: Float32 = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR_PX)
+def _smooth(image: UInt8, blur_px: float) -> Float32:
+    smooth: Float32 = cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px)
     return smooth
 
 
