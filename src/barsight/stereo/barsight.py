@@ -118,7 +118,7 @@ class BarsightStereo:
 
     def _start(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         settings = self.settings
-        if settings.preset == "fast":
+        if settings.preset == "fast" and _fits_opencv(pair, candidates):
             left_px = Sgbm(SgbmSettings(mode="3way", speckle_px=settings.island_px))(
                 pair, candidates
             ).disparity_px
@@ -138,6 +138,11 @@ def _contrast(image: UInt8) -> float:
 def _inside(candidates: DisparityRange, width: int) -> DisparityRange:
     lowest = min(max(candidates.lowest_px, -width), width - 1)
     return DisparityRange(lowest, max(min(candidates.highest_px, width), lowest + 1))
+
+
+def _fits_opencv(pair: RectifiedPair, candidates: DisparityRange) -> bool:
+    """OpenCV's matcher fails on images hardly wider than its candidates."""
+    return pair.camera.width >= 2 * candidates.count + abs(candidates.lowest_px) and pair.camera.height >= 16
 
 
 def _lands_on(valid: Bool, disparity: Float32) -> Bool:

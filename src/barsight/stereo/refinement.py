@@ -39,7 +39,7 @@ _HOLD = np.float32(0.1)
 _HOLD_UNMATCHED = np.float32(0.02)
 _SUPPORT = np.float32(0.5 * 2.15)
 """Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
-and the noise in the gradients cost: measured on rendered planes, not on the scenes that check sigma."""
+and the noise in the gradients cost: measured on rendered planes."""
 _LEAST_INFORMATION = np.float32(0.5)
 
 

@@ -1,0 +1,272 @@
+"""The kernels of our own stereo against slow, obvious references."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from barsight.core.errors import ConfigError
+from barsight.stereo.confidence import bend_around
+from barsight.stereo.consistency import agrees, without_islands
+from barsight.stereo.edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
+from barsight.stereo.filling import fill
+from barsight.stereo.semiglobal import SemiGlobalSettings, match
+from barsight.stereo.spline import row_coefficients, value_and_slope
+from barsight.stereo.supports import TILE_COLUMNS, TILE_ROWS, SupportShape, axis_means, fit_planes, tile_axes
+
+HEIGHT, WIDTH = 40, 70
+
+
+def _noise(seed: int, spread: float = 1.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return (spread * rng.standard_normal((HEIGHT, WIDTH))).astype(np.float32)
+
+
+def _axes(x: float, y: float) -> np.ndarray:
+    shape = (-(-HEIGHT // TILE_ROWS), -(-WIDTH // TILE_COLUMNS), 2)
+    return np.broadcast_to(np.array([x, y], dtype=np.float32), shape).copy()
+
+
+def test_spline_goes_through_the_samples_and_has_their_slope() -> None:
+    image = cv2.GaussianBlur(_noise(1, 40), (0, 0), 1.0)
+    coefficients = row_coefficients(image)
+    value, _ = value_and_slope(coefficients, np.zeros_like(image))
+    np.testing.assert_allclose(value, image, atol=1e-4)
+    shift = np.full_like(image, 3.3)
+    value, slope = value_and_slope(coefficients, shift)
+    inner = slice(14, -10)
+    for row in (0, 17, HEIGHT - 1):
+        curve = CubicSpline(np.arange(WIDTH), image[row].astype(np.float64))
+        at = np.arange(WIDTH)[inner] - 3.3
+        np.testing.assert_allclose(value[row, inner], curve(at), atol=1e-3)
+        np.testing.assert_allclose(slope[row, inner], curve(at, 1), atol=1e-3)
+
+
+def test_spline_reads_the_end_column_beyond_the_ends() -> None:
+    image = _noise(2, 10)
+    value, _ = value_and_slope(row_coefficients(image), np.full_like(image, 1000.0))
+    np.testing.assert_allclose(value, np.repeat(image[:, :1], WIDTH, axis=1), atol=1e-4)
+
+
+def test_axis_follows_stripes_and_is_the_column_on_noise() -> None:
+    rows, columns = np.mgrid[0:96, 0:128].astype(np.float32)
+    lean = np.radians(20)
+    stripes = 100 + 40 * np.sin((columns * np.cos(lean) + rows * np.sin(lean)) * 0.7)
+    axes = tile_axes(stripes.astype(np.float32))
+    along = np.array([-np.sin(lean), np.cos(lean)])
+    assert np.abs(axes[1:-1, 1:-1] @ along).min() > 0.998
+    rng = np.random.default_rng(0)
+    flat = tile_axes(cv2.GaussianBlur(rng.normal(100, 20, (96, 128)).astype(np.float32), (0, 0), 1.5))
+    assert (np.abs(flat[..., 1]) == 1).mean() > 0.8
+
+
+@pytest.mark.parametrize("direction", [(0.0, 1.0), (0.6, 0.8), (1.0, 0.0)])
+def test_axis_means_are_weighted_means_along_the_axis(direction: tuple[float, float]) -> None:
+    first, second, weight = _noise(3), _noise(4), np.abs(_noise(5))
+    found = axis_means(first, second, weight, _axes(*direction), 3.0)
+    for y, x in ((0, 0), (13, 31), (39, 69), (20, 40)):
+        total = sums = 0.0
+        for step in range(-7, 8):
+            row, column = y + round(step * direction[1]), x + round(step * direction[0])
+            if 0 <= row < HEIGHT and 0 <= column < WIDTH:
+                share = np.exp(-0.5 * (step / 3.0) ** 2) * weight[row, column]
+                total += share
+                sums += share * np.array([first[row, column], second[row, column]])
+        np.testing.assert_allclose([found[0][y, x], found[1][y, x]], sums / total, rtol=2e-4, atol=1e-5)
+
+
+def test_planes_are_weighted_least_squares_on_the_support() -> None:
+    disparity, weight, pull = _noise(6, 0.2), 0.2 + np.abs(_noise(7)), _noise(8, 0.1)
+    shape, same = SupportShape(4.0, 1.5), 1.0
+    fitted, information = fit_planes(disparity, weight, pull, _axes(0, 1), shape, same)
+    for y, x in ((0, 0), (11, 20), (39, 69), (25, 33)):
+        rows, values = [], []
+        for down in range(-8, 9):
+            for right in range(-3, 4):
+                # The axis (0, 1) runs down; across it is -x.
+                row, column = y + down, x - right
+                if not (0 <= row < HEIGHT and 0 <= column < WIDTH):
+                    continue
+                gap = float(disparity[row, column] - disparity[y, x])
+                kept = max(1 - (gap / same) ** 2, 0) ** 2
+                kept *= np.exp(-0.5 * (down / 4) ** 2 - 0.5 * (right / 1.5) ** 2)
+                w = kept * weight[row, column]
+                rows.append((w, down, right))
+                values.append(w * gap + kept * pull[row, column])
+        w, down, right = np.array(rows).T
+        basis = np.column_stack([np.ones_like(w), down, right])
+        normal = basis.T @ (w[:, None] * basis)
+        held = 0.02 * (normal[1, 1] + normal[2, 2]) + 1e-3
+        normal[[1, 2], [1, 2]] += held
+        value = np.linalg.solve(normal, basis.T @ np.array(values))[0]
+        assert fitted[y, x] == pytest.approx(disparity[y, x] + value, abs=2e-4)
+        assert information[y, x] == pytest.approx(1 / np.linalg.inv(normal)[0, 0], rel=2e-3)
+
+
+def test_planes_keep_a_plane_in_steps_and_stop_at_a_jump() -> None:
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    plane = 20 + 0.03 * columns - 0.01 * rows
+    plane[:, 35:] += 6
+    ones, zeros = np.ones_like(plane), np.zeros_like(plane)
+    for step in (1, 3, 5):
+        fitted, _ = fit_planes(plane, ones, zeros, _axes(0, 1), SupportShape(8.0, 1.5, step), 1.0)
+        np.testing.assert_allclose(fitted, plane, atol=0.03)
+
+
+def _slow_semiglobal(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
+    """Sum of eight paths over an obvious cost volume: (H, W, count)."""
+    settings = SemiGlobalSettings()
+    height, width = left.shape
+    framed = [np.pad(image.astype(int), 2, mode="edge") for image in (left, right)]
+    bits = [
+        np.stack(
+            [
+                f[2 + dy : 2 + dy + height, 2 + dx : 2 + dx + width] > f[2:-2, 2:-2]
+                for dy in range(-2, 3)
+                for dx in range(-2, 3)
+            ],
+            axis=-1,
+        )
+        for f in framed
+    ]
+    slopes = [
+        cv2.filter2D(i, cv2.CV_16S, np.array([[-1, 0, 1]], np.float32)).astype(int) for i in (left, right)
+    ]
+    greys = [left.astype(int), right.astype(int)]
+    cost = np.full((height, width, count), -1)
+    for x in range(width):
+        for k in range(count):
+            there = x - lowest - k
+            if 0 <= there < width:
+                hamming = (bits[0][:, x] != bits[1][:, there]).sum(axis=-1)
+                steep = np.minimum(np.abs(slopes[0][:, x] - slopes[1][:, there]), 20)
+                bright = np.minimum(np.abs(greys[0][:, x] - greys[1][:, there]), 20)
+                cost[:, x, k] = hamming + (steep + bright) // 2
+        inside = np.flatnonzero(cost[0, x] >= 0)
+        if inside.size == 0:
+            cost[:, x] = 60
+        else:
+            cost[:, x, : inside[0]] = cost[:, x, inside[0], None]
+            cost[:, x, inside[-1] + 1 :] = cost[:, x, inside[-1], None]
+    total = np.zeros_like(cost)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        path = np.zeros_like(cost)
+        for y in range(height) if dy >= 0 else range(height - 1, -1, -1):
+            for x in range(width) if dx >= 0 else range(width - 1, -1, -1):
+                row, column = y - dy, x - dx
+                if not (0 <= row < height and 0 <= column < width):
+                    path[y, x] = cost[y, x]
+                    continue
+                before = path[row, column]
+                contrast = abs(greys[0][y, x] - greys[0][row, column])
+                jump = max(settings.large_jump * 8 // (8 + contrast), settings.least_jump)
+                near = np.minimum(np.append(before[1:], 10**6), np.append(10**6, before[:-1]))
+                best = np.minimum(np.minimum(before, near + settings.small_jump), before.min() + jump)
+                path[y, x] = cost[y, x] + best - before.min()
+        total += path
+    return total
+
+
+@pytest.mark.parametrize("lowest", [0, -4, 3])
+def test_semiglobal_is_the_minimum_of_the_eight_paths(lowest: int) -> None:
+    rng = np.random.default_rng(9)
+    wide = cv2.GaussianBlur(rng.normal(120, 90, (14, 60)), (0, 0), 1.0).clip(0, 255).astype(np.uint8)
+    left, right = wide[:, 5:37].copy(), wide[:, 9:41].copy()
+    found = match(left, right, lowest, 12, SemiGlobalSettings())
+    total = _slow_semiglobal(left, right, lowest, 12)
+    winner = total.argmin(axis=-1)
+    assert np.abs(found.left_px - lowest - winner).max() <= 0.5
+    rows, columns = np.indices(winner.shape)
+    for y, x in zip(rows.ravel(), columns.ravel(), strict=True):
+        seen = [d for d in range(12) if 0 <= x + d + lowest < 32]
+        if seen:
+            best = min(seen, key=lambda d: total[y, x + d + lowest, d])
+            assert found.right_px[y, x] == best + lowest
+
+
+def test_stripes_of_the_semiglobal_match_leave_no_mark() -> None:
+    rng = np.random.default_rng(10)
+    wide = cv2.GaussianBlur(rng.normal(120, 90, (300, 90)), (0, 0), 1.2).clip(0, 255).astype(np.uint8)
+    left, right = wide[:, :64].copy(), wide[:, 7:71].copy()
+    whole = match(left, right, 0, 20, SemiGlobalSettings()).left_px
+    assert (np.abs(whole[:, 10:] - 7) < 0.5).mean() > 0.999
+
+
+def test_left_right_check_and_islands() -> None:
+    left, right = np.full((8, 20), 3, np.float32), np.full((8, 20), 3, np.float32)
+    right[2, 5] = 6
+    same = agrees(left, right, 1.0)
+    assert not same[:, :3].any()
+    assert not same[2, 8]
+    assert same[:, 3:].sum() == 8 * 17 - 1
+    left[4:6, 10:12] = 9
+    cleaned = without_islands(left, 10, 1.0)
+    assert np.isnan(cleaned[4:6, 10:12]).all()
+    assert np.isfinite(cleaned).sum() == 8 * 20 - 4
+
+
+def test_weighted_median_beside_jumps_agrees_with_sorting() -> None:
+    rng = np.random.default_rng(11)
+    disparity = np.where(np.arange(WIDTH) < 30, 10.0, 14.0) + rng.uniform(0, 0.4, (HEIGHT, WIDTH))
+    disparity = disparity.astype(np.float32)
+    disparity[5:9, 20:26] = np.nan
+    grey = (60 + 80 * (np.arange(WIDTH) < 32) + rng.integers(0, 8, (HEIGHT, WIDTH))).astype(np.uint8)
+    sharp = sharpen_edges(disparity, grey, 1.0)
+    assert np.array_equal(np.isnan(sharp), np.isnan(disparity))
+    far = np.abs(np.arange(WIDTH) - 29.5) > _BESIDE_PX + 2
+    assert np.array_equal(sharp[:, far], disparity[:, far], equal_nan=True)
+    for y, x in ((0, 29), (7, 30), (20, 31), (39, 28)):
+        rows = slice(max(0, y - _RADIUS_PX), y + _RADIUS_PX + 1)
+        columns = slice(max(0, x - _RADIUS_PX), x + _RADIUS_PX + 1)
+        there = disparity[rows, columns]
+        row, column = np.indices(there.shape)
+        distance = (row + rows.start - y) ** 2 + (column + columns.start - x) ** 2
+        contrast = np.abs(grey[rows, columns].astype(float) - float(grey[y, x]))
+        weight = np.exp(-distance / (2 * _DISTANCE_PX**2) - contrast / _GREY)
+        known = np.isfinite(there)
+        order = np.argsort(there[known])
+        passed = np.cumsum(weight[known][order])
+        median = there[known][order][np.searchsorted(passed, passed[-1] / 2)]
+        assert sharp[y, x] == pytest.approx(median, abs=0.03)
+    assert (sharp[:, 30:32] < 12).mean() > 0.9, "the edge moves to where the image has it"
+
+
+def test_filling_continues_the_plane_behind_and_leaves_the_input() -> None:
+    columns = np.mgrid[0:60, 0:120][1].astype(np.float32)
+    disparity = 20 + 0.05 * columns
+    disparity[:, 70:] = 45
+    disparity[:, 60:70] = np.nan
+    disparity[:, :12] = np.nan
+    before = disparity.copy()
+    right = np.full_like(disparity, 30)
+    filled, sigma = fill(disparity, np.full(disparity.shape, 100, np.uint8), right, 0, 60)
+    assert np.array_equal(before, disparity, equal_nan=True)
+    hidden = (slice(None), slice(60, 70))
+    assert (np.abs(filled[hidden] - (20 + 0.05 * columns[hidden])) < 0.5).mean() > 0.97
+    border = (slice(None), slice(0, 12))
+    assert np.abs(filled[border] - (20 + 0.05 * columns[border])).max() < 0.5
+    assert np.array_equal(np.isfinite(sigma), np.isnan(before))
+    assert np.nanmin(sigma) >= 1
+
+
+def test_filling_leaves_an_empty_map_empty() -> None:
+    empty = np.full((20, 30), np.nan, np.float32)
+    filled, sigma = fill(empty, np.zeros((20, 30), np.uint8), np.zeros((20, 30), np.float32), 0, 10)
+    assert np.isnan(filled).all()
+    assert np.isnan(sigma).all()
+
+
+def test_bend_is_zero_on_a_plane_and_half_the_step_beside_an_edge() -> None:
+    rows, columns = np.mgrid[0:20, 0:30].astype(np.float32)
+    plane = 0.1 * columns + 0.2 * rows
+    assert bend_around(plane, 0.5)[4:-4, 4:-4].max() < 1e-5
+    step = np.where(columns < 15, 0, 0.6).astype(np.float32)
+    assert bend_around(step, 0.5)[10, 13] == pytest.approx(0.3)
+    assert bend_around(step * 100, 0.5).max() == np.float32(0.5)
+
+
+def test_penalties_must_be_in_order() -> None:
+    with pytest.raises(ConfigError, match="penalties"):
+        SemiGlobalSettings(small_jump=50, large_jump=40)
