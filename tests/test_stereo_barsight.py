@@ -23,7 +23,8 @@ from barsight.stereo.spline import row_coefficients, value_and_slope
 DATA = Path(os.environ.get("BARSIGHT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 HEIGHT, WIDTH = 240, 360
 RANGE = DisparityRange(32, 64)
-BEST, FAST = BarsightStereo(BarsightSettings()), BarsightStereo(BarsightSettings(preset="fast"))
+BEST = BarsightStereo(BarsightSettings(fill_occlusions=False))
+FAST = BarsightStereo(BarsightSettings(fill_occlusions=False, preset="fast"))
 presets = pytest.mark.parametrize("method", [BEST, FAST], ids=["best", "fast"])
 Shape = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -255,3 +256,12 @@ def test_middlebury() -> None:
     half, one = np.mean(bad, axis=0)
     assert half < 9.0
     assert one < 5.0
+
+
+def test_guesses_stop_where_the_left_image_is_invalid() -> None:
+    pair, _ = _render(_plane, seed=9)
+    left_valid = pair.left_valid.copy()
+    left_valid[:40] = False
+    found = BarsightStereo(BarsightSettings())(replace(pair, left_valid=left_valid), RANGE)
+    assert np.isnan(found.disparity_px[:40]).all() and np.isnan(found.sigma_px[:40]).all()
+    assert np.isfinite(found.disparity_px[40:]).all()

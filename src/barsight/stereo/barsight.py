@@ -103,6 +103,7 @@ class BarsightStereo:
             sigma = np.where(np.isfinite(guessed), guessed, sigma)
         if settings.preset == "best":
             disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
+        disparity, sigma = np.where(pair.left_valid, disparity, _NAN), np.where(pair.left_valid, sigma, _NAN)
         return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
 
     def _sigma(self, pair: RectifiedPair, refined: Refined, matched: Bool) -> Float32:
