@@ -71,7 +71,7 @@ def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiG
     _match_stripes(
         _census(left), _reversed(_census(right)), _gradient(left), _reversed(_gradient(right)),
         left.astype(np.int16), _reversed(right.astype(np.int16)), lowest_px, count,
-        settings.small_jump, settings.large_jump, settings.least_jump, -(-height // stripes),
+        settings.small_jump, settings.large_jump, settings.least_jump, -(-height // stripes), threads,
         left_px, right_px,
     )  # fmt: skip
     return Match(left_px, right_px)
@@ -216,8 +216,10 @@ def _sweep(
 @kernel()
 def _choose(total: Int16, lowest: int, left_px: Float32, right_px: Float32) -> None:
     """Winners of one row for both images; the left one to a fraction with the equiangular line fit, which
-    suits a cost that rises linearly [Shimizu 2002]."""
+    suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that a
+    left pixel's candidates meet them in memory's order."""
     width, count = total.shape
+    right_least, right_winner = np.full(width, 32000, dtype=np.int16), np.full(width, -1, dtype=np.int16)
     for x in range(width):
         sums = total[x]
         least = np.int16(32000)
@@ -233,12 +235,18 @@ def _choose(total: Int16, lowest: int, left_px: Float32, right_px: Float32) -> N
             if steeper > 0:
                 fraction = np.float32(0.5) * (below - above) / steeper
         left_px[x] = np.float32(winner + lowest) + fraction
+        base = width - 1 - x + lowest
+        first, end = max(0, -base), min(count, width - base)
+        if first < end:
+            seen = sums[first:end]
+            leasts, winners = right_least[base + first : base + end], right_winner[base + first : base + end]
+            for k in range(end - first):
+                better = seen[k] < leasts[k]
+                winners[k] = np.int16(first + k) if better else winners[k]
+                leasts[k] = min(seen[k], leasts[k])
     for x in range(width):
-        least, winner = np.int16(32000), -1
-        for d in range(max(0, -x - lowest), min(count, width - x - lowest)):
-            if total[x + d + lowest, d] < least:
-                least, winner = total[x + d + lowest, d], d
-        right_px[x] = np.float32(winner + lowest) if winner >= 0 else _FAR
+        found = right_winner[width - 1 - x]
+        right_px[x] = np.float32(found + lowest) if found >= 0 else _FAR
 
 
 @kernel(parallel=True)
@@ -255,22 +263,28 @@ def _match_stripes(
     large: int,
     least_jump: int,
     stripe_rows: int,
+    workers: int,
     left_px: Float32,
     right_px: Float32,
 ) -> None:
+    """Each worker takes every so-manieth stripe and uses its two volumes again and again."""
     height, width = left_px.shape
-    for stripe in prange((height + stripe_rows - 1) // stripe_rows):
-        start, end = stripe * stripe_rows, min(height, stripe * stripe_rows + stripe_rows)
-        above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
-        cost = np.empty((below - above, width, count), dtype=np.uint8)
-        total = np.zeros((below - above, width, count), dtype=np.int16)
-        for y in range(above, below):
-            _row_costs(
-                left_code[y], right_code[y], left_slope[y], right_slope[y], left_grey[y], right_grey[y],
-                lowest, cost[y - above],
-            )  # fmt: skip
-        grey = left_grey[above:below]
-        _sweep(cost, total, grey, small, large, least_jump, False)
-        _sweep(cost, total, grey, small, large, least_jump, True)
-        for y in range(start, end):
-            _choose(total[y - above], lowest, left_px[y], right_px[y])
+    stripes = (height + stripe_rows - 1) // stripe_rows
+    for worker in prange(workers):
+        cost = np.empty((stripe_rows + 2 * _OVERLAP_ROWS, width, count), dtype=np.uint8)
+        total = np.empty((stripe_rows + 2 * _OVERLAP_ROWS, width, count), dtype=np.int16)
+        for stripe in range(worker, stripes, workers):
+            start, end = stripe * stripe_rows, min(height, stripe * stripe_rows + stripe_rows)
+            above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
+            rows = below - above
+            for y in range(above, below):
+                _row_costs(
+                    left_code[y], right_code[y], left_slope[y], right_slope[y], left_grey[y], right_grey[y],
+                    lowest, cost[y - above],
+                )  # fmt: skip
+                total[y - above] = 0
+            grey = left_grey[above:below]
+            _sweep(cost[:rows], total[:rows], grey, small, large, least_jump, False)
+            _sweep(cost[:rows], total[:rows], grey, small, large, least_jump, True)
+            for y in range(start, end):
+                _choose(total[y - above], lowest, left_px[y], right_px[y])
