@@ -1,0 +1,111 @@
+"""What the yard's stages pass on: bars, bundles and how sure they are.
+
+All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, counter-clockwise, in
+(-pi/2, pi/2]: the axis runs along (-sin yaw, cos yaw).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, UInt8
+from barsight.mapping.surface import Surface
+
+
+@dataclass(frozen=True, eq=False)
+class HeightMap:
+    """The map that the yard's stages read: arrays [y, x] with y rising.
+
+    Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
+    NaN where unknown. views: float32. source: `Source`.
+    """
+
+    x0_m: float
+    y0_m: float
+    cell_m: float
+    z_m: Float32
+    sigma_m: Float32
+    views: Float32
+    source: UInt8
+
+    @classmethod
+    def of(cls, surface: Surface) -> HeightMap:
+        """All that a surface knows."""
+        rows, columns = surface.shape
+        layers = surface.window(surface.columns[0], surface.rows[0], columns, rows)
+        x0_m, y0_m = surface.columns[0] * surface.cell_m, surface.rows[0] * surface.cell_m
+        return cls(x0_m, y0_m, surface.cell_m, layers.z_m, layers.sigma_m, layers.views, layers.source)
+
+
+@dataclass(frozen=True, eq=False)
+class Bar:
+    """One bar's visible part.
+
+    centre_m: (3,) the axis at the middle of what is seen. direction: (3,) unit vector, +y part positive.
+    length_m: of what is seen. covariance: (5, 5) of the axis's lateral place and height at the centre (m),
+    its yaw and pitch (rad) and the diameter (m).
+    """
+
+    centre_m: Float64
+    direction: Float64
+    diameter_m: float
+    length_m: float
+    covariance: Float64
+
+
+@dataclass(frozen=True)
+class BundleSigma:
+    """One standard deviation of each figure of a bundle; NaN where the figure is unknown."""
+
+    lateral_m: float
+    along_m: float
+    yaw_rad: float
+    length_m: float
+    width_m: float
+    top_z_m: float
+    bar_diameter_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """A bundle of round bars, or a single heavy bar.
+
+    id: its number in the result, from 0. centre_m: (3,) the axis at mid-length. yaw_rad, pitch_rad: of the
+    axis. ends_m: (2, 3) the axis at its low-y and high-y end. ends_open: (2,) True where that end was not
+    seen (out of view or covered), so the bundle may be longer. top_z_m: the highest line at mid-length.
+    visible_bars: bars seen from above. bars: bars in the bundle by its outline, 0 where unknown.
+    layer: 0 lies on the floor or on dunnage. on_top: nothing lies on it; None where that can't be seen.
+    neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
+    confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
+    """
+
+    id: int
+    centre_m: Float64
+    yaw_rad: float
+    pitch_rad: float
+    length_m: float
+    ends_m: Float64
+    ends_open: tuple[bool, bool]
+    width_m: float
+    top_z_m: float
+    bar_diameter_m: float
+    visible_bars: int
+    bars: int
+    layer: int
+    on_top: bool | None
+    neighbours: tuple[int, ...]
+    sigma: BundleSigma
+    known_share: float
+    confidence: float
+    reasons: tuple[str, ...]
+    bar_axes: tuple[Bar, ...] = ()
+
+    @property
+    def direction(self) -> Float64:
+        """(3,) unit vector of the axis towards +y."""
+        cos_pitch = np.cos(self.pitch_rad)
+        return np.array(
+            [-np.sin(self.yaw_rad) * cos_pitch, np.cos(self.yaw_rad) * cos_pitch, np.sin(self.pitch_rad)]
+        )
