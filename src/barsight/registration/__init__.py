@@ -1,0 +1,1 @@
+"""Floor 2: rigid motions between matched points."""
