@@ -1,5 +1,6 @@
 """The finished surface: windows over tile borders, filled gaps, the cloud."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,19 @@ def test_a_folder_used_again_shows_the_new_surface(tmp_path: Path) -> None:
     assert fused([view(x, y, 2.0)], tmp_path).window(0, 0, 1, 1).z_m[0, 0] == 2
 
 
+def test_the_intensity_is_that_of_the_elected_height(tmp_path: Path) -> None:
+    """Two views of a bar at 150 and 160, one stray height at 20; a filled gap has no grey level."""
+    x, y = block(9, 1)
+    seen = x != 4
+    views = [replace(view(x[seen], y[seen], 1.0), intensity=np.full(8, g, np.float32)) for g in (150, 160)]
+    stray = replace(view(x[seen], y[seen], 3.0), intensity=np.full(8, 20, np.float32))
+    surface = fused([*views, stray], tmp_path, MapSettings(min_views=2))
+    layers = surface.window(0, 0, 9, 1)
+    np.testing.assert_allclose(layers.intensity[seen], 155)
+    assert layers.source[0, 4] == Source.FILLED
+    assert np.isnan(layers.intensity[0, 4])
+
+
 def layers_of(z: np.ndarray, sigma: float = 0.01) -> Layers:
     """NaN is unknown, all else seen."""
     seen = np.isfinite(z)
@@ -49,6 +63,7 @@ def layers_of(z: np.ndarray, sigma: float = 0.01) -> Layers:
         np.where(seen, sigma, np.nan).astype(np.float32),
         seen.astype(np.float32),
         np.where(seen, Source.VISION, Source.UNKNOWN).astype(np.uint8),
+        np.where(seen, 100, np.nan).astype(np.float32),
     )
 
 

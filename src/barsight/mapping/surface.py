@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,20 +20,23 @@ _HALO = 16
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """A rectangle of the surface, [y, x] with y rising: z_m, sigma_m (NaN where unknown), views, source."""
+    """A rectangle of the surface, [y, x] with y rising: z_m, sigma_m (NaN where unknown), views, source.
+
+    intensity: mean grey level of the views that make the height, NaN where no view does.
+    """
 
     z_m: Float32
     sigma_m: Float32
     views: Float32
     source: UInt8
+    intensity: Float32
 
     @classmethod
     def unknown(cls, rows: int, columns: int) -> Layers:
         """A rectangle of which nothing is known."""
         nan = np.full((rows, columns), np.nan, np.float32)
-        return cls(
-            nan, nan.copy(), np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.uint8)
-        )
+        none = np.zeros((rows, columns), np.float32)
+        return cls(nan, nan.copy(), none, none.astype(np.uint8), nan.copy())
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +136,7 @@ def _elected(tile: Float32, min_views: int, top_share: float) -> Layers:
     layers.sigma_m[row, column] = height_sigma(won)
     layers.views[row, column] = won[:, VIEWS]
     layers.source[row, column] = Source.VISION
+    layers.intensity[row, column] = won[:, GREY]
     return layers
 
 
@@ -150,10 +154,7 @@ def _filled(folder: Path, key: TileKey, keys: frozenset[TileKey], reach: int) ->
     if reach > 0:
         fill_gaps(around, reach)
     inner = slice(_HALO, _HALO + TILE_CELLS)
-    return Layers(
-        around.z_m[inner, inner], around.sigma_m[inner, inner],
-        around.views[inner, inner], around.source[inner, inner],
-    )  # fmt: skip
+    return Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
 
 
 def fill_gaps(layers: Layers, reach: int) -> None:
@@ -229,14 +230,14 @@ def _tile_file(folder: Path, key: TileKey, kind: str) -> Path:
 
 
 def _write_tile(folder: Path, key: TileKey, layers: Layers, kind: str) -> None:
-    stacked = np.stack([layers.z_m, layers.sigma_m, layers.views, layers.source.astype(np.float32)])
+    stacked = np.stack([getattr(layers, field.name).astype(np.float32) for field in fields(Layers)])
     np.save(_tile_file(folder, key, kind), stacked)
 
 
 @lru_cache(maxsize=48)
 def _read_tile(folder: Path, key: TileKey, kind: str = "surface") -> Layers:
-    z, sigma, views, source = np.load(_tile_file(folder, key, kind))
-    return Layers(z, sigma, views, source.astype(np.uint8))
+    z, sigma, views, source, intensity = np.load(_tile_file(folder, key, kind))
+    return Layers(z, sigma, views, source.astype(np.uint8), intensity)
 
 
 def _paste(tile: Layers, key: TileKey, into: Layers, column: int, row: int) -> None:
@@ -251,5 +252,5 @@ def _paste(tile: Layers, key: TileKey, into: Layers, column: int, row: int) -> N
         slice(target[0].start - top, target[0].stop - top),
         slice(target[1].start - left, target[1].stop - left),
     )
-    for name in ("z_m", "sigma_m", "views", "source"):
-        getattr(into, name)[target] = getattr(tile, name)[source]
+    for field in fields(Layers):
+        getattr(into, field.name)[target] = getattr(tile, field.name)[source]
