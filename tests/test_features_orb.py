@@ -1,10 +1,9 @@
-"""Features spread over the image, mutual matches, and places to a fraction of a pixel."""
+"""Features spread over the image, and mutual matches."""
 
 import numpy as np
-import pytest
 
 from barsight.core.arrays import UInt8
-from barsight.features.matching import match_mutual, track
+from barsight.features.matching import match_mutual
 from barsight.features.orb import Features, detect_orb
 from synthetic_scenes import Texture, quantised
 
@@ -60,26 +59,3 @@ def test_mutual_matching_is_brute_force() -> None:
             expected.append((i, int(j)))
     assert [tuple(pair) for pair in pairs.tolist()] == expected
     assert len(expected) == 28
-
-
-@pytest.mark.parametrize("shift", [(0.3, -0.6), (5.25, 2.5)])
-def test_tracking_is_finer_than_a_twentieth_pixel(shift: tuple[float, float]) -> None:
-    source, target = shifted(0, 0), shifted(*shift)
-    places = detect_orb(source, 300).pixels
-    guesses = places + np.float32(np.round(shift))
-    before = guesses.copy()
-    found, kept = track(source, target, places, guesses)
-    assert kept.mean() > 0.95
-    error = np.linalg.norm(found[kept] - places[kept] - shift, axis=1)
-    assert np.median(error) < 0.02
-    assert np.percentile(error, 95) < 0.05
-    np.testing.assert_array_equal(guesses, before)
-
-
-def test_what_is_not_there_is_not_kept() -> None:
-    source, target = shifted(0, 0), quantised(Texture(9)(*np.meshgrid(np.arange(320.0), np.arange(240.0))))
-    places = detect_orb(source, 300).pixels
-    _, kept = track(source, target, places, places)
-    assert kept.mean() < 0.2
-    _, none = track(source, target, places[:0], places[:0])
-    assert none.shape == (0,)

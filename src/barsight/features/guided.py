@@ -6,15 +6,16 @@ point is carried by the predicted motion, and only what lies in its predicted el
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64
-from barsight.core.types import RectifiedCamera, RectifiedPair
-from barsight.features.matching import track
+from barsight.core.arrays import Bool, Float64
+from barsight.core.types import RectifiedCamera
+from barsight.features.patches import Located, PatchImage, PatchPair, locate
 
 GATE_SIGMAS = 4.0
+MOST_OFF_ROW_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +49,12 @@ class Predicted:
 
 @dataclass(frozen=True, eq=False)
 class GuidedMatches:
-    """stereo: (N, 3) u, v, right u where found. found: (N,). ambiguous: (N,) refused since the ellipse is not
-    clearly finer than the pattern repeats.
+    """stereo: (N, 3) u, v, right u where found, sigma_px: (N,) of each. found: (N,). ambiguous: (N,) refused
+    since the ellipse is not clearly finer than the pattern repeats.
     """
 
     stereo: Float64
+    sigma_px: Float64
     found: Bool
     ambiguous: Bool
 
@@ -107,39 +109,44 @@ def predict_places(
 
 
 def match_guided(
-    source: RectifiedPair, places: Float32, pair: RectifiedPair, predicted: Predicted,
+    source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: Predicted,
     sigma_px: float, repeat_px: Float64 | None = None,
 ) -> GuidedMatches:  # fmt: skip
-    """Looks for patches of `source`'s left picture at `places` (N, 2) in both pictures of `pair`.
+    """Looks for the patches of `source` at `places` (N, 2), `depth` (N,) m off, in both pictures of `pair`.
 
-    Lucas-Kanade from the predicted place, there and back, then across to the right picture. repeat_px: (N,)
-    how far off each patch's likeness is (the bars' pitch); an ellipse of 2 sigma that reaches a quarter of
-    it is ambiguous.
+    From the predicted place in the left picture, then across to the right one. repeat_px: (N,) how far off
+    each patch's likeness is (the bars' pitch); an ellipse of 2 sigma that reaches a quarter of it is
+    ambiguous.
     """
     count = len(places)
     ambiguous = np.zeros(count, dtype=np.bool_)
     if repeat_px is not None:
         ambiguous = predicted.inside & (2 * predicted.reach_px > repeat_px / 4)
-    stereo, found = np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_)
+    stereo, sigma = np.full((count, 3), np.nan), np.full(count, np.nan)
+    found = np.zeros(count, dtype=np.bool_)
     tried = np.flatnonzero(predicted.inside & ~ambiguous)
     if tried.size == 0:
-        return GuidedMatches(stereo, found, ambiguous)
-    guess = predicted.stereo[tried, :2].astype(np.float32)
-    left, kept = track(source.left, pair.left, places[tried], guess)
-    across = guess.copy()
-    across[:, 0] = left[:, 0] - (predicted.stereo[tried, 0] - predicted.stereo[tried, 2])
-    across[:, 1] = left[:, 1]
-    right, on_row = match_across(pair, left, across)
-    stereo[tried] = np.column_stack([left, right])
-    off = stereo[tried] - predicted.stereo[tried]
+        return GuidedMatches(stereo, sigma, found, ambiguous)
+    guess = predicted.stereo[tried]
+    disparity = guess[:, 0] - guess[:, 2]
+    camera = pair.pair.camera
+    now = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
+    left = locate(source, pair.left, places[tried], guess[:, :2], grown=depth[tried] / now)
+    right = match_across(pair, left.pixels, disparity, sure=True)
+    stereo[tried] = np.column_stack([left.pixels, right.pixels[:, 0]])
+    sigma[tried] = np.hypot(left.sigma_px, right.sigma_px) / 2**0.5
+    off = stereo[tried] - guess
     spread = predicted.covariance[tried] + sigma_px**2 * np.eye(3)
     distance2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
-    found[tried] = kept & on_row & (distance2 < GATE_SIGMAS**2)
-    return GuidedMatches(stereo, found, ambiguous)
+    found[tried] = left.found & right.found & (distance2 < GATE_SIGMAS**2)
+    return GuidedMatches(stereo, sigma, found, ambiguous)
 
 
-def match_across(pair: RectifiedPair, left: Float32, guess: Float32) -> tuple[Float32, Bool]:
-    """Right u (N,) of left places (N, 2) from guesses (N, 2), and which are on their row and came back."""
-    right, kept = track(pair.left, pair.right, left, guess)
-    kept &= np.abs(right[:, 1] - left[:, 1]) < 1.0
-    return right[:, 0], kept
+def match_across(pair: PatchPair, left: Float64, disparity: Float64, sure: bool = False) -> Located:
+    """Left places (N, 2), whose disparity (N,) is about known, in the right picture; found only on their row.
+
+    sure: the disparities are good to a pixel or two.
+    """
+    guess = np.column_stack([left[:, 0] - disparity, left[:, 1]])
+    right = locate(pair.left, pair.right, left, guess, sure)
+    return replace(right, found=right.found & (np.abs(right.pixels[:, 1] - left[:, 1]) < MOST_OFF_ROW_PX))

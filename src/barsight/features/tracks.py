@@ -14,7 +14,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.errors import ConfigError
-from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.core.types import RectifiedPair
 from barsight.features.guided import (
     GuidedMatches,
     Predicted,
@@ -24,6 +24,7 @@ from barsight.features.guided import (
     predict_places,
     triangulate,
 )
+from barsight.features.patches import PatchImage, PatchPair
 
 MOST_VIEWS = 8
 
@@ -40,7 +41,7 @@ class TrackSettings:
     """Corners weaker than this share of the strongest aren't used."""
     sigma_px: float = 0.25
     """The noise of a point's place (1 sigma)."""
-    most_scale: float = 1.08
+    most_scale: float = 1.3
     """A patch that has grown or shrunk by more is taken anew from its last view."""
     nearest_m: float = 0.5
     """Points nearer than this aren't used."""
@@ -56,77 +57,89 @@ class TrackSettings:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """What is followed. All of N points: track (their names), stereo (N, 3) in the last view (u, v, right u),
-    source (index into views of the patch's view), patch (N, 2) its place there, patch_depth (N,) m.
+    """What is followed. All of N points: track (their names), stereo (N, 3) in the last view (u, v, right u)
+    and sigma_px (N,) of each, source (index into views of the patch's view), patch (N, 2) its place there,
+    patch_depth (N,) m.
+
+    views: the left pictures that patches are from, the last frame's at the end. last: the last frame.
     """
 
-    views: tuple[RectifiedPair, ...] = ()
+    views: tuple[PatchImage, ...] = ()
+    last: RectifiedPair | None = None
     track: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     stereo: Float64 = field(default_factory=lambda: np.empty((0, 3)))
+    sigma_px: Float64 = field(default_factory=lambda: np.empty(0))
     source: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
-    patch: Float32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    patch: Float64 = field(default_factory=lambda: np.empty((0, 2)))
     patch_depth: Float64 = field(default_factory=lambda: np.empty(0))
     next_track: int = 0
 
     def chosen(self, kept: Bool) -> Tracks:
         """The points for which `kept` (N,) is true."""
         return replace(
-            self, track=self.track[kept], stereo=self.stereo[kept], source=self.source[kept],
-            patch=self.patch[kept], patch_depth=self.patch_depth[kept],
+            self, track=self.track[kept], stereo=self.stereo[kept], sigma_px=self.sigma_px[kept],
+            source=self.source[kept], patch=self.patch[kept], patch_depth=self.patch_depth[kept],
         )  # fmt: skip
 
 
 def find_again(
-    tracks: Tracks, pair: RectifiedPair, motion: PredictedMotion, settings: TrackSettings,
+    tracks: Tracks, pair: PatchPair, motion: PredictedMotion, settings: TrackSettings,
     repeat_px: Float64 | None = None,
 ) -> GuidedMatches:  # fmt: skip
     """Where the followed points are in a new pair."""
-    points = triangulate(tracks.stereo, pair.camera)
-    predicted = predict_places(points, settings.sigma_px, motion, pair.camera)
+    camera = pair.pair.camera
+    predicted = predict_places(triangulate(tracks.stereo, camera), settings.sigma_px, motion, camera)
     count = len(tracks.track)
-    stereo, found = np.full((count, 3), np.nan), np.zeros(count, np.bool_)
-    ambiguous = np.zeros(count, np.bool_)
+    stereo, sigma = np.full((count, 3), np.nan), np.full(count, np.nan)
+    found, ambiguous = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     for source in np.unique(tracks.source):
         group = np.flatnonzero(tracks.source == source)
         part = Predicted(predicted.stereo[group], predicted.covariance[group], predicted.inside[group])
         repeat = None if repeat_px is None else repeat_px[group]
         matches = match_guided(
-            tracks.views[source], tracks.patch[group], pair, part, settings.sigma_px, repeat
-        )
-        stereo[group], found[group] = matches.stereo, matches.found
+            tracks.views[source], tracks.patch[group], tracks.patch_depth[group], pair, part,
+            settings.sigma_px, repeat,
+        )  # fmt: skip
+        stereo[group], sigma[group], found[group] = matches.stereo, matches.sigma_px, matches.found
         ambiguous[group] = matches.ambiguous
-    return GuidedMatches(stereo, found, ambiguous)
+    return GuidedMatches(stereo, sigma, found, ambiguous)
 
 
 def carry_on(
-    tracks: Tracks, pair: RectifiedPair, stereo: Float64, kept: Bool, coarse: Float32, settings: TrackSettings
-) -> Tracks:
-    """The tracks after a new pair: those `kept` at their new places `stereo`, and new ones between them.
+    tracks: Tracks, pair: PatchPair, matches: GuidedMatches, kept: Bool, coarse: Float32,
+    settings: TrackSettings,
+) -> Tracks:  # fmt: skip
+    """The tracks after a new pair: those `kept` of the matches at their new places, and new ones between.
 
     coarse: the pair's coarse disparity (h, w), in px of the full picture, NaN unknown, for new points.
     """
-    followed = replace(tracks.chosen(kept), stereo=stereo[kept], views=(*tracks.views, pair))
+    followed = replace(
+        tracks.chosen(kept), stereo=matches.stereo[kept], sigma_px=matches.sigma_px[kept],
+        views=(*tracks.views, pair.left), last=pair.pair,
+    )  # fmt: skip
+    camera = pair.pair.camera
     last = len(followed.views) - 1
-    depth = triangulate(followed.stereo, pair.camera)[:, 2]
+    depth = triangulate(followed.stereo, camera)[:, 2]
     ratio = depth / followed.patch_depth
     anew = (ratio > settings.most_scale) | (ratio < 1 / settings.most_scale)
     anew |= followed.source <= last - MOST_VIEWS
     followed = replace(
         followed,
         source=np.where(anew, last, followed.source),
-        patch=np.where(anew[:, None], followed.stereo[:, :2], followed.patch).astype(np.float32),
+        patch=np.where(anew[:, None], followed.stereo[:, :2], followed.patch),
         patch_depth=np.where(anew, depth, followed.patch_depth),
     )
-    corners = detect_corners(pair.left, settings, followed.stereo[:, :2])
-    fresh = _across(pair, corners, coarse, settings)
+    corners = detect_corners(pair.pair.left, settings, followed.stereo[:, :2])
+    fresh, fresh_sigma = _across(pair, corners, coarse, settings)
     count = len(fresh)
     grown = replace(
         followed,
         track=np.concatenate([followed.track, followed.next_track + np.arange(count)]),
         stereo=np.vstack([followed.stereo, fresh]),
+        sigma_px=np.concatenate([followed.sigma_px, fresh_sigma]),
         source=np.concatenate([followed.source, np.full(count, last)]),
-        patch=np.vstack([followed.patch, fresh[:, :2]]).astype(np.float32),
-        patch_depth=np.concatenate([followed.patch_depth, triangulate(fresh, pair.camera)[:, 2]]),
+        patch=np.vstack([followed.patch, fresh[:, :2]]),
+        patch_depth=np.concatenate([followed.patch_depth, triangulate(fresh, camera)[:, 2]]),
         next_track=followed.next_track + count,
     )
     return _without_old_views(grown)
@@ -157,20 +170,23 @@ def detect_corners(image: UInt8, settings: TrackSettings, taken: Float64) -> Flo
     return np.concatenate(found).astype(np.float32) if found else np.empty((0, 2), np.float32)
 
 
-def _across(pair: RectifiedPair, corners: Float32, coarse: Float32, settings: TrackSettings) -> Float64:
-    """(M, 3) u, v and right u of the corners that the right picture shows too, at a useful depth."""
-    camera: RectifiedCamera = pair.camera
+def _across(
+    pair: PatchPair, corners: Float32, coarse: Float32, settings: TrackSettings
+) -> tuple[Float64, Float64]:
+    """u, v and right u (M, 3) of the corners that the right picture shows too at a useful depth; sigma."""
+    camera = pair.pair.camera
     row = (corners[:, 1] * coarse.shape[0] / camera.height).astype(int)
     column = (corners[:, 0] * coarse.shape[1] / camera.width).astype(int)
     guess = coarse[row, column]
     known = np.isfinite(guess)
-    places, guess = corners[known], guess[known]
-    right, kept = match_across(pair, places, places - np.column_stack([guess, 0 * guess]).astype(np.float32))
-    stereo = np.column_stack([places, right]).astype(np.float64)
+    places = corners[known].astype(np.float64)
+    right = match_across(pair, places, guess[known].astype(np.float64))
+    stereo = np.column_stack([places, right.pixels[:, 0]])
     depth = triangulate(stereo, camera)[:, 2]
     with np.errstate(invalid="ignore"):
-        kept &= (depth > settings.nearest_m) & (depth < settings.farthest_baselines * camera.baseline_m)
-    return stereo[kept]
+        kept = right.found & (depth > settings.nearest_m)
+        kept &= depth < settings.farthest_baselines * camera.baseline_m
+    return stereo[kept], right.sigma_px[kept]
 
 
 def _without_old_views(tracks: Tracks) -> Tracks:

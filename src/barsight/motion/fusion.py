@@ -24,6 +24,8 @@ from barsight.recording.base import Recording
 
 SENSORS = ("stereo", "imu", "crane")
 PLACE_SPACING_S = 0.4
+LEAST_SIGMA_PX = 0.03
+"""What no patch is better than, however well it fits: rectification, splines and aliasing."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,8 @@ class FusedTrajectory:
                 np.concatenate([np.full(len(s.track), at[s.stamp_ns]) for s in inputs.sightings]),
                 np.concatenate([s.track for s in inputs.sightings]),
                 np.vstack([s.stereo for s in inputs.sightings]),
-                rectifier.camera, rectifier.body_from_rect0, self.settings.front_end.tracks.sigma_px,
+                np.hypot(np.concatenate([s.sigma_px for s in inputs.sightings]), LEAST_SIGMA_PX),
+                rectifier.camera, rectifier.body_from_rect0,
             )  # fmt: skip
         problem = Problem(
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, tuple(placed),

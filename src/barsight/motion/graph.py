@@ -26,6 +26,7 @@ OFFSET_TRIAL_PX = 0.1
 SECANT_STEPS = 4
 LEAST_STEP_PX = 0.005
 LEAST_SIGHTINGS = 2
+LEAST_FACTOR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,8 @@ class Estimate:
 
 
 def solve(problem: Problem) -> Estimate:
-    """After a first solution sightings beyond 3.5 sigma leave and sigma is what was seen; then the disparity
+    """After a first solution sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was seen;
+    then the disparity
     offset is sought: at the best poses for a given offset the cost's slope along it is that of the residuals
     alone, so two solutions give the secant step, its curvature the offset's sigma, and the difference of
     their poses how the offset moves the trajectory.
@@ -69,9 +71,10 @@ def solve(problem: Problem) -> Estimate:
     swing = np.zeros((len(problem.start), 6))
     if seen is not None and used.any():
         residual = _residuals(values, seen, used, 0.0)
-        sigma = max(0.03, 1.4826 * float(np.median(np.abs(residual[used]))))
-        used = _often(seen, used & (np.abs(residual).max(axis=1) < FARTHEST_OUTLIER_SIGMAS * sigma))
-        seen = replace(seen, sigma_px=sigma)
+        share = np.abs(residual) / seen.sigma_px[:, None]
+        factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])))
+        used = _often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+        seen = replace(seen, sigma_px=factor * seen.sigma_px)
         problem = replace(problem, sightings=seen)
         values, graph = _optimised(problem, values, used, 0.0)
         if problem.offset_prior_px > 0 and used.any():
@@ -116,7 +119,7 @@ def _estimate(
         velocity = np.array([values.atVector(V(k)) for k in nodes])
         found = [values.atConstantBias(B(k)) for k in nodes]
         biases = tuple(ImuBias(np.array(b.gyroscope()), np.array(b.accelerometer())) for b in found)
-    sigma = 0.0 if problem.sightings is None else problem.sightings.sigma_px
+    sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
     return Estimate(poses, covariance, velocity, biases, sigma, offset, used)
 
 
@@ -140,10 +143,10 @@ def _slope(values: Any, problem: Problem, used: Bool, offset_px: float) -> float
     """The cost's derivative by the disparity offset, per px."""
     seen = problem.sightings
     assert seen is not None
-    residual = _residuals(values, seen, used, offset_px)[used] / seen.sigma_px
+    residual = _residuals(values, seen, used, offset_px)[used] / seen.sigma_px[used, None]
     size = np.linalg.norm(residual, axis=1)
     weight = np.minimum(1.0, HUBER_SIGMAS / np.maximum(size, 1e-9))
-    return -float((weight * residual[:, 2]).sum()) / seen.sigma_px
+    return -float((weight * residual[:, 2] / seen.sigma_px[used]).sum())
 
 
 def _offset(best_px: float, variance: float, problem: Problem) -> Offset:
@@ -268,8 +271,8 @@ def _add_stereo(graph: Any, seen: StereoSightings, used: Bool, offset_px: float)
         camera.focal_px, camera.focal_px, 0.0, camera.cx_px, camera.cy_px, camera.baseline_m
     )
     mounted = gtsam.Pose3(gtsam.Rot3(seen.body_from_rect0.rotation), seen.body_from_rect0.translation)
-    model = _robust(gtsam.noiseModel.Isotropic.Sigma(3, seen.sigma_px))
     for k in np.flatnonzero(used):
+        model = _robust(gtsam.noiseModel.Isotropic.Sigma(3, seen.sigma_px[k]))
         u, v, right = seen.stereo[k]
         measured = gtsam.StereoPoint2(u, right - camera.doffs_px - offset_px, v)
         node, track = X(int(seen.node[k])), L(int(seen.track[k]))

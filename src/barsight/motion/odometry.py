@@ -10,18 +10,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose
 from barsight.core.types import (
     PosedFrame,
     RectifiedCamera,
-    RectifiedPair,
     RefusedFrame,
     Trajectory,
 )
-from barsight.features.matching import match_mutual, track
+from barsight.features.guided import match_across
+from barsight.features.matching import match_mutual
 from barsight.features.orb import Features, detect_orb
+from barsight.features.patches import PatchPair, locate, patch_pair
 from barsight.motion.gravity import level_attitude
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import coarse_disparity
@@ -57,9 +58,9 @@ class OdometrySettings:
 class View:
     """One frame's features with a stereo disparity. points: (N, 3) in `rect0`."""
 
-    pair: RectifiedPair
+    pair: PatchPair
     features: Features
-    disparity: Float32
+    disparity: Float64
     points: Float64
 
 
@@ -101,7 +102,7 @@ class StereoOdometry:
                 refused.append(frame)
                 continue
             pair = rectifier(frame)
-            view = pair if isinstance(pair, Failed) else self.look(pair)
+            view = pair if isinstance(pair, Failed) else self.look(patch_pair(pair))
             if isinstance(view, Failed):
                 refused.append(RefusedFrame(frame.stamp_ns, view.reason))
                 continue
@@ -131,57 +132,48 @@ class StereoOdometry:
         sensors = ("stereo", "imu") if level.from_imu else ("stereo",)
         return Trajectory("world", tuple(placed), tuple(refused), sensors, level.warnings)
 
-    def look(self, pair: RectifiedPair) -> View | Failed:
-        camera, settings = pair.camera, self.settings
-        features = detect_orb(pair.left, settings.features)
-        coarse = coarse_disparity(pair.left, pair.right, camera.doffs_px)
+    def look(self, pair: PatchPair) -> View | Failed:
+        camera, settings = pair.pair.camera, self.settings
+        features = detect_orb(pair.pair.left, settings.features)
+        coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px)
         row = (features.pixels[:, 1] * coarse.shape[0] / camera.height).astype(int)
         column = (features.pixels[:, 0] * coarse.shape[1] / camera.width).astype(int)
         guess = coarse[row, column]
         near = np.isfinite(guess)
         features, guess = features.chosen(near), guess[near]
-        disparity, kept = _across(pair, features.pixels, guess, settings)
+        places = features.pixels.astype(np.float64)
+        right = match_across(pair, places, guess.astype(np.float64))
+        kept, disparity = right.found, places[:, 0] - right.pixels[:, 0]
         depth = camera.focal_px * camera.baseline_m / np.maximum(disparity + camera.doffs_px, 1e-3)
         kept &= (depth > settings.nearest_m) & (depth < settings.farthest_baselines * camera.baseline_m)
         if kept.sum() < settings.least_inliers:
             return Failed("no-features", f"only {int(kept.sum())} features have a depth")
         features, disparity = features.chosen(kept), disparity[kept]
-        return View(pair, features, disparity, _triangulated(features.pixels, disparity, camera))
+        return View(pair, features, disparity, _triangulated(places[kept], disparity, camera))
 
     def move(self, old: View, new: View, camera: RectifiedCamera) -> Step | Failed:
         settings = self.settings
         pairs = match_mutual(old.features, new.features)
         if len(pairs) < settings.least_inliers:
             return Failed("no-matches", f"only {len(pairs)} features match the frame before")
-        places, guesses = old.features.pixels[pairs[:, 0]], new.features.pixels[pairs[:, 1]]
-        found, kept = track(old.pair.left, new.pair.left, places, guesses)
-        disparity, across = _across(new.pair, found, new.disparity[pairs[:, 1]], settings)
-        kept &= across
-        pairs, found, disparity = pairs[kept], found[kept], disparity[kept]
+        places = old.features.pixels[pairs[:, 0]].astype(np.float64)
+        guesses = new.features.pixels[pairs[:, 1]].astype(np.float64)
+        again = locate(old.pair.left, new.pair.left, places, guesses)
+        right = match_across(new.pair, again.pixels, new.disparity[pairs[:, 1]], sure=True)
+        kept = again.found & right.found
+        pairs, target = pairs[kept], np.column_stack([again.pixels, right.pixels[:, 0]])[kept]
         if len(pairs) < settings.least_inliers:
             return Failed("no-matches", f"only {len(pairs)} features can be followed from the frame before")
         points = old.points[pairs[:, 0]]
-        start = ransac(points, found, camera, settings)
+        start = ransac(points, target[:, :2], camera, settings)
         if isinstance(start, Failed):
             return start
         rotation, translation = start
-        target = np.column_stack([found, found[:, 0] - disparity]).astype(np.float64)
         return refine(points, target, rotation, translation, camera, settings)
 
 
-def _across(
-    pair: RectifiedPair, places: Float32, guess: Float32, settings: OdometrySettings
-) -> tuple[Float32, Bool]:
-    """Disparities (N,) of left places (N, 2) to a fraction of a pixel, and which are on their row (N,)."""
-    guesses = places.copy()
-    guesses[:, 0] -= guess
-    found, kept = track(pair.left, pair.right, places, guesses)
-    kept &= np.abs(found[:, 1] - places[:, 1]) < settings.ransac_px
-    return places[:, 0] - found[:, 0], kept
-
-
-def _triangulated(pixels: Float32, disparity: Float32, camera: RectifiedCamera) -> Float64:
-    depth = camera.focal_px * camera.baseline_m / (disparity.astype(np.float64) + camera.doffs_px)
+def _triangulated(pixels: Float64, disparity: Float64, camera: RectifiedCamera) -> Float64:
+    depth = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
     x = (pixels[:, 0] - camera.cx_px) / camera.focal_px * depth
     y = (pixels[:, 1] - camera.cy_px) / camera.focal_px * depth
     return np.column_stack([x, y, depth])
@@ -199,7 +191,7 @@ def _by_old_places(points: Float64, camera: RectifiedCamera) -> Float64:
 
 def ransac(
     points: Float64,
-    pixels: Float32,
+    pixels: Float64,
     camera: RectifiedCamera,
     settings: OdometrySettings,
 ) -> tuple[Float64, Float64] | Failed:
@@ -207,7 +199,7 @@ def ransac(
     cv2.setRNGSeed(1)
     good, turn, shift, inliers = cv2.solvePnPRansac(
         points,
-        pixels.astype(np.float64),
+        np.ascontiguousarray(pixels),
         matrix,
         None,
         iterationsCount=500,

@@ -13,14 +13,16 @@ from barsight.inertial.preintegration import Preintegrated
 
 @dataclass(frozen=True, eq=False)
 class StereoSightings:
-    """Points seen: node, track (N,), stereo (N, 3) u, v, right u, px, and how the camera is mounted."""
+    """Points seen: node, track (N,), stereo (N, 3) u, v, right u, px, sigma_px (N,) of each, and how the
+    camera is mounted.
+    """
 
     node: Int64
     track: Int64
     stereo: Float64
+    sigma_px: Float64
     camera: RectifiedCamera
     body_from_rect0: Pose
-    sigma_px: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,9 @@ import numpy as np
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
-from barsight.core.types import RectifiedPair, RefusedFrame
-from barsight.features.guided import PredictedMotion, triangulate
+from barsight.core.types import RefusedFrame
+from barsight.features.guided import GuidedMatches, PredictedMotion, triangulate
+from barsight.features.patches import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, TrackSettings, carry_on, find_again
 from barsight.motion.odometry import OdometrySettings, Step, StereoOdometry, View, ransac, refine
 from barsight.recording.base import Recording
@@ -23,7 +24,8 @@ Predictor = Callable[[int, int], PredictedMotion | None]
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """What one frame shows. track: (N,) names of points; stereo: (N, 3) u, v and right u, px.
+    """What one frame shows. track: (N,) names of points; stereo: (N, 3) u, v and right u, px; sigma_px: (N,)
+    of each as the patches show it.
 
     motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
     one before. ambiguous: how many points were refused since the prediction was too coarse for the bars.
@@ -32,6 +34,7 @@ class Sighting:
     stamp_ns: int
     track: Int64
     stereo: Float64
+    sigma_px: Float64
     motion: PredictedMotion | None
     ambiguous: int
 
@@ -68,10 +71,11 @@ def follow(
         if isinstance(frame, RefusedFrame):
             refused.append(frame)
             continue
-        pair = rectifier(frame)
-        if isinstance(pair, Failed):
-            refused.append(RefusedFrame(frame.stamp_ns, pair.reason))
+        rectified = rectifier(frame)
+        if isinstance(rectified, Failed):
+            refused.append(RefusedFrame(frame.stamp_ns, rectified.reason))
             continue
+        pair = patch_pair(rectified)
         prediction = predictor(state.stamp_ns, frame.stamp_ns) if state else None
         result = _see(state, pair, prediction, settings)
         if isinstance(result, Failed) and state is not None and prediction is not None:
@@ -86,13 +90,14 @@ def follow(
 
 
 def _see(
-    state: _State | None, pair: RectifiedPair, prediction: PredictedMotion | None, settings: FrontEndSettings
+    state: _State | None, pair: PatchPair, prediction: PredictedMotion | None, settings: FrontEndSettings
 ) -> tuple[_State, Sighting] | Failed:
     view: View | None = None
     if state is None or state.tracks is None:
-        kept, stereo = np.zeros(0, np.bool_), np.empty((0, 3))
+        kept = np.zeros(0, np.bool_)
+        matches = GuidedMatches(np.empty((0, 3)), np.empty(0), kept, kept)
         tracks = Tracks(next_track=0 if state is None else state.next_track)
-        motion, ambiguous = None, 0
+        motion = None
         if prediction is None:
             rough = StereoOdometry(settings.rough).look(pair)
             view = None if isinstance(rough, Failed) else rough
@@ -108,47 +113,49 @@ def _see(
             found = _consensus(tracks, pair, prediction, settings)
             if isinstance(found, Failed):
                 return found
-        kept, stereo, motion, ambiguous = found
-    coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px)
-    tracks = carry_on(tracks, pair, stereo, kept, coarse, settings.tracks)
+        kept, matches, motion = found
+    coarse = coarse_disparity(pair.pair.left, pair.pair.right, pair.pair.camera.doffs_px)
+    tracks = carry_on(tracks, pair, matches, kept, coarse, settings.tracks)
     if len(tracks.track) < settings.rough.least_inliers:
         return Failed("no-features", f"only {len(tracks.track)} points have a depth")
-    sighting = Sighting(pair.stamp_ns, tracks.track, tracks.stereo, motion, ambiguous)
-    return _State(tracks, tracks.next_track, pair.stamp_ns, view), sighting
+    ambiguous = int(matches.ambiguous.sum())
+    sighting = Sighting(pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous)
+    return _State(tracks, tracks.next_track, pair.pair.stamp_ns, view), sighting
 
 
 def _rough(
-    state: _State, tracks: Tracks, pair: RectifiedPair, settings: FrontEndSettings
+    state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
 ) -> tuple[Step, View] | Failed:
     """The motion by ORB features of both pairs, without any prediction."""
     odometry = StereoOdometry(settings.rough)
-    old = state.view or odometry.look(tracks.views[-1])
+    assert tracks.last is not None
+    old = state.view or odometry.look(patch_pair(tracks.last))
     new = odometry.look(pair)
     if isinstance(old, Failed):
         return old
     if isinstance(new, Failed):
         return new
-    step = odometry.move(old, new, pair.camera)
+    step = odometry.move(old, new, pair.pair.camera)
     return step if isinstance(step, Failed) else (step, new)
 
 
 def _consensus(
-    tracks: Tracks, pair: RectifiedPair, prediction: PredictedMotion, settings: FrontEndSettings
-) -> tuple[Bool, Float64, PredictedMotion, int] | Failed:
+    tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings
+) -> tuple[Bool, GuidedMatches, PredictedMotion] | Failed:
     """Points found again in their ellipses that agree on one motion in 3D, and that motion."""
     matches = find_again(tracks, pair, prediction, settings.tracks)
-    ambiguous = int(matches.ambiguous.sum())
     index = np.flatnonzero(matches.found)
     least = settings.rough.least_inliers
     if index.size < least:
         return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again")
-    points, target = triangulate(tracks.stereo[index], pair.camera), matches.stereo[index]
-    start = ransac(points, target[:, :2].astype(np.float32), pair.camera, settings.rough)
+    camera = pair.pair.camera
+    points, target = triangulate(tracks.stereo[index], camera), matches.stereo[index]
+    start = ransac(points, target[:, :2], camera, settings.rough)
     if isinstance(start, Failed):
         return start
-    step = refine(points, target, *start, pair.camera, settings.rough)
+    step = refine(points, target, *start, camera, settings.rough)
     if isinstance(step, Failed):
         return step
     kept = np.zeros(len(tracks.track), np.bool_)
     kept[index[step.kept]] = True
-    return kept, matches.stereo, PredictedMotion(step.rotation, step.translation, step.covariance), ambiguous
+    return kept, matches, PredictedMotion(step.rotation, step.translation, step.covariance)
