@@ -13,6 +13,8 @@ import numpy as np
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
 from barsight.mapping.surface import Surface
+from barsight.yard.stock_list import StockMatch
+from barsight.yard.types import Bundle
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,8 @@ class Measurement:
     seconds: float
     peak_memory_mib: float
     preview: Preview | None
+    bundles: tuple[Bundle, ...]
+    stock: StockMatch | None
 
 
 def plain(value: Any) -> Any:

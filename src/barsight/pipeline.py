@@ -2,6 +2,7 @@
 
 recording -> rectified pair -> disparity -> points --+
 crane or matched features -> trajectory -------------+-> map -> height surface -> contours -> agreement
+                                                              +-> bundles
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.selection import SelectedSensors
 from barsight.recording.sensors import imu_hints
 from barsight.stereo.settings import StereoSettings, make_method
+from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.bundles import find_bundles
+from barsight.yard.stock_list import match_stock, read_stock
+from barsight.yard.types import HeightMap
 
 Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
@@ -52,6 +57,7 @@ class MeasureSettings:
     stereo: StereoSettings = field(default_factory=StereoSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
     map: MapSettings = field(default_factory=MapSettings)
+    bundles: BundleSettings = field(default_factory=BundleSettings)
 
     def __post_init__(self) -> None:
         if "stereo" not in self.use:
@@ -127,6 +133,11 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         by_number = {contour.profile: contour for contour in contours}
         agreed = [agree(by_number[p.profile], p) for p in laser if p.profile in by_number]
 
+    with watch("bundles"):
+        bundles = find_bundles(HeightMap.of(surface), settings.bundles)
+        expected = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
+        stock = match_stock(expected, bundles) if expected and trajectory.reference == "yard" else None
+
     warnings = [Notice("assumed", text) for text in source.notes]
     warnings += [Notice("imu", text) for text in hints]
     warnings += [Notice("calibration", text) for text in first.warnings]
@@ -164,6 +175,8 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         seconds=time.perf_counter() - start,
         peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         preview=preview,
+        bundles=bundles,
+        stock=stock,
     )
 
 

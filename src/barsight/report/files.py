@@ -19,11 +19,12 @@ from barsight.core.stamps import NS_PER_S, format_seconds
 from barsight.core.types import Contour, LaserProfile, Trajectory
 from barsight.mapping.surface import Layers, Surface
 from barsight.measurement import Measurement, Preview
+from barsight.yard.bundle_file import write_bundles
 
 SCHEMA_VERSION = 1
 RESULT_FILES = (
-    "trajectory.tum", "cloud.ply", "height.tif", "contour.csv", "laser.csv", "preview.png", "result.json",
-    "report.html",
+    "trajectory.tum", "cloud.ply", "height.tif", "contour.csv", "laser.csv", "bundles.json", "preview.png",
+    "result.json", "report.html",
 )  # fmt: skip
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
@@ -39,6 +40,8 @@ def write_results(measurement: Measurement, folder: Path) -> None:
     write_cloud(measurement.surface, folder / "cloud.ply")
     write_height(measurement.surface, folder / "height.tif")
     write_contours(measurement.contours, folder / "contour.csv")
+    reference = measurement.trajectory.reference
+    write_bundles(measurement.bundles, measurement.stock, reference, folder / "bundles.json")
     if measurement.laser:
         write_laser(measurement.laser, folder / "laser.csv")
     if measurement.preview is not None:

@@ -1,0 +1,71 @@
+"""The settings of finding bundles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from barsight.core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class BundleSettings:
+    """Bundles of round bars, or single heavy bars, found in the height map."""
+
+    catalogue_mm: tuple[float, ...] = ()
+    """Diameters of bars that may lie here; any diameter when not given."""
+    stock_list: Path | None = None
+    """CSV or JSON of the bundles that should lie here, to be held against those found."""
+    least_length_m: float = 0.5
+    """Shorter pieces aren't reported."""
+    least_bar_m: float = 0.014
+    """Thinnest bars in a bundle."""
+    least_single_m: float = 0.06
+    """Thinnest bar that counts as a bundle of its own."""
+    narrowest_m: float = 0.09
+    """Narrowest bundle of several bars."""
+    widest_m: float = 0.6
+    """Widest bundle."""
+    slice_step_m: float = 1.0
+    """Bundles are first looked for in cross-sections this far apart."""
+    slice_m: float = 0.2
+    """Length of the bundle that one cross-section averages."""
+    max_skew_deg: float = 4.0
+    """Bundles turned further from their neighbours are looked for as a heading of their own."""
+    agreement_m: float = 0.015
+    """A height within this of the bundle's outline agrees with it."""
+    smoothing_m: float = 0.006
+    """Standard deviation of the map's smoothing across the bars."""
+    placing_m: float = 0.004
+    """How far a height may lie beside its place: it counts the less the steeper the outline is there."""
+    correlated_along_m: float = 0.5
+    """Errors of heights along a bar are alike over this distance."""
+    correlated_across_m: float = 0.03
+    """Errors of heights across the bars are alike over this distance."""
+    shared_lateral_m: float = 0.0015
+    """Error of place that all of the map shares (one standard deviation)."""
+
+    shared_yaw_deg: float = 0.01
+    """Error of direction that all of the map shares (one standard deviation)."""
+    coarsest_cell_m: float = 0.025
+    """In a map of larger cells no bundles are looked for."""
+    least_rise_m: float = 0.03
+    """Heights nearer to the floor than this are floor."""
+
+    def __post_init__(self) -> None:
+        if any(not 5 <= d <= 500 for d in self.catalogue_mm):
+            raise ConfigError("catalogue_mm: a diameter must lie between 5 and 500 mm")
+        lengths = (
+            self.least_length_m, self.least_bar_m, self.least_single_m, self.narrowest_m, self.slice_step_m,
+            self.slice_m, self.agreement_m, self.correlated_along_m, self.correlated_across_m,
+            self.coarsest_cell_m,
+        )  # fmt: skip
+        if (
+            min(lengths) <= 0
+            or min(self.smoothing_m, self.placing_m, self.shared_lateral_m, self.shared_yaw_deg) < 0
+        ):
+            raise ConfigError("bundles: lengths must be positive, smoothing, placing and shares not negative")
+        if self.widest_m <= self.narrowest_m:
+            raise ConfigError("bundles: widest_m must be over narrowest_m")
+        if not 0 < self.max_skew_deg <= 15:
+            raise ConfigError(f"bundles: max_skew_deg must lie in 0...15, not {self.max_skew_deg}")

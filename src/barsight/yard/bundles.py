@@ -1,0 +1,148 @@
+"""Bundles found in the height map: guesses in cross-sections, grown along the bars, the best set kept."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.types import Source
+from barsight.yard.bundle_fit import AGREES, Fit, U, Z, grow
+from barsight.yard.bundle_record import Found, Reading, describe
+from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.floor import find_floor
+from barsight.yard.headings import find_headings
+from barsight.yard.matching import Guess, Templates, guess, make_templates
+from barsight.yard.outline import bundle_width
+from barsight.yard.selection import choose, strongest_rivals
+from barsight.yard.sheet import Sheet, turn
+from barsight.yard.types import Bundle, HeightMap
+
+_EDGE_CELLS = 3.0
+"""What a bundle costs per row: its edges explain nothing."""
+_CLAIM_M = 0.025
+_RIVAL_SHARE = 0.8
+_SUNKEN_M = 0.04
+
+
+def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundle, ...]:
+    """All bundles that the map shows, in the map's frame, from low to high x; empty where there are none.
+
+    A bundle is an outline of round bars in hexagonal packing (or one bar) that the measured heights follow.
+    Outlines are guessed in cross-sections, grown along the bars by least squares, and of those that want the
+    same place the set is kept that explains most heights.
+    """
+    if not (height_map.source == Source.VISION).any() or height_map.cell_m > settings.coarsest_cell_m:
+        return ()
+    floor = find_floor(height_map)
+    found: list[Found] = []
+    templates = make_templates(settings, height_map.cell_m)
+    for heading in find_headings(height_map, settings.max_skew_deg):
+        sheet = turn(height_map, heading, -np.inf if floor is None else floor + settings.least_rise_m)
+        found += [Found(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
+    weights = np.array([_weight(one.fit) for one in found])
+    claims = [_claims(one) for one in found]
+    chosen = choose(weights, claims)
+    rivals = strongest_rivals(chosen, weights, claims)
+    readings = [
+        Reading(found[k], float(weights[k]), *((None, 0.0) if r is None else (found[r], float(weights[r]))))
+        for k, r in zip(chosen.tolist(), rivals, strict=True)
+    ]
+    return describe(readings, floor, settings)
+
+
+def _on(floor_m: float | None, fit: Fit) -> bool:
+    """Whether the whole packing lies over the floor."""
+    return floor_m is None or fit.values[Z] - fit.width_m / 2 > floor_m - _SUNKEN_M
+
+
+def _readings(sheet: Sheet, templates: Templates, settings: BundleSettings) -> list[Fit]:
+    """Every outline that could be grown, of at least the least length."""
+    fits: list[Fit] = []
+    rows = sheet.z_m.shape[0]
+    step = max(round(settings.slice_step_m / sheet.cell_m), 1)
+    known = np.flatnonzero(np.isfinite(sheet.z_m).any(axis=1))
+    if known.size == 0:
+        return []
+    for row in range(int(known[0]) + min(step, known.size) // 2, int(known[-1]) + 1, step):
+        v = sheet.v0_m + row * sheet.cell_m
+        for candidate in _worth_growing(guess(sheet, templates, v, settings)):
+            if any(_same(candidate, fit, row) for fit in fits):
+                continue
+            fit = grow(sheet, _seed(candidate, row, rows, sheet, settings), settings)
+            if fit is not None and (fit.last - fit.first + 1) * sheet.cell_m >= settings.least_length_m:
+                fits.append(fit)
+    return fits
+
+
+def _seed(candidate: Guess, row: int, rows: int, sheet: Sheet, settings: BundleSettings) -> Fit:
+    half = max(round(settings.slice_m / sheet.cell_m / 2), 1)
+    first, last = max(row - half, 0), min(row + half, rows - 1)
+    values = np.array([candidate.u_m, 0.0, candidate.z_m, 0.0, candidate.roll_rad, candidate.diameter_m])
+    state, gain = np.zeros(rows, np.uint8), np.zeros(rows, np.float32)
+    return Fit(
+        candidate.rings, candidate.v_m, values, np.zeros((6, 6)), first, last, state, gain, np.nan, np.nan
+    )
+
+
+def _worth_growing(guesses: list[Guess]) -> list[Guess]:
+    """The best set of guesses that don't overlap, and other packings that do nearly as well there."""
+    if not guesses:
+        return []
+    low = np.array([g.u_m - 0.45 * bundle_width(g.rings, g.diameter_m) for g in guesses])
+    high = np.array([g.u_m + 0.45 * bundle_width(g.rings, g.diameter_m) for g in guesses])
+    weight = np.array([g.gain - _EDGE_CELLS for g in guesses])
+    best = _best_intervals(low, high, weight)
+    kept = [guesses[k] for k in best]
+    for k in best:
+        seen = {guesses[k].rings}
+        for other in guesses:
+            near = abs(other.u_m - guesses[k].u_m) < 0.5 * (high[k] - low[k])
+            if near and other.rings not in seen and other.gain > _RIVAL_SHARE * guesses[k].gain:
+                kept.append(other)
+                seen.add(other.rings)
+    return kept
+
+
+def _best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
+    """Weighted interval scheduling: the disjoint intervals that together weigh most."""
+    order = np.argsort(high, kind="stable")
+    before = np.searchsorted(high[order], low[order], side="right")
+    total = np.zeros(order.size + 1)
+    for n, k in enumerate(order):
+        total[n + 1] = max(total[n], total[min(before[n], n)] + weight[k])
+    kept, n = [], order.size
+    while n > 0:
+        k = order[n - 1]
+        if total[n] > total[n - 1]:
+            kept.append(int(k))
+            n = int(min(before[n - 1], n - 1))
+        else:
+            n -= 1
+    return kept
+
+
+def _same(candidate: Guess, fit: Fit, row: int) -> bool:
+    if candidate.rings != fit.rings or not fit.first <= row <= fit.last:
+        return False
+    u, z = fit.at(candidate.v_m)
+    return abs(candidate.u_m - u) < 0.3 * fit.width_m and abs(candidate.z_m - z) < 0.3 * fit.width_m
+
+
+def _weight(fit: Fit) -> float:
+    """Cells explained beyond the price of the bundle's edges."""
+    agreeing = fit.state[fit.first : fit.last + 1] == AGREES
+    return float((fit.gain[fit.first : fit.last + 1] - _EDGE_CELLS)[agreeing].sum())
+
+
+def _claims(reading: Found) -> Int64:
+    """Numbers of the map's patches of 25 mm that lie well inside the outline."""
+    sheet, fit = reading.sheet, reading.fit
+    rows = np.arange(fit.first, fit.last + 1)
+    rows = rows[fit.state[rows] == AGREES]
+    v = sheet.v0_m + sheet.cell_m * rows
+    middle = fit.values[U] + fit.values[1] * (v - fit.v_m)
+    across = np.linspace(-0.42, 0.42, max(int(fit.width_m / 0.02), 3)) * fit.width_m
+    uv = np.stack(np.broadcast_arrays(middle[:, None] + across, v[:, None]), axis=-1).reshape(-1, 2)
+    xy = sheet.to_map(uv)
+    patch = np.floor(xy / _CLAIM_M).astype(np.int64) + (1 << 20)
+    return np.unique(patch[:, 0] << 32 | patch[:, 1])

@@ -1,0 +1,35 @@
+"""The floor under the stack, where the map shows some of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.types import Source
+from barsight.yard.types import HeightMap
+
+_BLOCK_M = 0.3
+_FLAT_M = 0.012
+_LEVEL_M = 0.03
+_KNOWN_SHARE = 0.6
+
+
+def find_floor(height_map: HeightMap) -> float | None:
+    """Height (m) of the lowest level ground in the map; None where no block of 0.3 m is level.
+
+    No bundle has a level top of 0.3 m, so level blocks are floor (or a platform: the lowest counts).
+    """
+    block = max(round(_BLOCK_M / height_map.cell_m), 2)
+    rows, columns = (n // block for n in height_map.z_m.shape)
+    if rows == 0 or columns == 0:
+        return None
+    z = np.where(height_map.source == Source.VISION, height_map.z_m, np.nan)
+    cut = z[: rows * block, : columns * block].reshape(rows, block, columns, block)
+    blocks = cut.transpose(0, 2, 1, 3).reshape(rows * columns, -1)
+    blocks = blocks[np.isfinite(blocks).mean(axis=1) >= _KNOWN_SHARE]
+    if blocks.size == 0:
+        return None
+    low, middle, high = np.nanpercentile(blocks, (10, 50, 90), axis=1)
+    level = np.sort(middle[high - low < 2 * _FLAT_M])
+    if level.size == 0:
+        return None
+    return float(np.median(level[level < level[max(level.size // 50, 0)] + _LEVEL_M]))

@@ -1,0 +1,63 @@
+"""Which way the bars run: the headings that the map's slopes show."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from barsight.core.arrays import Float64
+from barsight.core.types import Source
+from barsight.yard.types import HeightMap
+
+_BLOCK_M = 0.3
+_COHERENT = 0.5
+_STEEPEST = 1.5
+_LEAST_SHARE = 0.02
+
+
+def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
+    """Headings (rad, in (-pi/2, pi/2], 0 along +y), the commonest first, at least `apart_deg` apart.
+
+    Bars slope across their axis only: the structure tensor of each block of 0.3 m says which way, and how
+    clearly [Bigun 1987]. A heading within `apart_deg` of an axis of the map is that axis.
+    """
+    z = np.where(height_map.source == Source.VISION, height_map.z_m, np.nan)
+    cell = height_map.cell_m
+    block = max(round(_BLOCK_M / cell), 1)
+    rows, columns = z.shape[0] // block, z.shape[1] // block
+    if rows < 1 or columns < 1 or min(z.shape) < 3:
+        return (0.0,)
+    gy, gx = np.gradient(z.astype(np.float64), cell)
+    usable = np.isfinite(gx) & np.isfinite(gy) & (np.hypot(gx, gy) < _STEEPEST)
+    gx, gy = np.where(usable, gx, 0.0), np.where(usable, gy, 0.0)
+
+    def blocks(values: Float64) -> Float64:
+        part = values[: rows * block, : columns * block].reshape(rows, block, columns, block)
+        summed: Float64 = part.sum(axis=(1, 3))
+        return summed
+
+    even, odd, energy = blocks(gx * gx - gy * gy), blocks(2 * gx * gy), blocks(gx * gx + gy * gy)
+    clear = np.hypot(even, odd) > _COHERENT * np.maximum(energy, 1e-12)
+    if not clear.any():
+        return (0.0,)
+    across = 0.5 * np.arctan2(odd[clear], even[clear])  # direction of the slope from +x: the heading itself
+    degrees = np.degrees(across)
+    counts, _ = np.histogram(degrees, bins=180, range=(-90, 90))
+    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), 2.0, mode="wrap")
+    found: list[float] = []
+    for index in np.argsort(-smooth, kind="stable"):
+        if smooth[index] < _LEAST_SHARE * smooth.sum() or len(found) == 4:
+            break
+        near = np.abs((degrees - (index - 89.5) + 90) % 180 - 90) < apart_deg
+        offset = np.median((degrees[near] - (index - 89.5) + 90) % 180 - 90) if near.any() else 0.0
+        heading = _snapped(index - 89.5 + float(offset), apart_deg)
+        if all(abs((heading - other + 90) % 180 - 90) > apart_deg for other in found):
+            found.append(heading)
+    return tuple(float(np.radians(h)) for h in found) or (0.0,)
+
+
+def _snapped(heading_deg: float, apart_deg: float) -> float:
+    for axis in (0.0, 90.0, -90.0):
+        if abs(heading_deg - axis) < 0.6 * apart_deg:
+            return abs(axis)
+    return heading_deg

@@ -1,0 +1,85 @@
+"""Which bundle lies on which, in which layer, and beside which."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.yard.types import Bundle
+
+_OVERLAP_M = 0.05
+_TOUCH_M = 0.03
+_DUNNAGE_M = 0.1
+_HIGHER_SHARE = 0.4
+
+
+def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
+    """Each bundle's layer by its height over the floor (the lowest bundle's underside where none was seen).
+
+    The distance of the layers is the smallest step between the undersides of bundles of its width that one
+    bundle and its dunnage can make, else the bundle's own height and 0.1 m.
+    """
+    bottoms = np.array([_bottom(b) for b in bundles])
+    layers = []
+    for bundle, bottom in zip(bundles, bottoms, strict=True):
+        height = bundle.top_z_m - bottom
+        alike = np.array([abs(b.width_m - bundle.width_m) < 0.15 * bundle.width_m for b in bundles])
+        steps = np.abs(np.subtract.outer(bottoms[alike], bottoms[alike])).ravel()
+        steps = steps[(steps > 0.8 * height) & (steps < height + 0.35)]
+        pitch = float(np.percentile(steps, 25)) if steps.size else height + _DUNNAGE_M
+        ground = floor_m if floor_m is not None else float(bottoms.min())
+        under = max(pitch - height, 0.0) if floor_m is not None else 0.0
+        layers.append(max(round((bottom - ground - under) / pitch), 0))
+    return layers
+
+
+def _bottom(bundle: Bundle) -> float:
+    """Height of the underside: a hexagon is as deep below its axis as it rises above it."""
+    return float(2 * bundle.centre_m[2] - bundle.top_z_m)
+
+
+def on_top_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[bool | None, tuple[str, ...]]:
+    """Whether no other lies on the bundle, and why not; None where what covers it isn't known."""
+    covers = [other.id for other in bundles if other.id != bundle.id and _lies_on(other, bundle)]
+    if covers:
+        return False, (f"bundle {', '.join(map(str, covers))} lies on it",)
+    if any("covers a part" in reason or "something higher" in reason for reason in bundle.reasons):
+        return None, ()
+    return True, ()
+
+
+def _lies_on(upper: Bundle, lower: Bundle) -> bool:
+    """Whether `upper` is higher and its footprint covers a place on `lower`."""
+    if upper.centre_m[2] - lower.centre_m[2] < _HIGHER_SHARE * (upper.width_m + lower.width_m) / 2:
+        return False
+    return _common_length(lower, upper, -0.1 * lower.width_m) > _OVERLAP_M
+
+
+def neighbours_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
+    """Ids of the bundles that lie no more than 30 mm beside it, at about its height."""
+    return tuple(
+        other.id
+        for other in bundles
+        if other.id != bundle.id
+        and abs(other.centre_m[2] - bundle.centre_m[2]) < 0.7 * (other.width_m + bundle.width_m) / 2
+        and _common_length(bundle, other, _TOUCH_M) > _OVERLAP_M
+    )
+
+
+def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:
+    """Length of `bundle` over which the two footprints, grown by margin_m in all, meet."""
+    along = np.arange(-bundle.length_m / 2, bundle.length_m / 2, 0.02)
+    across = np.array([-0.5, -0.25, 0.0, 0.25, 0.5]) * bundle.width_m
+    c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
+    centre = bundle.centre_m[:2]
+    places = centre + along[:, None, None] * np.array([-s, c]) + across[None, :, None] * np.array([c, s])
+    to_side, to_end = _beside(places, other)
+    meets = (to_side < other.width_m / 2 + margin_m) & (to_end < other.length_m / 2)
+    return 0.02 * float(meets.any(axis=1).sum())
+
+
+def _beside(places: Float64, bundle: Bundle) -> tuple[Float64, Float64]:
+    """Distances of (..., 2) places from the bundle's axis and, along it, from its middle."""
+    c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
+    offset = places - bundle.centre_m[:2]
+    return np.abs(offset @ np.array([c, s])), np.abs(offset @ np.array([-s, c]))

@@ -1,0 +1,57 @@
+"""Which of the readings that contradict each other hold: the set that explains most of the map."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import csc_matrix
+
+from barsight.core.arrays import Float64, Int64
+
+
+def choose(weights: Float64, claims: list[Int64]) -> Int64:
+    """Indices of the readings that together weigh most, no place claimed twice.
+
+    weights: (N,) what a reading explains. claims: for each reading the numbers of the places it takes.
+    """
+    useful = [k for k in range(len(claims)) if weights[k] > 0 and claims[k].size > 0]
+    if not useful:
+        return np.empty(0, np.int64)
+    owner, place = _owners([claims[k] for k in useful])
+    order = np.lexsort((owner, place))
+    groups = np.split(owner[order], np.flatnonzero(np.diff(place[order])) + 1)
+    rivals = sorted({tuple(g.tolist()) for g in groups if len(g) > 1})
+    if not rivals:
+        return np.array(useful, np.int64)
+    rows = np.repeat(np.arange(len(rivals)), [len(r) for r in rivals])
+    columns = np.concatenate([np.array(r) for r in rivals])
+    table = csc_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(rivals), len(useful)))
+    solved = milp(
+        -weights[useful], integrality=np.ones(len(useful), np.int64), bounds=Bounds(0, 1),
+        constraints=LinearConstraint(table, -np.inf, 1),
+    )  # fmt: skip
+    if solved.x is None:
+        raise RuntimeError(f"no choice of readings: {solved.message}")
+    return np.array(useful, np.int64)[np.flatnonzero(solved.x > 0.5)]
+
+
+def strongest_rivals(chosen: Int64, weights: Float64, claims: list[Int64]) -> list[int | None]:
+    """For each chosen reading the one that weighs most of those that want most of its place."""
+    if chosen.size == 0:
+        return []
+    owner, place = _owners(claims)
+    takes = csc_matrix((np.ones(owner.size), (owner, place)), shape=(len(claims), int(place.max()) + 1))
+    common = (takes[chosen] @ takes.T).toarray()
+    sizes = np.array([claims[k].size for k in chosen])
+    wants = common > 0.5 * sizes[:, None]
+    wants[np.arange(chosen.size), chosen] = False
+    rated = np.where(wants & (weights > 0), weights, 0.0)
+    best = rated.argmax(axis=1)
+    return [int(k) if rated[row, k] > 0 else None for row, k in enumerate(best)]
+
+
+def _owners(claims: list[Int64]) -> tuple[Int64, Int64]:
+    """Every claim as a pair: the reading's index and the place's, places counted from 0."""
+    owner = np.repeat(np.arange(len(claims), dtype=np.int64), [claim.size for claim in claims])
+    _, place = np.unique(np.concatenate(claims), return_inverse=True)
+    return owner, place.astype(np.int64)

@@ -1,0 +1,209 @@
+"""The stock list: what should lie in the yard, held against what was found."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from barsight.core.arrays import Float64
+from barsight.core.errors import InputError
+from barsight.yard.types import Bundle
+
+_NEEDED = ("name", "x_m", "y_m")
+_OPTIONAL = ("top_z_m", "yaw_deg", "length_m", "width_m", "bar_diameter_m", "bars")
+_REMEDY = (
+    f"give a CSV with the columns {', '.join(_NEEDED)} (and any of {', '.join(_OPTIONAL)}), or JSON objects"
+)
+_REACH_M = 1.0
+_MOVED_M = 0.05
+_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A bundle of the stock list: place of its middle (m, yard); the others are None where not listed."""
+
+    name: str
+    x_m: float
+    y_m: float
+    top_z_m: float | None = None
+    yaw_deg: float | None = None
+    length_m: float | None = None
+    width_m: float | None = None
+    bar_diameter_m: float | None = None
+    bars: int | None = None
+
+
+@dataclass(frozen=True)
+class Matched:
+    """A listed bundle and the found one. moved_m: along x, y (and z where listed; else 0).
+
+    disagrees: sentences where the found bundle isn't what the list says.
+    """
+
+    name: str
+    bundle: int
+    moved_m: tuple[float, float, float]
+    disagrees: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StockMatch:
+    """The list against the map. moved: names of matched bundles that lie elsewhere than listed.
+
+    missing: listed ones that weren't found where they could have been seen; hidden: listed ones under
+    another bundle, so that the map can't tell; extra: ids of found ones that aren't listed.
+    """
+
+    matched: tuple[Matched, ...]
+    moved: tuple[str, ...]
+    missing: tuple[str, ...]
+    hidden: tuple[str, ...]
+    extra: tuple[int, ...]
+
+
+def read_stock(path: Path) -> tuple[Expected, ...]:
+    """The list of a CSV or JSON file. Raises InputError where it is missing, torn, or names one twice."""
+    if not path.is_file():
+        raise InputError(path, "no such file", _REMEDY)
+    try:
+        rows = _json_rows(path) if path.suffix.lower() == ".json" else _csv_rows(path)
+    except (ValueError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, f"can't be read ({error})", _REMEDY) from error
+    listed = tuple(_expected(path, number, row) for number, row in enumerate(rows, start=1))
+    names = [one.name for one in listed]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(path, f"lists {twice[0]!r} {names.count(twice[0])} times", "give each its own name")
+    return listed
+
+
+def _csv_rows(path: Path) -> list[dict[str, Any]]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.DictReader(file)
+        missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
+        if missing:
+            raise InputError(path, f"has no column {missing[0]}", _REMEDY)
+        return [dict(row) for row in reader]
+
+
+def _json_rows(path: Path) -> list[dict[str, Any]]:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    rows = content.get("bundles") if isinstance(content, dict) else content
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError(path, "is no list of bundles", _REMEDY)
+    return rows
+
+
+def _expected(path: Path, number: int, row: dict[str, Any]) -> Expected:
+    figures: dict[str, float | None] = {}
+    for key in (*_NEEDED[1:], *_OPTIONAL):
+        text = row.get(key)
+        if text is None or text == "":
+            if key in _NEEDED:
+                raise InputError(path, f"bundle {number} has no {key}", _REMEDY)
+            figures[key] = None
+            continue
+        try:
+            value = float(text)
+        except (TypeError, ValueError):
+            value = float("nan")
+        positive = key in ("length_m", "width_m", "bar_diameter_m", "bars")
+        if not np.isfinite(value) or (positive and value <= 0):
+            raise InputError(path, f"bundle {number}: {key} can't be {text!r}", _REMEDY)
+        figures[key] = value
+    name = str(row.get("name") or "").strip()
+    if not name:
+        raise InputError(path, f"bundle {number} has no name", _REMEDY)
+    bars = figures.pop("bars")
+    return Expected(name, bars=None if bars is None else int(bars), **figures)  # type: ignore[arg-type]
+
+
+def match_stock(listed: tuple[Expected, ...], bundles: tuple[Bundle, ...]) -> StockMatch:
+    """Pair listed and found bundles, each once, so that the distances together are least, none over 1 m.
+
+    A pair further apart than 50 mm, and than three of the found place's sigmas, has moved.
+    """
+    cost = np.array([[_distance(one, bundle) for bundle in bundles] for one in listed])
+    cost = cost.reshape(len(listed), len(bundles))
+    pairs = zip(*linear_sum_assignment(np.minimum(cost, 10 * _REACH_M)), strict=True)
+    partner = {int(i): int(k) for i, k in pairs if cost[i, k] <= _REACH_M}
+    matched, moved = [], []
+    for i, k in partner.items():
+        shift = _shift(listed[i], bundles[k])
+        matched.append(Matched(listed[i].name, bundles[k].id, shift, _disagreements(listed[i], bundles[k])))
+        if _has_moved(shift, bundles[k]):
+            moved.append(listed[i].name)
+    absent = [one for i, one in enumerate(listed) if i not in partner]
+    hidden = tuple(one.name for one in absent if _is_covered(one, bundles))
+    taken = set(partner.values())
+    return StockMatch(
+        matched=tuple(matched),
+        moved=tuple(moved),
+        missing=tuple(one.name for one in absent if one.name not in hidden),
+        hidden=hidden,
+        extra=tuple(bundle.id for k, bundle in enumerate(bundles) if k not in taken),
+    )
+
+
+def _shift(one: Expected, bundle: Bundle) -> tuple[float, float, float]:
+    rise = 0.0 if one.top_z_m is None else bundle.top_z_m - one.top_z_m
+    return float(bundle.centre_m[0] - one.x_m), float(bundle.centre_m[1] - one.y_m), float(rise)
+
+
+def _across_along(shift: tuple[float, float, float], bundle: Bundle) -> tuple[float, float]:
+    c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
+    return float(c * shift[0] + s * shift[1]), float(-s * shift[0] + c * shift[1])
+
+
+def _distance(one: Expected, bundle: Bundle) -> float:
+    """Across and up count fully; along the axis a shift of 1 m is no further than 0.3 m across."""
+    shift = _shift(one, bundle)
+    across, along = _across_along(shift, bundle)
+    if any(bundle.ends_open) and abs(along) < bundle.length_m / 2:
+        along = 0.0
+    return float(np.linalg.norm([across, 0.3 * along, shift[2]]))
+
+
+def _has_moved(shift: tuple[float, float, float], bundle: Bundle) -> bool:
+    """Along the axis only where both ends were seen: else the middle isn't known."""
+    across, along = _across_along(shift, bundle)
+    sigma = bundle.sigma
+    moves: Float64 = np.abs([across, shift[2], 0.0 if any(bundle.ends_open) else along])
+    along_sigma = sigma.along_m if np.isfinite(sigma.along_m) else 0.0
+    limits = [max(_MOVED_M, _SIGMAS * s) for s in (sigma.lateral_m, sigma.top_z_m, along_sigma)]
+    return bool((moves > limits).any())
+
+
+def _disagreements(one: Expected, bundle: Bundle) -> tuple[str, ...]:
+    out = []
+    sigma = bundle.sigma
+    for name, listed, found, spread in (
+        ("width", one.width_m, bundle.width_m, sigma.width_m),
+        ("bars' diameter", one.bar_diameter_m, bundle.bar_diameter_m, sigma.bar_diameter_m),
+        ("length", one.length_m, bundle.length_m, sigma.length_m),
+    ):
+        if listed is None or not np.isfinite(spread):
+            continue
+        if abs(found - listed) > max(_SIGMAS * spread, 0.1 * listed):
+            out.append(f"{name} {1e3 * found:.0f} mm instead of {1e3 * listed:.0f} mm")
+    if one.bars is not None and bundle.bars not in (0, one.bars):
+        out.append(f"{bundle.bars} bars instead of {one.bars}")
+    return tuple(out)
+
+
+def _is_covered(one: Expected, bundles: tuple[Bundle, ...]) -> bool:
+    """Whether a found bundle lies over the listed place: at a known height, else anywhere over it."""
+    for bundle in bundles:
+        shift = _shift(one, bundle)
+        across, along = _across_along(shift, bundle)
+        over = abs(across) < bundle.width_m / 2 and abs(along) < bundle.length_m / 2
+        if over and (one.top_z_m is None or bundle.top_z_m > one.top_z_m):
+            return True
+    return False

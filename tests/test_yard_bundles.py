@@ -1,0 +1,123 @@
+"""Bundles found in maps drawn from known geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barsight.core.errors import ConfigError
+from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.bundles import find_bundles
+from barsight.yard.types import Bundle
+from yard_maps import Laid, draw
+
+SETTINGS = BundleSettings()
+
+
+def nearest(bundles: tuple[Bundle, ...], laid: Laid) -> Bundle:
+    place = np.array([laid.x_m, laid.y_m, laid.z_m])
+    return min(bundles, key=lambda b: float(np.linalg.norm(b.centre_m - place)))
+
+
+def expect(bundle: Bundle, laid: Laid) -> None:
+    """All figures within three stated sigmas and within the limits that a crane needs."""
+    yaw = np.radians(laid.yaw_deg)
+    offset = bundle.centre_m - np.array([laid.x_m, laid.y_m, laid.z_m])
+    lateral = offset[0] * np.cos(yaw) + offset[1] * np.sin(yaw)
+    sigma = bundle.sigma
+    assert abs(lateral) < min(3 * sigma.lateral_m, 0.010)
+    turned = (bundle.yaw_rad - yaw + np.pi / 2) % np.pi - np.pi / 2
+    assert abs(turned) < min(3 * sigma.yaw_rad, np.radians(0.2))
+    assert abs(bundle.top_z_m - laid.top_z_m) < min(3 * sigma.top_z_m, 0.010)
+    assert abs(bundle.width_m - laid.width_m) < 0.025
+    if not any(bundle.ends_open):
+        assert abs(bundle.length_m - laid.length_m) < 0.06
+
+
+def test_two_touching_neighbours_and_one_apart_are_three_bundles() -> None:
+    laid = [
+        Laid(0.2, 0.0, 0.225, 0.3, roll_deg=5),
+        Laid(0.48, 0.1, 0.225, 0.3, roll_deg=40),
+        Laid(1.2, -0.2, 0.225, -0.8, roll_deg=20),
+    ]
+    bundles = find_bundles(draw(laid), SETTINGS)
+    assert len(bundles) == 3
+    for one in laid:
+        expect(nearest(bundles, one), one)
+    assert [b.on_top for b in bundles] == [True] * 3
+    assert [b.layer for b in bundles] == [0] * 3
+    assert bundles[0].neighbours == (1,) and bundles[1].neighbours == (0,) and bundles[2].neighbours == ()
+    assert not any(any(b.ends_open) for b in bundles)
+
+
+def test_thin_bars_are_found_by_their_outline() -> None:
+    laid = [Laid(0.2, 0.0, 0.2, 0.2, 0.02, 61, roll_deg=1), Laid(0.6, 0.0, 0.25, 0.0, 0.04, 37, roll_deg=-1)]
+    bundles = find_bundles(draw(laid), SETTINGS)
+    assert len(bundles) == 2
+    for one in laid:
+        expect(nearest(bundles, one), one)
+
+
+def test_single_heavy_bars_are_bundles_of_one() -> None:
+    laid = [Laid(0.3, 0.0, 0.13, 0.5, 0.2, 1), Laid(0.56, 0.0, 0.13, 0.5, 0.2, 1)]
+    bundles = find_bundles(draw(laid), SETTINGS)
+    assert [b.bars for b in bundles] == [1, 1]
+    for one in laid:
+        expect(nearest(bundles, one), one)
+
+
+def test_a_bundle_across_others_lies_on_them() -> None:
+    laid = [Laid(0.3, 0.0, 0.2, 0.0), Laid(0.7, 0.0, 0.2, 1.0), Laid(0.5, 0.2, 0.47, 88.0, length_m=1.6)]
+    bundles = find_bundles(draw(laid), SETTINGS)
+    assert len(bundles) == 3
+    for one in laid:
+        expect(nearest(bundles, one), one)
+    assert nearest(bundles, laid[2]).on_top is True
+    assert nearest(bundles, laid[2]).layer == 1
+    for lower in laid[:2]:
+        bundle = nearest(bundles, lower)
+        assert bundle.on_top is False
+        assert any("lies on it" in reason for reason in bundle.reasons)
+
+
+def test_a_stack_turned_by_30_degrees_is_found_whole() -> None:
+    laid = [Laid(0.5, 0.0, 0.2, 30.0, length_m=2.0), Laid(0.9, 0.1, 0.2, 31.0, length_m=2.0)]
+    bundles = find_bundles(draw(laid), SETTINGS)
+    assert len(bundles) == 2
+    for one in laid:
+        expect(nearest(bundles, one), one)
+
+
+def test_an_end_out_of_view_is_open() -> None:
+    bundles = find_bundles(draw([Laid(0.5, 1.0, 0.2, 0.0)]), SETTINGS)
+    assert len(bundles) == 1
+    assert bundles[0].ends_open == (False, True)
+    assert np.isnan(bundles[0].sigma.length_m)
+    assert any("high-y end is open" in reason for reason in bundles[0].reasons)
+
+
+def test_an_empty_floor_and_an_unknown_map_hold_no_bundle() -> None:
+    assert find_bundles(draw([]), SETTINGS) == ()
+    assert find_bundles(draw([], floor=False), SETTINGS) == ()
+
+
+def test_the_bars_of_a_bundle_are_found_one_by_one() -> None:
+    laid = Laid(0.5, 0.0, 0.3, 0.7, roll_deg=8)
+    (bundle,) = find_bundles(draw([laid]), SETTINGS)
+    true = laid.axes_m + np.array([0.0, laid.z_m])
+    assert bundle.visible_bars == len(bundle.bar_axes) >= 3
+    for bar in bundle.bar_axes:
+        along = bar.centre_m[1] / np.cos(np.radians(0.7))
+        place = np.array([bar.centre_m[0] - 0.5 + along * np.sin(np.radians(0.7)), bar.centre_m[2]])
+        miss = np.abs(place - true)[np.linalg.norm(place - true, axis=1).argmin()]
+        assert miss[0] < 4 * np.sqrt(bar.covariance[0, 0])
+        assert miss[1] < 4 * np.sqrt(bar.covariance[1, 1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"catalogue_mm": (0.5,)}, {"widest_m": 0.05}, {"slice_m": 0.0}, {"max_skew_deg": 40.0}],
+)
+def test_impossible_settings_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        BundleSettings(**change)  # type: ignore[arg-type]
