@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedCamera
+from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
@@ -23,6 +26,7 @@ def view(
     return CellObservations(
         x.astype(np.int32),
         y.astype(np.int32),
+        np.ones(x.size, np.bool_),
         z.astype(np.float32),
         same * np.float32(sigma_m**2),
         same * np.float32(shared_m),
@@ -42,9 +46,23 @@ def fused(
     settings = settings or MapSettings(min_views=1)
     folder.mkdir(parents=True, exist_ok=True)
     store = TileStore(folder, resident)
+    poses = []
     for one in views:
         fuse(store, one, settings)
-    return finish(store, folder, cell_m, settings.min_views, settings)
+        poses.append(high_above(one, cell_m))
+    return finish(store, folder, cell_m, settings.min_views, settings, Sights.of(poses, FAR_CAMERA))
+
+
+HEIGHT_M = 5000.0
+FAR_CAMERA = RectifiedCamera(
+    focal_px=1e5, cx_px=1000.0, cy_px=1000.0, baseline_m=0.001, doffs_px=0.0, width=2000, height=2000
+)
+
+
+def high_above(one: CellObservations, cell_m: float) -> Pose:
+    """The place of a camera so far above the view's middle that it sees 100 m of everything from the top."""
+    middle = [cell_m * (a.min() + a.max()) / 2 if a.size else 0.0 for a in (one.x, one.y)]
+    return Pose("yard", "rect0", np.diag([1.0, -1.0, -1.0]), np.array([*middle, HEIGHT_M]))
 
 
 def block(columns: int, rows: int, column: int = 0, row: int = 0) -> tuple[np.ndarray, np.ndarray]:

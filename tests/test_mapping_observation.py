@@ -9,6 +9,7 @@ from barsight.core.types import StereoPoints
 from barsight.mapping.observation import observe
 
 CELL_M = 0.02
+SPACING_RAD = 1e-3
 BODY = Pose(
     "yard", "body", Rotation.from_euler("xyz", [3.1, 0.05, 0.4]).as_matrix(), np.array([-3.0, 2.0, 8.0])
 )
@@ -53,7 +54,11 @@ def observed_slowly(
         arm = point - origin
         swing = np.array([arm[1], -arm[0], 0, 0, 0, 1])
         row, column = (int(np.floor(point[k] / CELL_M + 0.5)) for k in (1, 0))
-        values = (np.float32(point[2]), (sigma * slope) ** 2, swing @ cov @ swing, abs(shared * slope), grey)
+        aside = max(abs(point[0] - column * CELL_M), abs(point[1] - row * CELL_M))
+        depth = (point - pose.translation) @ pose.rotation[:, 2]
+        middle = aside <= 0.5 * SPACING_RAD * depth
+        height, noise = np.float32(point[2]), (sigma * slope) ** 2
+        values = (height, noise, swing @ cov @ swing, abs(shared * slope), grey, middle)
         cells.setdefault((row, column), []).append(tuple(float(v) for v in values))
     result = []
     for (row, column), members in sorted(cells.items()):
@@ -63,15 +68,13 @@ def observed_slowly(
             group = np.array([member for member in left if member[0] >= floor])
             left = left[len(group) :]
             height = np.average(group[:, 0], weights=1 / group[:, 1])
-            result.append(
-                (column, row, height, *group[:, 1:3].mean(axis=0), group[:, 3].mean(), group[:, 4].mean())
-            )
+            result.append((column, row, height, *group[:, 1:5].mean(axis=0), group[:, 5].max()))
     return result
 
 
 def test_the_kernels_agree_with_the_slow_reference() -> None:
     seen, pose = points(), BODY @ BODY_FROM_RECT0
-    found = observe(seen, pose, BODY.translation, covariance(), CELL_M)
+    found = observe(seen, pose, BODY.translation, covariance(), CELL_M, SPACING_RAD)
     expected = np.array(observed_slowly(seen, pose, BODY.translation, covariance()))
     assert len(expected) > 1500
     np.testing.assert_array_equal(found.x, expected[:, 0])
@@ -80,6 +83,8 @@ def test_the_kernels_agree_with_the_slow_reference() -> None:
     np.testing.assert_allclose(found.variance_m2, expected[:, 3] + expected[:, 4], rtol=1e-4)
     np.testing.assert_allclose(found.shared_m, expected[:, 5], rtol=1e-4)
     np.testing.assert_allclose(found.intensity, expected[:, 6], rtol=1e-5)
+    np.testing.assert_array_equal(found.central, expected[:, 7])
+    assert 0.1 < found.central.mean() < 0.9
 
 
 def test_many_points_of_one_view_say_it_once() -> None:
@@ -87,8 +92,8 @@ def test_many_points_of_one_view_say_it_once() -> None:
     one = StereoPoints(1, *(np.array(v) for v in _flat(1)))
     many = StereoPoints(1, *(np.array(v) for v in _flat(100)))
     nothing = np.zeros((6, 6))
-    single = observe(one, BODY, BODY.translation, nothing, CELL_M)
-    crowd = observe(many, BODY, BODY.translation, nothing, CELL_M)
+    single = observe(one, BODY, BODY.translation, nothing, CELL_M, SPACING_RAD)
+    crowd = observe(many, BODY, BODY.translation, nothing, CELL_M, SPACING_RAD)
     assert len(single.z_m) == len(crowd.z_m) == 1
     np.testing.assert_allclose(crowd.variance_m2, single.variance_m2)
 
@@ -101,7 +106,7 @@ def _flat(count: int) -> tuple[np.ndarray, ...]:
 def test_the_variance_is_that_of_noisy_rays_and_poses() -> None:
     rng = np.random.default_rng(3)
     seen, cov = points(1, seed=5), covariance()
-    found = observe(seen, BODY @ BODY_FROM_RECT0, BODY.translation, cov, CELL_M)
+    found = observe(seen, BODY @ BODY_FROM_RECT0, BODY.translation, cov, CELL_M, SPACING_RAD)
     point = seen.xyz_m[0].astype(np.float64)
     heights = []
     for error in rng.multivariate_normal(np.zeros(6), cov, 4000):
@@ -118,5 +123,5 @@ def test_the_variance_is_that_of_noisy_rays_and_poses() -> None:
 
 def test_no_points() -> None:
     none = points(0)
-    found = observe(none, BODY, BODY.translation, covariance(), CELL_M)
+    found = observe(none, BODY, BODY.translation, covariance(), CELL_M, SPACING_RAD)
     assert found.x.shape == found.z_m.shape == (0,)

@@ -19,11 +19,13 @@ from typing import Literal
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.parallel import ordered_map
+from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame
 from barsight.evaluation.agreement import agree
 from barsight.mapping.contours import cut_contours
+from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.look import choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
@@ -106,23 +108,26 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         return view
 
     store = TileStore(scratch, settings.map.resident_tiles)
-    used, preview = 0, None
+    preview = None
+    placed: list[Pose] = []
     for done, view in enumerate(ordered_map(look, _placed(source, poses), WORKERS), start=1):
         if isinstance(view, Refusal):
             refusals.append(view)
         else:
             with watch("fuse", 1):
                 fuse(store, view.cells, settings.map)
-            used += 1
+            placed.append(poses[view.stamp_ns].reference_from_body @ rectifier.body_from_rect0)
             if preview is None or abs(done - total / 2) < 1:
                 preview = Preview(view.left, view.disparity_px)
         advance("map", done, len(poses))
+    used = len(placed)
     if used == 0:
         raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
 
     with watch("surface"):
         min_views = settings.map.min_views if used > 1 else 1
-        surface = finish(store, scratch, cell_m, min_views, settings.map)
+        sights = Sights.of(placed, rectifier.camera)
+        surface = finish(store, scratch, cell_m, min_views, settings.map, sights)
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")
     with watch("contours"):

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Int8, Int32, Int64, kernel
+from barsight.core.arrays import Bool, Float32, Int32, Int64, kernel
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import (
+    CENTRAL,
     GREY,
     SHARED,
     SLOTS,
@@ -45,6 +46,7 @@ def fuse(store: TileStore, view: CellObservations, settings: MapSettings) -> Non
             view.variance_m2,
             view.shared_m,
             view.intensity,
+            view.central,
             settings.gate_sigma,
             settings.least_gate_m,
         )
@@ -60,6 +62,7 @@ def _vote(
     variance: Float32,
     shared: Float32,
     intensity: Float32,
+    central: Bool,
     gate_sigma: float,
     least_gate: float,
 ) -> None:
@@ -87,6 +90,7 @@ def _vote(
             slots[best, SQUARES] += w * step * step * (1 - share)
             slots[best, WEIGHT] = total
             slots[best, VIEWS] += 1
+            slots[best, CENTRAL] += central[m]
             slots[best, SHARED] += share * (shared[m] - slots[best, SHARED])
             slots[best, GREY] += share * (intensity[m] - slots[best, GREY])
             continue
@@ -101,29 +105,7 @@ def _vote(
         slots[target, VIEWS] = 1
         slots[target, SHARED] = shared[m]
         slots[target, GREY] = intensity[m]
-
-
-@kernel()
-def elect(tile: Float32, min_views: int, top_share: float) -> Int8:
-    """Which of each cell's heights is the surface, (rows, columns), -1 where none has enough views.
-
-    Of the heights that enough views support, measured against the best supported one, the highest wins.
-    """
-    rows, columns = tile.shape[:2]
-    winner = np.full((rows, columns), -1, np.int8)
-    for i in range(rows):
-        for j in range(columns):
-            slots = tile[i, j]
-            most = 0.0
-            for s in range(SLOTS):
-                most = max(most, slots[s, VIEWS])
-            needed = max(float(min_views), top_share * most)
-            best = -1
-            for s in range(SLOTS):
-                if slots[s, VIEWS] >= needed and (best < 0 or slots[s, Z] > slots[best, Z]):
-                    best = s
-            winner[i, j] = best
-    return winner
+        slots[target, CENTRAL] = central[m]
 
 
 def height_sigma(slots: Float32) -> Float32:

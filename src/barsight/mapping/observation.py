@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, Int32, Int64, UInt8, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import StereoPoints
 
@@ -19,13 +19,15 @@ from barsight.core.types import StereoPoints
 class CellObservations:
     """A view's heights, cell by cell; a cell may have several (a side, an overhang), highest first.
 
-    x, y: (N,) int32 cell numbers (a cell's centre is its number times the cell's side). z_m, variance_m2:
+    x, y: (N,) int32 cell numbers (a cell's centre is its number times the cell's side). central: (N,)
+    bool, whether the view sees this height in the cell's middle and not only at its border. z_m, variance_m2:
     height and its noise (matching and pose), float32. shared_m: what the calibration may add, float32.
     intensity: (N,) float32 grey levels.
     """
 
     x: Int32
     y: Int32
+    central: Bool
     z_m: Float32
     variance_m2: Float32
     shared_m: Float32
@@ -38,16 +40,17 @@ def observe(
     body_origin_m: Float64,
     covariance: Float64,
     cell_m: float,
+    spacing_rad: float,
 ) -> CellObservations:
     """Bring a view's points into the reference frame and gather them by cell.
 
     body_origin_m: (3,) about which the attitude's error turns. covariance: (6, 6) of the body's pose,
-    rotation then translation, reference axes.
+    rotation then translation, reference axes. spacing_rad: angle between neighbouring points.
     """
     if len(points.xyz_m) == 0:
         return _no_observations()
     about = covariance[np.ix_((0, 1, 5), (0, 1, 5))]
-    x, y, z, variance, pose_variance, shared = _in_reference(
+    x, y, z, off, variance, pose_variance, shared = _in_reference(
         points.xyz_m,
         points.range_sigma_m,
         points.shared_sigma_m,
@@ -61,14 +64,20 @@ def observe(
     width, height = int(x.max()) - low_x + 1, int(y.max()) - low_y + 1
     flat = (y.astype(np.int64) - low_y) * width + (x - low_x)
     order, starts = _by_cell(flat, width * height)
-    cell, *heights = _gather(order, starts, z, variance, pose_variance, shared, points.intensity, 2 * cell_m)
+    half_pixel = 0.5 * spacing_rad * points.xyz_m[:, 2]
+    cell, central, *heights = _gather(
+        order, starts, z, off, half_pixel, variance, pose_variance, shared, points.intensity, cell_m
+    )
     rows, columns = np.divmod(cell, width)
-    return CellObservations((columns + low_x).astype(np.int32), (rows + low_y).astype(np.int32), *heights)
+    return CellObservations(
+        (columns + low_x).astype(np.int32), (rows + low_y).astype(np.int32), central, *heights
+    )
 
 
 def _no_observations() -> CellObservations:
     none = np.empty(0, np.float32)
-    return CellObservations(np.empty(0, np.int32), np.empty(0, np.int32), none, none, none, none)
+    whole = np.empty(0, np.int32)
+    return CellObservations(whole, whole, np.empty(0, np.bool_), none, none, none, none)
 
 
 @kernel()
@@ -81,15 +90,16 @@ def _in_reference(
     origin: Float64,
     about: Float64,
     cell_m: float,
-) -> tuple[Int32, Int32, Float32, Float32, Float32, Float32]:
-    """Cell numbers, height, matching variance, pose variance and shared sigma of the height, each (N,).
+) -> tuple[Int32, Int32, Float32, Float32, Float32, Float32, Float32]:
+    """Cell numbers, height, distance from the cell's middle (the larger of along x and y), matching variance,
+    pose variance and shared sigma of the height, each (N,).
 
     The height's error is the range error along the ray times the ray's slope, plus that of the pose:
     dz = dt_z + theta_x * q_y - theta_y * q_x for a point q as seen from the body.
     """
     count = xyz.shape[0]
     x, y = np.empty(count, np.int32), np.empty(count, np.int32)
-    z, variance = np.empty(count, np.float32), np.empty(count, np.float32)
+    z, off, variance = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.float32)
     pose_variance, shared = np.empty(count, np.float32), np.empty(count, np.float32)
     for i in range(count):
         a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
@@ -101,6 +111,7 @@ def _in_reference(
         x[i] = np.int32(np.floor(px / cell_m + 0.5))
         y[i] = np.int32(np.floor(py / cell_m + 0.5))
         z[i] = pz
+        off[i] = max(abs(px - x[i] * cell_m), abs(py - y[i] * cell_m))
         variance[i] = (range_sigma[i] * slope) ** 2
         shared[i] = np.abs(shared_sigma[i] * slope)
         jx, jy = py - origin[1], -(px - origin[0])
@@ -110,7 +121,7 @@ def _in_reference(
             + about[2, 2]
             + 2 * (about[0, 1] * jx * jy + about[0, 2] * jx + about[1, 2] * jy)
         )
-    return x, y, z, variance, pose_variance, shared
+    return x, y, z, off, variance, pose_variance, shared
 
 
 @kernel()
@@ -149,15 +160,17 @@ def _gather(
     order: Int64,
     starts: Int64,
     z: Float32,
+    off: Float32,
+    half_pixel: Float32,
     variance: Float32,
     pose_variance: Float32,
     shared: Float32,
     intensity: UInt8,
-    least_span: float,
-) -> tuple[Int64, Float32, Float32, Float32, Float32]:
+    cell_m: float,
+) -> tuple[Int64, Bool, Float32, Float32, Float32, Float32]:
     """Within each cell, from the top: points no deeper than 4 sigma below the first are one surface."""
     count = order.size
-    cell = np.empty(count, np.int64)
+    cell, middle = np.empty(count, np.int64), np.zeros(count, np.bool_)
     out = np.empty((4, count), np.float32)
     n = 0
     for k in range(starts.size - 1):
@@ -169,7 +182,7 @@ def _gather(
         i = 0
         while i < members.size:
             top = members[i]
-            floor = z[top] - max(4 * np.sqrt(variance[top]), least_span)
+            floor = z[top] - max(4 * np.sqrt(variance[top]), 2 * cell_m)
             weights = heights = variances = extra = grey = 0.0
             held = 0
             while i < members.size and z[members[i]] >= floor:
@@ -180,6 +193,7 @@ def _gather(
                 variances += variance[m] + pose_variance[m]
                 extra += shared[m]
                 grey += intensity[m]
+                middle[n] |= off[m] <= half_pixel[m]
                 held += 1
                 i += 1
             cell[n] = k
@@ -188,4 +202,4 @@ def _gather(
             out[2, n] = extra / held
             out[3, n] = grey / held
             n += 1
-    return cell[:n], out[0, :n], out[1, :n], out[2, :n], out[3, :n]
+    return cell[:n], middle[:n], out[0, :n], out[1, :n], out[2, :n], out[3, :n]

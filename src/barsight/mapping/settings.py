@@ -16,7 +16,11 @@ class MapSettings:
     min_views: int = 2
     """A cell seen in fewer frames is unknown (one is enough where the recording has only one)."""
     top_share: float = 0.35
-    """Of several heights in a cell the highest wins that has this share of the best-seen one's views."""
+    """What may hide a cell: its highest height that has this share of the best-seen one's views."""
+    inner_share: float = 0.3
+    """A height needs the votes of this share of the views that have a free line of sight to it."""
+    rim_share: float = 0.4
+    """The same beside a steep fall, where matching stretches the higher side."""
     gate_sigma: float = 3.0
     """Heights nearer than this many sigma are one surface."""
     least_gate_m: float = 0.015
@@ -35,7 +39,8 @@ class MapSettings:
             raise ConfigError(f"cell_m must lie in 0.001...10, not {self.cell_m}")
         if self.min_views < 1 or self.resident_tiles < 16:
             raise ConfigError("min_views must be at least 1 and resident_tiles at least 16")
-        if not 0 < self.top_share <= 1:
-            raise ConfigError(f"top_share must lie in 0...1, not {self.top_share}")
+        for name in ("top_share", "inner_share", "rim_share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must lie in 0...1, not {getattr(self, name)}")
         if self.gate_sigma <= 0 or self.least_gate_m < 0 or self.fill_m < 0 or self.max_sigma_m <= 0:
             raise ConfigError("gate_sigma, least_gate_m, fill_m and max_sigma_m can't be negative")

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.arrays import Bool, Float32, Int8, UInt8
 from barsight.core.types import Source
-from barsight.mapping.fusion import elect, height_sigma
+from barsight.mapping.election import Sights, elect, first_heights
+from barsight.mapping.fusion import height_sigma
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
 
@@ -88,14 +89,23 @@ class Surface:
                 yield CloudPart(part["xyz"], part["intensity"], part["sigma"], part["views"])
 
 
-def finish(store: TileStore, folder: Path, cell_m: float, min_views: int, settings: MapSettings) -> Surface:
+def finish(
+    store: TileStore, folder: Path, cell_m: float, min_views: int, settings: MapSettings, sights: Sights
+) -> Surface:
     """Elect each tile's surface, fill narrow gaps across tile borders, and write the tiles into `folder`."""
     _read_tile.cache_clear()
+    _read_first.cache_clear()
     keys = store.keys()
+    for key in keys:
+        np.save(
+            _tile_file(folder, key, "first"), first_heights(store.take(key), min_views, settings.top_share)
+        )
     seen = 0
     for key in keys:
         tile = store.take(key)
-        elected = _elected(tile, min_views, settings.top_share)
+        around = _first_around(folder, key, frozenset(keys))
+        winner = elect(tile, key, around, sights, cell_m, min_views, settings)
+        elected = _layers(tile, winner)
         _write_tile(folder, key, elected, "elected")
         _write_cloud(folder, key, tile, cell_m, min_views)
         seen += int((elected.source == Source.VISION).sum())
@@ -113,7 +123,8 @@ def finish(store: TileStore, folder: Path, cell_m: float, min_views: int, settin
             columns += [key[0] * TILE_CELLS + int(c) for c in _span(known.any(axis=0))]
             rows += [key[1] * TILE_CELLS + int(r) for r in _span(known.any(axis=1))]
     for key in keys:
-        _tile_file(folder, key, "elected").unlink()
+        for kind in ("first", "elected"):
+            _tile_file(folder, key, kind).unlink()
     all_sigmas = np.concatenate(sigmas) if sigmas else np.empty(0, np.float32)
     return Surface(
         folder=folder,
@@ -127,8 +138,25 @@ def finish(store: TileStore, folder: Path, cell_m: float, min_views: int, settin
     )
 
 
-def _elected(tile: Float32, min_views: int, top_share: float) -> Layers:
-    winner = elect(tile, min_views, top_share)
+def _first_around(folder: Path, key: TileKey, keys: frozenset[TileKey]) -> Float32:
+    """The first heights of a tile and its eight neighbours, (3 * TILE_CELLS, 3 * TILE_CELLS)."""
+    around = np.full((3 * TILE_CELLS, 3 * TILE_CELLS), np.nan, np.float32)
+    for i in range(3):
+        for j in range(3):
+            neighbour = (key[0] + j - 1, key[1] + i - 1)
+            if neighbour in keys:
+                rows = slice(i * TILE_CELLS, (i + 1) * TILE_CELLS)
+                around[rows, j * TILE_CELLS : (j + 1) * TILE_CELLS] = _read_first(folder, neighbour)
+    return around
+
+
+@lru_cache(maxsize=64)
+def _read_first(folder: Path, key: TileKey) -> Float32:
+    heights: Float32 = np.load(_tile_file(folder, key, "first"))
+    return heights
+
+
+def _layers(tile: Float32, winner: Int8) -> Layers:
     layers = Layers.unknown(TILE_CELLS, TILE_CELLS)
     row, column = np.nonzero(winner >= 0)
     won = tile[row, column, winner[row, column]]

@@ -12,10 +12,10 @@ from barsight.core.arrays import Float32
 TILE_CELLS = 256
 SLOTS = 4
 """Heights kept per cell."""
-FIELDS = 6
+FIELDS = 7
 """Of each height: mean z, weight (sum of 1 / variance), weighted squares about the mean, views, shared sigma,
-grey level."""
-Z, WEIGHT, SQUARES, VIEWS, SHARED, GREY = range(FIELDS)
+grey level, views that see it in the cell's middle."""
+Z, WEIGHT, SQUARES, VIEWS, SHARED, GREY, CENTRAL = range(FIELDS)
 
 TileKey = tuple[int, int]
 

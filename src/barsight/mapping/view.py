@@ -22,6 +22,7 @@ from barsight.stereo.settings import StereoSettings
 class View:
     """cells: what the frame says of the map. left, disparity_px: (H, W), for people to look at."""
 
+    stamp_ns: int
     cells: CellObservations
     left: UInt8
     disparity_px: Float32
@@ -72,10 +73,13 @@ class Viewer:
             )
             body = posed.reference_from_body
             reference_from_rect0 = body @ self.rectifier.body_from_rect0
-            cells = observe(points, reference_from_rect0, body.translation, posed.covariance, self.cell_m)
+            spacing_rad = 1 / (pair.camera.focal_px * self.per_pixel)
+            cells = observe(
+                points, reference_from_rect0, body.translation, posed.covariance, self.cell_m, spacing_rad
+            )
         if cells.z_m.size == 0:
             return Failed("no-depth", "no pixel has a depth within max_depth_m and max_sigma_m")
-        return View(cells, pair.left, disparity.disparity_px)
+        return View(pair.stamp_ns, cells, pair.left, disparity.disparity_px)
 
 
 def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:

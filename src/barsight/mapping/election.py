@@ -1,0 +1,195 @@
+"""The election of the surface: of a cell's heights the highest that those who must see it do see.
+
+A wrong height hangs in the air, most often beside an edge, where matching stretches the nearer surface by a
+few pixels. Every view that looks through it to what lies behind speaks against it. So a height's votes are
+held against the number of views whose two cameras have a free line of sight to it, over the surface as the
+votes alone would have it. A height that fewer than `min_views` views can see at all is an error of matching.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numba import prange
+
+from barsight.core.arrays import Float32, Float64, Int8, kernel
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedCamera
+from barsight.mapping.settings import MapSettings
+from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
+
+_BORDER_PX = 3.0
+_RIM_CELLS = 2
+_RIM_SLOPE = 2.5
+_NOTHING = np.float32(-1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """Where K views were taken from: rect0_from_reference as rotation (K, 3, 3) and translation (K, 3), and
+    the places of both cameras (K, 2, 3) in the reference frame."""
+
+    camera: RectifiedCamera
+    rotation: Float64
+    translation: Float64
+    eyes: Float64
+
+    @classmethod
+    def of(cls, poses: Sequence[Pose], camera: RectifiedCamera) -> Sights:
+        """From the views' reference_from_rect0."""
+        inverses = [pose.inverse() for pose in poses]
+        both = np.array([[0.0, 0.0, 0.0], [camera.baseline_m, 0.0, 0.0]])
+        return cls(
+            camera,
+            np.array([pose.rotation for pose in inverses]).reshape(-1, 3, 3),
+            np.array([pose.translation for pose in inverses]).reshape(-1, 3),
+            np.array([pose.apply(both) for pose in poses]).reshape(-1, 2, 3),
+        )
+
+    def near(self, low_m: Float64, high_m: Float64) -> Sights:
+        """Those views alone whose left picture may hold something of the box from low_m to high_m (3,)."""
+        corners = np.array(list(product(*zip(low_m, high_m, strict=True))))
+        x, y, depth = np.moveaxis(corners @ self.rotation.mT + self.translation[:, None], -1, 0)
+        camera = self.camera
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = camera.focal_px * x / depth + camera.cx_px, camera.focal_px * y / depth + camera.cy_px
+        touched = (u.max(1) >= 0) & (u.min(1) <= camera.width) & (v.max(1) >= 0) & (v.min(1) <= camera.height)
+        chosen = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
+        return Sights(camera, self.rotation[chosen], self.translation[chosen], self.eyes[chosen])
+
+
+def first_heights(tile: Float32, min_views: int, top_share: float) -> Float32:
+    """(rows, columns) what votes alone elect: the highest with top_share of the best-seen one's views; NaN
+    where none has enough views."""
+    views, z = tile[..., VIEWS], tile[..., Z]
+    needed = np.maximum(min_views, top_share * views.max(axis=-1, keepdims=True))
+    highest: Float32 = np.where(views >= needed, z, _NOTHING).max(axis=-1)
+    return np.where(highest > _NOTHING, highest, np.float32(np.nan))
+
+
+def elect(
+    tile: Float32,
+    key: TileKey,
+    around: Float32,
+    sights: Sights,
+    cell_m: float,
+    min_views: int,
+    settings: MapSettings,
+) -> Int8:
+    """Which of each cell's heights is the surface, (rows, columns), -1 where none is.
+
+    around: (3 * TILE_CELLS, 3 * TILE_CELLS) `first_heights` of the tile and its eight neighbours.
+    """
+    camera = sights.camera
+    lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m, camera.doffs_px])
+    size = np.array([camera.width, camera.height], np.float64)
+    known = np.isfinite(around)
+    ceiling = float(around[known].max()) if known.any() else 0.0
+    held = tile[..., Z][tile[..., VIEWS] > 0]
+    corner = np.array(key, np.float64) * TILE_CELLS
+    box = np.array([[*corner, held.min() / cell_m], [*(corner + TILE_CELLS), held.max() / cell_m]]) * cell_m
+    sights = sights.near(*box)
+    shares = settings.inner_share, settings.rim_share
+    return _elected(
+        tile, corner, np.where(known, around, _NOTHING), ceiling,
+        lens, size, sights.rotation, sights.translation, sights.eyes, cell_m, float(min_views), *shares,
+    )  # fmt: skip
+
+
+@kernel(parallel=True)
+def _elected(
+    tile: Float32,
+    corner: Float64,
+    around: Float32,
+    ceiling: float,
+    lens: Float64,
+    size: Float64,
+    rotation: Float64,
+    translation: Float64,
+    eyes: Float64,
+    cell_m: float,
+    min_views: float,
+    inner_share: float,
+    rim_share: float,
+) -> Int8:
+    rows, columns = tile.shape[:2]
+    winner = np.full((rows, columns), -1, np.int8)
+    for i in prange(rows):
+        for j in range(columns):
+            slots = tile[i, j]
+            tried = np.zeros(SLOTS, np.bool_)
+            for _ in range(SLOTS):
+                best = -1
+                for s in range(SLOTS):
+                    candidate = not tried[s] and slots[s, VIEWS] >= min_views
+                    if candidate and (best < 0 or slots[s, Z] > slots[best, Z]):
+                        best = s
+                if best < 0:
+                    break
+                tried[best] = True
+                z = float(slots[best, Z])
+                point = np.array([(corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z])
+                able = 0
+                for k in range(rotation.shape[0]):
+                    if _inside(point, lens, size, rotation[k], translation[k]):
+                        free = _free(point, i, j, eyes[k, 0], around, ceiling, cell_m)
+                        if free and _free(point, i, j, eyes[k, 1], around, ceiling, cell_m):
+                            able += 1
+                share = rim_share if _at_rim(z, i, j, around, cell_m) else inner_share
+                if able >= min_views and slots[best, CENTRAL] >= share * able:
+                    winner[i, j] = best
+                    break
+    return winner
+
+
+@kernel()
+def _inside(point: Float64, lens: Float64, size: Float64, rotation: Float64, translation: Float64) -> bool:
+    """Whether both cameras of a view have the point in their pictures."""
+    x, y, depth = translation[0], translation[1], translation[2]
+    for a in range(3):
+        x += rotation[0, a] * point[a]
+        y += rotation[1, a] * point[a]
+        depth += rotation[2, a] * point[a]
+    if depth <= 0:
+        return False
+    u, v = lens[0] * x / depth + lens[1], lens[0] * y / depth + lens[2]
+    right = u - (lens[0] * lens[3] / depth - lens[4])
+    across = min(u, right) >= _BORDER_PX and max(u, right) <= size[0] - 1 - _BORDER_PX
+    return bool(across and _BORDER_PX <= v <= size[1] - 1 - _BORDER_PX)
+
+
+@kernel()
+def _free(
+    point: Float64, row: int, column: int, eye: Float64, around: Float32, ceiling: float, cell_m: float
+) -> bool:
+    """Whether no cell between rises over the line from the point (in the middle tile) to the eye."""
+    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
+    length = max(abs(x), abs(y)) / cell_m
+    if length < 2:
+        return True
+    step_x, step_y, step_z = x / cell_m / length, y / cell_m / length, z / length
+    for n in range(2, int(length)):
+        height = point[2] + n * step_z
+        if height > ceiling:
+            return True
+        i = int(np.rint(row + TILE_CELLS + n * step_y))
+        j = int(np.rint(column + TILE_CELLS + n * step_x))
+        if i < 0 or j < 0 or i >= around.shape[0] or j >= around.shape[1]:
+            return True
+        if around[i, j] > height + cell_m:
+            return False
+    return True
+
+
+@kernel()
+def _at_rim(z: float, row: int, column: int, around: Float32, cell_m: float) -> bool:
+    """Whether the surface falls steeply, or nothing is known, within two cells."""
+    i, j = row + TILE_CELLS, column + TILE_CELLS
+    for di in range(-_RIM_CELLS, _RIM_CELLS + 1):
+        for dj in range(-_RIM_CELLS, _RIM_CELLS + 1):
+            if around[i + di, j + dj] < z - _RIM_SLOPE * _RIM_CELLS * cell_m:
+                return True
+    return False

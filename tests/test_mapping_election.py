@@ -1,0 +1,100 @@
+"""The election against lines of sight: a wall of 1 m on a floor, seen from a crane that passes over it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedCamera, Source
+from barsight.mapping.election import Sights
+from barsight.mapping.fusion import fuse
+from barsight.mapping.observation import CellObservations
+from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface import Layers, finish
+from barsight.mapping.tiles import TileStore
+from mapping_views import block, view
+
+CELL_M = 0.01
+CAMERA = RectifiedCamera(
+    focal_px=1000.0, cx_px=640.0, cy_px=512.0, baseline_m=0.5, doffs_px=0.0, width=1280, height=1024
+)
+EYES_X_M = np.linspace(-2.0, 2.0, 9)
+EYE_M = 8.0
+WALL = (0, 50)
+"""Cells along x; the wall is 1 m high and as long as the yard."""
+
+
+def pose_at(x_m: float) -> Pose:
+    return Pose("yard", "rect0", np.diag([1.0, -1.0, -1.0]), np.array([x_m, 0.05, EYE_M]))
+
+
+def seen_by_both(x: np.ndarray, z: np.ndarray, left_eye_m: float) -> np.ndarray:
+    """Whether no part of the wall lies between (x cells, z m) and either eye."""
+    free = np.ones(x.shape, bool)
+    at = x * CELL_M
+    for eye in (left_eye_m, left_eye_m + CAMERA.baseline_m):
+        for face in (WALL[0] - 0.5, WALL[1] - 0.5):
+            edge = face * CELL_M
+            crosses = (at < edge) != (eye < edge)
+            share = (edge - at) / np.where(crosses, eye - at, 1)
+            free &= ~crosses | (z + share * (EYE_M - z) >= 1) | (z >= 1)
+    return free
+
+
+def scene_view(left_eye_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y, z of what both cameras see."""
+    x, y = (a.ravel() for a in block(400, 12, -200))
+    z = np.where((x >= WALL[0]) & (x < WALL[1]), 1.0, 0.0)
+    seen = seen_by_both(x, z, left_eye_m)
+    return x[seen], y[seen], z[seen]
+
+
+def surface_of(views: list[CellObservations], folder: Path) -> Layers:
+    store = TileStore(folder, 64)
+    for one in views:
+        fuse(store, one, MapSettings())
+    sights = Sights.of([pose_at(x) for x in EYES_X_M], CAMERA)
+    return finish(store, folder, CELL_M, 2, MapSettings(fill_m=0.0), sights).window(-200, 0, 400, 12)
+
+
+def test_what_is_seen_is_elected_and_what_hangs_in_the_air_is_not(tmp_path: Path) -> None:
+    """Three of nine views stretch the wall by two cells; the floor there is right under the wall's foot."""
+    views = []
+    for number, eye in enumerate(EYES_X_M):
+        x, y, z = scene_view(eye)
+        if number % 3 == 0:
+            stretched_x, stretched_y = (a.ravel() for a in block(2, 12, WALL[0] - 2))
+            x, y = np.append(x, stretched_x), np.append(y, stretched_y)
+            z = np.append(z, np.ones(stretched_x.size))
+        views.append(view(x, y, z))
+    layers = surface_of(views, tmp_path)
+    wall = slice(200 + WALL[0], 200 + WALL[1])
+    np.testing.assert_allclose(layers.z_m[:, wall], 1.0)
+    assert (layers.source[:, wall] == Source.VISION).all()
+    beside = np.delete(layers.z_m, np.arange(wall.start, wall.stop), axis=1)
+    np.testing.assert_allclose(beside[np.isfinite(beside)], 0.0)
+    expected = sum(seen_by_both(np.arange(-200, 200), np.zeros(400), eye) for eye in EYES_X_M)
+    np.testing.assert_array_equal(np.isfinite(layers.z_m[5]), (expected >= 2) | (layers.z_m[5] == 1))
+
+
+def test_a_height_behind_the_wall_that_none_can_see_is_unknown(tmp_path: Path) -> None:
+    """All views match the bottom of a slit, 30 mm wide and 0.9 m deep, that no two eyes can look into."""
+    slit = WALL[0] + 20
+    inside_x, inside_y = (a.ravel() for a in block(3, 12, slit))
+    views = []
+    for eye in EYES_X_M:
+        x, y, z = scene_view(eye)
+        keep = (x < slit) | (x >= slit + 3)
+        x, y, z = np.append(x[keep], inside_x), np.append(y[keep], inside_y), z[keep]
+        views.append(view(x, y, np.append(z, np.full(inside_x.size, 0.1))))
+    layers = surface_of(views, tmp_path)
+    assert np.isnan(layers.z_m[:, 200 + slit : 203 + slit]).all()
+    np.testing.assert_allclose(layers.z_m[:, 200 : 200 + slit], 1.0)
+
+
+@pytest.mark.parametrize(("low", "high", "held"), [(-0.5, 0.5, True), (30.0, 31.0, False), (7.0, 8.0, False)])
+def test_views_far_from_a_box_are_left_out(low: float, high: float, held: bool) -> None:
+    sights = Sights.of([pose_at(0.0)], CAMERA)
+    near = sights.near(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0]))
+    assert len(near.eyes) == held
