@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.viewer.cloud import COLOURINGS, colour, read_cloud
+from barsight.result_folder import read_cloud
+from barsight.viewer.cloud import COLOURINGS, colour
 from barsight.viewer.view import line_segments, serving, view
 from result_folders import write_folder
 

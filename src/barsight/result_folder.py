@@ -1,4 +1,4 @@
-"""Floor 6: reading back the folder that `barsight measure` wrote, for the page and the viewer."""
+"""Floor 6: reading back the folder that `barsight measure` wrote, for the page, the viewer and the export."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from plyfile import PlyData, PlyParseError
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
 
+PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")
 _REMEDY = "measure the recording again"
 
 
@@ -24,6 +26,17 @@ class CameraPath:
     stamp_ns: Int64
     position_m: Float64
     quaternion_xyzw: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """xyz_m: (N, 3) float32. intensity, sigma_m, views: (N,) float32. total: points in the file."""
+
+    xyz_m: Float32
+    intensity: Float32
+    sigma_m: Float32
+    views: Float32
+    total: int
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -63,6 +76,35 @@ def read_path(folder: Path) -> CameraPath | None:
             raise InputError(path, f"line {count} has {len(fields)} numbers instead of 8", _REMEDY)
     table = np.array(numbers, dtype=np.float64).reshape(-1, 7)
     return CameraPath(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
+
+
+def read_cloud(path: Path, most_points: int | None = None) -> Cloud:
+    """cloud.ply, of which at most `most_points` evenly drawn points (all, if None) are read from disk.
+
+    Raises InputError where the file is missing, torn, empty or has other properties than formats.md says.
+    """
+    if not path.is_file():
+        raise InputError(path, "no such file", _REMEDY)
+    try:
+        vertex = PlyData.read(path)["vertex"]
+    except (PlyParseError, KeyError, ValueError, OSError) as error:
+        raise InputError(path, f"is torn ({error})", _REMEDY) from error
+    data = vertex.data
+    missing = [name for name in PROPERTIES if name not in (data.dtype.names or ())]
+    if missing:
+        raise InputError(path, f"has no property {missing[0]}", _REMEDY)
+    if data.size == 0:
+        raise InputError(path, "has no points", _REMEDY)
+    count = int(data.size) if most_points is None else min(int(data.size), most_points)
+    drawn = data[np.arange(count) * data.size // count]
+    column = {name: np.asarray(drawn[name], dtype=np.float32) for name in PROPERTIES}
+    return Cloud(
+        np.stack([column["x"], column["y"], column["z"]], axis=1),
+        column["intensity"],
+        column["sigma_z"],
+        column["views"],
+        int(data.size),
+    )
 
 
 def read_contours(folder: Path) -> tuple[Contour, ...]:

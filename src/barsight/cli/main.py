@@ -24,6 +24,7 @@ COMMANDS = {
     "odometry": "Estimate the trajectory and compare it with truth where there is any",
     "simulate": "Render a recording of a bar yard with exact truth",
     "score": "Compare a measured yard with the truth of its recording",
+    "export": "Write a measured cloud or map as PLY, PCD, LAS, LAZ, E57, GeoTIFF or CSV",
     "report": "Write report.html anew from a measured yard's files",
 }
 INTERRUPTED = 130

@@ -3,28 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
-from barsight.core.arrays import Float32, UInt8
-from barsight.core.errors import InputError
+from barsight.core.arrays import UInt8
+from barsight.result_folder import Cloud
 
-PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")
 COLOURINGS = ("height", "intensity", "sigma", "views")
-
-
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """xyz_m: (N, 3) float32. intensity, sigma_m, views: (N,) float32. total: points in the file."""
-
-    xyz_m: Float32
-    intensity: Float32
-    sigma_m: Float32
-    views: Float32
-    total: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,36 +22,6 @@ class Colouring:
     low: float
     high: float
     unit: str
-
-
-def read_cloud(path: Path, most_points: int) -> Cloud:
-    """cloud.ply, of which at most `most_points` evenly drawn points are read from disk.
-
-    Raises InputError where the file is missing, torn, empty or has other properties than formats.md says.
-    """
-    remedy = "measure the recording again"
-    if not path.is_file():
-        raise InputError(path, "no such file", remedy)
-    try:
-        vertex = PlyData.read(path)["vertex"]
-    except (PlyParseError, KeyError, ValueError, OSError) as error:
-        raise InputError(path, f"is torn ({error})", remedy) from error
-    data = vertex.data
-    missing = [name for name in PROPERTIES if name not in (data.dtype.names or ())]
-    if missing:
-        raise InputError(path, f"has no property {missing[0]}", remedy)
-    if data.size == 0:
-        raise InputError(path, "has no points", remedy)
-    count = min(int(data.size), most_points)
-    drawn = data[np.arange(count) * data.size // count]
-    column = {name: np.asarray(drawn[name], dtype=np.float32) for name in PROPERTIES}
-    return Cloud(
-        np.stack([column["x"], column["y"], column["z"]], axis=1),
-        column["intensity"],
-        column["sigma_z"],
-        column["views"],
-        int(data.size),
-    )
 
 
 def colour(cloud: Cloud, by: str) -> Colouring:

@@ -17,8 +17,16 @@ import viser
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import OutputError
 from barsight.core.types import Contour, LaserProfile
-from barsight.result_folder import CameraPath, read_contours, read_laser, read_path, read_summary
-from barsight.viewer.cloud import COLOURINGS, Cloud, colour, read_cloud
+from barsight.result_folder import (
+    CameraPath,
+    Cloud,
+    read_cloud,
+    read_contours,
+    read_laser,
+    read_path,
+    read_summary,
+)
+from barsight.viewer.cloud import COLOURINGS, colour
 
 HOST = "127.0.0.1"
 MOST_POINTS = 2_000_000

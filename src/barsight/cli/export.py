@@ -1,0 +1,29 @@
+"""`barsight export OUT FILE`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from barsight.cli.arguments import call
+from barsight.report.export import export
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and write."""
+
+    def command(out: tyro.conf.Positional[Path], file: tyro.conf.Positional[Path]) -> None:
+        """Write a measured cloud (.ply .pcd .las .laz .e57 .csv) or height map (.tif) for other programs.
+
+        Args:
+            out: A folder written by barsight measure.
+            file: The file to write; its suffix names the format.
+        """
+        points = export(out, file)
+        told = f" ({points} points)" if points else ""
+        Console(stderr=True).print(f"written: {file}{told}", soft_wrap=True, highlight=False, markup=False)
+
+    call(command, "export", arguments)

@@ -1,0 +1,91 @@
+"""A measured cloud or map in other programs' formats, chosen by the file's name.
+
+All keep metres and the reference frame. LAS and PCD keep sigma and view count as fields of their own; E57 has
+no place for them.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pye57
+from pypcd4 import PointCloud
+
+from barsight.core.errors import ConfigError, InputError
+from barsight.core.files import atomic_path
+from barsight.result_folder import Cloud, read_cloud
+
+_LAS_STEP_M = 1e-4
+
+
+def export(folder: Path, target: Path) -> int:
+    """Write `target` from the files of a measured folder; the points written (0 for a raster or a copy).
+
+    .ply and .tif are the folder's own files. Raises ConfigError for another suffix, InputError where the
+    folder lacks the file, OutputError where `target` can't be written.
+    """
+    kind = target.suffix.lower()
+    copies = {".ply": "cloud.ply", ".tif": "height.tif", ".tiff": "height.tif"}
+    if kind in copies:
+        source = folder / copies[kind]
+        if not source.is_file():
+            raise InputError(source, "no such file", "name a folder that `barsight measure` wrote")
+        with atomic_path(target) as path:
+            shutil.copyfile(source, path)
+        return 0
+    if kind not in _WRITERS:
+        known = " ".join(sorted([*copies, *_WRITERS]))
+        raise ConfigError(f"{target}: can't tell the format from {kind or 'no suffix'!r}; end it in {known}")
+    cloud = read_cloud(folder / "cloud.ply")
+    with atomic_path(target) as path:
+        _WRITERS[kind](cloud, path)
+    return cloud.total
+
+
+def _write_las(cloud: Cloud, path: Path, *, compress: bool) -> None:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams("sigma_z", "float32"), laspy.ExtraBytesParams("views", "uint16")]
+    )
+    header.scales = np.full(3, _LAS_STEP_M)
+    header.offsets = np.floor(cloud.xyz_m.min(axis=0)).astype(np.float64)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.xyz_m.T.astype(np.float64)
+    # LAS wants the full range of 16 bits.
+    las.intensity = (cloud.intensity * 257).astype(np.uint16)
+    las.sigma_z = cloud.sigma_m
+    las.views = cloud.views.astype(np.uint16)
+    with path.open("wb") as file:
+        las.write(file, do_compress=compress)
+
+
+def _write_pcd(cloud: Cloud, path: Path) -> None:
+    columns = np.column_stack([cloud.xyz_m, cloud.intensity, cloud.sigma_m, cloud.views])
+    fields = ("x", "y", "z", "intensity", "sigma_z", "views")
+    PointCloud.from_points(columns.astype(np.float32), fields, (np.float32,) * 6).save(path)
+
+
+def _write_e57(cloud: Cloud, path: Path) -> None:
+    x, y, z = cloud.xyz_m.T.astype(np.float64)
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw({"cartesianX": x, "cartesianY": y, "cartesianZ": z, "intensity": cloud.intensity})
+
+
+def _write_csv(cloud: Cloud, path: Path) -> None:
+    columns = np.column_stack([cloud.xyz_m, cloud.intensity, cloud.sigma_m, cloud.views])
+    head = "x_m,y_m,z_m,intensity,sigma_m,views"
+    form = ("%.4f", "%.4f", "%.5f", "%d", "%.5f", "%d")
+    np.savetxt(path, columns, form, delimiter=",", header=head, comments="")
+
+
+_WRITERS: dict[str, Callable[[Cloud, Path], None]] = {
+    ".las": lambda cloud, path: _write_las(cloud, path, compress=False),
+    ".laz": lambda cloud, path: _write_las(cloud, path, compress=True),
+    ".pcd": _write_pcd,
+    ".e57": _write_e57,
+    ".csv": _write_csv,
+}
