@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.core.types import LaserProfile, Source
-from barsight.mapping.contours import cut, cut_contours
+from barsight.core.types import Contour, LaserProfile, Source
+from barsight.mapping.contours import cut, cut_contours, smoothed
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import Surface
 from mapping_views import block, fused, view
@@ -114,3 +114,21 @@ def test_coarser_cells(tmp_path: Path, cell_m: float) -> None:
     between = (contour.x_m >= 0) & (contour.x_m <= 59 * cell_m)
     assert between.sum() == round(59 * cell_m / 0.01) + 1
     np.testing.assert_allclose(contour.z_m[between], plane(contour.x_m[between], 0.17), atol=1e-5)
+
+
+def test_the_papers_contour_fills_gaps_and_says_so(tmp_path: Path) -> None:
+    """A plane with a hole of 20 cells and one spike: the plane again, the hole flagged and unsure."""
+    x, y = block(80, 10)
+    hole = (x >= 30) & (x < 50)
+    z = plane(x * CELL_M, y * CELL_M) + np.where(x == 10, 0.02, 0.0)
+    surface = fused([view(x[~hole], y[~hole], z[~hole])], tmp_path, MapSettings(min_views=1, fill_m=0))
+    raw = cut(surface, 0, 0.05)
+    contour = smoothed(raw)
+    np.testing.assert_allclose(contour.z_m[3:-3], plane(contour.x_m[3:-3], 0.05), atol=1e-4)
+    filled = np.isnan(raw.z_m)
+    assert filled.sum() == 20
+    assert (contour.source[filled] == Source.FILLED).all()
+    np.testing.assert_array_equal(contour.source[~filled], raw.source[~filled])
+    assert contour.sigma_m[filled].min() > 0.5 * 0.3 * 0.19
+    lonely = Contour(0, raw.x_m, raw.y_m, np.full_like(raw.z_m, np.nan), raw.sigma_m, raw.source)
+    assert smoothed(lonely) is lonely

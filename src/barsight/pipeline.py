@@ -134,7 +134,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         whole_laser = source.laser()
         # Laser profiles are places in the yard: a map in a frame of its own can't be held against them.
         laser = whole_laser if trajectory.reference == "yard" else ()
-        contours = cut_contours(surface, laser, settings.map.profile_y_m)
+        contours = cut_contours(surface, laser, settings.map.profile_y_m, settings.map.contours)
         by_number = {contour.profile: contour for contour in contours}
         agreed = [agree(by_number[p.profile], p) for p in laser if p.profile in by_number]
 

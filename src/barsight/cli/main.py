@@ -19,7 +19,7 @@ COMMANDS = {
     "info": "Say what is in a recording: sensors, rates, gaps, calibration",
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
     "disparity": "Match one pair of pictures",
-    "bench": "Compare the stereo methods: stereo, subpixel, target-size",
+    "bench": "Compare methods: stereo, subpixel, target-size, yard",
     "calibrate": "Calibrate two cameras from pictures of a board, or an IMU's noise, with a verdict",
     "odometry": "Estimate the trajectory and compare it with truth where there is any",
     "simulate": "Render a recording of a bar yard with exact truth",

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import median_filter
+from scipy.signal import savgol_filter
 
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.types import Contour, LaserProfile, Source
@@ -11,15 +16,19 @@ from barsight.mapping.surface import Surface
 SPACING_M = 0.01
 SAME_Y_M = 0.001
 _JUMP_M = 0.03
+_FILTER_SAMPLES = 5
 
 
 def cut_contours(
-    surface: Surface, laser: tuple[LaserProfile, ...], profile_y_m: tuple[float, ...]
+    surface: Surface,
+    laser: tuple[LaserProfile, ...],
+    profile_y_m: tuple[float, ...],
+    kind: Literal["fused", "paper"] = "fused",
 ) -> tuple[Contour, ...]:
     """A contour at each y asked for; without any at each laser profile; without a laser in the middle.
 
     At a laser profile the samples fall on the laser's own x grid, continued over the whole surface, and the
-    contour has the laser's number; others are numbered on after the laser's.
+    contour has the laser's number; others are numbered on after the laser's. kind: `cut`, or `smoothed` too.
     """
     places = [(p.profile, float(np.median(p.y_m)), float(p.x_m[0])) for p in laser]
     if profile_y_m:
@@ -31,7 +40,8 @@ def cut_contours(
         places = list(dict.fromkeys(asked))
     elif not laser:
         places = [(0, (surface.rows[0] + surface.rows[1] - 1) / 2 * surface.cell_m, 0.0)]
-    return tuple(cut(surface, number, y, phase) for number, y, phase in places)
+    contours = tuple(cut(surface, number, y, phase) for number, y, phase in places)
+    return contours if kind == "fused" else tuple(smoothed(contour) for contour in contours)
 
 
 def cut(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0) -> Contour:
@@ -58,6 +68,30 @@ def cut(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0) -> Con
     sigma = np.stack([layers.sigma_m[c] for c in corners]).astype(np.float64)
     source = np.stack([layers.source[c] for c in corners])
     return Contour(profile, x, np.full(x.shape, y_m), *_blend(z, sigma, source, weights))
+
+
+def smoothed(contour: Contour) -> Contour:
+    """The paper's post-processing [paper 4.4]: median, cubic interpolation where there is no data, filter.
+
+    The paper takes the median over the points that several frames have at one place; those the map has fused
+    already, so it is taken over a sample and its neighbours. Interpolated samples are FILLED with half the
+    step that they bridge as their sigma at the least; at the ends nothing is added. The filter is that of
+    Savitzky and Golay (5 samples, second order), which the paper doesn't name.
+    """
+    known = np.flatnonzero(np.isfinite(contour.z_m))
+    if known.size < _FILTER_SAMPLES:
+        return contour
+    median = median_filter(contour.z_m[known], 3, mode="nearest")
+    inner = np.arange(known[0], known[-1] + 1)
+    z, sigma = np.full_like(contour.z_m, np.nan), contour.sigma_m.copy()
+    z[inner] = savgol_filter(PchipInterpolator(known, median)(inner), _FILTER_SAMPLES, 2)
+    source = contour.source.copy()
+    filled = inner[~np.isfinite(contour.z_m[inner])]
+    after = np.searchsorted(known, filled)
+    step = np.abs(median[after] - median[after - 1])
+    sigma[filled] = np.hypot(step / 2, np.maximum(sigma[known[after]], sigma[known[after - 1]]))
+    source[filled] = Source.FILLED
+    return Contour(contour.profile, contour.x_m, contour.y_m, z, sigma, source)
 
 
 def _blend(z: Float64, sigma: Float64, source: UInt8, weights: Float64) -> tuple[Float64, Float64, UInt8]:

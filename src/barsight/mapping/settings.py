@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from barsight.core.errors import ConfigError
 
@@ -31,6 +32,9 @@ class MapSettings:
     """Points less sure than this are left out."""
     resident_tiles: int = 64
     """Tiles of 256 x 256 cells kept in memory (6 MiB each); the others wait on disk."""
+    contours: Literal["fused", "paper"] = "fused"
+    """fused: the surface as it is, unknown where not seen. paper: its median, cubic interpolation and
+    filter; what it fills is flagged."""
     profile_y_m: tuple[float, ...] = ()
     """Where to cut contours; at the laser's profiles when not given, else in the middle."""
 

@@ -9,18 +9,20 @@ from barsight.motion.crane import CraneSettings, CraneTrajectory
 from barsight.motion.estimator import TrajectoryEstimator
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
 from barsight.motion.odometry import OdometrySettings, StereoOdometry
+from barsight.motion.stitching import PaperStitching, StitchingSettings
 
 
 @dataclass(frozen=True)
 class MotionSettings:
     """The trajectory."""
 
-    estimator: Literal["fused", "crane", "odometry"] = "fused"
+    estimator: Literal["fused", "crane", "odometry", "paper"] = "fused"
     """fused: all sensors in one estimate. crane: encoders, nominal attitude and the gyro's sway, no picture.
-    odometry: frame to frame from the pictures alone, for comparison."""
+    odometry: frame to frame from the pictures alone, for comparison. paper: the paper's stitching by SVD."""
     fusion: FusionSettings = field(default_factory=FusionSettings)
     crane: CraneSettings = field(default_factory=CraneSettings)
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    stitching: StitchingSettings = field(default_factory=StitchingSettings)
 
 
 def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
@@ -32,3 +34,5 @@ def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
             return CraneTrajectory(settings.crane)
         case "odometry":
             return StereoOdometry(settings.odometry)
+        case "paper":
+            return PaperStitching(settings.stitching, settings.odometry, settings.crane)

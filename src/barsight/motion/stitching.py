@@ -1,0 +1,142 @@
+"""The paper's stitching: each frame is tied to the one before by the SVD of matched points. For comparison.
+
+Its errors add up along the way, and its homography throws away what lies off the dominant plane; our own
+estimate does neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Bool, Int64
+from barsight.core.errors import ConfigError, Failed
+from barsight.core.pose import Pose
+from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
+from barsight.features.guided import project_stereo
+from barsight.features.matching import match_mutual
+from barsight.features.patches import patch_pair
+from barsight.motion.crane import CraneSettings, CraneTrajectory
+from barsight.motion.gravity import level_attitude
+from barsight.motion.odometry import OdometrySettings, StereoOdometry, View, _carried, _in_world
+from barsight.recording.base import Recording
+from barsight.registration.rigid import Alignment, align
+
+
+@dataclass(frozen=True)
+class StitchingSettings:
+    """The paper's stitching."""
+
+    homography_px: float = 3.0
+    """Matches further off the common homography than this are left out."""
+    trend_px: float = 25.0
+    """Matches further off the motion that crane and IMU predict than this are left out."""
+    least_matches: int = 12
+    """A frame with fewer matches is refused."""
+
+    def __post_init__(self) -> None:
+        if min(self.homography_px, self.trend_px) <= 0 or self.least_matches < 4:
+            raise ConfigError("the stitching's tolerances must be positive and least_matches at least 4")
+
+
+@dataclass(frozen=True)
+class PaperStitching:
+    """`TrajectoryEstimator`: mutual ORB matches by Hamming distance [paper Eq. 6], filtered by one homography
+    [paper Eq. 7] and by the predicted motion where the crane tells it, chained by SVD [paper Eq. 13-20].
+
+    The first frame stands where the crane says (`yard`), else levelled at the origin (`world`).
+    """
+
+    settings: StitchingSettings
+    features: OdometrySettings
+    crane: CraneSettings
+
+    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
+        """Frames without enough matches are refused; the next one is tied to the last good one."""
+        predicted = self._predicted(recording, rectifier)
+        look = StereoOdometry(self.features).look
+        placed: list[PosedFrame] = []
+        refused: list[RefusedFrame] = []
+        last: tuple[int, View] | None = None
+        noise = np.diag([1e-12] * 6)
+        for frame in recording.frames():
+            advance()
+            if isinstance(frame, RefusedFrame):
+                refused.append(frame)
+                continue
+            pair = rectifier(frame)
+            view = pair if isinstance(pair, Failed) else look(patch_pair(pair))
+            if isinstance(view, Failed):
+                refused.append(RefusedFrame(frame.stamp_ns, view.reason))
+                continue
+            if last is None:
+                first = predicted.get(frame.stamp_ns)
+                if predicted and first is None:
+                    refused.append(RefusedFrame(frame.stamp_ns, "the encoders don't cover the first frame"))
+                    continue
+                pose = level_attitude(recording).world_from_body if first is None else first
+            else:
+                trend = _between(predicted.get(last[0]), predicted.get(frame.stamp_ns), rectifier)
+                step = self._step(last[1], view, rectifier.camera, trend)
+                if isinstance(step, Failed):
+                    refused.append(RefusedFrame(frame.stamp_ns, step.reason))
+                    continue
+                old = placed[-1].reference_from_body
+                old_rect0 = old @ rectifier.body_from_rect0
+                new_rect0 = old_rect0 @ step.target_from_source
+                pose = new_rect0 @ rectifier.body_from_rect0.inverse()
+                added = _in_world(step.covariance, old_rect0.rotation)
+                lever = pose.translation - new_rect0.translation
+                noise = _carried(noise, pose.translation - old.translation) + _carried(added, lever)
+            placed.append(PosedFrame(frame.stamp_ns, pose, noise))
+            last = frame.stamp_ns, view
+        reference = "yard" if predicted else "world"
+        sensors = ("stereo", "crane") if predicted else ("stereo",)
+        return Trajectory(reference, tuple(placed), tuple(refused), sensors)
+
+    def _predicted(self, recording: Recording, rectifier: Rectifier) -> dict[int, Pose]:
+        if recording.crane() is None:
+            return {}
+        trajectory = CraneTrajectory(self.crane)(recording, rectifier, lambda: None)
+        return {frame.stamp_ns: frame.reference_from_body for frame in trajectory.frames}
+
+    def _step(self, old: View, new: View, camera: RectifiedCamera, trend: Pose | None) -> Alignment | Failed:
+        pairs = match_mutual(old.features, new.features)
+        if len(pairs) >= self.settings.least_matches:
+            kept = self._on_plane(old, new, pairs) & self._on_trend(old, new, pairs, camera, trend)
+            pairs = pairs[kept]
+        if len(pairs) < self.settings.least_matches:
+            return Failed("no-matches", f"only {len(pairs)} matches with the frame before agree")
+        return align(new.points[pairs[:, 1]], old.points[pairs[:, 0]], ("rect0", "rect0"))
+
+    def _on_plane(self, old: View, new: View, pairs: Int64) -> Bool:
+        cv2.setRNGSeed(1)
+        _, inliers = cv2.findHomography(
+            old.features.pixels[pairs[:, 0]], new.features.pixels[pairs[:, 1]], cv2.RANSAC,
+            self.settings.homography_px,
+        )  # fmt: skip
+        if inliers is None:
+            return np.zeros(len(pairs), np.bool_)
+        agreeing: Bool = inliers.ravel().astype(np.bool_)
+        return agreeing
+
+    def _on_trend(
+        self, old: View, new: View, pairs: Int64, camera: RectifiedCamera, trend: Pose | None
+    ) -> Bool:
+        if trend is None:
+            return np.ones(len(pairs), np.bool_)
+        expected = project_stereo(trend.apply(old.points[pairs[:, 0]]), camera)[:, :2]
+        off = np.linalg.norm(expected - new.features.pixels[pairs[:, 1]], axis=1)
+        near: Bool = off <= self.settings.trend_px
+        return near
+
+
+def _between(old: Pose | None, new: Pose | None, rectifier: Rectifier) -> Pose | None:
+    """new_from_old of `rect0`, from two body poses."""
+    if old is None or new is None:
+        return None
+    return (new @ rectifier.body_from_rect0).inverse() @ (old @ rectifier.body_from_rect0)
