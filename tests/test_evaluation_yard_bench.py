@@ -1,0 +1,43 @@
+"""bench yard on a tiny rendered yard: a row per method, each what its folder scores."""
+
+import json
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from barsight.cli.bench_yard import Method
+from barsight.cli.main import run
+from barsight.evaluation.yard_bench import VARIANTS
+from barsight.simulation.simulate import simulate
+from cli_runs import TINY
+
+
+def test_every_method_can_be_asked_for() -> None:
+    assert tuple(VARIANTS) == get_args(Method)
+    assert VARIANTS["ours"] == ()
+
+
+def test_a_row_per_method(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    recording, saved = tmp_path / "yard", tmp_path / "bench.json"
+    simulate(recording, TINY)
+    flags = ["--methods", "sgbm", "paper", "--recording", str(recording), "--json", str(saved)]
+    assert run(["bench", "yard", *flags]) == 0
+    printed = capsys.readouterr().out
+    content = json.loads(saved.read_text())
+    rows = {row["method"]: row for row in content["rows"]}
+    assert list(rows) == ["sgbm", "paper"]
+    assert abs(content["laser_bias_mm"]) < 0.3
+    assert 0.6 < content["laser_mae_mm"] < 1.0  # 1 mm of noise
+    for row in rows.values():
+        assert row["smooth"]["mae_mm"] > 0
+        assert f"{row['smooth']['mae_mm']:.1f}" in printed
+    assert rows["sgbm"]["heights"] != rows["paper"]["heights"]
+
+
+def test_a_recording_without_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["bench", "yard", "--recording", str(tmp_path)]) == 3
+    assert capsys.readouterr().err.count("\n") == 1
