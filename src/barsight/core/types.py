@@ -177,11 +177,44 @@ class PosedFrame:
         expect_shape("covariance", self.covariance, (6, 6))
 
 
+@dataclass(frozen=True, eq=False)
+class RigDrift:
+    """What the motion shows of the rig against its calibration.
+
+    yaw_rad: how far cam1 has turned about `rect0`'s y axis. scale: by which share the baseline is longer than
+    calibrated, if the encoders' metre is right. covariance: (2, 2) of both. prior_sigma: (2,) what was held
+    possible before. range_m: the points' median depth. by_encoders: whether a known way was there.
+    """
+
+    yaw_rad: float
+    scale: float
+    covariance: Float64
+    prior_sigma: Float64
+    baseline_m: float
+    range_m: float
+    by_encoders: bool
+
+    @property
+    def yaw_sigma_rad(self) -> float:
+        """One standard deviation of the yaw."""
+        return float(self.covariance[0, 0] ** 0.5)
+
+    @property
+    def scale_sigma(self) -> float:
+        """One standard deviation of the scale."""
+        return float(self.covariance[1, 1] ** 0.5)
+
+    def depth_error_m(self, range_m: float) -> float:
+        """What the yaw adds to a depth of `range_m` straight ahead if nothing is done about it."""
+        return -self.yaw_rad * range_m**2 / self.baseline_m
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Poses of the frames that could be placed, in time's order, and the refused ones.
 
     reference: `yard` or `world`. sensors: which were used. warnings: sentences for the result.
+    drift: of the rig, where the estimate sees it.
     """
 
     reference: str
@@ -189,6 +222,7 @@ class Trajectory:
     refused: tuple[RefusedFrame, ...]
     sensors: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    drift: RigDrift | None = None
 
     @property
     def stamp_ns(self) -> Int64:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE, ImuBias
@@ -21,6 +21,9 @@ from barsight.motion.odometry import StereoOdometry
 from barsight.motion.prediction import CranePredictor
 from barsight.motion.sightings import FrontEndSettings, Sighting, follow
 from barsight.recording.base import Recording
+
+if TYPE_CHECKING:
+    from barsight.motion.graph import Estimate
 
 SENSORS = ("stereo", "imu", "crane")
 PLACE_SPACING_S = 0.4
@@ -36,8 +39,10 @@ class FusionSettings:
     """Sensors to use where the recording has them: any of stereo, imu, crane, with commas."""
     front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
     calibration_sigma_px: float = 0.1
-    """How far the disparity may be off as calibrated (1 sigma); it is estimated too. 0 takes it as exact."""
-
+    """How far a yaw between the cameras may move the disparity (1 sigma); the yaw is estimated too. 0 takes
+    the calibration as exact."""
+    scale_sigma: float = 5e-4
+    """By which share baseline and encoders may disagree (1 sigma); that is estimated too."""
     systematic_attitude_deg: float = 0.012
     """Attitude error (1 sigma, each axis) that more pictures don't average out: highlights that wander over
     round bars, and the cameras' mounting on the body."""
@@ -48,6 +53,8 @@ class FusionSettings:
             raise ConfigError(f"use is {self.use!r}; name stereo or crane, and imu if wanted, with commas")
         if self.calibration_sigma_px < 0 or self.systematic_attitude_deg < 0:
             raise ConfigError("calibration_sigma_px and systematic_attitude_deg can't be negative")
+        if not 0 < self.scale_sigma <= 0.1:
+            raise ConfigError(f"scale_sigma must lie over 0 and up to 0.1, not {self.scale_sigma}")
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -89,18 +96,18 @@ class FusedTrajectory:
             return self._simple(recording, rectifier, inputs)
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
-            estimate_poses, covariance = self._solve(recording, rectifier, inputs, nodes, shift)
+            estimate = self._solve(recording, rectifier, inputs, nodes, shift)
         except RuntimeError as error:  # GTSAM's word for a system that the measurements leave undetermined
             simple = self._simple(recording, rectifier, inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             return replace(simple, warnings=(*simple.warnings, f"{reason}: estimated one by one"))
         placed = tuple(
-            PosedFrame(int(stamp), estimate_poses[k], covariance[k])
+            PosedFrame(int(stamp), estimate.poses[k], estimate.covariance[k])
             for stamp, k in zip(frames, nodes.frame, strict=True)
         )
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
-        return Trajectory(self._reference(inputs), placed, tuple(refused), sensors, warnings)
+        return Trajectory(self._reference(inputs), placed, tuple(refused), sensors, warnings, estimate.drift)
 
     def _simple(self, recording: Recording, rectifier: Rectifier, inputs: _Inputs) -> Trajectory:
         """Without a graph: the encoders' trajectory, or frame to frame."""
@@ -132,7 +139,7 @@ class FusedTrajectory:
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
-    ) -> tuple[tuple[Pose, ...], Float64]:
+    ) -> Estimate:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
         from barsight.motion.graph import solve
         from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
@@ -172,13 +179,13 @@ class FusedTrajectory:
         problem = Problem(
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, tuple(placed),
             tuple(attitudes), ties.still, ImuBias(ties.gyro_bias_radps, np.zeros(3)),
-            offset_prior_px=self.settings.calibration_sigma_px,
+            offset_prior_px=self.settings.calibration_sigma_px, scale_prior=self.settings.scale_sigma,
         )  # fmt: skip
         estimate = solve(problem)
         shared = np.zeros((6, 6))
         if inputs.sightings:
             shared[:3, :3] = np.eye(3) * np.deg2rad(self.settings.systematic_attitude_deg) ** 2
-        return estimate.poses, estimate.covariance + shared
+        return replace(estimate, covariance=estimate.covariance + shared)
 
 
 def _silent() -> None:

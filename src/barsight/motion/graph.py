@@ -12,38 +12,26 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
-from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.pose import Pose
+from barsight.core.types import RigDrift
 from barsight.inertial.model import ImuBias
+from barsight.motion import rig_drift
 from barsight.motion.problem import Problem, StereoSightings
 
-HUBER_SIGMAS = 2.2
-"""For the length of three whitened numbers, of which 19 % are longer; 1.345 is for one."""
 FARTHEST_OUTLIER_SIGMAS = 3.5
-OFFSET_TRIAL_PX = 0.1
-SECANT_STEPS = 4
-LEAST_STEP_PX = 0.005
+MOST_DRIFT_STEPS = 5
+LEAST_STEP_SIGMAS = 0.3
 LEAST_SIGHTINGS = 2
 LEAST_FACTOR = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class Offset:
-    """What the right picture's columns are off by against the calibration, px, and its sigma.
-
-    It makes every depth and every step too long or too short alike; the yaw between the cameras does it.
-    """
-
-    disparity_px: float
-    sigma_px: float
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """poses: (M,). covariance: (M, 6, 6) rotation then translation, reference axes. velocity_mps: (M, 3) or
     None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
+    drift: of the rig, None where no picture was used or the calibration is taken as exact.
     """
 
     poses: tuple[Pose, ...]
@@ -51,66 +39,73 @@ class Estimate:
     velocity_mps: Float64 | None
     biases: tuple[ImuBias, ...]
     pixel_sigma_px: float
-    offset: Offset
+    drift: RigDrift | None
     used: Bool
 
 
 def solve(problem: Problem) -> Estimate:
-    """After a first solution sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was seen;
-    then the disparity
-    offset is sought: at the best poses for a given offset the cost's slope along it is that of the residuals
-    alone, so two solutions give the secant step, its curvature the offset's sigma, and the difference of
-    their poses how the offset moves the trajectory.
+    """After a first solution, drift of the rig included, sightings beyond 3.5 sigma leave and all sigmas
+    grow or shrink to what was seen; then the drift is sought on and weighed against its prior. (A cut before
+    the drift is known would take the very sightings that show it best.)
     """
     seen = problem.sightings
-    offset = Offset(0.0, 0.0)
     used = np.ones(0 if seen is None else len(seen.node), np.bool_)
     if seen is not None:
         used = _often(seen, used)
-    values, graph = _optimised(problem, _start(problem), used, 0.0)
-    swing = np.zeros((len(problem.start), 6))
+    theta = np.zeros(2)
+    values, graph = _optimised(problem, _start(problem), used, _shift(problem, theta))
+    swing = np.zeros((len(problem.start), 6, 2))
+    drift: RigDrift | None = None
     if seen is not None and used.any():
-        residual = _residuals(values, seen, used, 0.0)
+        if problem.placed and problem.offset_prior_px > 0:
+            values, graph, theta, _ = _seek_drift(problem, values, graph, used, theta, 1)
+        residual = _residuals(values, seen, used, _shift(problem, theta))
         share = np.abs(residual) / seen.sigma_px[:, None]
         factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])))
         used = _often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
-        seen = replace(seen, sigma_px=factor * seen.sigma_px)
-        problem = replace(problem, sightings=seen)
-        values, graph = _optimised(problem, values, used, 0.0)
+        problem = replace(problem, sightings=replace(seen, sigma_px=factor * seen.sigma_px))
+        values, graph = _optimised(problem, values, used, _shift(problem, theta))
         if problem.offset_prior_px > 0 and used.any():
-            values, graph, offset, swing = _with_offset(problem, values, used)
+            # Encoders that contradict the scale pull with Huber's weights at first: more steps than one.
+            steps = MOST_DRIFT_STEPS if problem.placed else 1
+            values, graph, theta, shown = _seek_drift(problem, values, graph, used, theta, steps)
+            drift, swing = rig_drift.weigh(theta, shown.covariance, problem), shown.swing
+            shift = _shift(problem, np.array([drift.yaw_rad, drift.scale]))
+            values, graph = _optimised(problem, values, used, shift)
     poses = _poses(values, problem)
-    covariance = _covariances(graph, values, poses)
-    covariance += offset.sigma_px**2 * swing[:, :, None] * swing[:, None, :]
-    return _estimate(problem, values, poses, covariance, offset, used)
+    covariance = _covariances(graph, values, poses, swing, drift)
+    return _estimate(problem, values, poses, covariance, drift, used)
 
 
-def _with_offset(problem: Problem, values: Any, used: Bool) -> tuple[Any, Any, Offset, Float64]:
-    """The disparity offset by secant steps, the values with it, and (M, 6) how the poses move with it per px.
-
-    One step does without encoders; those that contradict the scale pull with Huber's weights at first, so
-    that the curvature is only right near the end.
-    """
-    old, old_slope, old_poses = 0.0, _slope(values, problem, used, 0.0), _poses(values, problem)
-    new = -float(np.sign(old_slope)) * OFFSET_TRIAL_PX
-    curvature, swing = 1e-6, np.zeros((len(old_poses), 6))
-    for _ in range(SECANT_STEPS if problem.placed else 1):
-        values, _ = _optimised(problem, values, used, new)
-        slope, poses = _slope(values, problem, used, new), _poses(values, problem)
-        curvature = max((slope - old_slope) / (new - old), 1e-6)
-        swing = np.array([_difference(a, b) for a, b in zip(old_poses, poses, strict=True)]) / (new - old)
-        step = float(np.clip(-slope / curvature, -0.5, 0.5))
-        old, old_slope, old_poses = new, slope, poses
-        new = new + step
-        if abs(step) < LEAST_STEP_PX:
+def _seek_drift(
+    problem: Problem, values: Any, graph: Any, used: Bool, theta: Float64, steps: int
+) -> tuple[Any, Any, Float64, rig_drift.Seen]:
+    """Values, graph and the rig's drift by Gauss-Newton from `theta`, and how it was last seen."""
+    seen = problem.sightings
+    assert seen is not None
+    for _ in range(steps):
+        residual = _residuals(values, seen, used, _shift(problem, theta))
+        shown = rig_drift.look(graph.linearize(values), problem, residual, used)
+        theta = theta + shown.step
+        values, graph = _optimised(problem, values.retract(shown.others), used, _shift(problem, theta))
+        if (np.abs(shown.step) < LEAST_STEP_SIGMAS * np.sqrt(np.diag(shown.covariance))).all():
             break
-    offset = _offset(new, 1 / curvature, problem)
-    values, graph = _optimised(problem, values, used, offset.disparity_px)
-    return values, graph, offset, swing
+    return values, graph, theta, shown
+
+
+def _shift(problem: Problem, theta: Float64) -> Float64:
+    """(N,) px by which a drift moves the sightings' right columns."""
+    seen = problem.sightings
+    return np.zeros(0) if seen is None else rig_drift.columns(seen) @ theta
 
 
 def _estimate(
-    problem: Problem, values: Any, poses: tuple[Pose, ...], covariance: Float64, offset: Offset, used: Bool
+    problem: Problem,
+    values: Any,
+    poses: tuple[Pose, ...],
+    covariance: Float64,
+    drift: RigDrift | None,
+    used: Bool,
 ) -> Estimate:
     velocity: Float64 | None = None
     biases: tuple[ImuBias, ...] = ()
@@ -120,18 +115,18 @@ def _estimate(
         found = [values.atConstantBias(B(k)) for k in nodes]
         biases = tuple(ImuBias(np.array(b.gyroscope()), np.array(b.accelerometer())) for b in found)
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
-    return Estimate(poses, covariance, velocity, biases, sigma, offset, used)
+    return Estimate(poses, covariance, velocity, biases, sigma, drift, used)
 
 
-def _optimised(problem: Problem, values: Any, used: Bool, offset_px: float) -> tuple[Any, Any]:
-    """The values that fit best, and the graph."""
+def _optimised(problem: Problem, values: Any, used: Bool, shift_px: Float64) -> tuple[Any, Any]:
+    """The values that fit best, and the graph. shift_px: (N,) of each sighting's right column."""
     graph = gtsam.NonlinearFactorGraph()
     _add_priors(graph, problem)
     if problem.has_imu:
         _add_imu(graph, problem)
     if problem.sightings is not None:
         _add_points(values, problem.sightings, used)
-        _add_stereo(graph, problem.sightings, used, offset_px)
+        _add_stereo(graph, problem.sightings, used, shift_px)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(25)
     parameters.setRelativeErrorTol(1e-5)
@@ -139,38 +134,9 @@ def _optimised(problem: Problem, values: Any, used: Bool, offset_px: float) -> t
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize(), graph
 
 
-def _slope(values: Any, problem: Problem, used: Bool, offset_px: float) -> float:
-    """The cost's derivative by the disparity offset, per px."""
-    seen = problem.sightings
-    assert seen is not None
-    residual = _residuals(values, seen, used, offset_px)[used] / seen.sigma_px[used, None]
-    size = np.linalg.norm(residual, axis=1)
-    weight = np.minimum(1.0, HUBER_SIGMAS / np.maximum(size, 1e-9))
-    return -float((weight * residual[:, 2] / seen.sigma_px[used]).sum())
-
-
-def _offset(best_px: float, variance: float, problem: Problem) -> Offset:
-    """The seen offset weighed against the calibration's.
-
-    What rectification leaves differs from place to place in the picture. Near points lie low and far ones
-    high, so that passes for an offset as large as itself; only encoders, which know the way, are above that.
-    """
-    prior = problem.offset_prior_px**2
-    if not problem.placed:
-        variance += prior
-    share = prior / (prior + variance)
-    return Offset(float(np.clip(share * best_px, -1.0, 1.0)), float((share * variance) ** 0.5))
-
-
 def _poses(values: Any, problem: Problem) -> tuple[Pose, ...]:
     target = problem.start[0].target
     return tuple(_pose(values.atPose3(X(k)), target) for k in range(len(problem.start)))
-
-
-def _difference(old: Pose, new: Pose) -> Float64:
-    """(6,) rotation vector and translation from old to new, reference axes."""
-    turn = Rotation.from_matrix(new.rotation @ old.rotation.T).as_rotvec()
-    return np.concatenate([turn, new.translation - old.translation])
 
 
 def _gtsam_pose(pose: Pose) -> Any:
@@ -186,7 +152,9 @@ def _sigmas(*sigmas: float) -> Any:
 
 
 def _robust(model: Any) -> Any:
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS), model)
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(rig_drift.HUBER_SIGMAS), model
+    )
 
 
 def _start(problem: Problem) -> Any:
@@ -265,7 +233,7 @@ def _add_points(values: Any, seen: StereoSightings, used: Bool) -> None:
             values.insert(key, values.atPose3(X(int(seen.node[k]))).transformFrom(points[k]))
 
 
-def _add_stereo(graph: Any, seen: StereoSightings, used: Bool, offset_px: float) -> None:
+def _add_stereo(graph: Any, seen: StereoSightings, used: Bool, shift_px: Float64) -> None:
     camera = seen.camera
     calibration = gtsam.Cal3_S2Stereo(
         camera.focal_px, camera.focal_px, 0.0, camera.cx_px, camera.cy_px, camera.baseline_m
@@ -274,12 +242,12 @@ def _add_stereo(graph: Any, seen: StereoSightings, used: Bool, offset_px: float)
     for k in np.flatnonzero(used):
         model = _robust(gtsam.noiseModel.Isotropic.Sigma(3, seen.sigma_px[k]))
         u, v, right = seen.stereo[k]
-        measured = gtsam.StereoPoint2(u, right - camera.doffs_px - offset_px, v)
+        measured = gtsam.StereoPoint2(u, right - camera.doffs_px - shift_px[k], v)
         node, track = X(int(seen.node[k])), L(int(seen.track[k]))
         graph.add(gtsam.GenericStereoFactor3D(measured, model, node, track, calibration, mounted))
 
 
-def _residuals(values: Any, seen: StereoSightings, used: Bool, offset_px: float) -> Float64:
+def _residuals(values: Any, seen: StereoSightings, used: Bool, shift_px: Float64) -> Float64:
     """(N, 3) px, 0 where unused."""
     residual = np.zeros((len(used), 3))
     camera = seen.camera
@@ -289,16 +257,20 @@ def _residuals(values: Any, seen: StereoSightings, used: Bool, offset_px: float)
         rect0_from_world = (_pose(values.atPose3(X(node)), "world") @ seen.body_from_rect0).inverse()
         x, y, z = rect0_from_world.apply(points).T
         u, v = camera.focal_px * x / z + camera.cx_px, camera.focal_px * y / z + camera.cy_px
-        right = u - camera.focal_px * camera.baseline_m / z + camera.doffs_px + offset_px
+        right = u - camera.focal_px * camera.baseline_m / z + camera.doffs_px + shift_px[rows]
         residual[rows] = seen.stereo[rows] - np.column_stack([u, v, right])
     return residual
 
 
-def _covariances(graph: Any, values: Any, poses: tuple[Pose, ...]) -> Float64:
+def _covariances(
+    graph: Any, values: Any, poses: tuple[Pose, ...], swing: Float64, drift: RigDrift | None
+) -> Float64:
     marginals = gtsam.Marginals(graph, values)
+    shared = np.zeros((2, 2)) if drift is None else drift.covariance
     result = np.zeros((len(poses), 6, 6))
     for k, pose in enumerate(poses):
         turned = np.zeros((6, 6))
         turned[:3, :3] = turned[3:, 3:] = pose.rotation
-        result[k] = turned @ marginals.marginalCovariance(X(k)) @ turned.T
+        own = marginals.marginalCovariance(X(k)) + swing[k] @ shared @ swing[k].T
+        result[k] = turned @ own @ turned.T
     return result

@@ -63,7 +63,14 @@ class Problem:
     gyro_bias_sigma_radps: float = 0.02
     accel_bias_sigma_mps2: float = 0.1
     offset_prior_px: float = 0.1
-    """How far the disparity may be off as calibrated (1 sigma); 0 takes it as exact."""
+    """How far a yaw between the cameras may move the disparity (1 sigma); 0 takes it as exact."""
+    scale_prior: float = 5e-4
+    """By which share baseline and encoders may disagree (1 sigma)."""
+
+    @property
+    def sees_scale(self) -> bool:
+        """Whether encoders say how long the way is."""
+        return bool(self.placed)
 
     @property
     def has_imu(self) -> bool:
