@@ -94,7 +94,9 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
     yaw_prior = SERVICE_RAD if problem.placed else problem.offset_prior_px / focal
     prior = np.array([yaw_prior, problem.scale_prior]) ** 2
-    floor = _floor(disparity, focal) if problem.placed else np.diag([prior[0], 0.0])
+    floor = _floor(disparity, focal)
+    if not problem.placed:
+        floor[0, 0] += prior[0]
     information = np.linalg.inv(covariance + floor)
     combined = np.linalg.inv(information + np.diag(1 / prior))
     yaw, scale = combined @ information @ theta
