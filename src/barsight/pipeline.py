@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.parallel import ordered_map
@@ -24,6 +25,7 @@ from barsight.core.settings import expect_numbers
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame
 from barsight.evaluation.agreement import agree
+from barsight.kept import keeping_folder, once
 from barsight.mapping.contours import cut_contours
 from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
@@ -67,9 +69,17 @@ class MeasureSettings:
         expect_numbers(asdict(self))
 
 
-def measure(recording: Recording, settings: MeasureSettings, scratch: Path, advance: Advance) -> Measurement:
+def measure(
+    recording: Recording,
+    settings: MeasureSettings,
+    scratch: Path,
+    advance: Advance,
+    resume: Path | None = None,
+) -> Measurement:
     """Measure a recording. `scratch` is an empty folder for the map's tiles; the caller removes it.
 
+    resume: a folder that keeps the trajectory and each frame's view (about 30 MB for 1.3 megapixels), so that
+    a killed run goes on where it was; the caller removes it when all is written.
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
     """
@@ -83,10 +93,15 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         hints = imu_hints(imu) if imu is not None else ()
         cell_m = settings.map.cell_m or choose_cell(first, has_crane=source.crane() is not None)
     total = len(source.index.stamps_ns)
+    configuration, inputs = plain(asdict(settings)), source.digests()
+    kept = None
+    if resume is not None:
+        kept = keeping_folder(resume, digest([barsight.__version__, configuration, inputs]))
 
     with watch("trajectory", total):
         estimate = make_estimator(settings.motion)
-        trajectory = estimate(source, rectifier, _counter("trajectory", total, advance))
+        count = _counter("trajectory", total, advance)
+        trajectory = once(kept, "trajectory", lambda: estimate(source, rectifier, count))
 
     poses = {frame.stamp_ns: frame for frame in trajectory.frames}
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
@@ -102,7 +117,7 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
         frame, posed = placed
         if isinstance(frame, RefusedFrame):
             return Refusal("recording", frame)
-        view = viewer(frame, posed)
+        view = once(kept, f"view_{frame.stamp_ns}", lambda: viewer(frame, posed))
         if isinstance(view, Failed):
             return Refusal("stereo", RefusedFrame(frame.stamp_ns, view.reason))
         return view
@@ -157,14 +172,13 @@ def measure(recording: Recording, settings: MeasureSettings, scratch: Path, adva
     frames_total = total + len(source.index.unpaired)
     if refusals:
         warnings.append(Notice("frames-refused", f"{len(refusals)} of {frames_total} frames were refused"))
-    configuration = plain(asdict(settings))
     return Measurement(
         recording_path=source.path,
         recording_format=source.format,
         is_simulated=source.is_simulated,
         calibration_hash=digest(plain(asdict(source.rig))),
         configuration_hash=digest(configuration),
-        input_hashes=source.digests(),
+        input_hashes=inputs,
         configuration=configuration,
         trajectory=trajectory,
         frames_total=frames_total,

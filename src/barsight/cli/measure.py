@@ -34,6 +34,7 @@ def run(arguments: Sequence[str]) -> None:
         settings: Annotated[MeasureSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
         overwrite: bool = False,
+        resume: bool = False,
         verbose: Annotated[bool, tyro.conf.arg(aliases=("-v",))] = False,
     ) -> None:
         """Measure a stereo recording into OUT: map, contours, trajectory, cloud and report.html.
@@ -47,11 +48,12 @@ def run(arguments: Sequence[str]) -> None:
             out: The folder for the results.
             settings: Settings of the stages.
             config: TOML file with settings; flags go before it.
+            resume: Keep what is done beside OUT until the end; a killed run started again with it goes on.
             overwrite: Replace the result files of an earlier run in OUT.
             verbose: Print the time that each stage took.
         """
         console = Console(stderr=True)
-        measured = measure_into(recording, out, settings, console, overwrite=overwrite)
+        measured = measure_into(recording, out, settings, console, overwrite=overwrite, resume=resume)
         print_outcome(measured, console, verbose=verbose)
         console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
 
@@ -65,20 +67,23 @@ def measure_into(
     console: Console,
     *,
     overwrite: bool = False,
+    resume: bool = False,
     truth_of: Path | None = None,
 ) -> dict[str, Any]:
     """Measure, write all files and the report into `out`, and return what result.json says.
 
+    resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
     truth_of: a recording with truth to score against; only after the measuring is done.
     """
     if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     recording = open_recording(path, settings.recording)
+    keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
         with stages(console) as advance:
-            measured = measure(recording, settings, scratch, advance)
+            measured = measure(recording, settings, scratch, advance, keep)
         content = summary(measured)
         write_results(measured, staging)
         shutil.rmtree(scratch)
@@ -86,6 +91,8 @@ def measure_into(
             content["truth"] = score(truth_of, staging)
         write_summary(content, staging / "result.json")
         write_report(staging, staging / "report.html")
+    if keep is not None:
+        shutil.rmtree(keep, ignore_errors=True)
     return content
 
 
