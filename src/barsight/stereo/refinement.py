@@ -17,14 +17,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
+from barsight.stereo.sgbm import image_noise
 from barsight.stereo.spline import row_coefficients, value_and_slope
-from barsight.stereo.supports import SupportShape, axis_means, fit_planes, tile_axes
+from barsight.stereo.supports import SupportShape, axis_means, curvature_across, fit_planes, tile_axes
 
 _BLUR_PX = 0.5
 _FIRST_BLUR_PX = 0.7
@@ -40,6 +42,10 @@ _HOLD_UNMATCHED = np.float32(0.02)
 _SUPPORT = np.float32(0.5 * 2.15)
 """Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
 and the noise in the gradients cost: measured on rendered planes."""
+_MOST_UNDAMPED = np.float32(1.5)
+_SPREAD_ACROSS_PX2 = np.float32(3)
+"""Mean square distance across the axis that the supports average over: their own and the axis' error."""
+_SAG_WINDOW_PX = 11
 _LEAST_INFORMATION = np.float32(0.5)
 
 
@@ -91,22 +97,30 @@ def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: R
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
     axes = tile_axes(left.astype(np.float32))
     usable = matched.astype(np.float32)
+    noise = 0.5 * (image_noise(left) ** 2 + image_noise(right) ** 2)
     disparity, variance = start, np.full_like(start, np.inf)
     for step in range(settings.steps):
         remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
         blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
         left_grey, right_grey = _smooth(left, blur_px), _smooth(right, blur_px)
         warped, right_slope = value_and_slope(row_coefficients(right_grey), disparity)
-        slope = _own_slope(row_coefficients(left_grey))
+        slope, slope_noise = _own_slope(row_coefficients(left_grey)), noise * _slope_gain(blur_px)
         if remaining > 0:
-            slope = (slope + right_slope) * np.float32(0.5)
+            slope, slope_noise = (slope + right_slope) * np.float32(0.5), 0.5 * slope_noise
         residual = _residual(left_grey, warped, usable, settings.window_px)
         trust = usable / (1 + np.square(residual / np.float32(settings.outlier_grey)))
         weight, pull = _evidence(residual, slope, trust, axes, settings)
+        short_of = _undamped(weight, trust, slope_noise, settings.window_px)
+        if remaining > 0:
+            pull *= short_of
         power = _power(weight, pull, usable, settings.window_px)
         weight += _HOLD * (usable + _HOLD_UNMATCHED)
         fitted, variance = _fit(disparity, weight, pull, power, usable, axes, settings)
-        disparity = disparity + np.clip(fitted - disparity, -_LONGEST_STEP_PX, _LONGEST_STEP_PX)
+        sagged = _sag(fitted, axes)
+        move = np.clip(fitted - sagged - disparity, -_LONGEST_STEP_PX, _LONGEST_STEP_PX)
+        disparity = disparity + move
+        # What the last step fell short of, and half of what was put right for curvature, may still be wrong.
+        variance = variance + np.square((short_of - 1) * move) + np.float32(0.25) * np.square(sagged)
     return Refined(disparity, variance)
 
 
@@ -118,6 +132,34 @@ def _smooth(image: UInt8, blur_px: float) -> Float32:
 def _own_slope(coefficients: Float32) -> Float32:
     slope: Float32 = (coefficients[:, 2:-1] - coefficients[:, :-3]) * np.float32(0.5)
     return slope
+
+
+def _undamped(weight: Float32, trust: Float32, slope_noise: float, side: int) -> Float32:
+    """(H, W) what a step must be multiplied by: noise in the slopes adds to the weights and nothing to the
+    pulls, so that each step falls short by its share of the weights. At most 1.5, where a step may still not
+    overshoot by more than half.
+    """
+    spurious = np.float32(slope_noise) * _mean(trust, side)
+    mean_weight = _mean(weight, side)
+    factor: Float32 = mean_weight / np.maximum(mean_weight - spurious, mean_weight / _MOST_UNDAMPED + np.float32(1e-6))
+    return factor
+
+
+def _sag(fitted: Float32, axes: Float32) -> Float32:
+    """(H, W) what a plane over the support takes off a surface that is round across the axis: half its
+    curvature times the support's mean square width. A bar's curvature is the same all along, so that its
+    mean over a window adds hardly any noise.
+    """
+    return 0.5 * _SPREAD_ACROSS_PX2 * _mean(curvature_across(fitted, axes), _SAG_WINDOW_PX)
+
+
+@lru_cache
+def _slope_gain(blur_px: float) -> float:
+    """Variance of `_own_slope` per variance of a white noise in the image before `_smooth`."""
+    impulse = np.zeros((33, 33), dtype=np.uint8)
+    impulse[16, 16] = 100
+    response = _own_slope(row_coefficients(_smooth(impulse, blur_px))) / 100
+    return float(np.square(response).sum())
 
 
 def _mean(image: Float32, side: int) -> Float32:

@@ -29,6 +29,7 @@ _UNKNOWN_COST = 60
 _EDGE_GREY = 8
 _BORDER = np.int16(10000)
 _FAR = np.float32(-1e6)
+_WORST = np.int32(2**31 - 1)
 
 
 @dataclass(frozen=True)
@@ -151,21 +152,33 @@ def _row_costs(
 
 @kernel()
 def _extend_path(
-    cost: UInt8, before: Int16, least_before: Any, small: int, jump: Any, path: Int16, total: Int16
+    cost: UInt8,
+    before: Int16,
+    least_before: Any,
+    small: int,
+    jump: Any,
+    path: Int16,
+    total: Int16,
+    places: tuple[int, int, int],
+    count: int,
 ) -> np.int16:
-    """One pixel further along a path [Hirschmueller 2008, Eq. 13]; the path's least cost there."""
+    """One pixel further along a path [Hirschmueller 2008, Eq. 13]; the path's least cost there.
+
+    places: where the pixel's candidates begin in cost and total, in before, and in path, all flat. Flat arrays
+    and unsigned places, because slices and signs would cost more than the few vector instructions in between.
+    """
+    at, at_before, at_path = np.uint64(places[0]), np.uint64(places[1]), np.uint64(places[2])
+    one, two = np.uint64(1), np.uint64(2)
     least = np.int16(32000)
     ceiling = np.int16(least_before + jump)
     step, base = np.int16(small), np.int16(least_before)
-    count = cost.shape[0]
-    below, same, above = before[0:count], before[1 : count + 1], before[2 : count + 2]
-    here = path[1 : count + 1]
-    for d in range(count):
-        best = np.int16(min(below[d], above[d]) + step)
-        best = min(min(best, same[d]), ceiling)
-        value = np.int16(np.int16(best - base) + np.int16(cost[d]))
-        here[d] = value
-        total[d] = np.int16(total[d] + value)
+    for candidate in range(count):
+        d = np.uint64(candidate)
+        best = np.int16(min(before[at_before + d], before[at_before + d + two]) + step)
+        best = min(min(best, before[at_before + d + one]), ceiling)
+        value = np.int16(np.int16(best - base) + np.int16(cost[at + d]))
+        path[at_path + d + one] = value
+        total[at + d] = np.int16(total[at + d] + value)
         least = min(least, value)
     return least
 
@@ -176,12 +189,17 @@ def _sweep(
 ) -> None:
     """Adds four of the eight paths: along the row and from the three neighbours in the row before."""
     height, width, count = cost.shape
-    paths = np.full((2, 3, width, count + 2), _BORDER, dtype=np.int16)
+    costs, totals = cost.reshape(-1), total.reshape(-1)
+    side = count + 2
+    paths = np.full(6 * width * side, _BORDER, dtype=np.int16)
     leasts = np.zeros((2, 3, width), dtype=np.int16)
-    along = np.full((2, count + 2), _BORDER, dtype=np.int16)
-    fresh = np.zeros(count + 2, dtype=np.int16)
+    along = np.full(2 * side, _BORDER, dtype=np.int16)
+    fresh = np.zeros(side, dtype=np.int16)
     fresh[0] = _BORDER
     fresh[count + 1] = _BORDER
+    jumps = np.empty(256, dtype=np.int16)
+    for contrast in range(256):
+        jumps[contrast] = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least_jump)
     for i in range(height):
         y = height - 1 - i if upwards else i
         y_before = y + 1 if upwards else y - 1
@@ -189,64 +207,65 @@ def _sweep(
         least_along = np.int16(0)
         for j in range(width):
             x = width - 1 - j if upwards else j
-            here = np.int32(grey[y, x])
+            here, at = np.int32(grey[y, x]), (y * width + x) * count
+            place = (at, (1 - (j & 1)) * side, (j & 1) * side)
             if j == 0:
-                least_along = _extend_path(cost[y, x], fresh, 0, small, large, along[0], total[y, x])
+                place = (at, 0, 0)
+                least_along = _extend_path(costs, fresh, 0, small, large, along, totals, place, count)
             else:
-                contrast = abs(here - np.int32(grey[y, x + 1 if upwards else x - 1]))
-                jump = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least_jump)
+                jump = jumps[abs(here - np.int32(grey[y, x + 1 if upwards else x - 1]))]
                 least_along = _extend_path(
-                    cost[y, x], along[1 - (j & 1)], least_along, small, jump, along[j & 1], total[y, x]
+                    costs, along, least_along, small, jump, along, totals, place, count
                 )
             for r in range(3):
                 x_before = x + r - 1
+                at_path = ((new * 3 + r) * width + x) * side
                 if i == 0 or x_before < 0 or x_before >= width:
+                    place = (at, 0, at_path)
                     leasts[new, r, x] = _extend_path(
-                        cost[y, x], fresh, 0, small, large, paths[new, r, x], total[y, x]
+                        costs, fresh, 0, small, large, paths, totals, place, count
                     )
                     continue
-                contrast = abs(here - np.int32(grey[y_before, x_before]))
-                jump = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least_jump)
+                place = (at, ((old * 3 + r) * width + x_before) * side, at_path)
+                jump = jumps[abs(here - np.int32(grey[y_before, x_before]))]
                 leasts[new, r, x] = _extend_path(
-                    cost[y, x], paths[old, r, x_before], leasts[old, r, x_before], small, jump,
-                    paths[new, r, x], total[y, x],
-                )  # fmt: skip
+                    costs, paths, leasts[old, r, x_before], small, jump, paths, totals, place, count
+                )
 
 
 @kernel()
 def _choose(total: Int16, lowest: int, left_px: Float32, right_px: Float32) -> None:
     """Winners of one row for both images; the left one to a fraction with the equiangular line fit, which
-    suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that a
-    left pixel's candidates meet them in memory's order."""
+    suits a cost that rises linearly [Shimizu 2002]. A sum and its candidate share one number, so that the
+    least number is the winner. The right ones are kept reversed meanwhile, so that a left pixel's candidates
+    meet them in memory's order."""
     width, count = total.shape
-    right_least, right_winner = np.full(width, 32000, dtype=np.int16), np.full(width, -1, dtype=np.int16)
+    sums = total.reshape(-1)
+    right_least = np.full(width, _WORST, dtype=np.int32)
     for x in range(width):
-        sums = total[x]
-        least = np.int16(32000)
-        for d in range(count):
-            least = min(least, sums[d])
-        winner = 0
-        while sums[winner] != least:
-            winner += 1
+        at, least = np.uint64(x * count), _WORST
+        for candidate in range(count):
+            key = np.int32(np.int32(sums[at + np.uint64(candidate)]) << 16 | candidate)
+            least = min(least, key)
+        winner = least & 0xFFFF
         fraction = np.float32(0)
         if 0 < winner < count - 1:
-            below, above = np.float32(sums[winner - 1] - least), np.float32(sums[winner + 1] - least)
+            middle = least >> 16
+            below, above = np.float32(total[x, winner - 1] - middle), np.float32(total[x, winner + 1] - middle)
             steeper = max(below, above)
             if steeper > 0:
                 fraction = np.float32(0.5) * (below - above) / steeper
         left_px[x] = np.float32(winner + lowest) + fraction
         base = width - 1 - x + lowest
         first, end = max(0, -base), min(count, width - base)
-        if first < end:
-            seen = sums[first:end]
-            leasts, winners = right_least[base + first : base + end], right_winner[base + first : base + end]
-            for k in range(end - first):
-                better = seen[k] < leasts[k]
-                winners[k] = np.int16(first + k) if better else winners[k]
-                leasts[k] = min(seen[k], leasts[k])
+        at_right = np.uint64(base + first)
+        for candidate in range(end - first):
+            k = np.uint64(candidate)
+            key = np.int32(np.int32(sums[at + np.uint64(first) + k]) << 16 | (first + candidate))
+            right_least[at_right + k] = min(right_least[at_right + k], key)
     for x in range(width):
-        found = right_winner[width - 1 - x]
-        right_px[x] = np.float32(found + lowest) if found >= 0 else _FAR
+        found = right_least[width - 1 - x]
+        right_px[x] = np.float32((found & 0xFFFF) + lowest) if found < _WORST else _FAR
 
 
 @kernel(parallel=True)

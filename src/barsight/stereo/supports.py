@@ -21,6 +21,9 @@ TILE_COLUMNS = 32
 MARGIN = 48
 _LEAST_COHERENCE = 0.35
 _REACH = 2.0
+_CURVATURE_REACH_PX = 5
+_STEEPEST_PX = 2.5
+_ROUNDEST_PX = 0.75
 
 
 @dataclass(frozen=True)
@@ -97,10 +100,18 @@ def _axis_means(
     second_mean: Float32,
 ) -> None:
     height, width = first_mean.shape
+    framed_width = first.shape[1]
+    firsts, seconds, weights = first.reshape(-1), second.reshape(-1), weight.reshape(-1)
+    shares = np.empty(2 * reach + 1, dtype=np.float32)
+    for step in range(-reach, reach + 1):
+        shares[step + reach] = math.exp(-0.5 * (step / sigma_px) ** 2)
     for tile_y in prange(axes.shape[0]):
         sums = np.empty((3, TILE_COLUMNS), dtype=np.float32)
+        offsets = np.empty(2 * reach + 1, dtype=np.int64)
         for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
+            for step in range(-reach, reach + 1):
+                offsets[step + reach] = round(step * axis_y) * framed_width + round(step * axis_x)
             x0 = tile_x * TILE_COLUMNS
             count = min(TILE_COLUMNS, width - x0)
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
@@ -108,18 +119,15 @@ def _axis_means(
                 total[:] = np.float32(1e-6)
                 total_first[:] = 0
                 total_second[:] = 0
-                for step in range(-reach, reach + 1):
-                    row = y + MARGIN + round(step * axis_y)
-                    column = x0 + MARGIN + round(step * axis_x)
-                    share = np.float32(math.exp(-0.5 * (step / sigma_px) ** 2))
-                    weights = weight[row, column : column + count]
-                    firsts = first[row, column : column + count]
-                    seconds = second[row, column : column + count]
-                    for i in range(count):
-                        w = share * weights[i]
+                middle = (y + MARGIN) * framed_width + x0 + MARGIN
+                for step in range(2 * reach + 1):
+                    at, share = np.uint64(middle + offsets[step]), shares[step]
+                    for index in range(count):
+                        i = np.uint64(index)
+                        w = share * weights[at + i]
                         total[i] += w
-                        total_first[i] += w * firsts[i]
-                        total_second[i] += w * seconds[i]
+                        total_first[i] += w * firsts[at + i]
+                        total_second[i] += w * seconds[at + i]
                 for i in range(count):
                     first_mean[y, x0 + i] = total_first[i] / total[i]
                     second_mean[y, x0 + i] = total_second[i] / total[i]
@@ -163,6 +171,33 @@ def fit_planes(
     return fitted, information
 
 
+def curvature_across(disparity: Float32, axes: Float32) -> Float32:
+    """(H, W) second derivative (1 / px) across each tile's axis, out of points 5 px to both sides; 0 beside
+    jumps, where it says nothing. No NaN in."""
+    curvature = np.empty_like(disparity)
+    _curvature_across(disparity, axes, curvature)
+    return curvature
+
+
+@kernel(parallel=True)
+def _curvature_across(disparity: Float32, axes: Float32, curvature: Float32) -> None:
+    height, width = disparity.shape
+    scale = np.float32(1.0 / _CURVATURE_REACH_PX**2)
+    for tile_y in prange(axes.shape[0]):
+        for tile_x in range(axes.shape[1]):
+            down = round(-_CURVATURE_REACH_PX * axes[tile_y, tile_x, 0])
+            right = round(_CURVATURE_REACH_PX * axes[tile_y, tile_x, 1])
+            for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+                after = disparity[min(max(y + down, 0), height - 1)]
+                before = disparity[min(max(y - down, 0), height - 1)]
+                for x in range(tile_x * TILE_COLUMNS, min(width, tile_x * TILE_COLUMNS + TILE_COLUMNS)):
+                    here = disparity[y, x]
+                    forth = after[min(max(x + right, 0), width - 1)] - here
+                    back = before[min(max(x - right, 0), width - 1)] - here
+                    smooth = max(abs(forth), abs(back)) < _STEEPEST_PX and abs(forth + back) < _ROUNDEST_PX
+                    curvature[y, x] = scale * (forth + back) if smooth else np.float32(0)
+
+
 def _summed_along(
     disparity: Float32,
     weight: Float32,
@@ -193,6 +228,8 @@ def _sum_along(
 ) -> None:
     height, width = weight_sum.shape
     nearness, one, zero = np.float32(1.0 / same_surface_px), np.float32(1), np.float32(0)
+    framed_width = disparity.shape[1]
+    theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
     for tile_y in prange(axes.shape[0]):
         for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
@@ -206,17 +243,16 @@ def _sum_along(
                 for step in range(-reach, reach + 1):
                     row = y + MARGIN + round(step * axis_y)
                     column = x0 + MARGIN + round(step * axis_x)
-                    there = disparity[row, column : column + count]
-                    weights = weight[row, column : column + count]
-                    pulls = pull[row, column : column + count]
-                    for i in range(count):
-                        gap = there[i] - centre[i]
+                    at = np.uint64(row * framed_width + column)
+                    for index in range(count):
+                        i = np.uint64(index)
+                        gap = theres[at + i] - centre[i]
                         scaled = gap * nearness
                         same = max(one - scaled * scaled, zero)
                         kept = same * same
-                        w = kept * weights[i]
+                        w = kept * weights[at + i]
                         total[i] += w
-                        total_pull[i] += w * gap + kept * pulls[i]
+                        total_pull[i] += w * gap + kept * pulls[at + i]
 
 
 @kernel(parallel=True, fastmath=True)
@@ -236,6 +272,11 @@ def _fit_planes(
 ) -> None:
     height, width = fitted.shape
     nearness, one, zero = np.float32(1.0 / same_surface_px), np.float32(1), np.float32(0)
+    framed_width = disparity.shape[1]
+    theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
+    shares = np.empty(2 * reach_along + 1, dtype=np.float32)
+    for j in range(-reach_along, reach_along + 1):
+        shares[j + reach_along] = math.exp(-0.5 * (j * step_along / along_px) ** 2)
     for tile_y in prange(axes.shape[0]):
         sums, line = (
             np.empty((9, TILE_COLUMNS), dtype=np.float32),
@@ -245,31 +286,33 @@ def _fit_planes(
             sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8],
         )  # fmt: skip
         n, na, naa, m, ma = line[0], line[1], line[2], line[3], line[4]
+        offsets = np.empty((2 * reach_across + 1, 2 * reach_along + 1), dtype=np.int64)
         for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
+            for k in range(-reach_across, reach_across + 1):
+                for j in range(-reach_along, reach_along + 1):
+                    along = j * step_along
+                    row, column = round(along * axis_y + k * axis_x), round(along * axis_x - k * axis_y)
+                    offsets[k + reach_across, j + reach_along] = row * framed_width + column
             x0 = tile_x * TILE_COLUMNS
             count = min(TILE_COLUMNS, width - x0)
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
                 sums[:, :] = 0
                 centre = disparity[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
+                middle = (y + MARGIN) * framed_width + x0 + MARGIN
                 for k in range(-reach_across, reach_across + 1):
                     line[:, :] = 0
                     for j in range(-reach_along, reach_along + 1):
-                        along = j * step_along
-                        row = y + MARGIN + round(along * axis_y + k * axis_x)
-                        column = x0 + MARGIN + round(along * axis_x - k * axis_y)
-                        share = np.float32(math.exp(-0.5 * (along / along_px) ** 2))
-                        a = np.float32(along)
-                        there = disparity[row, column : column + count]
-                        weights = weight[row, column : column + count]
-                        pulls = pull[row, column : column + count]
-                        for i in range(count):
-                            gap = there[i] - centre[i]
+                        share, a = shares[j + reach_along], np.float32(j * step_along)
+                        at = np.uint64(middle + offsets[k + reach_across, j + reach_along])
+                        for index in range(count):
+                            i = np.uint64(index)
+                            gap = theres[at + i] - centre[i]
                             scaled = gap * nearness
                             same = max(one - scaled * scaled, zero)
                             kept = share * same * same
-                            w = kept * weights[i]
-                            b = w * gap + kept * pulls[i]
+                            w = kept * weights[at + i]
+                            b = w * gap + kept * pulls[at + i]
                             wa = w * a
                             n[i] += w
                             na[i] += wa
