@@ -10,11 +10,13 @@ from scipy.interpolate import CubicSpline
 from barsight.core.errors import ConfigError
 from barsight.stereo.confidence import bend_around
 from barsight.stereo.consistency import agrees, without_islands
+from barsight.stereo.curvature import curvature_across
 from barsight.stereo.edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
 from barsight.stereo.filling import fill
+from barsight.stereo.plane_fits import SupportShape, fit_planes
 from barsight.stereo.semiglobal import SemiGlobalSettings, match
 from barsight.stereo.spline import row_coefficients, value_and_slope
-from barsight.stereo.supports import TILE_COLUMNS, TILE_ROWS, SupportShape, axis_means, fit_planes, tile_axes
+from barsight.stereo.supports import TILE_COLUMNS, TILE_ROWS, axis_means, tile_axes
 
 HEIGHT, WIDTH = 40, 70
 
@@ -270,3 +272,15 @@ def test_bend_is_zero_on_a_plane_and_half_the_step_beside_an_edge() -> None:
 def test_penalties_must_be_in_order() -> None:
     with pytest.raises(ConfigError, match="penalties"):
         SemiGlobalSettings(small_jump=50, large_jump=40)
+
+
+def test_curvature_is_taken_across_the_axis_and_not_over_a_jump() -> None:
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    round_across_rows = 0.5 * 0.01 * (columns - 35) ** 2 + 0.3 * rows + 0.05 * columns
+    inner = (slice(8, 32), slice(25, 45))
+    down = curvature_across(round_across_rows, _axes(0.0, 1.0))
+    np.testing.assert_allclose(down[inner], 0.01, atol=1e-5)
+    along = curvature_across(round_across_rows, _axes(1.0, 0.0))
+    np.testing.assert_allclose(along[inner], 0.0, atol=1e-5)
+    stepped = np.where(columns > 35, np.float32(4), np.float32(0))
+    assert not curvature_across(stepped, _axes(0.0, 1.0)).any()

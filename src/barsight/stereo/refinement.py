@@ -24,9 +24,11 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
+from barsight.stereo.curvature import curvature_across
+from barsight.stereo.plane_fits import SupportShape, fit_planes
 from barsight.stereo.sgbm import image_noise
 from barsight.stereo.spline import row_coefficients, value_and_slope
-from barsight.stereo.supports import SupportShape, axis_means, curvature_across, fit_planes, tile_axes
+from barsight.stereo.supports import axis_means, tile_axes
 
 _BLUR_PX = 0.5
 _FIRST_BLUR_PX = 0.7
@@ -141,7 +143,9 @@ def _undamped(weight: Float32, trust: Float32, slope_noise: float, side: int) ->
     """
     spurious = np.float32(slope_noise) * _mean(trust, side)
     mean_weight = _mean(weight, side)
-    factor: Float32 = mean_weight / np.maximum(mean_weight - spurious, mean_weight / _MOST_UNDAMPED + np.float32(1e-6))
+    factor: Float32 = mean_weight / np.maximum(
+        mean_weight - spurious, mean_weight / _MOST_UNDAMPED + np.float32(1e-6)
+    )
     return factor
 
 

@@ -11,21 +11,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numba
 import numpy as np
 from numba import prange
-from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, UInt8, kernel
 from barsight.core.errors import ConfigError
-
-Int16 = NDArray[np.int16]
-UInt32 = NDArray[np.uint32]
+from barsight.stereo.semiglobal_cost import (
+    Int16,
+    UInt32,
+    census_codes,
+    reversed_rows,
+    row_costs,
+    row_gradient,
+)
 
 _OVERLAP_ROWS = 20
 _STRIPE_BYTES = 128 * 2**20
-_UNKNOWN_COST = 60
 _EDGE_GREY = 8
 _BORDER = np.int16(10000)
 _FAR = np.float32(-1e6)
@@ -70,84 +72,13 @@ def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiG
     affordable = max(_STRIPE_BYTES // (3 * width * count) - 2 * _OVERLAP_ROWS, 16)
     stripes = threads * -(-height // (threads * min(affordable, 256)))
     _match_stripes(
-        _census(left), _reversed(_census(right)), _gradient(left), _reversed(_gradient(right)),
-        left.astype(np.int16), _reversed(right.astype(np.int16)), lowest_px, count,
+        census_codes(left), reversed_rows(census_codes(right)),
+        row_gradient(left), reversed_rows(row_gradient(right)),
+        left.astype(np.int16), reversed_rows(right.astype(np.int16)), lowest_px, count,
         settings.small_jump, settings.large_jump, settings.least_jump, -(-height // stripes), threads,
         left_px, right_px,
     )  # fmt: skip
     return Match(left_px, right_px)
-
-
-def _census(image: UInt8) -> UInt32:
-    codes = np.zeros(image.shape, dtype=np.uint32)
-    _write_census(cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_REPLICATE), codes)
-    return codes
-
-
-def _gradient(image: UInt8) -> Int16:
-    gradient: Int16 = cv2.filter2D(image, cv2.CV_16S, np.array([[-1, 0, 1]], dtype=np.float32))
-    return gradient
-
-
-def _reversed(image: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(image[:, ::-1])
-
-
-@kernel(parallel=True)
-def _write_census(framed: UInt8, codes: UInt32) -> None:
-    """Bit k is set where neighbour k is brighter than the centre. framed: (H + 4, W + 4)."""
-    height, width = codes.shape
-    one = np.uint32(1)
-    for y in prange(height):
-        row = codes[y]
-        centre = framed[y + 2, 2 : 2 + width]
-        for dy in range(5):
-            for dx in range(5):
-                if dy == 2 and dx == 2:
-                    continue
-                there = framed[y + dy, dx : dx + width]
-                for x in range(width):
-                    row[x] = (row[x] << one) | np.uint32(there[x] > centre[x])
-
-
-@kernel()
-def _row_costs(
-    left_code: UInt32,
-    right_code: UInt32,
-    left_slope: Int16,
-    right_slope: Int16,
-    left_grey: Int16,
-    right_grey: Int16,
-    lowest: int,
-    cost: UInt8,
-) -> None:
-    """(W, count) costs of one row. The right row is reversed, so that candidates lie in memory's order."""
-    width, count = cost.shape
-    for x in range(width):
-        base = width - 1 - x + lowest
-        first, end = max(0, -base), min(count, width - base)
-        here = cost[x]
-        if end <= first:
-            here[:] = _UNKNOWN_COST
-            continue
-        code, slope, grey = left_code[x], left_slope[x], left_grey[x]
-        codes = right_code[base + first : base + end]
-        slopes = right_slope[base + first : base + end]
-        greys = right_grey[base + first : base + end]
-        inside = here[first:end]
-        for k in range(end - first):
-            bits = np.uint32(code ^ codes[k])
-            bits = np.uint32(bits - ((bits >> np.uint32(1)) & np.uint32(0x55555555)))
-            bits = np.uint32(
-                (bits & np.uint32(0x33333333)) + ((bits >> np.uint32(2)) & np.uint32(0x33333333))
-            )
-            bits = np.uint32((bits + (bits >> np.uint32(4))) & np.uint32(0x0F0F0F0F))
-            hamming = np.uint32(np.uint32(bits * np.uint32(0x01010101)) >> np.uint32(24))
-            steep = min(np.int16(abs(np.int16(slope - slopes[k]))), np.int16(20))
-            bright = min(np.int16(abs(np.int16(grey - greys[k]))), np.int16(20))
-            inside[k] = np.uint8(np.uint8(hamming) + np.uint8(np.int16(steep + bright) >> np.int16(1)))
-        here[:first] = here[first]
-        here[end:] = here[end - 1]
 
 
 @kernel()
@@ -164,8 +95,8 @@ def _extend_path(
 ) -> np.int16:
     """One pixel further along a path [Hirschmueller 2008, Eq. 13]; the path's least cost there.
 
-    places: where the pixel's candidates begin in cost and total, in before, and in path, all flat. Flat arrays
-    and unsigned places, because slices and signs would cost more than the few vector instructions in between.
+    places: where the pixel's candidates begin in cost and total, in before, and in path, all flat: with flat
+    arrays and unsigned places, since slices and signs cost more than the few vector instructions in between.
     """
     at, at_before, at_path = np.uint64(places[0]), np.uint64(places[1]), np.uint64(places[2])
     one, two = np.uint64(1), np.uint64(2)
@@ -251,7 +182,10 @@ def _choose(total: Int16, lowest: int, left_px: Float32, right_px: Float32) -> N
         fraction = np.float32(0)
         if 0 < winner < count - 1:
             middle = least >> 16
-            below, above = np.float32(total[x, winner - 1] - middle), np.float32(total[x, winner + 1] - middle)
+            below, above = (
+                np.float32(total[x, winner - 1] - middle),
+                np.float32(total[x, winner + 1] - middle),
+            )
             steeper = max(below, above)
             if steeper > 0:
                 fraction = np.float32(0.5) * (below - above) / steeper
@@ -297,7 +231,7 @@ def _match_stripes(
             above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
             rows = below - above
             for y in range(above, below):
-                _row_costs(
+                row_costs(
                     left_code[y], right_code[y], left_slope[y], right_slope[y], left_grey[y], right_grey[y],
                     lowest, cost[y - above],
                 )  # fmt: skip
