@@ -17,6 +17,8 @@ def expect_numbers(settings: Mapping[str, Any], prefix: str = "") -> None:
         if isinstance(value, Mapping):
             expect_numbers(value, f"{prefix}{name}.")
         for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, Mapping):
+                expect_numbers(number, f"{prefix}{name}.")
             if isinstance(number, float) and not math.isfinite(number):
                 raise ConfigError(f"{prefix}{name} is {number}; give a number")
             if isinstance(number, int) and abs(number) > MOST:

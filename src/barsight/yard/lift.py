@@ -1,0 +1,137 @@
+"""Lift targets: for every bundle that may be free the best placement of the magnet, ranked, or the vetoes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.yard.assess import Lift, Yard, assess
+from barsight.yard.footprint import BundleTable, Placement
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.magnet import Magnet
+from barsight.yard.stability import Footing, footings
+from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.vetoes import Veto
+
+ACROSS_M = (0.0, 0.012, -0.012, 0.024, -0.024, 0.036, -0.036)
+ALONG_M = (0.1, -0.1, 0.25, -0.25)
+FINALISTS = 3
+SAME_TOP_M = 0.03
+SAME_YAW_RAD = np.radians(2.0)
+RULE = (
+    "Offered lifts come safest first: by the smallest of pull over needed pull, capacity over load, and "
+    "tolerance over the crane's tolerance; the higher bundle first where two are equal."
+)
+FROM_WARNINGS = {
+    "calibration": "calibration-drift",
+    "calibration-drift": "calibration-drift",
+    "trajectory": "trajectory-degraded",
+    "trajectory-degraded": "trajectory-degraded",
+    "one-view": "one-view",
+}
+"""Which of a result's warnings forbid every lift."""
+
+
+@dataclass(frozen=True, eq=False)
+class LiftPlan:
+    """offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
+
+    vetoes: those that hold for the whole map; with any of them nothing is offered.
+    """
+
+    magnet: Magnet
+    settings: LiftSettings
+    offered: tuple[Lift, ...]
+    refused: tuple[Lift, ...]
+    vetoes: tuple[Veto, ...]
+    footings: tuple[Footing, ...]
+
+
+def map_vetoes(
+    warnings: Iterable[tuple[str, str]], reference: str, age_s: float | None, settings: LiftSettings
+) -> tuple[Veto, ...]:
+    """What forbids every lift of a map: its warnings (code, sentence), its frame, its age (None: unknown)."""
+    vetoes = [Veto(FROM_WARNINGS[code], text) for code, text in warnings if code in FROM_WARNINGS]
+    if reference != "yard":
+        vetoes.append(Veto("no-yard-frame", f"the map is in the {reference} frame: no crane gave its place"))
+    if age_s is None:
+        vetoes.append(Veto("map-too-old", "when the map was measured is not known"))
+    elif age_s > settings.max_age_s:
+        vetoes.append(
+            Veto("map-too-old", f"the map is {age_s / 60:.0f} min old, {settings.max_age_s / 60:.0f} are allowed")
+        )
+    return tuple(vetoes)
+
+
+def plan_lifts(
+    heights: HeightMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
+    vetoes: tuple[Veto, ...],
+) -> LiftPlan:  # fmt: skip
+    """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`)."""
+    standing = footings(heights, bundles, settings)
+    yard = Yard(heights, BundleTable.of(bundles), standing, ())
+    offered, refused = [], []
+    for group in _groups(bundles, settings.bundles):
+        lift = _best(group, yard, magnet, settings)
+        if lift.vetoes or vetoes:
+            refused.append(_with(lift, vetoes))
+        else:
+            offered.append(lift)
+    top = {b.id: b.top_z_m for b in bundles}
+    offered.sort(key=lambda lift: (-round(lift.safety, 2), -max(top[i] for i in lift.bundles)))
+    return LiftPlan(magnet, settings, tuple(offered), tuple(refused), vetoes, standing)
+
+
+def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:
+    return Lift(**{**vars(lift), "vetoes": (*vetoes, *lift.vetoes)})
+
+
+def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
+    """Bundles on which nothing lies (or may), each with its next count - 1 neighbours towards high x."""
+    free = sorted((b for b in bundles if b.on_top is not False), key=lambda b: float(b.centre_m[0]))
+    for place, first in enumerate(free):
+        group = [first]
+        for other in free[place + 1 :]:
+            if len(group) == count:
+                break
+            level = abs(other.top_z_m - group[-1].top_z_m) < SAME_TOP_M
+            parallel = abs(other.yaw_rad - first.yaw_rad) < SAME_YAW_RAD
+            between = float(other.centre_m[0] - group[-1].centre_m[0])
+            if level and parallel and between < (other.width_m + group[-1].width_m) / 2 + 0.1:
+                group.append(other)
+        if len(group) == count:
+            yield tuple(group)
+
+
+def _best(group: tuple[Bundle, ...], yard: Yard, magnet: Magnet, settings: LiftSettings) -> Lift:
+    """The placement with the fewest vetoes, then the safest."""
+    def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
+        places = (_place(group, along, across) for along, across in offsets)
+        found = [assess(place, yard, magnet, settings, search=False) for place in places]
+        return sorted(found, key=_worst_first)
+
+    limit = magnet.limits.offset_across_m
+    quick = tried((0.0, across) for across in ACROSS_M if abs(across) < limit)
+    if quick[0].vetoes:
+        across = quick[0].offset_across_m if np.isfinite(quick[0].offset_across_m) else 0.0
+        quick = sorted([*quick, *tried((along, across) for along in ALONG_M)], key=_worst_first)
+    if quick[0].vetoes:
+        return quick[0]
+    finalists = [
+        assess(lift.place, yard, magnet, settings) for lift in quick[:FINALISTS] if not lift.vetoes
+    ]
+    return min(finalists, key=_worst_first)
+
+
+def _worst_first(lift: Lift) -> tuple[int, float]:
+    return len(lift.vetoes), -lift.safety
+
+
+def _place(group: tuple[Bundle, ...], along: float, across: float) -> Placement:
+    centre = np.mean([b.centre_m[:2] for b in group], axis=0)
+    yaw = float(np.mean([b.yaw_rad for b in group]))
+    place = Placement(float(centre[0]), float(centre[1]), yaw)
+    moved = centre + along * place.along + across * place.across
+    return Placement(float(moved[0]), float(moved[1]), yaw)

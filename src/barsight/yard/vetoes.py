@@ -1,0 +1,47 @@
+"""All reasons not to lift: one table of codes, and the record that carries one with its figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+VETOES = {
+    "map-too-old": "The map is older than the settings allow, or its age is unknown.",
+    "calibration-drift": "The cameras' calibration doesn't fit the pictures any more.",
+    "trajectory-degraded": "The trajectory came from less than the recording's sensors should give.",
+    "one-view": "One frame made the map: no height is confirmed by another.",
+    "no-yard-frame": "The map isn't in the crane's yard frame, so the crane can't go there.",
+    "no-bundle": "No bundle lies under the footprint within the magnet's reach.",
+    "unknown-under-footprint": "Too many cells under the poles were not seen (filled ones count as not seen).",
+    "unexplained-surface": "Something under the poles, within reach, belongs to no known bundle.",
+    "bundle-doubtful": "The bundle is less sure than the settings ask.",
+    "covered": "Something lies on the bundle, or whether something does isn't known.",
+    "straddles-neighbour": "The footprint reaches over more bundles than are to be lifted.",
+    "count-uncertain": "How many bundles the magnet would take isn't sure enough.",
+    "narrow-tolerance": "Within the crane's own tolerance the lift would not stay as checked.",
+    "obstructed": "Something stands so high that the beam or a pole would hit it.",
+    "tilt": "The faces don't lie: they slope too much, or rest beside their middle and tip.",
+    "gap": "Too little of a pole's face lies on steel.",
+    "weak-pull": "The lower bound of the pull is less than the load's weight times the safety factor.",
+    "mass-unknown": "The mass can't be told from what was seen.",
+    "overweight": "The load's upper bound is more than the magnet or the crane may carry.",
+    "off-centre": "The magnet's centre is too far from the load's centre of mass.",
+    "overhang": "The bars reach too far beyond the outermost pole and would sag.",
+    "end-open": "An end of the bundle was not seen: length, mass and balance are not known.",
+    "overhanging": "The bundle lies over the edge of what carries it.",
+    "unstable-side": "A neighbour leans over or rests on this bundle and may follow it.",
+    "no-support": "What should carry the bundle isn't there, as far as can be seen.",
+    "over-stanchion": "The bundle stands higher than the stanchions allow.",
+}
+"""Code to what it means; docs/yard.md lists each with the test that trips it."""
+
+
+@dataclass(frozen=True)
+class Veto:
+    """Why not to lift: a code of `VETOES` and a sentence with the figures."""
+
+    code: str
+    reason: str
+
+    def __post_init__(self) -> None:
+        if self.code not in VETOES:
+            raise ValueError(f"{self.code!r} is no veto")
