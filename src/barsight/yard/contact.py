@@ -6,47 +6,47 @@ upper envelope around the middle, or on fewer with the suspension holding it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, UInt8, kernel
-from barsight.core.types import Source
+from barsight.core.arrays import Float64, kernel
 from barsight.yard.footprint import Placement
 from barsight.yard.magnet import Magnet
+from barsight.yard.settle import ALL, POLE, SEEN, U, V, Z, profiles, settle, straighten
 from barsight.yard.types import HeightMap
 
-SEGMENT_M = 0.45
-"""Heights are taken as medians along the bars over this length: bars are straight, noise is not."""
-STEP_M = 0.01
-CORRELATED_CELLS = 5.0
-"""Neighbouring cells share their matching windows: so many count as one."""
 NEWTON_PER_KG = 9.81
-_COLUMNS = 6
-_U, _V, _Z, _SCATTER, _SEEN, _ALL = range(_COLUMNS)
-_STEEPEST = 0.35
+UPPER = 1.645
+"""Sigmas to a bound that holds in 95 % of cases."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoleContact:
-    """One pole's face. gap_m: mean air gap; gap_map_m: (across, along) air gaps, NaN where unknown.
-
-    contact_share: of the face that lies on steel. unknown_share: of the cells under it that were not seen.
+    """One pole's face. gap_m: mean air gap, least_gap_m: where it is nearest to steel; gap_map_m: (across,
+    along) air gaps, NaN where unknown. contact_share: of the face that lies on steel. unknown_share: of the
+    cells under it that were not seen. z_m: height of its centre. pull_n, pull_low_n: its part of the pull.
     """
 
     gap_m: float
-    gap_map_m: Float64
+    least_gap_m: float
     contact_share: float
     unknown_share: float
+    pull_n: float
+    pull_low_n: float
+    z_m: float
+    gap_map_m: Float64
 
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """How all faces lie. z_m: (P,) height of the faces at the poles' centres; centre_z_m at the magnet's.
+    """How all faces lie. centre_z_m: height of their plane at the magnet's centre, z_m: (P,) at the poles'.
 
     pitch_rad: rise along the beam; roll_rad: rise across. rests_off_m: how far beside the middle the faces
     rest, where the suspension's stop holds them, else 0. sigma_m: of the plane over the points.
-    pull_n, pull_low_n: the pull, and its lower bound (95 %).
+    pull_n, pull_low_n: the pull, and its lower bound (95 %). widest_gap_m: the least gap of the pole that is
+    furthest from steel. contact_share: of all faces; unknown_share: the worst pole's.
     """
 
     centre_z_m: float
@@ -56,8 +56,16 @@ class Contact:
     rests_off_m: float
     sigma_m: float
     poles: tuple[PoleContact, ...]
-    pull_n: float
-    pull_low_n: float
+
+    @property
+    def pull_n(self) -> float:
+        """The pull."""
+        return sum(pole.pull_n for pole in self.poles)
+
+    @property
+    def pull_low_n(self) -> float:
+        """Its lower bound (95 %)."""
+        return sum(pole.pull_low_n for pole in self.poles)
 
     @property
     def unknown_share(self) -> float:
@@ -66,8 +74,13 @@ class Contact:
 
     @property
     def contact_share(self) -> float:
-        """The worst pole's."""
-        return min(pole.contact_share for pole in self.poles)
+        """Of all faces together."""
+        return sum(pole.contact_share for pole in self.poles) / len(self.poles)
+
+    @property
+    def widest_gap_m(self) -> float:
+        """The least gap of the pole that is furthest from steel; infinite where a pole knows none."""
+        return max(pole.least_gap_m for pole in self.poles)
 
 
 def touch(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
@@ -76,143 +89,60 @@ def touch(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: f
     contact_gap_m: a face nearer than this to steel lies on it.
     """
     poles = magnet.pole_table
-    points = _profiles(
-        heights.z_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m, poles,
-        place.x_m, place.y_m, place.yaw_rad, STEP_M, SEGMENT_M,
-    )  # fmt: skip
-    flat = np.concatenate(points)
-    known = flat[np.isfinite(flat[:, _Z])]
-    if len(known) < 3:
+    shape, points = profiles(heights, place, poles)
+    seen = np.isfinite(points[:, Z])
+    if seen.sum() < 3:
         return None
+    noise = straighten(points, seen)
     most = np.tan(np.radians(magnet.limits.roll_deg))
-    height, roll, pitch = rest(known[:, _U], known[:, _V], known[:, _Z], most)
-    # The highest of many noisy points is too high: the median's noise says by how much.
-    cells = np.median(known[:, _SEEN])
-    noise = float(1.25 * np.median(known[:, _SCATTER]) / np.sqrt(max(cells / CORRELATED_CELLS, 1.0)))
-    height -= noise
-    held = abs(roll) > 0.999 * most
-    rests_off = 0.0
-    if held:
-        gap = height + roll * known[:, _U] + pitch * known[:, _V] - known[:, _Z]
-        near = known[gap <= gap.min() + noise + 0.0005]
-        rests_off = float(np.abs(np.median(near[:, _U])))
-    pull = magnet.pull
-    found, force, force_low = [], 0.0, 0.0
-    for pole, own in zip(magnet.poles, points, strict=True):
-        gap = np.maximum(height + roll * own[:, _U] + pitch * own[:, _V] - own[:, _Z], 0.0)
-        seen = np.isfinite(gap)
-        area = pole.length_m * pole.width_m / len(own)
-        force += 1e3 * area * float(np.interp(gap[seen], pull.gap_m, pull.kilopascal, right=0.0).sum())
-        low = np.interp(gap[seen] + 1.645 * noise, pull.gap_m, pull.kilopascal, right=0.0)
-        force_low += 1e3 * area * float(low.sum())
-        columns = len(np.unique(own[:, _U]))
-        found.append(
-            PoleContact(
-                float(gap[seen].mean()) if seen.any() else float("nan"),
-                gap.reshape(columns, -1),
-                float((gap[seen] <= contact_gap_m).sum() / len(own)),
-                float(1 - own[:, _SEEN].sum() / own[:, _ALL].sum()),
-            )
-        )
-    faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
-    return Contact(
-        height, faces, float(np.arctan(pitch)), float(np.arctan(roll)), rests_off, noise, tuple(found),
-        force, force_low,
+    u, v, z = (np.ascontiguousarray(points[seen, k]) for k in (U, V, Z))
+    height, roll, pitch, rests_off = settle(u, v, z, noise, most)
+    table, gaps = _gaps(
+        points, height, roll, pitch, noise, contact_gap_m + noise, poles,
+        np.array(magnet.pull.gap_m), np.array(magnet.pull.kilopascal),
     )  # fmt: skip
-
-
-def _profiles(
-    z: Float32, source: UInt8, x0: float, y0: float, cell: float, poles: Float64, x: float, y: float,
-    yaw: float, step: float, segment: float,
-) -> list[Float64]:  # fmt: skip
-    """For each pole (N, _COLUMNS): place across and along, median height, scatter, cells seen and in all."""
-    found = []
-    for along, across, length, width in poles:
-        columns, parts = max(round(width / step), 2), max(round(length / segment), 1)
-        own = np.empty((columns * parts, _COLUMNS))
-        _profile(
-            z, source, x0, y0, cell, x, y, np.cos(yaw), np.sin(yaw), along, across, length, width, parts,
-            step, own,
-        )  # fmt: skip
-        found.append(own)
-    return found
+    faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
+    found, first = [], 0
+    for number, (columns, parts) in enumerate(shape):
+        last = first + columns * parts
+        mean, least, share, unknown, pull, pull_low = (float(figure) for figure in table[number])
+        gap_map = gaps[first:last].reshape(columns, parts)
+        face = float(faces[number])
+        found.append(PoleContact(mean, least, share, unknown, pull, pull_low, face, gap_map))
+        first = last
+    return Contact(height, faces, math.atan(pitch), math.atan(roll), rests_off, noise, tuple(found))
 
 
 @kernel()
-def _profile(
-    z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: float, y: float, cos: float, sin: float,
-    along: float, across: float, length: float, width: float, parts: int, step: float, out: Float64,
-) -> None:  # fmt: skip
-    columns = out.shape[0] // parts
-    samples = max(int(length / parts / step), 1)
-    values = np.empty(samples)
-    for i in range(columns):
-        u = across + width * ((i + 0.5) / columns - 0.5)
-        for k in range(parts):
-            count = 0
-            for m in range(samples):
-                v = along + length * ((k + (m + 0.5) / samples) / parts - 0.5)
-                column = int(np.floor((x + u * cos - v * sin - x0) / cell + 0.5))
-                row = int(np.floor((y + u * sin + v * cos - y0) / cell + 0.5))
-                if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
-                    continue
-                if source[row, column] == 0 or source[row, column] == 3 or np.isnan(z[row, column]):
-                    continue
-                values[count] = z[row, column]
-                count += 1
-            own = out[i * parts + k]
-            own[_U], own[_V] = u, along + length * ((k + 0.5) / parts - 0.5)
-            own[_SEEN], own[_ALL] = count, samples
-            own[_Z] = own[_SCATTER] = np.nan
-            if 2 * count >= samples:
-                middle = np.median(values[:count])
-                own[_Z] = middle
-                own[_SCATTER] = 1.4826 * np.median(np.abs(values[:count] - middle))
-
-
-assert Source.FILLED == 3 and Source.UNKNOWN == 0
-
-
-@kernel()
-def rest(u: Float64, v: Float64, z: Float64, most_roll: float) -> tuple[float, float, float]:
-    """Height at the origin, slope along u and along v of the plane that rests on the points.
-
-    Of all planes on or above the points it has the lowest origin; its slope along u is held within
-    `most_roll`. The height is convex in the slopes: two nested searches find the one lowest place.
-    """
-    best = (0.0, 0.0, 0.0)
-    low, high = -most_roll, most_roll
-    for _ in range(36):
-        a, b = low + (high - low) * 0.382, low + (high - low) * 0.618
-        at_a, at_b = _rest_along(u, v, z, a), _rest_along(u, v, z, b)
-        if at_a[0] <= at_b[0]:
-            high = b
-        else:
-            low = a
-    roll = (low + high) / 2
-    if most_roll - abs(roll) < 1e-3 * most_roll:
-        roll = most_roll if roll > 0 else -most_roll
-    height, pitch = _rest_along(u, v, z, roll)
-    best = (height, roll, pitch)
-    return best
-
-
-@kernel()
-def _rest_along(u: Float64, v: Float64, z: Float64, roll: float) -> tuple[float, float]:
-    low, high = -_STEEPEST, _STEEPEST
-    for _ in range(36):
-        a, b = low + (high - low) * 0.382, low + (high - low) * 0.618
-        at_a = at_b = -np.inf
-        for i in range(u.size):
-            left = z[i] - roll * u[i]
-            at_a = max(at_a, left - a * v[i])
-            at_b = max(at_b, left - b * v[i])
-        if at_a <= at_b:
-            high = b
-        else:
-            low = a
-    slope = (low + high) / 2
-    height = -np.inf
-    for i in range(u.size):
-        height = max(height, z[i] - roll * u[i] - slope * v[i])
-    return height, slope
+def _gaps(
+    points: Float64, height: float, roll: float, pitch: float, noise: float, near: float, poles: Float64,
+    gap_m: Float64, kilopascal: Float64,
+) -> tuple[Float64, Float64]:  # fmt: skip
+    """(P, 6) mean and least gap, shares of contact and unknown cells, pull and its lower bound; (N,) gaps."""
+    table, gaps = np.zeros((len(poles), 6)), np.empty(len(points))
+    counts = np.zeros((len(poles), 4))
+    table[:, 1] = np.inf
+    for k in range(len(points)):
+        own = points[k]
+        p = int(own[POLE])
+        gaps[k] = max(height + roll * own[U] + pitch * own[V] - own[Z], 0.0)
+        counts[p, 0] += 1
+        counts[p, 2] += own[SEEN]
+        counts[p, 3] += own[ALL]
+        if np.isnan(own[Z]):
+            gaps[k] = np.nan
+            continue
+        counts[p, 1] += 1
+        table[p, 0] += gaps[k]
+        table[p, 1] = min(table[p, 1], gaps[k])
+        table[p, 2] += gaps[k] <= near
+        table[p, 4] += np.interp(gaps[k], gap_m, kilopascal)
+        table[p, 5] += np.interp(gaps[k] + UPPER * noise, gap_m, kilopascal)
+    for p in range(len(poles)):
+        area = 1e3 * poles[p, 2] * poles[p, 3] / counts[p, 0]
+        table[p, 0] = table[p, 0] / counts[p, 1] if counts[p, 1] else np.nan
+        table[p, 2] /= counts[p, 0]
+        table[p, 3] = 1 - counts[p, 2] / counts[p, 3]
+        table[p, 4] *= area
+        table[p, 5] *= area
+    return table, gaps

@@ -1,18 +1,18 @@
 """Which bundles lie under a magnet's poles, as an integer with its probability.
 
 Poles and bundles are rectangles seen from above; two overlap where no side of either separates them. Each
-overlap has a depth, the depth a sigma (of the bundle's place, yaw, width and ends) and a bound on how much the
-crane's tolerance can change it: the count is as sure as all depths together.
+overlap has a depth, the depth a sigma (of the bundle's place, yaw, width and ends) and a bound on how much
+the crane's tolerance can change it: the count is as sure as all depths together.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Bool, Float64, kernel
 from barsight.yard.magnet import Magnet, Tolerance
 from barsight.yard.types import Bundle
 
@@ -66,7 +66,13 @@ class BundleTable:
         yaw = np.array([b.yaw_rad for b in bundles])
         sigma = np.array(
             [
-                (b.sigma.lateral_m, b.sigma.along_m, b.sigma.yaw_rad, b.sigma.width_m / 2, b.sigma.length_m / 2)
+                (
+                    b.sigma.lateral_m,
+                    b.sigma.along_m,
+                    b.sigma.yaw_rad,
+                    b.sigma.width_m / 2,
+                    b.sigma.length_m / 2,
+                )
                 for b in bundles
             ]
         ).reshape(-1, 5)
@@ -105,61 +111,96 @@ def grip(
 
     face_z_m: (P,) height of each pole's face. tolerance: how far off the crane may set down; a hard bound.
     """
-    poles = magnet.pole_table
-    count = len(table.bundles)
-    if count == 0:
+    if not table.bundles:
         return Grip((), 1.0, np.empty(0))
-    centre = np.array([place.x_m, place.y_m]) + poles[:, :1] * place.along + poles[:, 1:2] * place.across
-    half = poles[:, [3, 2]] / 2
-    seen, sigma, slack = _depth(place, centre, half, table, table.centre, table.half, tolerance, poles)
-    miss = ndtr(-np.maximum(np.abs(seen) - slack, 0) / sigma)
-    # Where a bundle's open end may lie under the pole, nobody knows.
-    shift = (table.open_ends[:, 1].astype(float) - table.open_ends[:, 0]) * BEYOND_OPEN_END_M / 2
-    longer = table.half + np.stack([np.zeros(count), table.open_ends.sum(axis=1) * BEYOND_OPEN_END_M / 2], 1)
-    further = table.centre + shift[:, None] * table.along
-    most, _, _ = _depth(place, centre, half, table, further, longer, tolerance, poles)
-    miss[(most > 0) & (seen <= 0)] = 0.5
-
-    away = np.einsum("pbi,bi->pb", centre[:, None] - table.centre, table.along)
-    over = table.top + away * table.slope - (face_z_m[:, None] - magnet.reach_m)
-    low = ndtr(-np.abs(over) / np.hypot(table.sigma_top, HEIGHT_SIGMA_M))
-    under = np.where(seen > 0, 1 - miss, miss) * np.where(over > 0, 1 - low, low)
-    taken = (seen > 0) & (over > 0)
-    gripped = taken.any(axis=0)
-    kept = np.where(taken, 1 - under, 1.0).min(axis=0)
-    added = np.minimum(under.sum(axis=0), 1.0)
-    flips = np.where(gripped, kept, added)
-    return Grip(tuple(np.flatnonzero(gripped).tolist()), float(np.prod(1 - flips)), flips)
+    slack = np.array([tolerance.x_m, tolerance.y_m, np.radians(tolerance.yaw_deg)])
+    flips, taken = _grip(
+        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, face_z_m - magnet.reach_m, slack,
+        table.centre, table.along, table.half, table.top, table.slope, table.sigma, table.sigma_top,
+        table.open_ends,
+    )  # fmt: skip
+    return Grip(tuple(np.flatnonzero(taken).tolist()), float(np.prod(1 - flips)), flips)
 
 
-def _depth(
-    place: Placement, pole_centre: Float64, pole_half: Float64, table: BundleTable, centre: Float64,
-    half: Float64, tolerance: Tolerance, poles: Float64,
-) -> tuple[Float64, Float64, Float64]:  # fmt: skip
-    """(P, B) overlap depth (negative is a distance), its sigma and the crane's slack, along the axis that counts."""
-    between = pole_centre[:, None] - centre[None]
-    sideways = np.stack([table.along[:, 1], -table.along[:, 0]], axis=1)
-    lateral_yaw = np.abs(np.einsum("pbi,bi->pb", between, table.along)) * table.sigma[:, 2]
-    yaw = np.radians(tolerance.yaw_deg)
-    lever = np.abs(poles[:, 0]) + poles[:, 2] / 2, np.abs(poles[:, 1]) + poles[:, 3] / 2
-    best: tuple[Float64, Float64, Float64] | None = None
-    shape = between.shape[:2]
-    own = (np.broadcast_to(place.across, (shape[1], 2)), np.broadcast_to(place.along, (shape[1], 2)))
-    for normal in (sideways, table.along, *own):
-        reach_b = np.abs((normal * sideways).sum(1)) * half[:, 0] + np.abs((normal * table.along).sum(1)) * half[:, 1]
-        n_across, n_along = np.abs(normal @ place.across), np.abs(normal @ place.along)
-        reach_p = n_across[None] * pole_half[:, :1] + n_along[None] * pole_half[:, 1:]
-        depth = reach_b[None] + reach_p - np.abs(np.einsum("pbi,bi->pb", between, normal))
-        side, end = (normal * sideways).sum(1) ** 2, (normal * table.along).sum(1) ** 2
-        s = table.sigma
-        variance = side * (s[:, 0] ** 2 + lateral_yaw**2 + s[:, 3] ** 2) + end * (s[:, 1] ** 2 + s[:, 4] ** 2)
-        slack = tolerance.x_m * np.abs(normal[:, 0]) + tolerance.y_m * np.abs(normal[:, 1])
-        slack = slack[None] + yaw * (lever[0][:, None] * n_across[None] + lever[1][:, None] * n_along[None])
-        found = depth, np.sqrt(variance + LEAST_SIGMA_M**2), slack
-        if best is None:
-            best = found
+@kernel()
+def _grip(
+    x: float, y: float, yaw: float, poles: Float64, reach_z: Float64, slack: Float64, centre: Float64,
+    along: Float64, half: Float64, top: Float64, slope: Float64, sigma: Float64, sigma_top: Float64,
+    open_ends: Bool,
+) -> tuple[Float64, Bool]:  # fmt: skip
+    """(B,) probability of a wrong count, and whether each bundle is taken."""
+    count = len(centre)
+    flips, taken = np.zeros(count), np.zeros(count, np.bool_)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    for b in range(count):
+        kept, added = 1.0, 0.0
+        for p in range(len(poles)):
+            px = x - poles[p, 0] * sin + poles[p, 1] * cos
+            py = y + poles[p, 0] * cos + poles[p, 1] * sin
+            dx, dy = px - centre[b, 0], py - centre[b, 1]
+            depth, spread, loose = overlap(
+                dx, dy, cos, sin, poles[p], along[b], half[b, 0], half[b, 1], sigma[b], slack
+            )
+            miss = _below(-max(abs(depth) - loose, 0.0) / spread)
+            if depth <= 0 and (open_ends[b, 0] or open_ends[b, 1]):
+                # Where a bundle's open end may lie under the pole, nobody knows.
+                longer = (open_ends[b, 0] + open_ends[b, 1]) * BEYOND_OPEN_END_M / 2
+                shift = (1.0 * open_ends[b, 1] - 1.0 * open_ends[b, 0]) * BEYOND_OPEN_END_M / 2
+                most = overlap(
+                    dx - shift * along[b, 0], dy - shift * along[b, 1], cos, sin, poles[p], along[b],
+                    half[b, 0], half[b, 1] + longer, sigma[b], slack,
+                )[0]  # fmt: skip
+                if most > 0:
+                    miss = 0.5
+            over = top[b] + (dx * along[b, 0] + dy * along[b, 1]) * slope[b] - reach_z[p]
+            low = _below(-abs(over) / np.hypot(sigma_top[b], HEIGHT_SIGMA_M))
+            under = (1 - miss if depth > 0 else miss) * (1 - low if over > 0 else low)
+            if depth > 0 and over > 0:
+                taken[b] = True
+                kept = min(kept, 1 - under)
+            added += under
+        flips[b] = kept if taken[b] else min(added, 1.0)
+    return flips, taken
+
+
+@kernel()
+def _below(z: float) -> float:
+    """The normal distribution's share below z."""
+    return 0.5 * math.erfc(-z / math.sqrt(2.0))
+
+
+@kernel()
+def overlap(
+    dx: float, dy: float, cos: float, sin: float, pole: Float64, along: Float64, half_width: float,
+    half_length: float, sigma: Float64, slack: Float64,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Depth of a pole's overlap with a bundle (negative is a distance), its sigma and the crane's slack.
+
+    dx, dy: pole's centre minus bundle's. Of the four axes across the rectangles' sides the one with the
+    least overlap counts (separating axes).
+    """
+    best = (np.inf, 1.0, 0.0)
+    away = dx * along[0] + dy * along[1]
+    for axis in range(4):
+        if axis == 0:
+            nx, ny = along[1], -along[0]
+        elif axis == 1:
+            nx, ny = along[0], along[1]
+        elif axis == 2:
+            nx, ny = cos, sin
         else:
-            nearer = found[0] < best[0]
-            best = tuple(np.where(nearer, new, old) for new, old in zip(found, best, strict=True))  # type: ignore[assignment]
-    assert best is not None
+            nx, ny = -sin, cos
+        side, end = abs(nx * along[1] - ny * along[0]), abs(nx * along[0] + ny * along[1])
+        across, lengthwise = abs(nx * cos + ny * sin), abs(ny * cos - nx * sin)
+        depth = (
+            side * half_width + end * half_length + across * pole[3] / 2 + lengthwise * pole[2] / 2
+            - abs(dx * nx + dy * ny)
+        )  # fmt: skip
+        if depth < best[0]:
+            variance = side**2 * (sigma[0] ** 2 + (away * sigma[2]) ** 2 + sigma[3] ** 2)
+            variance += end**2 * (sigma[1] ** 2 + sigma[4] ** 2) + LEAST_SIGMA_M**2
+            loose = slack[0] * abs(nx) + slack[1] * abs(ny)
+            loose += slack[2] * across * (abs(pole[0]) + pole[2] / 2)
+            loose += slack[2] * lengthwise * (abs(pole[1]) + pole[3] / 2)
+            best = (depth, math.sqrt(variance), loose)
     return best

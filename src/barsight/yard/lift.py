@@ -60,7 +60,10 @@ def map_vetoes(
         vetoes.append(Veto("map-too-old", "when the map was measured is not known"))
     elif age_s > settings.max_age_s:
         vetoes.append(
-            Veto("map-too-old", f"the map is {age_s / 60:.0f} min old, {settings.max_age_s / 60:.0f} are allowed")
+            Veto(
+                "map-too-old",
+                f"the map is {age_s / 60:.0f} min old, {settings.max_age_s / 60:.0f} are allowed",
+            )
         )
     return tuple(vetoes)
 
@@ -107,6 +110,7 @@ def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, .
 
 def _best(group: tuple[Bundle, ...], yard: Yard, magnet: Magnet, settings: LiftSettings) -> Lift:
     """The placement with the fewest vetoes, then the safest."""
+
     def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
         places = (_place(group, along, across) for along, across in offsets)
         found = [assess(place, yard, magnet, settings, search=False) for place in places]
@@ -119,9 +123,12 @@ def _best(group: tuple[Bundle, ...], yard: Yard, magnet: Magnet, settings: LiftS
         quick = sorted([*quick, *tried((along, across) for along in ALONG_M)], key=_worst_first)
     if quick[0].vetoes:
         return quick[0]
-    finalists = [
-        assess(lift.place, yard, magnet, settings) for lift in quick[:FINALISTS] if not lift.vetoes
-    ]
+    finalists = []
+    for lift in quick[:FINALISTS]:
+        if not lift.vetoes:
+            finalists.append(assess(lift.place, yard, magnet, settings))
+            if not finalists[-1].vetoes:
+                break
     return min(finalists, key=_worst_first)
 
 

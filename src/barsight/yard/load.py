@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from barsight.yard.contact import UPPER
 from barsight.yard.types import Bundle
 
 STEEL_KG_PER_M3 = 7850.0
-UPPER = 1.645
-"""Sigmas to a bound that holds in 95 % of cases."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class Pole:
     width_m: float
 
     def __post_init__(self) -> None:
-        _expect(0.01 <= min(self.length_m, self.width_m), "a pole must be at least 10 mm long and wide")
+        _expect(min(self.length_m, self.width_m) >= 0.01, "a pole must be at least 10 mm long and wide")
         _expect(max(self.length_m, self.width_m) <= 10, "a pole can't be longer than 10 m")
         _expect(max(abs(self.along_m), abs(self.across_m)) <= 20, "a pole lies within 20 m of the centre")
 
@@ -44,7 +44,7 @@ class Beam:
 
 @dataclass(frozen=True)
 class Pull:
-    """Pull per area of pole at each air gap; linear between, nothing beyond the last."""
+    """Pull per area of pole at each air gap; linear between, 0 at the last and beyond."""
 
     gap_m: tuple[float, ...]
     kilopascal: tuple[float, ...]
@@ -55,7 +55,7 @@ class Pull:
         rising = all(b > a for a, b in zip(self.gap_m, self.gap_m[1:], strict=False))
         _expect(self.gap_m[0] == 0 and rising, "pull gap_m must begin at 0 and rise")
         falling = all(b <= a for a, b in zip(self.kilopascal, self.kilopascal[1:], strict=False))
-        _expect(falling and self.kilopascal[-1] >= 0, "pull kilopascal must fall with the gap and not below 0")
+        _expect(falling and self.kilopascal[-1] == 0, "pull kilopascal must fall with the gap and end at 0")
         _expect(0 < self.kilopascal[0] <= 4000, "pull kilopascal must lie between 0 and 4000 without a gap")
 
 
@@ -68,7 +68,7 @@ class Tolerance:
     yaw_deg: float
 
     def __post_init__(self) -> None:
-        within = 0 <= min(self.x_m, self.y_m) and max(self.x_m, self.y_m) <= 1 and 0 <= self.yaw_deg <= 20
+        within = min(self.x_m, self.y_m) >= 0 and max(self.x_m, self.y_m) <= 1 and 0 <= self.yaw_deg <= 20
         _expect(within, "tolerance x_m and y_m lie between 0 and 1, yaw_deg between 0 and 20")
 
 
@@ -81,13 +81,14 @@ class Limits:
     offset_along_m: float
     offset_across_m: float
     overhang_m: float
+    gap_m: float
     contact_share: float
 
     def __post_init__(self) -> None:
-        angles = 0 < min(self.pitch_deg, self.roll_deg) and max(self.pitch_deg, self.roll_deg) <= 45
+        angles = min(self.pitch_deg, self.roll_deg) > 0 and max(self.pitch_deg, self.roll_deg) <= 45
         _expect(angles, "limits pitch_deg and roll_deg lie between 0 and 45")
-        lengths = min(self.offset_along_m, self.offset_across_m, self.overhang_m)
-        _expect(lengths > 0, "limits offset_along_m, offset_across_m and overhang_m must be over 0")
+        lengths = min(self.offset_along_m, self.offset_across_m, self.overhang_m, self.gap_m)
+        _expect(lengths > 0, "limits offset_along_m, offset_across_m, overhang_m and gap_m must be over 0")
         _expect(0 <= self.contact_share < 1, "limits contact_share lies between 0 and 1")
 
 

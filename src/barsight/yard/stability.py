@@ -14,8 +14,8 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.types import Source
+from barsight.yard.contact import UPPER
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.load import UPPER
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
@@ -58,9 +58,7 @@ class Footing:
     freeboard_m: float
 
 
-def footings(
-    heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings
-) -> tuple[Footing, ...]:
+def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> tuple[Footing, ...]:
     """How each bundle stands, in the bundles' order."""
     return tuple(_footing(heights, bundle, settings) for bundle in bundles)
 
@@ -142,7 +140,7 @@ def _distance(bundle: Bundle, x: float, y: float) -> float:
     cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     beside = abs(away @ (cos, sin)) - bundle.width_m / 2
     beyond = abs(away @ (-sin, cos)) - bundle.length_m / 2
-    return float(np.hypot(max(beside, 0.0), max(beyond, 0.0)))
+    return math.hypot(max(float(beside), 0.0), max(float(beyond), 0.0))
 
 
 def footing_vetoes(
@@ -171,8 +169,8 @@ def footing_vetoes(
         )  # fmt: skip
     if own.freeboard_m < settings.least_freeboard_m:
         vetoes.append(
-            Veto("over-stanchion", f"the stanchion beside it is {1e3 * own.freeboard_m:.0f} mm above its top, "
-                 f"{1e3 * settings.least_freeboard_m:.0f} mm are needed")
+            Veto("over-stanchion", f"the stanchion beside it is {1e3 * own.freeboard_m:.0f} mm above its "
+                 f"top, {1e3 * settings.least_freeboard_m:.0f} mm are needed")
         )  # fmt: skip
     for other in bundles:
         leaning = by_id[other.id]
