@@ -13,6 +13,7 @@ import numpy as np
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
 from barsight.mapping.surface import Surface
+from barsight.yard.lift import LiftPlan
 from barsight.yard.stock_list import StockMatch
 from barsight.yard.types import Bundle
 
@@ -79,6 +80,7 @@ class Measurement:
     peak_memory_mib: float
     preview: Preview | None
     bundles: tuple[Bundle, ...]
+    lifts: LiftPlan
     stock: StockMatch | None
 
 

@@ -2,7 +2,7 @@
 
 recording -> rectified pair -> disparity -> points --+
 crane or matched features -> trajectory -------------+-> map -> height surface -> contours -> agreement
-                                                              +-> bundles
+                                                              +-> bundles -> lifts
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ from barsight.recording.sensors import imu_hints
 from barsight.stereo.settings import StereoSettings, make_method
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
+from barsight.yard.lift import map_vetoes, plan_lifts
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.magnet import Magnet, load_magnet
 from barsight.yard.stock_list import match_stock, read_stock
 from barsight.yard.types import HeightMap
 
@@ -62,6 +65,7 @@ class MeasureSettings:
     motion: MotionSettings = field(default_factory=MotionSettings)
     map: MapSettings = field(default_factory=MapSettings)
     bundles: BundleSettings = field(default_factory=BundleSettings)
+    lift: LiftSettings = field(default_factory=LiftSettings)
 
     def __post_init__(self) -> None:
         if "stereo" not in self.use:
@@ -75,11 +79,14 @@ def measure(
     scratch: Path,
     advance: Advance,
     resume: Path | None = None,
+    magnet: Magnet | None = None,
 ) -> Measurement:
     """Measure a recording. `scratch` is an empty folder for the map's tiles; the caller removes it.
 
     resume: a folder that keeps the trajectory and each frame's view (about 30 MB for 1.3 megapixels), so that
     a killed run goes on where it was; the caller removes it when all is written.
+    magnet: what lifts are chosen for; the package's documented example where there is none.
+
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
     """
@@ -154,7 +161,8 @@ def measure(
         agreed = [agree(by_number[p.profile], p) for p in laser if p.profile in by_number]
 
     with watch("bundles"):
-        bundles = find_bundles(HeightMap.of(surface), settings.bundles)
+        heights = HeightMap.of(surface)
+        bundles = find_bundles(heights, settings.bundles)
         expected = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
         stock = match_stock(expected, bundles) if expected and trajectory.reference == "yard" else None
 
@@ -172,6 +180,10 @@ def measure(
     frames_total = total + len(source.index.unpaired)
     if refusals:
         warnings.append(Notice("frames-refused", f"{len(refusals)} of {frames_total} frames were refused"))
+    with watch("lifts"):
+        told = [(notice.code, notice.message) for notice in warnings]
+        forbidden = map_vetoes(told, trajectory.reference, 0.0, settings.lift)
+        lifts = plan_lifts(heights, bundles, magnet or load_magnet(None), settings.lift, forbidden)
     return Measurement(
         recording_path=source.path,
         recording_format=source.format,
@@ -195,6 +207,7 @@ def measure(
         peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         preview=preview,
         bundles=bundles,
+        lifts=lifts,
         stock=stock,
     )
 

@@ -1,19 +1,23 @@
-"""Floor 6: reading back the folder that `barsight measure` wrote, for the page, the viewer and the export."""
+"""Floor 6: reading back the folder that `barsight measure` wrote, for page, viewer, export and lifts."""
 
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tifffile
 from plyfile import PlyData, PlyParseError
 
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
+from barsight.yard.types import HeightMap
 
 PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")
 _REMEDY = "measure the recording again"
@@ -54,6 +58,35 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if not isinstance(summary, dict):
         raise InputError(path, "is not a JSON object", _REMEDY)
     return summary
+
+
+def age_s(summary: dict[str, Any]) -> float | None:
+    """How long ago result.json says that it was measured; None where it doesn't say."""
+    try:
+        measured = datetime.fromisoformat(str(summary.get("measured_at")))
+    except ValueError:
+        return None
+    if measured.tzinfo is None:
+        return None
+    return (datetime.now(UTC) - measured).total_seconds()
+
+
+def read_heights(folder: Path) -> HeightMap:
+    """height.tif, whole. Raises InputError where it is missing or torn."""
+    path = folder / "height.tif"
+    if not path.is_file():
+        raise InputError(folder, "has no height.tif", _REMEDY)
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages.first
+            bands = page.asarray()
+            cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
+            tie = page.tags["ModelTiepointTag"].value
+            z, sigma, views, source = np.ascontiguousarray(bands[:4, ::-1])
+    except (tifffile.TiffFileError, zlib.error, OSError, ValueError, KeyError, IndexError) as error:
+        raise InputError(path, f"is torn ({error})", _REMEDY) from error
+    x0_m, y0_m = float(tie[3]) + cell_m / 2, float(tie[4]) - (z.shape[0] - 0.5) * cell_m
+    return HeightMap(x0_m, y0_m, cell_m, z, sigma, views, source.astype(np.uint8))
 
 
 def read_path(folder: Path) -> CameraPath | None:

@@ -22,6 +22,7 @@ from barsight.pipeline import MeasureSettings, measure
 from barsight.recording.open import open_recording
 from barsight.report.files import RESULT_FILES, summary, write_results, write_summary
 from barsight.report.page import write_report
+from barsight.yard.magnet import load_magnet
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -33,6 +34,7 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         settings: Annotated[MeasureSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
+        magnet: Path | None = None,
         overwrite: bool = False,
         resume: bool = False,
         verbose: Annotated[bool, tyro.conf.arg(aliases=("-v",))] = False,
@@ -49,11 +51,14 @@ def run(arguments: Sequence[str]) -> None:
             settings: Settings of the stages.
             config: TOML file with settings; flags go before it.
             resume: Keep what is done beside OUT until the end; a killed run started again with it goes on.
+            magnet: TOML file of the magnet that lifts are chosen for; docs/yard.md describes one.
             overwrite: Replace the result files of an earlier run in OUT.
             verbose: Print the time that each stage took.
         """
         console = Console(stderr=True)
-        measured = measure_into(recording, out, settings, console, overwrite=overwrite, resume=resume)
+        measured = measure_into(
+            recording, out, settings, console, overwrite=overwrite, resume=resume, magnet=magnet
+        )
         print_outcome(measured, console, verbose=verbose)
         console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
 
@@ -69,6 +74,7 @@ def measure_into(
     overwrite: bool = False,
     resume: bool = False,
     truth_of: Path | None = None,
+    magnet: Path | None = None,
 ) -> dict[str, Any]:
     """Measure, write all files and the report into `out`, and return what result.json says.
 
@@ -79,11 +85,12 @@ def measure_into(
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     recording = open_recording(path, settings.recording)
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
+    described = load_magnet(magnet)
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
         with stages(console) as advance:
-            measured = measure(recording, settings, scratch, advance, keep)
+            measured = measure(recording, settings, scratch, advance, keep, described)
         content = summary(measured)
         write_results(measured, staging)
         shutil.rmtree(scratch)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,12 @@ from barsight.core.types import Contour, LaserProfile, Trajectory
 from barsight.mapping.surface import Layers, Surface
 from barsight.measurement import Measurement, Preview
 from barsight.yard.bundle_file import write_bundles
+from barsight.yard.lift_file import write_lifts
 
 SCHEMA_VERSION = 1
 RESULT_FILES = (
-    "trajectory.tum", "cloud.ply", "height.tif", "contour.csv", "laser.csv", "bundles.json", "preview.png",
-    "result.json", "report.html",
+    "trajectory.tum", "cloud.ply", "height.tif", "contour.csv", "laser.csv", "bundles.json", "lifts.json",
+    "preview.png", "result.json", "report.html",
 )  # fmt: skip
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
@@ -42,6 +44,7 @@ def write_results(measurement: Measurement, folder: Path) -> None:
     write_contours(measurement.contours, folder / "contour.csv")
     reference = measurement.trajectory.reference
     write_bundles(measurement.bundles, measurement.stock, reference, folder / "bundles.json")
+    write_lifts(measurement.lifts, reference, folder / "lifts.json")
     if measurement.laser:
         write_laser(measurement.laser, folder / "laser.csv")
     if measurement.preview is not None:
@@ -186,6 +189,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
     content = {
         "schema_version": SCHEMA_VERSION,
         "software": {"name": "barsight", "version": barsight.__version__},
+        "measured_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "is_simulated": measurement.is_simulated,
         "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
         "reference": trajectory.reference,
@@ -225,7 +229,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "agreement": [asdict(agreement) for agreement in measurement.agreements],
         "truth": None,
         "warnings": [asdict(warning) for warning in measurement.warnings],
-        "vetoes": [],
+        "vetoes": [asdict(veto) for veto in measurement.lifts.vetoes],
     }
     rounded: dict[str, Any] = _rounded(content)
     return rounded

@@ -31,6 +31,11 @@ class Placement:
     yaw_rad: float
 
     @property
+    def yaw_deg(self) -> float:
+        """The yaw for people and plants."""
+        return math.degrees(self.yaw_rad)
+
+    @property
     def along(self) -> Float64:
         """(2,) unit vector along the beam."""
         return np.array([-np.sin(self.yaw_rad), np.cos(self.yaw_rad)])
@@ -133,7 +138,9 @@ def _grip(
     flips, taken = np.zeros(count), np.zeros(count, np.bool_)
     cos, sin = np.cos(yaw), np.sin(yaw)
     for b in range(count):
-        kept, added = 1.0, 0.0
+        kept = 1.0
+        # Poles on one side of the middle err together; those on the other by the opposite yaw.
+        added = np.zeros(2)
         for p in range(len(poles)):
             px = x - poles[p, 0] * sin + poles[p, 1] * cos
             py = y + poles[p, 0] * cos + poles[p, 1] * sin
@@ -158,8 +165,9 @@ def _grip(
             if depth > 0 and over > 0:
                 taken[b] = True
                 kept = min(kept, 1 - under)
-            added += under
-        flips[b] = kept if taken[b] else min(added, 1.0)
+            side = 1 if dx * along[b, 0] + dy * along[b, 1] > 0 else 0
+            added[side] = max(added[side], under)
+        flips[b] = kept if taken[b] else min(added.sum(), 1.0)
     return flips, taken
 
 

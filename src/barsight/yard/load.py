@@ -9,6 +9,8 @@ from barsight.yard.contact import UPPER
 from barsight.yard.types import Bundle
 
 STEEL_KG_PER_M3 = 7850.0
+FILLED, FILLED_SIGMA = 0.76, 0.015
+"""Steel's share of the circle around a hexagonal bundle: 0.778 for 7 bars, 0.753 for 61."""
 
 
 @dataclass(frozen=True)
@@ -29,18 +31,20 @@ class Mass:
 
 
 def mass_of(bundle: Bundle) -> Mass:
-    """Bars x section x length x 7850 kg/m3; NaN where the bars' number or diameter is unknown.
+    """Steel's section x length x 7850 kg/m3; NaN where width or length is unknown.
 
-    Of a bundle with an open end it is the mass of what was seen. The number of bars comes from the outline,
-    so its uncertainty is that of the width, twice; a single bar is a single bar.
+    The section is the bars' number times one bar's where the number is known, else a share of the circle
+    around the bundle. Of a bundle with an open end it is the mass of what was seen.
     """
-    if bundle.bars < 1 or not bundle.bar_diameter_m > 0 or not bundle.length_m > 0:
+    width, diameter, sigma = bundle.width_m, bundle.bar_diameter_m, bundle.sigma
+    if not (width > 0 and diameter > 0 and bundle.length_m > 0):
         return Mass(math.nan, math.nan)
-    section = math.pi / 4 * bundle.bar_diameter_m**2
-    kg = bundle.bars * section * bundle.length_m * STEEL_KG_PER_M3
-    sigma = bundle.sigma
-    outline = 2 * sigma.width_m / bundle.width_m if bundle.bars > 1 else 0.0
-    share = math.hypot(
-        2 * sigma.bar_diameter_m / bundle.bar_diameter_m, sigma.length_m / bundle.length_m, outline
-    )
-    return Mass(kg, kg * share)
+    if bundle.bars > 0:
+        section = bundle.bars * math.pi / 4 * diameter**2
+        share = 2 * sigma.bar_diameter_m / diameter
+    else:
+        section = FILLED * math.pi / 4 * width**2
+        share = math.hypot(2 * sigma.width_m / width, FILLED_SIGMA / FILLED)
+    kg = section * bundle.length_m * STEEL_KG_PER_M3
+    longer = sigma.length_m / bundle.length_m if math.isfinite(sigma.length_m) else 0.0
+    return Mass(kg, kg * math.hypot(share, longer))

@@ -1,0 +1,95 @@
+"""`barsight lifts OUT --magnet FILE`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from barsight.cli.arguments import call, config_path, load_settings
+from barsight.report.page import write_report
+from barsight.result_folder import age_s, read_heights, read_summary
+from barsight.yard.bundle_file import read_bundles
+from barsight.yard.lift import LiftPlan, map_vetoes, plan_lifts
+from barsight.yard.lift_file import write_lifts
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.magnet import load_magnet
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, choose, write and print."""
+    default = load_settings(config_path(arguments), LiftSettings)
+
+    def command(
+        out: tyro.conf.Positional[Path],
+        magnet: Path | None = None,
+        settings: Annotated[LiftSettings, tyro.conf.arg(name="")] = default,
+        config: Path | None = None,
+    ) -> None:
+        """Choose lift targets anew from a measured yard, without measuring again.
+
+        Writes OUT/lifts.json and OUT/report.html and prints the lifts, safest first.
+
+        Args:
+            out: A folder written by barsight measure.
+            magnet: TOML file of the magnet; docs/yard.md describes one. Without it an example is assumed.
+            settings: What a lift must fulfil.
+            config: TOML file with settings; flags go before it.
+        """
+        described = load_magnet(magnet)
+        summary = read_summary(out)
+        warnings = [(str(w.get("code")), str(w.get("message"))) for w in summary.get("warnings") or []]
+        reference = str(summary.get("reference", "world"))
+        vetoes = map_vetoes(warnings, reference, age_s(summary), settings)
+        bundles = read_bundles(out / "bundles.json")
+        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes)
+        write_lifts(plan, reference, out / "lifts.json")
+        write_report(out, out / "report.html")
+        print_lifts(plan, Console(stderr=True))
+
+    call(command, "lifts", arguments)
+
+
+def print_lifts(plan: LiftPlan, console: Console) -> None:
+    """The offered lifts as a table, the vetoes as counts."""
+    console.print(f"magnet: {escape(plan.magnet.name)}", highlight=False)
+    for veto in plan.vetoes:
+        console.print(f"[red]{veto.code}:[/red] {escape(veto.reason)}", highlight=False)
+    if plan.offered:
+        table = Table(title="Lifts, safest first", box=SIMPLE_HEAD)
+        for head in (
+            "rank",
+            "bundle",
+            "x m",
+            "y m",
+            "yaw deg",
+            "kg",
+            "pull/needed",
+            "tolerance mm",
+            "safety",
+        ):
+            table.add_column(head, justify="right", no_wrap=True)
+        for rank, lift in enumerate(plan.offered, start=1):
+            assert lift.contact is not None
+            table.add_row(
+                str(rank), ", ".join(str(b) for b in lift.bundles), f"{lift.place.x_m:.3f}",
+                f"{lift.place.y_m:.3f}", f"{lift.place.yaw_deg:.2f}",
+                f"{lift.mass.kg:.0f} ± {lift.mass.sigma_kg:.0f}",
+                f"{lift.contact.pull_low_n / lift.needed_n:.1f}",
+                f"{1e3 * lift.tolerance.x_m:.0f} x {1e3 * lift.tolerance.y_m:.0f}", f"{lift.safety:.2f}",
+            )  # fmt: skip
+        console.print(table)
+    else:
+        what = "no bundle was found" if not plan.refused else f"all {len(plan.refused)} places are vetoed"
+        console.print(f"no lift is offered: {what}", highlight=False)
+    reasons = Counter(veto.code for lift in plan.refused for veto in lift.vetoes)
+    if reasons:
+        listed = ", ".join(f"{code} {count}" for code, count in reasons.most_common())
+        console.print(f"refused: {len(plan.refused)} ({listed})", highlight=False)

@@ -1,0 +1,67 @@
+"""Small yards for the tests of lifts: bundles drawn from geometry, with records that state small sigmas."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from barsight.yard.assess import Lift, Yard, assess
+from barsight.yard.footprint import BundleTable, Placement
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.magnet import Magnet, load_magnet
+from barsight.yard.stability import footings
+from barsight.yard.types import Bundle, BundleSigma, HeightMap
+from yard_maps import Laid, draw
+
+MAGNET = load_magnet(None)
+SETTINGS = LiftSettings()
+SIGMA = BundleSigma(0.003, 0.02, 0.0006, 0.03, 0.006, 0.003, 0.001)
+LENGTH_M = 7.0
+
+
+def laid(x: float, z: float = 0.2, **changes: Any) -> Laid:
+    """A bundle of 7 bars of 90 mm, two of them level on top."""
+    return replace(Laid(x, 0.0, z, 0.0, length_m=LENGTH_M, roll_deg=0.0), **changes)
+
+
+def record(one: Laid, number: int = 0, **changes: Any) -> Bundle:
+    """The bundle as it would be found."""
+    yaw = np.radians(one.yaw_deg)
+    along = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    centre = np.array([one.x_m, one.y_m, one.z_m])
+    whole = Bundle(
+        id=number, centre_m=centre, yaw_rad=float(yaw), pitch_rad=0.0, length_m=one.length_m,
+        ends_m=np.stack([centre + s * one.length_m / 2 * along for s in (-1, 1)]), ends_open=(False, False),
+        width_m=one.width_m, top_z_m=one.top_z_m, bar_diameter_m=one.diameter_m, visible_bars=3,
+        bars=one.bars, layer=0, on_top=True, neighbours=(), sigma=SIGMA, known_share=1.0, confidence=0.99,
+        reasons=(),
+    )  # fmt: skip
+    return replace(whole, **changes)
+
+
+def map_of(bundles: list[Laid], **changes: Any) -> HeightMap:
+    """A map that sees all of them from end to end."""
+    width = max((b.x_m for b in bundles), default=1.0) + 1.5
+    return draw(bundles, **({"x_m": (-1.5, width), "y_m": (-4.0, 4.0), "sigma_m": 0.002} | changes))
+
+
+def yard_of(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings = SETTINGS) -> Yard:
+    return Yard(heights, BundleTable.of(bundles), footings(heights, bundles, settings), ())
+
+
+def judged(
+    stock: list[Laid], bundles: tuple[Bundle, ...] | None = None, place: Placement | None = None,
+    magnet: Magnet = MAGNET, settings: LiftSettings = SETTINGS, heights: HeightMap | None = None,
+) -> Lift:  # fmt: skip
+    """The lift at a place, else over the first bundle's middle."""
+    if bundles is None:
+        bundles = tuple(record(one, k) for k, one in enumerate(stock))
+    place = place or Placement(stock[0].x_m, 0.0, 0.0)
+    heights = heights if heights is not None else map_of(stock)
+    return assess(place, yard_of(heights, bundles, settings), magnet, settings)
+
+
+def codes(lift: Lift) -> set[str]:
+    return {veto.code for veto in lift.vetoes}

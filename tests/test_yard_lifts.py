@@ -1,0 +1,321 @@
+"""Lifts: every veto has a case that trips it, a good lift has none, and the figures are those of geometry."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from barsight.core.types import Source
+from barsight.yard.contact import touch
+from barsight.yard.footprint import BundleTable, Placement, grip
+from barsight.yard.lift import map_vetoes, plan_lifts
+from barsight.yard.lift_file import lifts_content, read_lifts, schema, write_lifts
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.load import mass_of
+from barsight.yard.magnet import Beam, Magnet, Tolerance
+from barsight.yard.settle import rest
+from barsight.yard.vetoes import VETOES, Veto
+from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
+from yard_maps import Laid
+
+
+def test_a_free_bundle_is_offered_with_the_figures_of_geometry() -> None:
+    stock = [laid(0.3), laid(0.62)]
+    bundles = tuple(record(one, k) for k, one in enumerate(stock))
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, ())
+    assert sorted(lift.bundles for lift in plan.offered) == [(0,), (1,)]
+    assert plan.refused == ()
+    for lift in plan.offered:
+        assert lift.contact is not None
+        true_kg = 7 * math.pi / 4 * 0.09**2 * 7.0 * 7850
+        assert abs(lift.mass.kg - true_kg) < 3 * lift.mass.sigma_kg < 0.1 * true_kg
+        assert lift.count == 1 and lift.count_probability > 0.999
+        assert abs(lift.contact.centre_z_m - stock[0].top_z_m) < 0.003
+        assert lift.tolerance.x_m >= MAGNET.tolerance.x_m
+        assert lift.overhang_m == pytest.approx(3.5 - 2.55, abs=0.05)
+        assert lift.safety >= 1
+
+
+def test_the_plane_rests_as_the_linear_program_says() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        u, v, z = rng.uniform(-0.05, 0.05, 40), rng.uniform(-2.5, 2.5, 40), rng.normal(0, 0.003, 40)
+        height, roll, pitch = rest(u, v, z, 0.1)
+        table = -np.column_stack([np.ones(40), u, v])
+        best = linprog([1, 0, 0], table, -z, bounds=[(None, None), (-0.1, 0.1), (-0.35, 0.35)])
+        assert height == pytest.approx(best.x[0], abs=2e-5)
+        assert (height + roll * u + pitch * v - z).min() == pytest.approx(0, abs=1e-9)
+
+
+def test_pull_is_the_table_over_the_faces() -> None:
+    heights = map_of([], sigma_m=0.0)
+    contact = touch(heights, Placement(0.5, 0.0, 0.0), MAGNET, 0.003)
+    assert contact is not None
+    whole = 4 * 0.9 * 0.1 * 560e3
+    assert contact.pull_n == pytest.approx(whole, rel=0.01)
+    assert contact.contact_share == 1
+
+
+def test_the_count_is_as_sure_as_monte_carlo_says() -> None:
+    stock = [laid(0.0), laid(0.33)]
+    wide = replace(SIGMA, lateral_m=0.01, width_m=0.02, yaw_rad=0.002)
+    table = BundleTable.of(tuple(record(one, k, sigma=wide) for k, one in enumerate(stock)))
+    exact = Tolerance(0.0, 0.0, 0.0)
+    rng = np.random.default_rng(1)
+    for x in (0.10, 0.12, 0.13):
+        place = Placement(x, 0.0, 0.0)
+        faces = np.full(4, stock[0].top_z_m)
+        said = grip(place, MAGNET, exact, table, faces)
+        right = 0
+        for _ in range(600):
+            drawn = tuple(
+                record(
+                    replace(
+                        one, x_m=one.x_m + rng.normal(0, 0.01),
+                        yaw_deg=math.degrees(rng.normal(0, 0.002)),
+                    ), k, width_m=one.width_m + rng.normal(0, 0.02),
+                ) for k, one in enumerate(stock)
+            )  # fmt: skip
+            right += grip(place, MAGNET, exact, BundleTable.of(drawn), faces).gripped == said.gripped
+        # The stated figure may be too careful, since it bounds how poles err together.
+        assert right / 600 - 0.12 < said.probability < right / 600 + 0.04
+
+
+def test_no_bundle_beside_them() -> None:
+    assert "no-bundle" in codes(judged([laid(0.3)], place=Placement(1.4, 0.0, 0.0)))
+
+
+def test_unknown_cells_under_a_pole() -> None:
+    stock = [laid(0.3)]
+    heights = map_of(stock)
+    rows = slice(*np.searchsorted(heights.y0_m + np.arange(heights.z_m.shape[0]) * 0.01, (0.5, 0.8)))
+    columns = slice(*np.searchsorted(heights.x0_m + np.arange(heights.z_m.shape[1]) * 0.01, (0.2, 0.4)))
+    for source in (Source.FILLED, Source.UNKNOWN):
+        heights.source[rows, columns] = source
+        assert codes(judged(stock, heights=heights)) == {"unknown-under-footprint"}
+
+
+def test_steel_of_no_known_bundle() -> None:
+    found = codes(judged([laid(0.3), laid(0.6)], (record(laid(0.6), 1),), Placement(0.4, 0.0, 0.0)))
+    assert "unexplained-surface" in found
+
+
+def test_a_doubtful_bundle() -> None:
+    lift = judged([laid(0.3)], (record(laid(0.3), confidence=0.3, reasons=("it may be two",)),))
+    assert codes(lift) == {"bundle-doubtful"}
+    assert "it may be two" in lift.vetoes[0].reason
+
+
+@pytest.mark.parametrize("on_top", [False, None])
+def test_a_covered_bundle(on_top: bool | None) -> None:
+    assert codes(judged([laid(0.3)], (record(laid(0.3), on_top=on_top),))) == {"covered"}
+
+
+def test_accident_two_a_footprint_over_two_bundles() -> None:
+    stock = [laid(0.3), laid(0.58)]
+    lift = judged(stock, place=Placement(0.44, 0.0, 0.0))
+    assert "straddles-neighbour" in codes(lift)
+    assert lift.count == 2 and set(lift.straddled) == {0, 1}
+    two = judged(stock, place=Placement(0.44, 0.0, 0.0), settings=LiftSettings(bundles=2))
+    assert two.count == 2 and "straddles-neighbour" not in codes(two)
+
+
+def test_an_edge_too_near_to_count_surely() -> None:
+    unsure = tuple(
+        record(one, k, sigma=replace(SIGMA, lateral_m=0.03)) for k, one in enumerate([laid(0.3), laid(0.58)])
+    )
+    assert "count-uncertain" in codes(judged([laid(0.3), laid(0.58)], unsure))
+
+
+def test_an_open_end_that_may_lie_under_a_pole_is_not_counted_out() -> None:
+    far = replace(laid(0.3), length_m=2.0)
+    near = record(far, 0, ends_open=(False, True))
+    assert "count-uncertain" in codes(judged([far], (near,), Placement(0.3, 3.8, 0.0)))
+
+
+def test_accident_one_a_magnet_80_mm_beside_the_axis() -> None:
+    lift = judged([laid(0.3)], place=Placement(0.38, 0.0, 0.0))
+    assert {"off-centre", "tilt"} <= codes(lift)
+    assert any("80 mm across" in veto.reason for veto in lift.vetoes)
+
+
+def test_a_slope_along_the_bars_is_a_tilt() -> None:
+    stock = [laid(0.3)]
+    heights = map_of(stock)
+    y = heights.y0_m + np.arange(heights.z_m.shape[0]) * heights.cell_m
+    heights.z_m[:] += (math.tan(math.radians(4)) * y)[:, None].astype(np.float32)
+    found = judged(stock, (record(stock[0], pitch_rad=math.radians(4)),), heights=heights)
+    assert "tilt" in codes(found)
+
+
+def test_a_pole_over_a_hollow_is_a_gap() -> None:
+    stock = [laid(0.3)]
+    heights = map_of(stock)
+    y = heights.y0_m + np.arange(heights.z_m.shape[0]) * heights.cell_m
+    heights.z_m[(y > 0.2) & (y < 1.2)] -= 0.03
+    assert "gap" in codes(judged(stock, heights=heights))
+
+
+def weak(**changes: object) -> Magnet:
+    return replace(MAGNET, **changes)  # type: ignore[arg-type]
+
+
+def test_too_little_pull() -> None:
+    assert codes(judged([laid(0.3)], magnet=weak(safety_factor=8.0))) == {"weak-pull"}
+
+
+def test_too_heavy_for_magnet_or_crane() -> None:
+    assert codes(judged([laid(0.3)], magnet=weak(capacity_kg=2000.0))) == {"overweight"}
+    assert codes(judged([laid(0.3)], magnet=weak(crane_capacity_kg=4000.0))) == {"overweight"}
+
+
+def test_mass_that_cannot_be_told() -> None:
+    assert "mass-unknown" in codes(judged([laid(0.3)], (record(laid(0.3), bar_diameter_m=math.nan),)))
+
+
+def test_mass_by_the_outline_agrees_with_mass_by_the_bars() -> None:
+    for bars, diameter in ((7, 0.09), (19, 0.04), (37, 0.02), (61, 0.02)):
+        one = record(Laid(0, 0, 0.2, 0, diameter, bars, 6.0))
+        known, unknown = mass_of(one), mass_of(replace(one, bars=0))
+        assert abs(unknown.kg - known.kg) < 2 * unknown.sigma_kg
+
+
+def test_a_magnet_off_the_middle_along_the_bars() -> None:
+    lift = judged([laid(0.3)], place=Placement(0.3, 0.4, 0.0))
+    assert codes(lift) == {"off-centre"}
+    assert lift.offset_along_m == pytest.approx(0.4)
+
+
+def test_bars_that_reach_too_far() -> None:
+    lift = judged([laid(0.3)], magnet=weak(limits=replace(MAGNET.limits, overhang_m=0.5)))
+    assert codes(lift) == {"overhang"}
+
+
+def test_an_end_that_was_not_seen() -> None:
+    assert codes(judged([laid(0.3)], (record(laid(0.3), ends_open=(False, True)),))) == {"end-open"}
+
+
+def test_a_neighbour_taller_than_the_beam_hangs() -> None:
+    low = weak(beam=Beam(5.4, 0.8, 0.1))
+    assert "obstructed" in codes(judged([laid(0.3), laid(0.65, z=0.45)], magnet=low))
+
+
+def test_a_crane_that_misses_by_more_than_the_lift_bears() -> None:
+    coarse = weak(tolerance=Tolerance(0.09, 0.03, 0.2))
+    assert codes(judged([laid(0.3)], magnet=coarse)) == {"narrow-tolerance"}
+
+
+def stack(shift_m: float) -> tuple[list[Laid], tuple]:  # type: ignore[type-arg]
+    """Two layers, the upper bundle shifted to high x; of the lower only what shows could be found."""
+    stock = [laid(0.0, z=0.2), laid(shift_m, z=0.56)]
+    return stock, (record(stock[1], 1, layer=1),)
+
+
+def test_accident_three_a_top_bundle_over_the_edge() -> None:
+    stock, bundles = stack(0.0)
+    place = Placement(0.0, 0.0, 0.0)
+    assert codes(judged(stock, bundles, place)) == set()
+    stock, bundles = stack(0.09)
+    lift = judged(stock, bundles, replace(place, x_m=0.09))
+    assert "overhanging" in codes(lift)
+    (reason,) = (veto.reason for veto in lift.vetoes if veto.code == "overhanging")
+    said = re.search(r"(\d+) mm over", reason)
+    assert said is not None and abs(int(said[1]) - 90) <= 30
+
+
+def test_a_top_bundle_whose_middle_is_not_carried() -> None:
+    stock, bundles = stack(0.15)
+    assert "no-support" in codes(judged(stock, bundles, Placement(0.15, 0.0, 0.0)))
+
+
+def test_accident_three_a_leaning_side() -> None:
+    stock = [laid(0.05 * k, z=0.2 + 0.36 * k) for k in range(3)]
+    top = record(stock[2], 2, layer=2)
+    lift = judged(stock, (top,), Placement(0.1, 0.0, 0.0))
+    assert "unstable-side" in codes(lift)
+    assert "leans by" in next(v.reason for v in lift.vetoes if v.code == "unstable-side")
+
+
+def test_a_bundle_beside_one_that_leans_over_it() -> None:
+    stock = [laid(0.0, z=0.2), laid(0.09, z=0.56), laid(0.5, z=0.2)]
+    bundles = (record(stock[1], 1, layer=1), record(stock[2], 2))
+    lift = judged(stock, bundles, Placement(0.5, 0.0, 0.0))
+    assert "unstable-side" in codes(lift)
+    assert "bundle 1" in next(v.reason for v in lift.vetoes if v.code == "unstable-side")
+
+
+def test_a_bundle_above_its_stanchion() -> None:
+    low = LiftSettings(stanchions=((0.0, 2.0, 0.3),))
+    assert codes(judged([laid(0.3)], settings=low)) == {"over-stanchion"}
+    high = LiftSettings(stanchions=((0.0, 2.0, 0.5),))
+    assert codes(judged([laid(0.3)], settings=high)) == set()
+
+
+@pytest.mark.parametrize(
+    ("warning", "reference", "age_s", "code"),
+    [
+        ("calibration", "yard", 1.0, "calibration-drift"),
+        ("calibration-drift", "yard", 1.0, "calibration-drift"),
+        ("trajectory", "yard", 1.0, "trajectory-degraded"),
+        ("one-view", "yard", 1.0, "one-view"),
+        ("assumed", "world", 1.0, "no-yard-frame"),
+        ("assumed", "yard", 4000.0, "map-too-old"),
+        ("assumed", "yard", None, "map-too-old"),
+    ],
+)
+def test_what_forbids_every_lift(warning: str, reference: str, age_s: float | None, code: str) -> None:
+    vetoes = map_vetoes([(warning, "as the result says")], reference, age_s, SETTINGS)
+    assert [veto.code for veto in vetoes] == [code]
+    stock = [laid(0.3)]
+    plan = plan_lifts(map_of(stock), (record(stock[0]),), MAGNET, SETTINGS, vetoes)
+    assert plan.offered == () and codes(plan.refused[0]) == {code}
+
+
+def test_a_sound_map_forbids_nothing() -> None:
+    assert map_vetoes([("frames-refused", "1 of 9")], "yard", 10.0, SETTINGS) == ()
+
+
+def test_an_empty_yard_and_one_without_a_free_bundle_offer_nothing() -> None:
+    plan = plan_lifts(map_of([]), (), MAGNET, SETTINGS, ())
+    assert plan.offered == plan.refused == ()
+    stock = [laid(0.3)]
+    plan = plan_lifts(map_of(stock), (record(stock[0], on_top=False),), MAGNET, SETTINGS, ())
+    assert plan.offered == plan.refused == ()
+
+
+def test_two_bundles_at_once_where_they_are_asked_for() -> None:
+    stock = [laid(0.1 + 0.19 * k, diameter_m=0.06) for k in range(2)]
+    bundles = tuple(record(one, k) for k, one in enumerate(stock))
+    wide = replace(
+        MAGNET, poles=tuple(replace(p, width_m=0.3) for p in MAGNET.poles),
+        limits=replace(MAGNET.limits, roll_deg=8.0),
+    )  # fmt: skip
+    plan = plan_lifts(map_of(stock), bundles, wide, LiftSettings(bundles=2), ())
+    assert [lift.bundles for lift in plan.offered] == [(0, 1)]
+
+
+def test_the_file_fits_its_schema_and_comes_back(tmp_path: Path) -> None:
+    stock = [laid(0.3), laid(0.62)]
+    bundles = (record(stock[0], 0), record(stock[1], 1, ends_open=(True, False)))
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, ())
+    content = lifts_content(plan, "yard")
+    jsonschema.validate(content, schema())
+    assert content["magnet"]["name"].startswith("example")
+    assert [lift["rank"] for lift in content["lifts"]] == [1]
+    assert content["refused"][0]["vetoes"][0]["code"] == "end-open"
+    write_lifts(plan, "yard", tmp_path / "lifts.json")
+    assert read_lifts(tmp_path / "lifts.json") == json.loads(json.dumps(content))
+
+
+def test_an_unknown_code_is_no_veto() -> None:
+    with pytest.raises(ValueError, match="no veto"):
+        Veto("because", "so")
+    assert all(re.fullmatch(r"[a-z]+(-[a-z]+)*", code) for code in VETOES)
