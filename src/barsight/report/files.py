@@ -229,7 +229,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "agreement": [asdict(agreement) for agreement in measurement.agreements],
         "truth": None,
         "warnings": [asdict(warning) for warning in measurement.warnings],
-        "vetoes": [asdict(veto) for veto in measurement.lifts.vetoes],
+        "vetoes": [{"code": v.code, "message": v.reason} for v in measurement.lifts.vetoes],
     }
     rounded: dict[str, Any] = _rounded(content)
     return rounded
