@@ -1,4 +1,4 @@
-"""`barsight bench stereo|subpixel|target-size|yard`: tables of methods, side by side in one run."""
+"""`barsight bench stereo|subpixel|target-size|yard|lifts`: tables of methods, side by side in one run."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from barsight.cli.arguments import call
+from barsight.cli.bench_lifts import bench_lift_targets
 from barsight.cli.bench_yard import bench_yard
 from barsight.core.errors import ConfigError
 from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table
@@ -32,6 +33,7 @@ def run(arguments: Sequence[str]) -> None:
         "subpixel": _subpixel,
         "target-size": _target_size,
         "yard": bench_yard,
+        "lifts": bench_lift_targets,
     }
     names = " | ".join(benches)
     if not arguments or arguments[0] in ("-h", "--help"):

@@ -20,13 +20,14 @@ from barsight.core.stamps import NS_PER_S, format_seconds
 from barsight.core.types import Contour, LaserProfile, Trajectory
 from barsight.mapping.surface import Layers, Surface
 from barsight.measurement import Measurement, Preview
+from barsight.report.orthophoto import georeference, write_orthophoto
 from barsight.yard.bundle_file import write_bundles
 from barsight.yard.lift_file import write_lifts
 
 SCHEMA_VERSION = 1
 RESULT_FILES = (
     "trajectory.tum", "cloud.ply", "height.tif", "contour.csv", "laser.csv", "bundles.json", "lifts.json",
-    "preview.png", "result.json", "report.html",
+    "ortho.tif", "ortho.png", "preview.png", "result.json", "report.html",
 )  # fmt: skip
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
@@ -41,6 +42,7 @@ def write_results(measurement: Measurement, folder: Path) -> None:
     write_trajectory(measurement.trajectory, folder / "trajectory.tum")
     write_cloud(measurement.surface, folder / "cloud.ply")
     write_height(measurement.surface, folder / "height.tif")
+    write_orthophoto(measurement.surface, folder)
     write_contours(measurement.contours, folder / "contour.csv")
     reference = measurement.trajectory.reference
     write_bundles(measurement.bundles, measurement.stock, reference, folder / "bundles.json")
@@ -88,15 +90,10 @@ def write_cloud(surface: Surface, target: Path) -> None:
 def write_height(surface: Surface, target: Path) -> None:
     """Tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is no data."""
     rows, columns = surface.shape
-    cell = surface.cell_m
-    left = (surface.columns[0] - 0.5) * cell
-    top = (surface.rows[1] - 0.5) * cell
     bands = "".join(
         f'<Item name="DESCRIPTION" sample="{i}" role="description">{name}</Item>'
         for i, name in enumerate(BANDS)
     )
-    # GeoKeys: a projected system of its own (32767), pixels as areas, metres.
-    keys = (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32767, 3076, 0, 1, 9001)
     with atomic_path(target) as path:
         tifffile.imwrite(
             path,
@@ -110,9 +107,7 @@ def write_height(surface: Surface, target: Path) -> None:
             metadata=None,
             software=f"barsight {barsight.__version__}",
             extratags=[
-                (33550, "d", 3, (cell, cell, 0.0), True),
-                (33922, "d", 6, (0.0, 0.0, 0.0, left, top, 0.0), True),
-                (34735, "H", len(keys), keys, True),
+                *georeference(surface),
                 (42112, "s", 0, f"<GDALMetadata>{bands}</GDALMetadata>", True),
                 (42113, "s", 0, "nan", True),
             ],

@@ -16,6 +16,7 @@ from plotly.offline import get_plotlyjs
 from barsight.core.files import atomic_path
 from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_path import path_plots
+from barsight.report.page_yard import yard_part
 from barsight.report.pictures import preview_uri, read_raster
 from barsight.report.plots import (
     Plot,
@@ -57,7 +58,8 @@ def render_page(out_dir: Path) -> str:
     compared = compare(read_contours(out_dir), laser)
     path = read_path(out_dir)
     height = out_dir / "height.tif"
-    maps: tuple[MapFigure, ...] = map_figures(read_raster(height), laser) if height.is_file() else ()
+    raster = read_raster(height) if height.is_file() else None
+    maps: tuple[MapFigure, ...] = map_figures(raster, laser) if raster else ()
     contours = [contour_plot(item) for item in compared]
     agreement = [
         found
@@ -70,6 +72,7 @@ def render_page(out_dir: Path) -> str:
         result=result,
         figures=key_figures(result),
         maps=maps,
+        yard=yard_part(out_dir, raster),
         contours=contours,
         agreement_plots=agreement,
         ways=ways,

@@ -45,8 +45,30 @@ class Level:
 
 
 @dataclass(frozen=True)
+class Shape:
+    """A line over a map, in m or in the drawing's units, with a label at its middle where there is one."""
+
+    points: tuple[tuple[float, float], ...]
+    colour: str
+    width: float
+    dashed: bool = False
+    label: str = ""
+
+    @property
+    def path(self) -> str:
+        """The points as SVG wants them."""
+        return " ".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Where the label goes."""
+        low, high = np.min(self.points, axis=0), np.max(self.points, axis=0)
+        return float((low[0] + high[0]) / 2), float((low[1] + high[1]) / 2)
+
+
+@dataclass(frozen=True)
 class Drawing:
-    """One strip of a map in SVG units, WIDTH wide."""
+    """One strip of a map in SVG units, WIDTH wide. scale: units per m; corner_m: x, y of its upper left."""
 
     image: str
     x: float
@@ -58,6 +80,9 @@ class Drawing:
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
     levels: tuple[Level, ...]
+    scale: float
+    corner_m: tuple[float, float]
+    shapes: tuple[Shape, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -104,7 +129,7 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         "Height above z = 0, lit from the upper left. The colours end at the 1st and 99th percentile."
         + (" Dashed: laser profiles." if levels else "")
         + scaled,
-        _draw(paint_height(raster, low, high), raster, levels, LARGE_TEXT),
+        draw_map(paint_height(raster, low, high), raster, levels, LARGE_TEXT),
         _bar(low * 1e3, high * 1e3, cv2.COLORMAP_VIRIDIS, "mm"),
         (tint, UNKNOWN_KEY),
     )
@@ -113,7 +138,7 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         "sigma",
         "Uncertainty",
         "One standard deviation of the height; the colours end at the seen cells' 95th percentile." + scaled,
-        _draw(paint_scale(raster.sigma_m, 0, worst, cv2.COLORMAP_MAGMA), raster, (), SMALL_MAP_TEXT),
+        draw_map(paint_scale(raster.sigma_m, 0, worst, cv2.COLORMAP_MAGMA), raster, (), SMALL_MAP_TEXT),
         _bar(0, worst * 1e3, cv2.COLORMAP_MAGMA, "mm"),
         (UNKNOWN_KEY,),
     )
@@ -122,7 +147,7 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         "views",
         "Views",
         "How many frames support the height of a cell." + scaled,
-        _draw(paint_scale(raster.views, 0, most, cv2.COLORMAP_CIVIDIS), raster, (), SMALL_MAP_TEXT),
+        draw_map(paint_scale(raster.views, 0, most, cv2.COLORMAP_CIVIDIS), raster, (), SMALL_MAP_TEXT),
         _bar(0, most, cv2.COLORMAP_CIVIDIS, "views"),
         (UNKNOWN_KEY,),
     )
@@ -131,14 +156,14 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         "source",
         "Source",
         "Where each cell's height comes from; filled cells were not seen." + scaled,
-        _draw(paint_source(raster.source), raster, (), SMALL_MAP_TEXT, lossless=True),
+        draw_map(paint_source(raster.source), raster, (), SMALL_MAP_TEXT, lossless=True),
         None,
         (*(Key(names[code], "rgb({},{},{})".format(*rgb)) for code, rgb in SOURCE_RGB.items()), UNKNOWN_KEY),
     )
     return height, sigma, views, source
 
 
-def _draw(
+def draw_map(
     picture: UInt8,
     raster: Raster,
     levels: tuple[tuple[str, float], ...],
@@ -146,6 +171,7 @@ def _draw(
     *,
     lossless: bool = False,
 ) -> tuple[Drawing, ...]:
+    """A picture in strips with axes around them. levels: label and y (m) of lines across; text: its size."""
     strips = cut_strips(picture, raster, lossless=lossless)
     widest = max(strip.x_max_m - strip.x_min_m for strip in strips)
     tall = raster.z_m.shape[0] * raster.cell_m
@@ -178,6 +204,8 @@ def _drawing(strip: Strip, scale: float, levels: tuple[tuple[str, float], ...], 
             for label, y in levels
             if strip.y_min_m < y < strip.y_max_m
         ),
+        scale=scale,
+        corner_m=(strip.x_min_m, strip.y_max_m),
     )
 
 

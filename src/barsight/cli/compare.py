@@ -1,0 +1,97 @@
+"""`barsight compare OLD NEW`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from barsight.cli.arguments import call
+from barsight.core.errors import MeasurementError
+from barsight.core.files import atomic_path
+from barsight.result_folder import read_heights, read_summary
+from barsight.yard.bundle_file import read_bundles
+from barsight.yard.changes import Change, compare_yards
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, compare and print."""
+
+    def command(
+        old: tyro.conf.Positional[Path], new: tyro.conf.Positional[Path], json: Path | None = None
+    ) -> None:
+        """Say what changed between two measured yards: moved, settled, taken, added, in mm and kg.
+
+        A change counts as significant where chance would do as much in less than one case of a hundred, by
+        the sigmas of both.
+
+        Args:
+            old: The earlier folder written by barsight measure.
+            new: The later one.
+            json: JSON file for all figures.
+        """
+        for folder in (old, new):
+            reference = read_summary(folder).get("reference")
+            if reference != "yard":
+                raise MeasurementError(
+                    f"{folder}: is in the {reference} frame; only maps with a crane's place can be compared"
+                )
+        changes = compare_yards(
+            read_bundles(old / "bundles.json"), read_heights(old),
+            read_bundles(new / "bundles.json"), read_heights(new),
+        )  # fmt: skip
+        if json is not None:
+            _write(changes, json)
+        _print(changes, Console())
+
+    call(command, "compare", arguments)
+
+
+def _write(changes: tuple[Change, ...], target: Path) -> None:
+    rows = [asdict(change) | {"significant": change.significant} for change in changes]
+    with atomic_path(target) as path:
+        path.write_text(json.dumps({"changes": _plain(rows)}, indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print(changes: tuple[Change, ...], console: Console) -> None:
+    told = [change for change in changes if change.kind != "same"]
+    if told:
+        table = Table(box=SIMPLE_HEAD, title="Changes")
+        for head in ("what", "old", "new", "across mm", "along mm", "up mm", "yaw deg", "kg"):
+            table.add_column(head, justify="right", no_wrap=True)
+        for change in told:
+            across, along, up, yaw = change.sigmas
+            table.add_row(
+                change.kind, _name(change.old), _name(change.new), _figure(change.across_mm, across, 0),
+                _figure(change.along_mm, along, 0), _figure(change.up_mm, up, 0),
+                _figure(change.yaw_deg, yaw, 2), _figure(change.kg, change.sigma_kg, 0),
+            )  # fmt: skip
+        console.print(table)
+    same = len(changes) - len(told)
+    console.print(f"{same} of {len(changes)} bundles lie where they lay", highlight=False)
+
+
+def _name(number: int | None) -> str:
+    return "-" if number is None else str(number)
+
+
+def _figure(value: float, sigma: float, decimals: int) -> str:
+    if math.isnan(value):
+        return "-"
+    return f"{value:+.{decimals}f} ± {sigma:.{decimals}f}"

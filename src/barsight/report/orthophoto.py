@@ -1,0 +1,61 @@
+"""The orthophoto: the grey level of each cell's height, as a GeoTIFF on height.tif's grid and as a PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+
+import barsight
+from barsight.core.arrays import UInt8
+from barsight.core.files import atomic_path
+from barsight.mapping.surface import Surface
+
+NO_DATA = 0
+_ROWS = 256
+
+
+def georeference(surface: Surface) -> list[tuple[int, str, int, Any, bool]]:
+    """Tags that place a raster of the surface: a projected system of its own (32767), pixels as areas, m."""
+    cell = surface.cell_m
+    left, top = (surface.columns[0] - 0.5) * cell, (surface.rows[1] - 0.5) * cell
+    keys = (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32767, 3076, 0, 1, 9001)
+    return [
+        (33550, "d", 3, (cell, cell, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, left, top, 0.0), True),
+        (34735, "H", len(keys), keys, True),
+    ]
+
+
+def orthophoto(surface: Surface) -> UInt8:
+    """(rows, columns) grey levels from 1, NO_DATA where no view saw the cell; row 0 at the highest y."""
+    rows, columns = surface.shape
+    picture = np.full((rows, columns), NO_DATA, np.uint8)
+    for row in range(0, rows, _ROWS):
+        count = min(_ROWS, rows - row)
+        lowest = surface.rows[1] - row - count
+        grey = surface.window(surface.columns[0], lowest, columns, count).intensity[::-1]
+        known = np.isfinite(grey)
+        picture[row : row + count][known] = grey[known].round().clip(1, 255).astype(np.uint8)
+    return picture
+
+
+def write_orthophoto(surface: Surface, folder: Path) -> None:
+    """ortho.tif and ortho.png, each whole or not at all."""
+    picture = orthophoto(surface)
+    with atomic_path(folder / "ortho.tif") as path:
+        tifffile.imwrite(
+            path,
+            picture,
+            photometric="minisblack",
+            tile=(256, 256),
+            compression="zlib",
+            metadata=None,
+            software=f"barsight {barsight.__version__}",
+            extratags=[*georeference(surface), (42113, "s", 0, str(NO_DATA), True)],
+        )
+    with atomic_path(folder / "ortho.png") as path:
+        path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())

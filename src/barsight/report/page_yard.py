@@ -1,0 +1,139 @@
+"""The page's yard: bundles and lifts drawn on the orthophoto and on the height map, with their tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Float64, UInt8
+from barsight.core.errors import InputError
+from barsight.report.page_maps import LARGE_TEXT, Drawing, Key, MapFigure, Shape, draw_map
+from barsight.report.pictures import Raster, paint_height, robust_range
+from barsight.yard.bundle_file import read_bundles
+from barsight.yard.lift_file import read_lifts
+from barsight.yard.types import Bundle
+
+FREE_RGB, COVERED_RGB, LIFT_RGB, REFUSED_RGB = "#39d353", "#f2b134", "#ff2fb3", "#ff5a4f"
+
+
+@dataclass(frozen=True)
+class YardPart:
+    """What the page says of bundles and lifts. lifts: lifts.json, None where there is none."""
+
+    figures: tuple[MapFigure, ...]
+    bundles: tuple[Bundle, ...]
+    lifts: dict[str, Any] | None
+
+
+def yard_part(out_dir: Path, raster: Raster | None) -> YardPart | None:
+    """Bundles, lifts and their pictures; None where the folder has no bundles.json."""
+    if not (out_dir / "bundles.json").is_file():
+        return None
+    bundles = read_bundles(out_dir / "bundles.json")
+    lifts = read_lifts(out_dir / "lifts.json") if (out_dir / "lifts.json").is_file() else None
+    if raster is None:
+        return YardPart((), bundles, lifts)
+    shapes = (*bundle_shapes(bundles), *(lift_shapes(lifts) if lifts else ()))
+    keys = (
+        Key("bundle, free", FREE_RGB), Key("bundle, covered or not known", COVERED_RGB),
+        Key("magnet of an offered lift, its rank", LIFT_RGB),
+    )  # fmt: skip
+    low, high = robust_range(raster.z_m, 1, 99)
+    pictures = [("yard-height", "Bundles and lifts on the height map", paint_height(raster, low, high))]
+    if (out_dir / "ortho.png").is_file():
+        photo = _orthophoto(out_dir / "ortho.png", raster)
+        pictures.insert(0, ("yard-ortho", "Bundles and lifts on the orthophoto", photo))
+    caption = (
+        "Outline and axis of each bundle with its number, an open end dashed; the magnet's poles where a "
+        "lift is offered. The coordinates are those of lifts.json."
+    )
+    figures = tuple(
+        MapFigure(
+            name, title, caption,
+            tuple(_with(drawing, shapes) for drawing in draw_map(picture, raster, (), LARGE_TEXT)),
+            None, keys,
+        ) for name, title, picture in pictures
+    )  # fmt: skip
+    return YardPart(figures, bundles, lifts)
+
+
+def _orthophoto(path: Path, raster: Raster) -> UInt8:
+    """(H, W, 4) the orthophoto in the raster's size, transparent where nothing was seen."""
+    grey = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise InputError(path, "is torn", "measure the recording again")
+    step, (rows, columns) = raster.step, raster.z_m.shape
+    whole = np.zeros((rows * step, columns * step), np.uint8)
+    whole[: grey.shape[0], : grey.shape[1]] = grey[: rows * step, : columns * step]
+    small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+    bright = np.clip(small.astype(np.float32) * (235 / max(np.percentile(small[small > 0], 99), 1)
+                     if (small > 0).any() else 1), 0, 255).astype(np.uint8)  # fmt: skip
+    return np.dstack([bright, bright, bright, np.where(small > 0, 255, 0).astype(np.uint8)])
+
+
+def _with(drawing: Drawing, shapes: tuple[Shape, ...]) -> Drawing:
+    """The drawing with the shapes that touch it, in its own units."""
+    scale, (x0, y1) = drawing.scale, drawing.corner_m
+    inside = []
+    for shape in shapes:
+        x = drawing.x + (np.array([p[0] for p in shape.points]) - x0) * scale
+        y = drawing.y + (y1 - np.array([p[1] for p in shape.points])) * scale
+        if x.max() > drawing.x and x.min() < drawing.x + drawing.width:
+            inside.append(replace(shape, points=tuple(zip(x.tolist(), y.tolist(), strict=True))))
+    return replace(drawing, shapes=tuple(inside))
+
+
+def bundle_shapes(bundles: tuple[Bundle, ...]) -> tuple[Shape, ...]:
+    """Outline and axis of each bundle, in m; open ends dashed."""
+    shapes = []
+    for bundle in bundles:
+        colour = FREE_RGB if bundle.on_top else COVERED_RGB
+        corners = rectangle(bundle.centre_m[:2], bundle.yaw_rad, bundle.width_m, bundle.length_m)
+        low, high = bundle.ends_m[:, :2].tolist()
+        for a, b, dashed in (
+            (corners[0], corners[1], bundle.ends_open[0]), (corners[1], corners[2], False),
+            (corners[2], corners[3], bundle.ends_open[1]), (corners[3], corners[0], False),
+        ):  # fmt: skip
+            shapes.append(Shape((a, b), colour, 1.6, dashed))
+        shapes.append(Shape((tuple(low), tuple(high)), colour, 0.8, False, str(bundle.id)))
+    return tuple(shapes)
+
+
+def lift_shapes(lifts: dict[str, Any]) -> tuple[Shape, ...]:
+    """The magnet's poles at each offered lift, with its rank."""
+    shapes = []
+    for lift in lifts["lifts"]:
+        label = f"#{lift['rank']}"
+        for corners in pole_corners(lift["target"], lifts["magnet"]["poles"]):
+            shapes.append(Shape((*corners, corners[0]), LIFT_RGB, 2.2, False, label))
+            label = ""
+    return tuple(shapes)
+
+
+def pole_corners(
+    target: dict[str, float], poles: list[dict[str, float]]
+) -> list[tuple[tuple[float, float], ...]]:
+    """The four corners of each pole, yard axes, m."""
+    yaw = np.radians(target["yaw_deg"])
+    across, along = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    found = []
+    for pole in poles:
+        centre = np.array([target["x_m"], target["y_m"]])
+        centre = centre + pole["across_m"] * across + pole["along_m"] * along
+        found.append(rectangle(centre, float(yaw), pole["width_m"], pole["length_m"]))
+    return found
+
+
+def rectangle(
+    centre: Float64, yaw_rad: float, width: float, length: float
+) -> tuple[tuple[float, float], ...]:
+    """Corners: low-y end from low to high side, then the high-y end back."""
+    across = width / 2 * np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+    along = length / 2 * np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
+    corners = (centre - along - across, centre - along + across, centre + along + across,
+               centre + along - across)  # fmt: skip
+    return tuple((float(x), float(y)) for x, y in corners)
