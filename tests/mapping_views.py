@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +43,11 @@ def fused(
     cell_m: float = 0.01,
     resident: int = 64,
 ) -> Surface:
-    """The finished surface of some views."""
+    """The finished surface of some views, every cell for itself: a rim asks nothing of the cells beside it
+    unless the settings say how much."""
     settings = settings or MapSettings(min_views=1)
+    if settings.rim_share == MapSettings().rim_share:
+        settings = replace(settings, rim_share=0.001)
     folder.mkdir(parents=True, exist_ok=True)
     store = TileStore(folder, resident)
     poses = []

@@ -93,6 +93,21 @@ def test_a_height_behind_the_wall_that_none_can_see_is_unknown(tmp_path: Path) -
     np.testing.assert_allclose(layers.z_m[:, 200 : 200 + slit], 1.0)
 
 
+def test_a_hook_that_travels_along_leaves_no_ghost(tmp_path: Path) -> None:
+    """It hangs 4 m over the floor, hides what is below it and is somewhere else in each view."""
+    views = []
+    for eye in EYES_X_M:
+        x, y, z = scene_view(eye)
+        hook = round((eye + 0.3) / CELL_M)
+        kept = np.abs(x - hook) > 4
+        hook_x, hook_y = (a.ravel() for a in block(9, 12, hook - 4))
+        x, y = np.append(x[kept], hook_x), np.append(y[kept], hook_y)
+        views.append(view(x, y, np.append(z[kept], np.full(hook_x.size, 4.0))))
+    layers = surface_of(views, tmp_path)
+    assert (layers.source == Source.VISION).mean() > 0.85
+    assert np.nanmax(layers.z_m) <= 1.0 + 1e-6
+
+
 @pytest.mark.parametrize(("low", "high", "held"), [(-0.5, 0.5, True), (30.0, 31.0, False), (7.0, 8.0, False)])
 def test_views_far_from_a_box_are_left_out(low: float, high: float, held: bool) -> None:
     sights = Sights.of([pose_at(0.0)], CAMERA)

@@ -24,6 +24,8 @@ from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
 _BORDER_PX = 3.0
 _RIM_CELLS = 2
 _RIM_SLOPE = 2.5
+_ALONG = 5
+_ALIKE_CELLS = 3.0
 _NOTHING = np.float32(-1e6)
 
 
@@ -92,15 +94,16 @@ def elect(
     corner = np.array(key, np.float64) * TILE_CELLS
     box = np.array([[*corner, held.min() / cell_m], [*(corner + TILE_CELLS), held.max() / cell_m]]) * cell_m
     sights = sights.near(*box)
-    shares = settings.inner_share, settings.rim_share
-    return _elected(
-        tile, corner, np.where(known, around, _NOTHING), ceiling,
-        lens, size, sights.rotation, sights.translation, sights.eyes, cell_m, float(min_views), *shares,
+    around = np.where(known, around, _NOTHING)
+    share = _supported(
+        tile, corner, around, ceiling, lens, size, sights.rotation, sights.translation, sights.eyes,
+        cell_m, float(min_views),
     )  # fmt: skip
+    return _elected(tile, share, around, cell_m, settings.inner_share, settings.rim_share)
 
 
 @kernel(parallel=True)
-def _elected(
+def _supported(
     tile: Float32,
     corner: Float64,
     around: Float32,
@@ -112,25 +115,17 @@ def _elected(
     eyes: Float64,
     cell_m: float,
     min_views: float,
-    inner_share: float,
-    rim_share: float,
-) -> Int8:
+) -> Float32:
+    """(rows, columns, SLOTS) the share of those views that can see a height which do see it in the cell's
+    middle; -1 where fewer than min_views see or can see it."""
     rows, columns = tile.shape[:2]
-    winner = np.full((rows, columns), -1, np.int8)
+    share = np.full((rows, columns, SLOTS), -1, np.float32)
     for i in prange(rows):
         for j in range(columns):
-            slots = tile[i, j]
-            tried = np.zeros(SLOTS, np.bool_)
-            for _ in range(SLOTS):
-                best = -1
-                for s in range(SLOTS):
-                    candidate = not tried[s] and slots[s, VIEWS] >= min_views
-                    if candidate and (best < 0 or slots[s, Z] > slots[best, Z]):
-                        best = s
-                if best < 0:
-                    break
-                tried[best] = True
-                z = float(slots[best, Z])
+            for s in range(SLOTS):
+                if tile[i, j, s, VIEWS] < min_views:
+                    continue
+                z = float(tile[i, j, s, Z])
                 point = np.array([(corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z])
                 able = 0
                 for k in range(rotation.shape[0]):
@@ -138,11 +133,55 @@ def _elected(
                         free = _free(point, i, j, eyes[k, 0], around, ceiling, cell_m)
                         if free and _free(point, i, j, eyes[k, 1], around, ceiling, cell_m):
                             able += 1
-                share = rim_share if _at_rim(z, i, j, around, cell_m) else inner_share
-                if able >= min_views and slots[best, CENTRAL] >= share * able:
-                    winner[i, j] = best
-                    break
+                if able >= min_views:
+                    share[i, j, s] = min(tile[i, j, s, CENTRAL] / able, 1.0)
+    return share
+
+
+@kernel(parallel=True)
+def _elected(
+    tile: Float32, share: Float32, around: Float32, cell_m: float, inner_share: float, rim_share: float
+) -> Int8:
+    rows, columns = tile.shape[:2]
+    winner = np.full((rows, columns), -1, np.int8)
+    for i in prange(rows):
+        for j in range(columns):
+            best = -1
+            for s in range(SLOTS):
+                z = float(tile[i, j, s, Z])
+                if share[i, j, s] < 0 or (best >= 0 and z <= tile[i, j, best, Z]):
+                    continue
+                if _at_rim(z, i, j, around, cell_m):
+                    enough = _share_along(tile, share, i, j, z, cell_m) >= rim_share
+                else:
+                    enough = share[i, j, s] >= inner_share
+                if enough:
+                    best = s
+            winner[i, j] = best
     return winner
+
+
+@kernel()
+def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
+    """The mean share of a height and its like within `_ALONG` cells, along that of four directions in which
+    most of the tile's cells have one: the rim's own."""
+    most, result = -1, 0.0
+    for direction in range(4):
+        di, dj = (0, 1, 1, 1)[direction], (1, 0, 1, -1)[direction]
+        alike, inside, total = 0, 0, 0.0
+        for n in range(-_ALONG, _ALONG + 1):
+            i, j = row + n * di, column + n * dj
+            if i < 0 or j < 0 or i >= tile.shape[0] or j >= tile.shape[1]:
+                continue
+            inside += 1
+            for s in range(SLOTS):
+                if share[i, j, s] >= 0 and abs(tile[i, j, s, Z] - z) <= _ALIKE_CELLS * cell_m:
+                    alike += 1
+                    total += share[i, j, s]
+                    break
+        if alike > most:
+            most, result = alike, total / inside
+    return result
 
 
 @kernel()
