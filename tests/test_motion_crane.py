@@ -35,7 +35,8 @@ def readings(count: int = 40, noise: float = 0.0, rng: np.random.Generator | Non
 def test_a_parabola_is_met_exactly() -> None:
     crane = readings()
     for stamp in (START_NS + 500_000_007, START_NS + 1_234_567_891):
-        position, covariance = fit_position(crane, stamp, WINDOW_NS)
+        fit = fit_position(crane, stamp, WINDOW_NS)
+        position, covariance = fit.position_m, fit.covariance
         np.testing.assert_allclose(position, place((stamp - START_NS) / 1e9), atol=1e-10)
         assert 0 < covariance[0, 0] < STD_M**2
 
@@ -47,7 +48,8 @@ def test_the_covariance_is_right(count: int) -> None:
     nees = []
     for _ in range(400):
         crane = readings(count, STD_M, rng)
-        position, covariance = fit_position(crane, START_NS + 25_000_000 * count, WINDOW_NS)
+        fit = fit_position(crane, START_NS + 25_000_000 * count, WINDOW_NS)
+        position, covariance = fit.position_m, fit.covariance
         nees.append((position - truth) @ np.linalg.solve(covariance, position - truth) / 3)
     # For five readings the line's bias (0.2 m/s^2 over 0.1 s) adds to the noise.
     assert 0.8 < np.mean(nees) < (1.5 if count == 5 else 1.2)
@@ -62,7 +64,8 @@ def test_wild_readings_dont_pull(size_m: float, wild: list[int]) -> None:
     for _ in range(100):
         crane = readings(15, STD_M, rng)
         crane.position_m[wild, 0] += size_m
-        position, covariance = fit_position(crane, START_NS + 350_000_000, WINDOW_NS)
+        fit = fit_position(crane, START_NS + 350_000_000, WINDOW_NS)
+        position, covariance = fit.position_m, fit.covariance
         errors.append(position - truth)
         sigmas.append(np.sqrt(covariance[0, 0]))
     assert np.sqrt(np.mean(np.square(errors))) < 1.3 * np.mean(sigmas)

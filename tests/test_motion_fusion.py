@@ -85,8 +85,9 @@ def fused(
     recording: Recording, monkeypatch: pytest.MonkeyPatch, sightings: tuple[Sighting, ...]
 ) -> Trajectory:
     monkeypatch.setattr(fusion, "follow", lambda *_: (sightings, ()))
-    settings = FusionSettings(systematic_attitude_deg=0.0)
-    return FusedTrajectory(settings, CraneSettings())(recording, Rectifier(recording.rig), lambda: None)
+    return FusedTrajectory(FusionSettings(), CraneSettings())(
+        recording, Rectifier(recording.rig), lambda: None
+    )
 
 
 @pytest.mark.slow
@@ -98,7 +99,7 @@ def test_the_covariance_is_right_over_seeds(monkeypatch: pytest.MonkeyPatch) -> 
         assert drift is not None
         drifts.append(drift)
     mean = np.mean([[d.nees_position, d.nees_attitude, d.reference_rmse_mm] for d in drifts], axis=0)
-    assert 0.6 < mean[0] < 1.4
+    assert 0.7 < mean[0] < 1.4
     assert 0.7 < mean[1] < 1.4
     assert mean[2] < 1.0
 
@@ -136,7 +137,7 @@ def test_a_crane_without_encoders(data: Path, use: str, most_mm: float) -> None:
 
 
 def test_encoders_and_imu_without_pictures(data: Path) -> None:
-    assert measured(data / "yard_dev", "crane,imu").reference_rmse_mm < 1.1
+    assert measured(data / "yard_dev", "crane,imu").reference_rmse_mm < 1.5
 
 
 def test_what_cant_be() -> None:

@@ -107,62 +107,40 @@ def _coefficients(image: UInt8) -> Float32:
 
 
 @kernel(fastmath=True)
-def _read(image: Float32, x: float, y: float, half: int, patch: Float64) -> bool:
-    """The (2 half + 1)^2 patch around (x, y); false where it leaves the picture."""
-    column, row = int(np.floor(x)), int(np.floor(y))
-    size = 2 * half + 1
-    left, top = column - half - 1, row - half - 1
-    if left < 0 or top < 0 or left + size + 3 > image.shape[1] or top + size + 3 > image.shape[0]:
-        return False
-    t, s = x - column, y - row
-    a0, a1 = (1 - t) ** 3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6
-    a2, a3 = (1 + 3 * t + 3 * t**2 - 3 * t**3) / 6, t**3 / 6
-    b0, b1 = (1 - s) ** 3 / 6, (4 - 6 * s**2 + 3 * s**3) / 6
-    b2, b3 = (1 + 3 * s + 3 * s**2 - 3 * s**3) / 6, s**3 / 6
-    for i in range(size):
-        for j in range(size):
-            patch[i, j] = 0.0
-    for k in range(size + 3):
-        for j in range(size):
-            c = left + j
-            line = image[top + k]
-            value = a0 * line[c] + a1 * line[c + 1] + a2 * line[c + 2] + a3 * line[c + 3]
-            if k < size:
-                patch[k, j] += b0 * value
-            if 1 <= k <= size:
-                patch[k - 1, j] += b1 * value
-            if 2 <= k <= size + 1:
-                patch[k - 2, j] += b2 * value
-            if k >= 3:
-                patch[k - 3, j] += b3 * value
-    return True
+def _weights(t: float, weights: Float64) -> None:
+    """The four B-spline weights at a fraction t of a pixel."""
+    t2, rest = t * t, 1 - t
+    weights[0] = rest * rest * rest / 6
+    weights[3] = t2 * t / 6
+    weights[1] = (4 - 6 * t2) / 6 + 3 * weights[3]
+    weights[2] = 1 - weights[0] - weights[1] - weights[3]
 
 
 @kernel(fastmath=True)
-def _read_sized(image: Float32, x: float, y: float, half: int, step: float, patch: Float64) -> bool:
-    """As `_read` with `step` px between the patch's pixels."""
+def _read(image: Float32, x: float, y: float, half: int, step: float, patch: Float64, room: Float64) -> bool:
+    """The (2 half + 1)^2 patch around (x, y), `step` px between its pixels; false where it leaves it.
+
+    room: (2, at least 2 half + 1, 4) scratch.
+    """
     reach = half * step
     if x - reach < 1 or y - reach < 1 or x + reach > image.shape[1] - 3 or y + reach > image.shape[0] - 3:
         return False
-    a = np.empty(4)
-    b = np.empty(4)
-    for i in range(2 * half + 1):
-        py = y + (i - half) * step
-        top = int(np.floor(py))
-        s = py - top
-        b[0], b[1] = (1 - s) ** 3 / 6, (4 - 6 * s**2 + 3 * s**3) / 6
-        b[2], b[3] = (1 + 3 * s + 3 * s**2 - 3 * s**3) / 6, s**3 / 6
-        for j in range(2 * half + 1):
-            px = x + (j - half) * step
-            left = int(np.floor(px))
-            t = px - left
-            a[0], a[1] = (1 - t) ** 3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6
-            a[2], a[3] = (1 + 3 * t + 3 * t**2 - 3 * t**3) / 6, t**3 / 6
+    size = 2 * half + 1
+    for j in range(size):
+        px, py = x + (j - half) * step, y + (j - half) * step
+        _weights(px - np.floor(px), room[0, j])
+        _weights(py - np.floor(py), room[1, j])
+    for i in range(size):
+        top = int(np.floor(y + (i - half) * step)) - 1
+        b = room[1, i]
+        first, second, third, fourth = image[top], image[top + 1], image[top + 2], image[top + 3]
+        for j in range(size):
+            left = int(np.floor(x + (j - half) * step)) - 1
             value = 0.0
             for k in range(4):
-                line = image[top - 1 + k]
-                value += b[k] * (
-                    a[0] * line[left - 1] + a[1] * line[left] + a[2] * line[left + 1] + a[3] * line[left + 2]
+                c = left + k
+                value += room[0, j, k] * (
+                    b[0] * first[c] + b[1] * second[c] + b[2] * third[c] + b[3] * fourth[c]
                 )
             patch[i, j] = value
     return True
@@ -175,11 +153,12 @@ def _locate(
 ) -> None:  # fmt: skip
     half, size = HALF_PX, 2 * HALF_PX + 1
     wide = np.empty((size + 2, size + 2))
+    room = np.empty((2, size + 2, 4))
     other = np.empty((size, size))
     design = np.empty((size * size, 4))
     residual = np.empty(size * size)
     for n in range(places.shape[0]):
-        if not _read_sized(source, places[n, 0], places[n, 1], half + 1, 1 / grown[n], wide):
+        if not _read(source, places[n, 0], places[n, 1], half + 1, 1 / grown[n], wide, room):
             continue
         mean = wide[1:-1, 1:-1].mean()
         for i in range(size):
@@ -199,7 +178,7 @@ def _locate(
         x, y = x0, y0
         settled = False
         for _ in range(MOST_STEPS):
-            if not _read(target, x, y, half, other):
+            if not _read(target, x, y, half, 1.0, other, room):
                 break
             for i in range(size):
                 for j in range(size):

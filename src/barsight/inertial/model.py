@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_opening
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.documents import ImuNoise
@@ -17,6 +18,8 @@ from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.core.types import ImuSamples
 
 GRAVITY_MPS2 = 9.80665
+SATURATED_SIGMAS = 6.0
+SATURATED_SAMPLES = 4
 ORDINARY_NOISE = ImuNoise(2.0e-4, 2.0e-5, 2.0e-3, 1.0e-3, 200.0)
 """A good MEMS IMU's (those of EuRoC and of most cameras), for recordings that don't state their own."""
 
@@ -46,6 +49,24 @@ class BodyState:
 def corrected(imu: ImuSamples, bias: ImuBias) -> ImuSamples:
     """The samples without their bias [paper Eq. 9-10]."""
     return ImuSamples(imu.stamp_ns, imu.gyro_radps - bias.gyro_radps, imu.accel_mps2 - bias.accel_mps2)
+
+
+def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
+    """The samples at which no axis stands at its end of scale, and how many left.
+
+    An axis that keeps its highest or lowest value for four samples, far from its usual ones, can't follow.
+    """
+    wrong = np.zeros(imu.stamp_ns.size, dtype=np.bool_)
+    for axis in np.hstack([imu.gyro_radps, imu.accel_mps2]).T:
+        middle = np.median(axis)
+        usual = 1.4826 * np.median(np.abs(axis - middle)) + 1e-6
+        for end in (axis.min(initial=np.inf), axis.max(initial=-np.inf)):
+            if axis.size and abs(end - middle) > SATURATED_SIGMAS * usual:
+                there = axis == end
+                wrong |= binary_opening(there, np.ones(SATURATED_SAMPLES, np.bool_))
+    kept = ~wrong
+    part = ImuSamples(imu.stamp_ns[kept], imu.gyro_radps[kept], imu.accel_mps2[kept])
+    return part, int(wrong.sum())
 
 
 def integrate_slowly(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,6 +18,7 @@ from barsight.motion.sway import sway_at, turned_angle
 from barsight.recording.base import Recording
 
 CAUCHY_SIGMAS = 3.0
+LEAST_FOR_NOISE = 100
 
 
 @dataclass(frozen=True)
@@ -76,16 +77,28 @@ class CraneTrajectory:
                     attitude_std_deg = settings.sway_std_deg
             covariance = np.zeros((6, 6))
             covariance[:3, :3] = np.eye(3) * np.deg2rad(attitude_std_deg) ** 2
-            covariance[3:, 3:] = fit[1]
-            pose = Pose("yard", "body", attitude, fit[0] + crane.crane_to_body_m)
+            covariance[3:, 3:] = fit.covariance
+            pose = Pose("yard", "body", attitude, fit.position_m + crane.crane_to_body_m)
             placed.append(PosedFrame(stamp, pose, covariance))
         sensors = ("crane",) if imu is None or without_sway == len(placed) else ("crane", "imu")
         warnings = (f"the IMU doesn't cover {without_sway} frames: nominal attitude",) if without_sway else ()
         return Trajectory("yard", tuple(placed), tuple(refused), sensors, warnings)
 
 
-def fit_position(crane: CraneSamples, stamp_ns: int, window_ns: int) -> tuple[Float64, Float64] | Failed:
-    """The crane point at `stamp_ns` (3,) in `yard`, and its covariance (3, 3).
+@dataclass(frozen=True, eq=False)
+class FittedPlace:
+    """The crane point near a stamp: position_m, velocity_mps, acceleration_mps2 (3,) in `yard`; covariance
+    (3, 3) of the position.
+    """
+
+    position_m: Float64
+    velocity_mps: Float64
+    acceleration_mps2: Float64
+    covariance: Float64
+
+
+def fit_position(crane: CraneSamples, stamp_ns: int, window_ns: int) -> FittedPlace | Failed:
+    """The crane point at `stamp_ns` by the readings around it.
 
     A parabola through the readings within the window (a line where they are fewer than six), by least
     squares with Cauchy's weights, so that single wild readings don't pull however far off they are. Failed
@@ -109,4 +122,19 @@ def fit_position(crane: CraneSamples, stamp_ns: int, window_ns: int) -> tuple[Fl
         weights = 1 / np.sqrt(1 + (residual / CAUCHY_SIGMAS) ** 2)
     information = (design * weights[:, None] ** 2).T @ design
     variance = np.linalg.inv(information)[0, 0] * crane.position_std_m**2
-    return coefficients[0], np.eye(3) * variance
+    window_s = window_ns / NS_PER_S
+    bend = 2 * coefficients[2] / window_s**2 if degree == 2 else np.zeros(3)
+    return FittedPlace(coefficients[0], coefficients[1] / window_s, bend, np.eye(3) * variance)
+
+
+def with_seen_noise(crane: CraneSamples) -> CraneSamples:
+    """The readings with the sigma that they show themselves, within a factor of two of the stated one.
+
+    From fourth differences, which no smooth motion passes; their median, so that wild ones don't count.
+    """
+    if len(crane.stamp_ns) < LEAST_FOR_NOISE:
+        return crane
+    fourth = np.abs(np.diff(crane.position_m, n=4, axis=0))
+    seen = 1.4826 * float(np.median(fourth)) / 70**0.5
+    stated = crane.position_std_m
+    return replace(crane, position_std_m=float(np.clip(seen, stated / 2, stated * 2)))

@@ -10,14 +10,15 @@ import numpy as np
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Int64
-from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
-from barsight.inertial.model import ORDINARY_NOISE, ImuBias
-from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position
+from barsight.inertial.model import ORDINARY_NOISE, without_saturation
+from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position, with_seen_noise
 from barsight.motion.gravity import Level, level_attitude
 from barsight.motion.nodes import Nodes, make_nodes, start_poses, tied_by_imu
 from barsight.motion.odometry import StereoOdometry
+from barsight.motion.plausibility import check_crane, frames_off, gyro_in_degrees
 from barsight.motion.prediction import CranePredictor
 from barsight.motion.sightings import FrontEndSettings, Sighting, follow
 from barsight.recording.base import Recording
@@ -43,16 +44,13 @@ class FusionSettings:
     the calibration as exact."""
     scale_sigma: float = 5e-4
     """By which share baseline and encoders may disagree (1 sigma); that is estimated too."""
-    systematic_attitude_deg: float = 0.012
-    """Attitude error (1 sigma, each axis) that more pictures don't average out: highlights that wander over
-    round bars, and the cameras' mounting on the body."""
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.sensors if name not in SENSORS]
         if unknown or not ({"stereo", "crane"} & set(self.sensors)):
             raise ConfigError(f"use is {self.use!r}; name stereo or crane, and imu if wanted, with commas")
-        if self.calibration_sigma_px < 0 or self.systematic_attitude_deg < 0:
-            raise ConfigError("calibration_sigma_px and systematic_attitude_deg can't be negative")
+        if self.calibration_sigma_px < 0:
+            raise ConfigError("calibration_sigma_px can't be negative")
         if not 0 < self.scale_sigma <= 0.1:
             raise ConfigError(f"scale_sigma must lie over 0 and up to 0.1, not {self.scale_sigma}")
 
@@ -69,6 +67,7 @@ class _Inputs:
     sightings: tuple[Sighting, ...]
     refused: tuple[RefusedFrame, ...]
     level: Level | None
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -91,12 +90,11 @@ class FusedTrajectory:
             left = set(frames.tolist())
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())
-        warnings = inputs.level.warnings if inputs.level else ()
         if len(frames) < 2:
             return self._simple(recording, rectifier, inputs)
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
-            estimate = self._solve(recording, rectifier, inputs, nodes, shift)
+            estimate, seen = self._solve(recording, rectifier, inputs, nodes, shift)
         except RuntimeError as error:  # GTSAM's word for a system that the measurements leave undetermined
             simple = self._simple(recording, rectifier, inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
@@ -107,7 +105,9 @@ class FusedTrajectory:
         )
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
-        return Trajectory(self._reference(inputs), placed, tuple(refused), sensors, warnings, estimate.drift)
+        return Trajectory(
+            self._reference(inputs), placed, tuple(refused), sensors, inputs.warnings + seen, estimate.drift
+        )
 
     def _simple(self, recording: Recording, rectifier: Rectifier, inputs: _Inputs) -> Trajectory:
         """Without a graph: the encoders' trajectory, or frame to frame."""
@@ -120,8 +120,12 @@ class FusedTrajectory:
 
     def _gather(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> _Inputs:
         use = self.settings.sensors
-        crane = recording.crane() if "crane" in use else None
-        imu = recording.imu() if "imu" in use else None
+        stated = recording.crane() if "crane" in use else None
+        checked = None if stated is None else check_crane(with_seen_noise(stated))
+        crane = None if checked is None else checked.samples
+        imu, spoiled = recording.imu() if "imu" in use else None, 0
+        if imu is not None:
+            imu, spoiled = without_saturation(imu)
         if crane is None and "stereo" not in use:
             raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
         sightings: tuple[Sighting, ...] = ()
@@ -134,13 +138,38 @@ class FusedTrajectory:
         else:
             for _ in recording.index.stamps_ns:
                 advance()
+        self._refuse_wrong_sensors(recording, rectifier, sightings, imu, crane)
         level = None if crane else level_attitude(recording)
-        return _Inputs(crane, imu, sightings, refused, level)
+        warnings = (level.warnings if level else ()) + (checked.warnings if checked else ())
+        if spoiled:
+            warnings += (f"{spoiled} IMU samples are at the end of their scale and were left out",)
+        return _Inputs(crane, imu, sightings, refused, level, warnings)
+
+    def _refuse_wrong_sensors(
+        self, recording: Recording, rectifier: Rectifier, sightings: tuple[Sighting, ...],
+        imu: ImuSamples | None, crane: CraneSamples | None,
+    ) -> None:  # fmt: skip
+        """Raises InputError where the pictures show that a sensor's unit or the cameras' stamps are wrong."""
+        shift = recording.rig.timeshift_cam_imu_ns
+        if imu is not None and gyro_in_degrees(sightings, imu, rectifier, shift):
+            raise InputError(
+                recording.path, "the gyro turns 57 times as far as the pictures, so it is in degrees/s",
+                "multiply it by pi / 180",
+            )  # fmt: skip
+        late = frames_off(sightings, imu, crane, rectifier, shift)
+        if late:
+            raise InputError(
+                recording.path,
+                f"the cameras' stamps are {abs(late)} frame(s) {'late' if late > 0 else 'early'} "
+                "against gyro and encoders",
+                "repair the stamps, or use the pictures alone (--use stereo)",
+            )
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
-    ) -> Estimate:
+    ) -> tuple[Estimate, tuple[str, ...]]:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
+        from barsight.motion.encoders import encoder_warnings
         from barsight.motion.graph import solve
         from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
 
@@ -156,8 +185,9 @@ class FusedTrajectory:
                     inputs.crane, int(nodes.stamp_ns[k]), seconds_to_ns(PLACE_SPACING_S / 2 + 0.01)
                 )
                 if not isinstance(fit, Failed):
-                    sigma = float(np.sqrt(fit[1][0, 0]))
-                    placed.append(Placed(k, fit[0] + inputs.crane.crane_to_body_m, sigma))
+                    place = fit.position_m + inputs.crane.crane_to_body_m
+                    sigma = float(np.sqrt(fit.covariance[0, 0]))
+                    placed.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
             nominal = inputs.crane.yard_from_body_nominal
             still = [k for k in chosen if k in ties.still]
             for k in chosen:
@@ -178,14 +208,14 @@ class FusedTrajectory:
             )  # fmt: skip
         problem = Problem(
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, tuple(placed),
-            tuple(attitudes), ties.still, ImuBias(ties.gyro_bias_radps, np.zeros(3)),
+            tuple(attitudes), ties.still, ties.bias,
             offset_prior_px=self.settings.calibration_sigma_px, scale_prior=self.settings.scale_sigma,
         )  # fmt: skip
         estimate = solve(problem)
-        shared = np.zeros((6, 6))
-        if inputs.sightings:
-            shared[:3, :3] = np.eye(3) * np.deg2rad(self.settings.systematic_attitude_deg) ** 2
-        return replace(estimate, covariance=estimate.covariance + shared)
+        warnings = encoder_warnings(
+            estimate.encoders, nodes.stamp_ns, problem.placed, estimate.encoder_off_m, estimate.encoder_used
+        )
+        return estimate, warnings
 
 
 def _silent() -> None:

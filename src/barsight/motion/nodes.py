@@ -17,7 +17,7 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.inertial.model import ImuBias
-from barsight.inertial.standstill import stands_still
+from barsight.inertial.standstill import standing_start, stands_still
 from barsight.motion.crane import fit_position
 from barsight.motion.gravity import Level
 from barsight.motion.sightings import Sighting
@@ -41,11 +41,11 @@ class Nodes:
 
 @dataclass(frozen=True, eq=False)
 class ImuTies:
-    """preintegrated: between nodes k and k + 1 or None. still: nodes at rest. gyro_bias_radps: (3,)."""
+    """preintegrated: between nodes k and k + 1 or None. still: nodes at rest. bias: as the rest shows it."""
 
     preintegrated: tuple[Preintegrated | None, ...]
     still: tuple[int, ...]
-    gyro_bias_radps: Float64
+    bias: ImuBias
 
 
 def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
@@ -75,7 +75,7 @@ def start_poses(
             fit = fit_position(crane, stamp, seconds_to_ns(0.35))
             if not isinstance(fit, Failed):
                 stamps.append(stamp)
-                places.append(fit[0] + crane.crane_to_body_m)
+                places.append(fit.position_m + crane.crane_to_body_m)
         turns = Rotation.from_matrix(np.repeat(crane.yard_from_body_nominal[None], len(stamps), axis=0))
         return _between("yard", nodes.stamp_ns, np.array(stamps), np.array(places), turns)
     assert level is not None
@@ -109,7 +109,7 @@ def tied_by_imu(nodes: Nodes, start: tuple[Pose, ...], imu: ImuSamples | None, n
     """
     count = len(nodes.stamp_ns)
     if imu is None:
-        return ImuTies((None,) * (count - 1), (), np.zeros(3))
+        return ImuTies((None,) * (count - 1), (), ImuBias.none())
     from barsight.inertial.preintegration import Preintegrator
 
     quiet = stands_still(imu, noise)
@@ -120,13 +120,21 @@ def tied_by_imu(nodes: Nodes, start: tuple[Pose, ...], imu: ImuSamples | None, n
         first, last = max(0, k - 1), min(count - 1, k + 1)
         if quiet[nearest[k]] and np.linalg.norm(place[last] - place[first]) < MOST_STILL_M:
             still.append(k)
-    resting = np.zeros(imu.stamp_ns.size, np.bool_)
-    for k in still:
-        resting |= np.abs(imu.stamp_ns - nodes.stamp_ns[k]) < seconds_to_ns(0.2)
-    bias = imu.gyro_radps[resting & quiet].mean(axis=0) if (resting & quiet).sum() > 20 else np.zeros(3)
+    bias = _bias_at_rest(nodes, still, imu, noise)
     integrator = Preintegrator(imu, noise)
     parts = []
     for first_ns, last_ns in zip(nodes.stamp_ns[:-1], nodes.stamp_ns[1:], strict=True):
-        part = integrator.between(int(first_ns), int(last_ns), ImuBias(bias, np.zeros(3)))
+        part = integrator.between(int(first_ns), int(last_ns), bias)
         parts.append(None if isinstance(part, Failed) else part)
     return ImuTies(tuple(parts), tuple(still), bias)
+
+
+def _bias_at_rest(nodes: Nodes, still: list[int], imu: ImuSamples, noise: ImuNoise) -> ImuBias:
+    """The biases as the first rest shows them, zero where there is none."""
+    if not still:
+        return ImuBias.none()
+    last = still[0]
+    while last + 1 in still:
+        last += 1
+    start = standing_start(imu, int(nodes.stamp_ns[still[0]]), int(nodes.stamp_ns[last]), noise)
+    return ImuBias.none() if isinstance(start, Failed) else start.bias

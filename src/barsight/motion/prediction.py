@@ -18,7 +18,7 @@ from barsight.motion.sway import turned_angle
 WINDOW_S = 0.3
 SWAY_RAD = float(np.deg2rad(0.15))
 GYRO_BIAS_SIGMA_RADPS = 5e-4
-SLEW_SIGMA_S = 0.01
+SLEW_SIGMA_S = 0.03
 """What isn't known of the encoders' latency, s: it matters while the speed changes only."""
 
 
@@ -45,14 +45,17 @@ class CranePredictor:
             return None
         turn, turn_sigma = self._turn(old_ns, new_ns)
         nominal = self._crane.yard_from_body_nominal
-        yard_from_old = Pose("yard", "body", nominal, old[0]) @ self._body_from_rect0
+        yard_from_old = Pose("yard", "body", nominal, old.position_m) @ self._body_from_rect0
         attitude = nominal @ Rotation.from_rotvec(turn).as_matrix()
-        yard_from_new = Pose("yard", "body", attitude, new[0]) @ self._body_from_rect0
+        yard_from_new = Pose("yard", "body", attitude, new.position_m) @ self._body_from_rect0
         motion = yard_from_new.inverse() @ yard_from_old
-        travel = float(np.linalg.norm(new[0] - old[0]))
+        travel = float(np.linalg.norm(new.position_m - old.position_m))
+        slew = float(np.linalg.norm(new.velocity_mps - old.velocity_mps)) * SLEW_SIGMA_S
         covariance = np.eye(6) * turn_sigma**2
-        swing = (SWAY_RAD * travel) ** 2 + (2e-3) ** 2
-        covariance[3:, 3:] = motion.rotation @ (old[1] + new[1]) @ motion.rotation.T + np.eye(3) * swing
+        swing = (SWAY_RAD * travel) ** 2 + (2e-3) ** 2 + slew**2
+        covariance[3:, 3:] = (
+            motion.rotation @ (old.covariance + new.covariance) @ motion.rotation.T + np.eye(3) * swing
+        )
         return PredictedMotion(motion.rotation, motion.translation, covariance)
 
     def _turn(self, old_ns: int, new_ns: int) -> tuple[Float64, float]:

@@ -27,10 +27,12 @@ class StereoSightings:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A node's place by the encoders: (3,) of the body in `yard` and its sigma, m."""
+    """A node's place by the encoders: (3,) of the body in `yard`, how it moves, and the place's sigma, m."""
 
     node: int
     position_m: Float64
+    velocity_mps: Float64
+    acceleration_mps2: Float64
     sigma_m: float
 
 
@@ -62,6 +64,7 @@ class Problem:
     bias: ImuBias
     gyro_bias_sigma_radps: float = 0.02
     accel_bias_sigma_mps2: float = 0.1
+    encoder_latency_sigma_s: float = 0.02
     offset_prior_px: float = 0.1
     """How far a yaw between the cameras may move the disparity (1 sigma); 0 takes it as exact."""
     scale_prior: float = 5e-4

@@ -132,7 +132,7 @@ def _system(linear: Any) -> tuple[csc_matrix, Float64]:
 
 def _starts(linear: Any) -> dict[int, int]:
     """Where each key's unknowns begin in the linear system: keys ascend."""
-    sizes = {"x": 6, "v": 3, "b": 6, "l": 3}
+    sizes = {"x": 6, "v": 3, "b": 6, "l": 3, "e": 1}
     keys = linear.keyVector()
     widths = [sizes[chr(gtsam.symbolChr(key))] for key in keys]
     return dict(zip(keys, np.concatenate([[0], np.cumsum(widths)[:-1]]).tolist(), strict=True))

@@ -8,15 +8,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import Failed
-from barsight.core.types import RefusedFrame
+from barsight.core.parallel import ordered_map
+from barsight.core.types import RefusedFrame, StereoFrame
 from barsight.features.guided import GuidedMatches, PredictedMotion, triangulate
 from barsight.features.patches import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, TrackSettings, carry_on, find_again
 from barsight.motion.odometry import OdometrySettings, Step, StereoOdometry, View, ransac, refine
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import coarse_disparity
+
+PREPARED = 1
+"""Pairs that are rectified ahead while the one before is followed."""
+LEAST_KNOWN = 200
+SPAN = 1.6
+"""New points are sought up to this much nearer and further than the known ones."""
 
 Predictor = Callable[[int, int], PredictedMotion | None]
 """From two frames' stamps to the motion of `rect0` between them as the other sensors know it, or None."""
@@ -66,23 +73,28 @@ def follow(
     sightings: list[Sighting] = []
     refused: list[RefusedFrame] = []
     state: _State | None = None
-    for frame in recording.frames():
-        advance()
+
+    def prepare(frame: StereoFrame | RefusedFrame) -> PatchPair | RefusedFrame:
         if isinstance(frame, RefusedFrame):
-            refused.append(frame)
-            continue
+            return frame
         rectified = rectifier(frame)
         if isinstance(rectified, Failed):
-            refused.append(RefusedFrame(frame.stamp_ns, rectified.reason))
+            return RefusedFrame(frame.stamp_ns, rectified.reason)
+        return patch_pair(rectified)
+
+    for pair in ordered_map(prepare, recording.frames(), PREPARED):
+        advance()
+        if isinstance(pair, RefusedFrame):
+            refused.append(pair)
             continue
-        pair = patch_pair(rectified)
-        prediction = predictor(state.stamp_ns, frame.stamp_ns) if state else None
+        stamp_ns = pair.pair.stamp_ns
+        prediction = predictor(state.stamp_ns, stamp_ns) if state else None
         result = _see(state, pair, prediction, settings)
         if isinstance(result, Failed) and state is not None and prediction is not None:
             # The other sensors tie the frame to the ones before; pictures begin anew.
             result = _see(replace(state, tracks=None), pair, prediction, settings)
         if isinstance(result, Failed):
-            refused.append(RefusedFrame(frame.stamp_ns, result.reason))
+            refused.append(RefusedFrame(stamp_ns, result.reason))
             continue
         state, sighting = result
         sightings.append(sighting)
@@ -114,13 +126,22 @@ def _see(
             if isinstance(found, Failed):
                 return found
         kept, matches, motion = found
-    coarse = coarse_disparity(pair.pair.left, pair.pair.right, pair.pair.camera.doffs_px)
+    coarse = _coarse(pair, matches.stereo[kept])
     tracks = carry_on(tracks, pair, matches, kept, coarse, settings.tracks)
     if len(tracks.track) < settings.rough.least_inliers:
         return Failed("no-features", f"only {len(tracks.track)} points have a depth")
     ambiguous = int(matches.ambiguous.sum())
     sighting = Sighting(pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous)
     return _State(tracks, tracks.next_track, pair.pair.stamp_ns, view), sighting
+
+
+def _coarse(pair: PatchPair, known: Float64) -> Float32:
+    """The coarse disparity, sought around that of the points found again, (N, 3), where there are enough."""
+    camera, span = pair.pair.camera, None
+    if len(known) >= LEAST_KNOWN:
+        low, high = np.percentile(known[:, 0] - known[:, 2] + camera.doffs_px, (1, 99))
+        span = (low / SPAN - camera.doffs_px, high * SPAN - camera.doffs_px)
+    return coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px, known=span)
 
 
 def _rough(

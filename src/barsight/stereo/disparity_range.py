@@ -59,11 +59,13 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
 
 
 def coarse_disparity(
-    left: UInt8, right: UInt8, doffs_px: float = 0.0, width_share: float = _USUAL_SHARE
-) -> Float32:
+    left: UInt8, right: UInt8, doffs_px: float = 0.0, width_share: float = _USUAL_SHARE,
+    known: tuple[float, float] | None = None,
+) -> Float32:  # fmt: skip
     """Left-right consistent disparities of a quarter-size match, else NaN, also where nothing changes.
 
-    From 1 px above -doffs_px, which is infinitely far, over `width_share` of the width.
+    From 1 px above -doffs_px, which is infinitely far, over `width_share` of the width, and within that from
+    the lowest to the highest disparity `known` beforehand, px.
     Returns (H / 4, W / 4) float32 in full-size px.
     """
     size = (max(left.shape[1] // _SCALE, 32), max(left.shape[0] // _SCALE, 32))
@@ -73,6 +75,10 @@ def coarse_disparity(
     scale = left.shape[1] / size[0]
     infinity = -doffs_px / scale
     lowest = int(np.floor(infinity))
+    if known is not None:
+        first = max(lowest, int(np.floor(known[0] / scale)))
+        last = min(lowest + count, int(np.ceil(known[1] / scale)))
+        lowest, count = first, max(16, -(-(last - first) // 16) * 16)
     forward = _match(small_left, small_right, lowest, count)
     # The right image's disparity: the same match with both images mirrored and exchanged.
     backward = _match(cv2.flip(small_right, 1), cv2.flip(small_left, 1), lowest, count)[:, ::-1]

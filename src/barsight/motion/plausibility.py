@@ -1,0 +1,228 @@
+"""Sensors that contradict themselves or each other before anything is estimated from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Bool, Float64
+from barsight.core.stamps import NS_PER_S, interpolate_at
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.motion.sightings import Sighting
+from barsight.motion.sway import turned_angle
+
+SIDE = 8
+"""Readings on either side that a jump is measured from."""
+LEAST_JUMP_SIGMAS = 8.0
+LEAST_JUMP_M = 0.01
+LEAST_FROZEN = 5
+LEAST_FROZEN_SPEED_MPS = 0.05
+MOST_FRAMES_OFF = 2
+LEAST_STEPS = 8
+TURN_SIGMA_RAD = 5e-4
+WAY_SIGMA_M = 0.005
+CLEARLY_BETTER = 0.1
+DEGREES = 180 / np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedCrane:
+    """The readings that can be used, and sentences on what was left out."""
+
+    samples: CraneSamples
+    warnings: tuple[str, ...]
+
+
+def check_crane(crane: CraneSamples) -> CheckedCrane:
+    """Leaves out readings that stand still while the crane must be moving, and those beyond a jump.
+
+    Which side of a jump is right can't be told from the encoders: the longer one stays.
+    """
+    samples, warnings = crane, []
+    for first, last in _frozen(crane):
+        seconds = [(crane.stamp_ns[k] - crane.stamp_ns[0]) / NS_PER_S for k in (first, last)]
+        warnings.append(
+            f"the encoders were frozen from {seconds[0]:.1f} s to {seconds[1]:.1f} s while the crane moved"
+        )
+        away = (samples.stamp_ns >= crane.stamp_ns[first]) & (samples.stamp_ns <= crane.stamp_ns[last])
+        samples = _chosen(samples, ~away)
+    jumps = _jumps(samples)
+    if jumps:
+        bounds = [0, *(k for k, _ in jumps), len(samples.stamp_ns)]
+        longest = int(np.argmax(np.diff(bounds)))
+        for k, size in jumps:
+            at = (samples.stamp_ns[k] - crane.stamp_ns[0]) / NS_PER_S
+            warnings.append(
+                f"the encoders jump by {1e3 * size:.0f} mm at {at:.1f} s; only the longest stretch "
+                "without a jump is used"
+            )
+        index = np.arange(len(samples.stamp_ns))
+        samples = _chosen(samples, (index >= bounds[longest]) & (index < bounds[longest + 1]))
+    return CheckedCrane(samples, tuple(warnings))
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What pictures and other sensors say of the same K steps between frames.
+
+    turn: (K, 3) rotation vector old body from new body and way: (K,) m by the pictures. gyro: (K, 3) and
+    travel: (K,) by IMU and encoders, NaN where they don't cover it. seconds: (K,).
+    """
+
+    turn: Float64
+    way: Float64
+    gyro: Float64
+    travel: Float64
+    seconds: Float64
+
+
+def compare_steps(
+    sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
+    rectifier: Rectifier, shift_ns: int, off: int = 0,
+) -> Steps:  # fmt: skip
+    """The steps of all frames but the outer ones, the other sensors taken `off` frames further on."""
+    count = len(sightings)
+    steps = [k for k, s in enumerate(sightings) if s.motion is not None]
+    steps = [k for k in steps if MOST_FRAMES_OFF < k < count - MOST_FRAMES_OFF]
+    stamps = np.array([s.stamp_ns for s in sightings]) + shift_ns
+    old, new = stamps[[k + off - 1 for k in steps]], stamps[[k + off for k in steps]]
+    turn, way = _seen(sightings, steps, rectifier)
+    gyro, travel = np.full((len(steps), 3), np.nan), np.full(len(steps), np.nan)
+    if imu is not None:
+        angle = turned_angle(imu)
+        gyro = interpolate_at(new, imu.stamp_ns, angle) - interpolate_at(old, imu.stamp_ns, angle)
+    if crane is not None:
+        place = interpolate_at(new, crane.stamp_ns, crane.position_m)
+        travel = np.linalg.norm(place - interpolate_at(old, crane.stamp_ns, crane.position_m), axis=1)
+    return Steps(turn, way, gyro, travel, (new - old) / NS_PER_S)
+
+
+def frames_off(
+    sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
+    rectifier: Rectifier, shift_ns: int,
+) -> int:  # fmt: skip
+    """By how many frames the cameras' stamps are late against gyro and encoders; 0 where that isn't clear.
+
+    The turns and ways that pictures show between neighbouring frames are held against those of the other
+    sensors between the stamps of neighbours further on or back. The gyro's bias is fitted each time.
+    """
+    cost = {}
+    for off in range(-MOST_FRAMES_OFF, MOST_FRAMES_OFF + 1):
+        steps = compare_steps(sightings, imu, crane, rectifier, shift_ns, off)
+        turned = _gyro_residual(steps)
+        travelled = np.isfinite(steps.travel)
+        terms = []
+        if len(turned) >= LEAST_STEPS:
+            terms.append(float((turned**2).mean()) / TURN_SIGMA_RAD**2)
+        if travelled.sum() >= LEAST_STEPS:
+            wrong = (steps.travel - steps.way)[travelled]
+            terms.append(float((wrong**2).mean()) / WAY_SIGMA_M**2)
+        cost[off] = float(np.mean(terms)) if terms else 0.0
+    best = min(cost, key=lambda off: cost[off])
+    clear = cost[best] < CLEARLY_BETTER * cost[0] and cost[0] > 1 / CLEARLY_BETTER
+    return -best if clear else 0
+
+
+def gyro_in_degrees(
+    sightings: tuple[Sighting, ...], imu: ImuSamples, rectifier: Rectifier, shift_ns: int
+) -> bool:
+    """Whether the gyro turns some 57 times as far as the pictures, step by step."""
+    steps = compare_steps(sightings, imu, None, rectifier, shift_ns)
+    radians, degrees = _gyro_residual(steps), _gyro_residual(steps, DEGREES)
+    if len(radians) < LEAST_STEPS:
+        return False
+    spread = float((radians**2).mean())
+    return (
+        float((degrees**2).mean()) < CLEARLY_BETTER * spread and spread > TURN_SIGMA_RAD**2 / CLEARLY_BETTER
+    )
+
+
+def _gyro_residual(steps: Steps, per_turn: float = 1.0) -> Float64:
+    """(K, 3) gyro minus `per_turn` times the pictures' turn, without the constant rate that fits best."""
+    known = np.isfinite(steps.gyro).all(axis=1)
+    time = steps.seconds[known, None]
+    off = steps.gyro[known] - per_turn * steps.turn[known]
+    residual: Float64 = off - time * (time * off).sum(axis=0) / max(float((time**2).sum()), 1e-12)
+    return residual
+
+
+def _seen(sightings: tuple[Sighting, ...], steps: list[int], rectifier: Rectifier) -> tuple[Float64, Float64]:
+    """(K, 3) turn old body from new body, and (K,) length of the way, by the pictures."""
+    mount = rectifier.body_from_rect0
+    turns, ways = [], []
+    for k in steps:
+        motion = sightings[k].motion
+        assert motion is not None
+        old_from_new = motion.rotation.T
+        rotation = mount.rotation @ old_from_new @ mount.rotation.T
+        move = mount.rotation @ (-old_from_new @ motion.translation)
+        move = move + mount.translation - rotation @ mount.translation
+        turns.append(Rotation.from_matrix(rotation).as_rotvec())
+        ways.append(np.linalg.norm(move))
+    return np.array(turns).reshape(-1, 3), np.array(ways)
+
+
+def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
+    return replace(crane, stamp_ns=crane.stamp_ns[kept], position_m=crane.position_m[kept])
+
+
+def _frozen(crane: CraneSamples) -> list[tuple[int, int]]:
+    """Stretches (first, last) of equal readings that a moving crane runs into."""
+    same = np.r_[False, (np.diff(crane.position_m, axis=0) == 0).all(axis=1), False]
+    edges = np.flatnonzero(np.diff(same.astype(int)))
+    found = []
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        before = slice(max(0, first - SIDE), first)
+        if last - first + 1 < LEAST_FROZEN or first < SIDE // 2:
+            continue
+        time = (crane.stamp_ns[before] - crane.stamp_ns[first]) / NS_PER_S
+        line = np.polyfit(time, crane.position_m[before], 2 if len(time) >= 6 else 1)
+        if np.linalg.norm(line[-2]) > LEAST_FROZEN_SPEED_MPS:
+            found.append((int(first), int(last)))
+    return found
+
+
+def _jumps(crane: CraneSamples) -> list[tuple[int, float]]:
+    """(index of the first reading beyond, size m) of steps between neighbouring readings that stay."""
+    stamps, place = crane.stamp_ns, crane.position_m
+    if len(stamps) < 2 * SIDE + 1:
+        return []
+    step_ns = np.diff(stamps)
+    rate = np.diff(place, axis=0) / step_ns[:, None]
+    found: list[tuple[int, float]] = []
+    for k in range(SIDE, len(stamps) - SIDE):
+        around = slice(k - SIDE, k + SIDE - 1)
+        if step_ns[around].max() > 3 * np.median(step_ns):
+            continue
+        excess = np.linalg.norm((rate[k - 1] - np.median(rate[around], axis=0)) * step_ns[k - 1])
+        if excess < max(LEAST_JUMP_M, LEAST_JUMP_SIGMAS * crane.position_std_m) / 2:
+            continue
+        size = _step(crane, k)
+        if size > max(LEAST_JUMP_M, LEAST_JUMP_SIGMAS * crane.position_std_m):
+            if found and k - found[-1][0] <= SIDE:
+                found[-1] = max(found[-1], (k, size), key=lambda jump: jump[1])
+            else:
+                found.append((k, size))
+    return found
+
+
+def _step(crane: CraneSamples, k: int) -> float:
+    """m by which the readings from k on stand off those before, over a common parabola; Cauchy's weights.
+
+    0 where it isn't clear.
+    """
+    around = slice(k - SIDE, k + SIDE)
+    time = (crane.stamp_ns[around] - crane.stamp_ns[k]) / NS_PER_S
+    design = np.column_stack([np.ones(2 * SIDE), time, time**2, np.arange(2 * SIDE) >= SIDE])
+    values, weights = crane.position_m[around], np.ones(2 * SIDE)
+    for _ in range(10):
+        fit, *_ = np.linalg.lstsq(design * weights[:, None], values * weights[:, None], rcond=None)
+        residual = np.linalg.norm(values - design @ fit, axis=1) / (3**0.5 * crane.position_std_m)
+        weights = 1 / np.sqrt(1 + (residual / 3) ** 2)
+    information = (design * weights[:, None] ** 2).T @ design
+    sigma = float(np.sqrt(np.linalg.inv(information)[3, 3])) * crane.position_std_m
+    size = float(np.linalg.norm(fit[3]))
+    return size if size > LEAST_JUMP_SIGMAS * sigma else 0.0

@@ -1,0 +1,121 @@
+"""Sensors that contradict themselves or each other: found, told, and left out or refused."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.errors import InputError
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.evaluation.drift import compare
+from barsight.inertial.model import without_saturation
+from barsight.motion.crane import CraneSettings, with_seen_noise
+from barsight.motion.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.plausibility import check_crane
+from barsight.recording.open import open_recording
+from barsight.recording.truth import read_ground_truth
+from spoiled_recording import SpoiledRecording, frozen_between, late, with_outliers
+
+
+def travelling(seed: int = 0) -> CraneSamples:
+    """20 s: standing, speeding up at 0.35 m/s^2, 0.6 m/s, braking, standing; 1.5 mm noise, in whole mm."""
+    time = np.arange(0, 20, 0.05)
+    speed = np.clip(np.minimum(time - 2, 18 - time) * 0.35, 0, 0.6)
+    place = np.column_stack([np.cumsum(speed) * 0.05, 0 * time + 0.4, 0 * time + 8])
+    noisy = place + np.random.default_rng(seed).normal(0, 0.0015, place.shape)
+    stamps = (time * 1e9).astype(np.int64)
+    return CraneSamples(stamps, noisy.round(3), np.zeros(3), np.eye(3), 0.002)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_encoders_that_are_right_pass(seed: int) -> None:
+    crane = travelling(seed)
+    for samples in (crane, with_outliers(crane, 0.05, 0.05), replace(crane, position_m=crane.position_m * 0)):
+        checked = check_crane(samples)
+        assert checked.warnings == ()
+        assert len(checked.samples.stamp_ns) == len(samples.stamp_ns)
+
+
+def test_frozen_encoders_are_found_while_moving_only() -> None:
+    checked = check_crane(frozen_between(travelling(), 8.0, 9.5))
+    assert checked.warnings == ("the encoders were frozen from 8.1 s to 9.4 s while the crane moved",)
+    assert not ((checked.samples.stamp_ns > 8.1e9) & (checked.samples.stamp_ns < 9.4e9)).any()
+    assert check_crane(frozen_between(travelling(), 0.2, 1.5)).warnings == ()
+
+
+@pytest.mark.parametrize("size_m", [0.03, 0.09, -0.5])
+def test_a_jump_leaves_the_longer_side(size_m: float) -> None:
+    crane = travelling()
+    step = np.where((crane.stamp_ns >= 13_000_000_000)[:, None], [size_m, 0, 0], 0)
+    checked = check_crane(replace(crane, position_m=crane.position_m + step))
+    assert len(checked.warnings) == 1
+    assert "at 13.0 s" in checked.warnings[0]
+    assert abs(float(checked.warnings[0].split("jump by ")[1].split(" mm")[0]) - 1e3 * abs(size_m)) < 4
+    assert checked.samples.stamp_ns.max() < 13_000_000_000
+
+
+def test_the_noise_is_what_the_readings_show() -> None:
+    for stated in (0.001, 0.002, 0.003):
+        seen = with_seen_noise(replace(travelling(), position_std_m=stated))
+        assert seen.position_std_m == pytest.approx(0.00153, rel=0.1)
+    assert with_seen_noise(replace(travelling(), position_std_m=0.02)).position_std_m == 0.01
+
+
+def test_saturated_samples_leave() -> None:
+    rng = np.random.default_rng(0)
+    stamps = np.arange(2000) * 5_000_000
+    imu = ImuSamples(stamps, rng.normal(0, 0.01, (2000, 3)), rng.normal([0, 0, 9.8], 0.1, (2000, 3)))
+    assert without_saturation(imu)[1] == 0
+    accel = imu.accel_mps2.copy()
+    accel[500:520, 1] = 39.2
+    part, gone = without_saturation(replace(imu, accel_mps2=accel))
+    assert gone == 20
+    assert len(part.stamp_ns) == 1980
+    still = ImuSamples(stamps, np.zeros((2000, 3)), np.tile([0, 0, 9.8], (2000, 1)))
+    assert without_saturation(still)[1] == 0
+
+
+def estimated(path: Path, **spoiling: Callable) -> tuple[float, float, tuple[str, ...]]:
+    """mm, deg and warnings of the whole estimate on a spoiled recording."""
+    recording = SpoiledRecording(open_recording(path), **spoiling)
+    estimator = FusedTrajectory(FusionSettings(), CraneSettings())
+    trajectory = estimator(recording, Rectifier(recording.rig), lambda: None)
+    drift = compare(trajectory, read_ground_truth(path), recording.rig.timeshift_cam_imu_ns)
+    assert drift is not None
+    return drift.reference_rmse_mm, drift.reference_rmse_deg, trajectory.warnings
+
+
+def test_lost_frames_wild_and_late_encoders(data: Path) -> None:
+    """A tenth of the frames and 2 s lost, 5 % of the readings 50 mm off, all 40 ms late."""
+    stamps = open_recording(data / "yard_dev").index.stamps_ns
+
+    def kept(k: int) -> bool:
+        return k not in (4, 13) and not 6 < (stamps[k] - stamps[0]) / 1e9 < 8
+
+    mm, deg, warnings = estimated(
+        data / "yard_dev", kept=kept, spoil_crane=lambda crane: late(with_outliers(crane, 0.05, 0.05), 0.04)
+    )
+    assert mm < 0.95
+    assert deg < 0.02
+    assert len(warnings) == 1
+    assert "the encoders are 40 ms late" in warnings[0] or "the encoders are 41 ms late" in warnings[0]
+
+
+def test_frozen_encoders_dont_pull(data: Path) -> None:
+    mm, deg, warnings = estimated(data / "yard_dev", spoil_crane=lambda crane: frozen_between(crane, 8, 10))
+    assert mm < 0.95
+    assert deg < 0.02
+    assert any("frozen from 8" in warning for warning in warnings)
+
+
+def test_wrong_stamps_and_units_are_refused(data: Path) -> None:
+    with pytest.raises(InputError, match=r"1 frame\(s\) late"):
+        estimated(data / "yard_dev", stamps=lambda stamps: [*stamps[1:], 2 * stamps[-1] - stamps[-2]])
+    with pytest.raises(InputError, match="degrees/s"):
+        estimated(
+            data / "yard_dev",
+            spoil_imu=lambda imu: replace(imu, gyro_radps=np.degrees(imu.gyro_radps)),
+        )
