@@ -35,6 +35,7 @@ from barsight.mapping.surface import finish
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import View, Viewer
 from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, digest, plain
+from barsight.motion.self_calibration import self_calibrated
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.selection import SelectedSensors
@@ -60,6 +61,8 @@ class MeasureSettings:
 
     use: tuple[Literal["stereo", "imu", "crane"], ...] = ("stereo", "imu", "crane")
     """Sensors that may be used, where the recording has them."""
+    self_calibrate: Literal["none", "yaw"] = "none"
+    """yaw: turn the right camera as the crane's known travel asks for (see `barsight calibrate check`)."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
     stereo: StereoSettings = field(default_factory=StereoSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
@@ -109,6 +112,10 @@ def measure(
         estimate = make_estimator(settings.motion)
         count = _counter("trajectory", total, advance)
         trajectory = once(kept, "trajectory", lambda: estimate(source, rectifier, count))
+        calibrated = self_calibrated(
+            source.rig, rectifier, trajectory.drift, correct=settings.self_calibrate == "yaw"
+        )
+        rectifier = calibrated.rectifier
 
     poses = {frame.stamp_ns: frame for frame in trajectory.frames}
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
@@ -169,6 +176,7 @@ def measure(
     warnings = [Notice("assumed", text) for text in source.notes]
     warnings += [Notice("imu", text) for text in hints]
     warnings += [Notice("calibration", text) for text in first.warnings]
+    warnings += [Notice("calibration-drift", text) for text in calibrated.warnings]
     warnings += [Notice("trajectory", text) for text in trajectory.warnings]
     warnings += [Notice(a.code, a.reason) for a in agreed if isinstance(a, Failed)]
     if len(laser) < len(whole_laser):

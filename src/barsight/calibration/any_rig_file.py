@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
+
+import numpy as np
 
 from barsight.calibration.documents import read_document
 from barsight.calibration.euroc import read_rig, write_rig
@@ -40,6 +43,27 @@ def read_rig_file(path: Path) -> StereoRig:
     if "cam0" in document.values:
         return read_camchain(path).rig
     raise CalibrationError(path, "holds no stereo rig", f"give {KNOWN}")
+
+
+def chosen_rig(path: Path | None, own: StereoRig) -> StereoRig:
+    """The rig of a file that the user names, or the recording's `own` where none is named.
+
+    A calibration of two cameras alone says nothing of the body: `own` says where cam0 sits, and the clocks.
+    """
+    if path is None:
+        return own
+    rig = read_rig_file(path)
+    if not body_is_cam0(rig):
+        return rig
+    return replace(
+        rig, body_from_cam0=own.body_from_cam0, body_from_cam1=own.body_from_cam0 @ rig.cam0_from_cam1,
+        timeshift_cam_imu_ns=own.timeshift_cam_imu_ns,
+    )  # fmt: skip
+
+
+def body_is_cam0(rig: StereoRig) -> bool:
+    """Whether the rig's body is its left camera: nobody said where an IMU sits."""
+    return bool(np.array_equal(rig.body_from_cam0.matrix, np.eye(4)))
 
 
 def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> None:

@@ -45,7 +45,7 @@ class Rectifier:
         self._right_size = (rig.cam1.height, rig.cam1.width)
         rotation = _rectified_axes(rig)
         self.body_from_rect0 = rig.body_from_cam0 @ Pose("cam0", "rect0", rotation, np.zeros(3))
-        right_rotation = rig.cam0_from_cam1.rotation.T @ rotation
+        right_rotation = right_from_rectified(rig)
         self._warps: tuple[_Warp, _Warp] | None = None
         if _is_rectified(rig):
             self.camera = RectifiedCamera(
@@ -95,6 +95,12 @@ def _rectified_axes(rig: StereoRig) -> Float64:
     y = np.cross(mean_axis, x)
     y /= np.linalg.norm(y)
     return np.column_stack([x, y, np.cross(x, y)])
+
+
+def right_from_rectified(rig: StereoRig) -> Float64:
+    """(3, 3) cam1_from_rect1: the rectified axes, which both cameras share, in the right camera."""
+    right: Float64 = rig.cam0_from_cam1.rotation.T @ _rectified_axes(rig)
+    return right
 
 
 def _is_rectified(rig: StereoRig) -> bool:

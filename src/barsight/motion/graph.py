@@ -27,7 +27,7 @@ MOST_ROUNDS = 3
 LEAST_AGREEING = 0.5
 """Where fewer of the encoders' places agree, none is left out: who is wrong can't be told."""
 MOST_DRIFT_STEPS = 5
-LEAST_STEP_SIGMAS = 0.3
+LEAST_STEP_PX = 0.02
 LEAST_FACTOR = 0.1
 
 
@@ -66,7 +66,7 @@ def solve(problem: Problem) -> Estimate:
     drift: RigDrift | None = None
     if problem.sightings is not None and used.any():
         if problem.placed and problem.offset_prior_px > 0:
-            values, graph, theta, _ = _seek_drift(problem, values, graph, used, theta, 1)
+            values, graph, theta, _ = _seek_drift(problem, values, graph, used, theta, MOST_DRIFT_STEPS)
         problem, values, graph, used = _with_seen_noise(problem, problem.sightings, values, used, theta)
     everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)
     for _ in range(MOST_ROUNDS):
@@ -126,7 +126,7 @@ def _seek_drift(
         shown = rig_drift.look(graph.linearize(values), problem, residual, used)
         theta = theta + shown.step
         values, graph = _optimised(problem, values.retract(shown.others), used, _shift(problem, theta))
-        if (np.abs(shown.step) < LEAST_STEP_SIGMAS * np.sqrt(np.diag(shown.covariance))).all():
+        if np.abs(rig_drift.columns(seen) * shown.step).max() < LEAST_STEP_PX:
             break
     return values, graph, theta, shown
 

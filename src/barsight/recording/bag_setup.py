@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from barsight.calibration.any_rig_file import body_is_cam0, chosen_rig, read_rig_file
 from barsight.calibration.kalibr import CamChain, ImuFile, read_camchain, read_imu_file
 from barsight.core.errors import InputError
 from barsight.recording.bag_file import CLOUD_TYPE, COMPRESSED_TYPE, IMAGE_TYPE, IMU_TYPE, POINT_TYPE, Topic
@@ -42,6 +43,9 @@ def find_calibration(path: Path, settings: RecordingSettings) -> BagCalibration:
     """
     folders = [path, path.parent] if path.is_dir() else [path.parent]
     chain_path = settings.camchain or _find(folders, ("*camchain-imucam*", "*camchain*"), ())
+    if chain_path is None and settings.rig is not None:
+        rig = read_rig_file(settings.rig)
+        return BagCalibration(CamChain(rig, (None, None), not body_is_cam0(rig)), None, (settings.rig,))
     if chain_path is None:
         raise InputError(
             path,
@@ -51,7 +55,9 @@ def find_calibration(path: Path, settings: RecordingSettings) -> BagCalibration:
     imu_path = settings.imu_yaml or _find([chain_path.parent], ("imu", "*imu*"), ("camchain", "results"))
     imu = read_imu_file(imu_path) if imu_path else None
     files = (chain_path, imu_path) if imu_path else (chain_path,)
-    return BagCalibration(read_camchain(chain_path), imu, files)
+    chain = read_camchain(chain_path)
+    chain = replace(chain, rig=chosen_rig(settings.rig, chain.rig))
+    return BagCalibration(chain, imu, files if settings.rig is None else (*files, settings.rig))
 
 
 def choose_topics(

@@ -26,6 +26,9 @@ class RecordingSettings:
     pair_tolerance_s: float = 0.002
     """How far apart the stamps of a left and a right picture may lie. Triggered cameras' stamps agree
     exactly; 2 ms leave room for drivers that stamp on arrival, in which a crane moves 1 mm."""
+    rig: Path | None = None
+    """A rig file to use instead of the recording's own calibration: ours, Kalibr's, OpenCV's or an EuRoC
+    folder. Where it doesn't say how the cameras sit on the body, the recording's mounting of cam0 stays."""
     camchain: Path | None = None
     """Kalibr's camchain-imucam.yaml for a bag; found in or beside the bag when not given."""
     imu_yaml: Path | None = None

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
+from barsight.calibration.any_rig_file import chosen_rig
 from barsight.calibration.documents import ImuNoise, read_document
 from barsight.calibration.euroc import read_imu, read_rig
 from barsight.calibration.rig import StereoRig
@@ -39,7 +40,7 @@ class EurocRecording:
                 raise InputError(
                     self._mav0, f"has no folder {camera}", "a stereo recording needs both cam0 and cam1"
                 )
-        self.rig: StereoRig = read_rig(self._mav0)
+        self.rig: StereoRig = chosen_rig(settings.rig, read_rig(self._mav0))
         left_ns, left_names = read_image_list(self._mav0 / "cam0" / "data.csv")
         right_ns, right_names = read_image_list(self._mav0 / "cam1" / "data.csv")
         self._left = self._image_paths("cam0", left_names)

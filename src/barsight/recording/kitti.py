@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from barsight.calibration.any_rig_file import chosen_rig
 from barsight.calibration.camera import Camera
 from barsight.calibration.documents import ImuNoise, canonical_pose
 from barsight.calibration.euroc import build_rig
@@ -69,7 +70,8 @@ class KittiRecording:
             path, _stamps(path, left, times), _stamps(path, right, times), settings.pair_tolerance_s
         )
         projections = _read_projections(path / "calib.txt", (keys[0], keys[1]))
-        self.rig = _rig(path / "calib.txt", projections, (_size(self._left), _size(self._right)))
+        own = _rig(path / "calib.txt", projections, (_size(self._left), _size(self._right)))
+        self.rig = chosen_rig(settings.rig, own)
 
     @property
     def index(self) -> FrameIndex:

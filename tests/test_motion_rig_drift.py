@@ -1,0 +1,120 @@
+"""Yaw and scale of the rig from known travel: errors as large as stated, and what follows from them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.pose import Pose
+from barsight.core.types import CraneSamples, RigDrift
+from barsight.features.guided import project_stereo
+from barsight.motion import fusion, rig_drift
+from barsight.motion.crane import CraneSettings
+from barsight.motion.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.rig_drift import MATCHING_BIAS_PX
+from barsight.motion.self_calibration import is_drifted, self_calibrated, turned_right
+from barsight.motion.sightings import Sighting
+from motion_recordings import MemoryRecording, ideal_rig
+
+DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+RIG = ideal_rig(1280, 1024)
+CAMERA = replace(RIG.cam0, fx_px=1250, fy_px=1250)
+MOUNT = Pose("body", "cam0", np.eye(3), np.array([0.06, -0.09, 0.04]))
+RIG = replace(
+    RIG, cam0=CAMERA, cam1=CAMERA, body_from_cam0=MOUNT, body_from_cam1=MOUNT @ RIG.cam0_from_cam1
+)  # fmt: skip
+
+
+def travel(seed: int, yaw_rad: float, scale: float, bias_px: float) -> tuple[MemoryRecording, list[Sighting]]:
+    """A crane over points on a stack and the floor: sightings and encoders, no pictures.
+
+    The right camera has turned by `yaw_rad`, exactly; matching is off by up to `bias_px` as the floor says.
+    """
+    rng = np.random.default_rng(seed)
+    stamps = (np.arange(8) * 800_000_000 + 10_000_000_000).astype(np.int64)
+    encoder_ns = np.arange(9_000_000_000, 17_000_000_000, 50_000_000, dtype=np.int64)
+    place = np.column_stack([(encoder_ns - encoder_ns[0]) / 1e9 * 0.6, *np.zeros((2, len(encoder_ns)))])
+    place[:, 2] = 8.0
+    poses = []
+    for stamp in stamps:
+        sway = np.deg2rad(rng.normal(0, 0.1, 3))
+        x = (stamp - encoder_ns[0]) / 1e9 * 0.6
+        cross = np.array([[0, -sway[2], sway[1]], [sway[2], 0, -sway[0]], [-sway[1], sway[0], 0]])
+        poses.append(Pose("yard", "body", (np.eye(3) + cross) @ DOWN, np.array([x, 0, 8.0])))
+    points = np.column_stack([rng.uniform(-4, 9, 900), rng.uniform(-4, 4, 900), rng.uniform(0, 1.5, 900)])
+    rectifier = Rectifier(replace(RIG, body_from_cam1=RIG.body_from_cam1))
+    camera = rectifier.camera
+    bias, slope = rng.normal(0, bias_px, 2)
+    sightings = []
+    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+        in_left = (pose @ rectifier.body_from_rect0).inverse().apply(points)
+        stereo = project_stereo(in_left, camera)
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        x, _, z = (in_left - [camera.baseline_m * (1 + scale), 0, 0]).T
+        disparity = stereo[:, 0] - stereo[:, 2]
+        stereo[:, 2] = camera.focal_px * (cos * x - sin * z) / (sin * x + cos * z) + camera.cx_px
+        shown = (stereo[:, [0, 2]] > 0).all(1) & (stereo[:, [0, 2]] < 1280).all(1)
+        shown &= (stereo[:, 1] > 0) & (stereo[:, 1] < 1024)
+        stereo[:, 2] += bias + slope * (disparity - disparity.mean()) / disparity.std()
+        seen = stereo[shown] + rng.normal(0, 0.1, (int(shown.sum()), 3))
+        sightings.append(Sighting(stamp, np.flatnonzero(shown), seen, np.full(len(seen), 0.1), None, 0))
+    encoders = place + rng.normal(0, 0.002, place.shape)
+    crane = CraneSamples(encoder_ns, encoders, np.zeros(3), DOWN, 0.002)
+    return MemoryRecording(RIG, stamps_ns=tuple(stamps.tolist()), crane_samples=crane), sightings
+
+
+def drift_of(recording: MemoryRecording, sightings: list[Sighting], patch: pytest.MonkeyPatch) -> RigDrift:
+    patch.setattr(fusion, "follow", lambda *_: (tuple(sightings), ()))
+    estimator = FusedTrajectory(FusionSettings(), CraneSettings())
+    found = estimator(recording, Rectifier(RIG), lambda: None).drift
+    assert found is not None
+    assert found.by_encoders
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bias_px", [0.0, MATCHING_BIAS_PX])
+def test_errors_are_as_large_as_stated(bias_px: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig_drift, "MATCHING_BIAS_PX", bias_px)
+    squares = []
+    for seed in range(40):
+        rng = np.random.default_rng((seed, 1))
+        truth = rng.normal(0, [np.deg2rad(0.03), FusionSettings().scale_sigma])
+        found = drift_of(*travel(seed, *truth, bias_px), monkeypatch)
+        error = np.array([found.yaw_rad, found.scale]) - truth
+        squares.append(error @ np.linalg.solve(found.covariance, error) / 2)
+    assert 0.75 < np.mean(squares) < 1.3
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.01, -0.1])
+def test_a_yaw_is_found(degrees: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = drift_of(*travel(3, np.deg2rad(degrees), 0.0, 0.0), monkeypatch)
+    assert abs(np.rad2deg(found.yaw_rad) - degrees) < 0.003
+    assert is_drifted(found) == (degrees != 0)
+
+
+def test_without_encoders_nothing_is_corrected(monkeypatch: pytest.MonkeyPatch) -> None:
+    drift = drift_of(*travel(3, np.deg2rad(0.05), 0.0, 0.0), monkeypatch)
+    rectifier = Rectifier(RIG)
+    blind = replace(drift, by_encoders=False)
+    assert self_calibrated(RIG, rectifier, blind, correct=False).warnings == ()
+    refused = self_calibrated(RIG, rectifier, blind, correct=True)
+    assert refused.rectifier is rectifier
+    assert "only with encoders" in refused.warnings[0]
+    warned = self_calibrated(RIG, rectifier, drift, correct=False)
+    assert warned.rectifier is rectifier
+    assert "calibrate anew" in warned.warnings[0]
+
+
+def test_the_turned_rig_takes_the_yaw_off() -> None:
+    """A point's disparity in the corrected rectification is that of its true depth."""
+    yaw = np.deg2rad(0.2)
+    true = turned_right(RIG, np.array([0.0, yaw, 0.0]))
+    drift = RigDrift(yaw, 0.0, np.eye(2) * 1e-12, np.ones(2), 0.4, 7.0, True)
+    corrected = self_calibrated(RIG, Rectifier(RIG), drift, correct=True).rectifier
+    assert corrected.camera == Rectifier(true).camera
+    point = np.array([[0.3, -0.4, 7.0]])
+    cam1_from_cam0 = true.cam0_from_cam1.inverse()
+    raw = RIG.cam1.project(cam1_from_cam0.apply(point))[0, 0] - RIG.cam0.project(point)[0, 0]
+    assert abs(raw + 1250 * 0.4 / 7 + 1250 * yaw) < 0.05
