@@ -27,11 +27,18 @@ from barsight.result_folder import (
     read_summary,
 )
 from barsight.viewer.cloud import COLOURINGS, colour
+from barsight.viewer.yard_lines import yard_lines
 
 HOST = "127.0.0.1"
 MOST_POINTS = 2_000_000
 MOST_AXES = 200
 MOST_LINE_POINTS = 20_000
+YARD_RGB = {
+    "free": (57, 211, 83),
+    "covered": (242, 177, 52),
+    "axes": (255, 255, 255),
+    "poles": (255, 47, 179),
+}
 LASER_RGB, CONTOUR_RGB, PATH_RGB = (230, 40, 40), (255, 140, 0), (30, 110, 200)
 
 
@@ -55,6 +62,7 @@ def serving(out_dir: Path, port: int, most_points: int = MOST_POINTS) -> Iterato
     summary = read_summary(out_dir)
     cloud = read_cloud(out_dir / "cloud.ply", most_points)
     path, laser, contours = read_path(out_dir), read_laser(out_dir), read_contours(out_dir)
+    yard = yard_lines(out_dir)
     _expect_free(port)
     with _quiet():
         server = viser.ViserServer(host=HOST, port=port, label="barsight", verbose=False)
@@ -66,6 +74,7 @@ def serving(out_dir: Path, port: int, most_points: int = MOST_POINTS) -> Iterato
         _aim(server, cloud, path)
         _show_cloud(server, cloud)
         _show_lines(server, path, laser, contours)
+        _show_yard(server, yard)
         where = str(summary.get("reference", "world"))
         simulated = " **SIMULATED.**" if summary.get("is_simulated") else ""
         server.gui.add_markdown(f"{len(cloud.xyz_m):,} of {cloud.total:,} points, {where} frame.{simulated}")
@@ -174,6 +183,19 @@ def _show_lines(
             _line(server, f"/contours/{contour.profile}", points, CONTOUR_RGB)
     _checkbox(server, "Axes (1 m)", "/axes", True)
     server.scene.add_frame("/axes/origin", axes_length=1.0, axes_radius=0.015)
+
+
+def _show_yard(server: viser.ViserServer, yard: dict[str, Float32]) -> None:
+    """Boxes and axes of the bundles, the magnet's poles at offered lifts."""
+    if {"free", "covered"} & set(yard):
+        _checkbox(server, "Bundles", "/bundles", True)
+    if "poles" in yard:
+        _checkbox(server, "Lifts", "/lifts", True)
+    for name, segments in yard.items():
+        where = "/lifts/poles" if name == "poles" else f"/bundles/{name}"
+        server.scene.add_line_segments(
+            where, segments, YARD_RGB[name], thickness=2.0, thickness_units="screen"
+        )
 
 
 def _checkbox(server: viser.ViserServer, label: str, name: str, visible: bool) -> None:

@@ -11,6 +11,7 @@ from barsight.yard.assess import Lift, Yard, assess
 from barsight.yard.footprint import BundleTable, Placement
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet
+from barsight.yard.set_down import FreePlace, free_places
 from barsight.yard.stability import Footing, footings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
@@ -38,7 +39,8 @@ FROM_WARNINGS = {
 class LiftPlan:
     """offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
 
-    vetoes: those that hold for the whole map; with any of them nothing is offered.
+    vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
+    stands. free: places to set down the longest and widest bundle, in `set_down.RULE`'s order.
     """
 
     magnet: Magnet
@@ -47,6 +49,7 @@ class LiftPlan:
     refused: tuple[Lift, ...]
     vetoes: tuple[Veto, ...]
     footings: tuple[Footing, ...]
+    free: tuple[FreePlace, ...]
 
 
 def map_vetoes(
@@ -84,7 +87,10 @@ def plan_lifts(
             offered.append(lift)
     top = {b.id: b.top_z_m for b in bundles}
     offered.sort(key=lambda lift: (-round(lift.safety, 2), -max(top[i] for i in lift.bundles)))
-    return LiftPlan(magnet, settings, tuple(offered), tuple(refused), vetoes, standing)
+    wide = max((b.width_m for b in bundles), default=settings.set_down_width_m)
+    long = max((b.length_m for b in bundles), default=settings.set_down_length_m)
+    free = free_places(heights, wide, long)
+    return LiftPlan(magnet, settings, tuple(offered), tuple(refused), vetoes, standing, free)
 
 
 def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:

@@ -62,6 +62,7 @@ def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
             "lifts": [_lift(lift, rank) for rank, lift in enumerate(plan.offered, start=1)],
             "refused": [_lift(lift, None) for lift in plan.refused],
             "footings": [_footing(footing) for footing in plan.footings],
+            "free_places": [asdict(place) for place in plan.free],
         }
     )
     return content

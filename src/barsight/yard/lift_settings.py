@@ -29,6 +29,10 @@ class LiftSettings:
     """Of its width that a bundle may stand over the edge of what carries it."""
     max_lean_deg: float = 5.0
     """How far a side of the pile may lean outwards."""
+    set_down_width_m: float = 0.3
+    """Width of the bundle that free places are looked for, where the map shows none to go by."""
+    set_down_length_m: float = 6.0
+    """Its length."""
     stanchions: tuple[tuple[float, float, float], ...] = ()
     """x, y and height (m) of the stanchions, where there are any."""
     least_freeboard_m: float = 0.05
@@ -47,5 +51,7 @@ class LiftSettings:
             raise ConfigError("lift shares, least_confidence and least_count_probability lie in 0...1")
         if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
             raise ConfigError("lift contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
+        if min(self.set_down_width_m, self.set_down_length_m) <= 0:
+            raise ConfigError("lift set_down_width_m and set_down_length_m must be over 0")
         if not 0 < self.max_lean_deg <= 45:
             raise ConfigError(f"lift max_lean_deg must lie in 0...45, not {self.max_lean_deg}")

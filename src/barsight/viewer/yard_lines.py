@@ -1,0 +1,68 @@
+"""Bundles as boxes with axes, and the magnet's poles at each offered lift, as line segments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64
+from barsight.yard.bundle_file import read_bundles
+from barsight.yard.lift_file import read_lifts
+from barsight.yard.types import Bundle
+
+POLE_HEIGHT_M = 0.15
+"""How high a pole is drawn above its face."""
+_EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+
+
+def yard_lines(out_dir: Path) -> dict[str, Float32]:
+    """(N, 2, 3) segments by name: free and covered bundles' boxes, axes, poles; without what isn't there."""
+    lines: dict[str, list[Float64]] = {"free": [], "covered": [], "axes": [], "poles": []}
+    if (out_dir / "bundles.json").is_file():
+        for bundle in read_bundles(out_dir / "bundles.json"):
+            lines["free" if bundle.on_top else "covered"].append(bundle_box(bundle))
+            lines["axes"].append(bundle.ends_m[None])
+    if (out_dir / "lifts.json").is_file():
+        lifts = read_lifts(out_dir / "lifts.json")
+        lines["poles"] += [pole_boxes(lift, lifts["magnet"]["poles"]) for lift in lifts["lifts"]]
+    return {name: np.concatenate(parts).astype(np.float32) for name, parts in lines.items() if parts}
+
+
+def bundle_box(bundle: Bundle) -> Float64:
+    """(12, 2, 3) edges of the box around a bundle: its width, its length, from its top down by its width."""
+    along = bundle.direction
+    across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
+    up = np.cross(across, along)
+    middle = bundle.centre_m + up * (bundle.top_z_m - bundle.centre_m[2] - bundle.width_m / 2)
+    half = bundle.width_m / 2
+    return _box(middle, across * half, along * bundle.length_m / 2, up * half)
+
+
+def pole_boxes(lift: dict[str, Any], poles: list[dict[str, float]]) -> Float64:
+    """(12 * P, 2, 3) edges of the poles as they lie."""
+    target = lift["target"]
+    yaw, pitch = np.radians(target["yaw_deg"]), np.radians(lift["pitch_deg"])
+    roll = np.radians(lift["roll_deg"])
+    across = np.array([np.cos(yaw), np.sin(yaw), np.tan(roll)])
+    along = np.array([-np.sin(yaw), np.cos(yaw), np.tan(pitch)])
+    up = np.array([0.0, 0.0, POLE_HEIGHT_M / 2])
+    origin = np.array([target["x_m"], target["y_m"], target["z_m"]]) + up
+    boxes = [
+        _box(
+            origin + pole["along_m"] * along + pole["across_m"] * across,
+            across * pole["width_m"] / 2,
+            along * pole["length_m"] / 2,
+            up,
+        )
+        for pole in poles
+    ]
+    return np.concatenate(boxes)
+
+
+def _box(middle: Float64, a: Float64, b: Float64, c: Float64) -> Float64:
+    """(12, 2, 3) edges of a box by its middle and half sides."""
+    corners = np.array([middle + s * c + p for s in (-1, 1) for p in (-a - b, a - b, a + b, b - a)])
+    edges: Float64 = corners[np.array(_EDGES)]
+    return edges
