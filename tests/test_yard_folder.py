@@ -1,0 +1,147 @@
+"""Lifts of a measured folder: command, page, 3D view, orthophoto, comparison; and what bad folders get."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from barsight.cli.main import run
+from barsight.mapping.settings import MapSettings
+from barsight.report.orthophoto import orthophoto, write_orthophoto
+from barsight.result_folder import read_heights
+from barsight.viewer.yard_lines import yard_lines
+from barsight.yard.bundle_file import write_bundles
+from barsight.yard.lift_file import read_lifts
+from lift_yards import laid, map_of, record
+from mapping_views import block, fused, view
+from result_folders import summary
+
+STOCK = [laid(0.3), laid(0.65)]
+
+
+def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **changes: object) -> Path:
+    """What measure leaves of a small yard, as far as lifts need it."""
+    folder.mkdir()
+    stock = [laid(0.3 + shift_m), laid(0.65)]
+    heights = map_of(stock)
+    bands = np.stack([heights.z_m, heights.sigma_m, heights.views, heights.source.astype(np.float32)])
+    top = heights.y0_m + (heights.z_m.shape[0] - 0.5) * heights.cell_m
+    tifffile.imwrite(
+        folder / "height.tif", np.ascontiguousarray(bands[:, ::-1]), photometric="minisblack",
+        planarconfig="separate", tile=(256, 256), metadata=None,
+        extratags=[
+            (33550, "d", 3, (heights.cell_m, heights.cell_m, 0.0), True),
+            (33922, "d", 6, (0.0, 0.0, 0.0, heights.x0_m - heights.cell_m / 2, top, 0.0), True),
+        ],
+    )  # fmt: skip
+    photo = np.full(heights.z_m.shape, 90, np.uint8)
+    (folder / "ortho.png").write_bytes(cv2.imencode(".png", photo)[1].tobytes())
+    bundles = tuple(record(one, k) for k, one in enumerate(stock))
+    write_bundles(bundles, None, "yard", folder / "bundles.json")
+    measured = datetime.now(UTC) - timedelta(seconds=age_s)
+    content = summary() | {"measured_at": measured.isoformat(), "agreement": []} | changes
+    (folder / "result.json").write_text(json.dumps(content), encoding="utf-8")
+    return folder
+
+
+def test_heights_come_back_as_they_were(tmp_path: Path) -> None:
+    folder, heights = write_folder(tmp_path / "out"), map_of(STOCK)
+    back = read_heights(folder)
+    assert (back.x0_m, back.y0_m) == pytest.approx((heights.x0_m, heights.y0_m))
+    np.testing.assert_array_equal(back.z_m, heights.z_m)
+    np.testing.assert_array_equal(back.source, heights.source)
+
+
+def test_lifts_are_chosen_shown_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "out")
+    assert run(["lifts", str(folder)]) == 0
+    assert "safest first" in capsys.readouterr().err
+    lifts = read_lifts(folder / "lifts.json")
+    assert sorted(lift["bundles"] for lift in lifts["lifts"]) == [[0], [1]]
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Bundles and lifts on the orthophoto" in page and ">#1</text>" in page
+    assert page.count('class="shape"') == 2 * (2 * 5 + 2 * 4)
+    lines = yard_lines(folder)
+    assert lines["free"].shape == (24, 2, 3) and lines["poles"].shape == (2 * 4 * 12, 2, 3)
+    assert lines["free"][..., 2].max() == pytest.approx(STOCK[0].top_z_m, abs=0.001)
+    assert lines["poles"][..., 2].min() == pytest.approx(STOCK[0].top_z_m, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"age_s": 7200.0}, "map-too-old"),
+        ({"reference": "world"}, "no-yard-frame"),
+        ({"warnings": [{"code": "calibration", "message": "rows off"}]}, "calibration-drift"),
+    ],
+)
+def test_what_result_says_vetoes_every_lift(
+    tmp_path: Path, change: dict[str, object], code: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "out", **change)  # type: ignore[arg-type]
+    assert run(["lifts", str(folder)]) == 0
+    assert code in capsys.readouterr().err
+    lifts = read_lifts(folder / "lifts.json")
+    assert lifts["lifts"] == [] and len(lifts["refused"]) == 2
+    assert lifts["vetoes"][0]["code"] == code
+    assert "No lift is offered" in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_an_empty_yard_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "out")
+    write_bundles((), None, "yard", folder / "bundles.json")
+    assert run(["lifts", str(folder)]) == 0
+    assert "no lift is offered: no bundle was found" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["bundles.json", "height.tif", "result.json"])
+@pytest.mark.parametrize("torn", [True, False])
+def test_a_torn_folder_is_one_line(
+    tmp_path: Path, name: str, torn: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "out")
+    if torn:
+        (folder / name).write_bytes((folder / name).read_bytes()[:200])
+    else:
+        (folder / name).unlink()
+    assert run(["lifts", str(folder)]) == 3
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (folder / "lifts.json").exists()
+
+
+def test_two_folders_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old, new = write_folder(tmp_path / "old"), write_folder(tmp_path / "new", shift_m=-0.08)
+    assert run(["compare", str(old), str(new), "--json", str(tmp_path / "c.json")]) == 0
+    assert "1 of 2 bundles lie where they lay" in capsys.readouterr().out
+    changes = json.loads((tmp_path / "c.json").read_text())["changes"]
+    assert [c["kind"] for c in changes] == ["moved", "same"]
+    assert changes[0]["across_mm"] == pytest.approx(-80) and changes[0]["significant"]
+
+
+def test_a_map_of_its_own_frame_cannot_be_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = write_folder(tmp_path / "old"), write_folder(tmp_path / "new", reference="world")
+    assert run(["compare", str(old), str(new)]) == 5
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_orthophoto_lies_on_the_height_maps_grid(tmp_path: Path) -> None:
+    x, y = block(40, 30, column=-7, row=5)
+    surface = fused([view(x, y, 0.1 * np.ones(x.shape))], tmp_path / "tiles", MapSettings(min_views=1))
+    write_orthophoto(surface, tmp_path)
+    with tifffile.TiffFile(tmp_path / "ortho.tif") as file:
+        page = file.pages.first
+        assert page.asarray().shape == surface.shape and page.asarray().dtype == np.uint8
+        assert page.tags["ModelPixelScaleTag"].value[:2] == (0.01, 0.01)
+        tie = page.tags["ModelTiepointTag"].value
+        assert tie[3:5] == pytest.approx((-0.075, 0.345))
+        assert (page.asarray() == 100).all()
+    picture = cv2.imread(str(tmp_path / "ortho.png"), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(picture, orthophoto(surface))
