@@ -13,7 +13,7 @@ from barsight.core.errors import InputError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table
 from barsight.evaluation.stereo_provenance import write_json
-from barsight.evaluation.stereo_scenes import load_scene, load_scenes, visible_in_both
+from barsight.evaluation.stereo_scenes import load_scene, load_scenes
 from barsight.evaluation.stereo_scores import score_disparity
 from barsight.evaluation.stereo_speed import bench_speed, speed_table
 from barsight.stereo.disparity_files import write_disparity
@@ -28,12 +28,12 @@ def _disparity(values: np.ndarray, sigma: float = 1.0) -> Disparity:
 def test_missing_pixels_count_as_bad_and_unknown_truth_does_not_count() -> None:
     truth = np.array([[10, 10, 10, 10, np.nan]], dtype=np.float32)
     found = _disparity([[10.4, 10.6, 12.5, np.nan, 3]])
-    nonocc = np.array([[True, True, False, True, True]])
-    score = score_disparity(found, truth, nonocc)
+    counted = np.array([[True, True, False, True, True]])
+    score = score_disparity(found, truth, counted)
     assert (score.bad05_pct, score.bad1_pct, score.bad2_pct) == (75, 50, 50)
-    assert score.nonocc_bad05_pct == pytest.approx(200 / 3)
-    assert score.nonocc_bad1_pct == score.nonocc_bad2_pct == pytest.approx(100 / 3)
-    assert score.coverage_pct == 75 and score.nonocc_coverage_pct == pytest.approx(200 / 3)
+    assert score.counted_bad05_pct == pytest.approx(200 / 3)
+    assert score.counted_bad1_pct == score.counted_bad2_pct == pytest.approx(100 / 3)
+    assert score.coverage_pct == 75 and score.counted_coverage_pct == pytest.approx(200 / 3)
     assert score.average_px == pytest.approx((0.4 + 0.6 + 2.5) / 3, abs=1e-6)
     assert score.median_px == pytest.approx(0.6, abs=1e-6)
     assert (score.within1_pct, score.within2_pct) == (100, 100)
@@ -45,16 +45,6 @@ def test_shares_within_sigma_of_a_gaussian_error_are_those_of_a_gaussian() -> No
     score = score_disparity(_disparity(truth + rng.normal(0, 0.3, truth.shape), 0.3), truth, truth > 0)
     assert score.within1_pct == pytest.approx(68.27, abs=1)
     assert score.within2_pct == pytest.approx(95.45, abs=0.5)
-
-
-def test_a_near_strip_hides_the_background_to_its_left_and_the_border_is_out_of_view() -> None:
-    truth = np.full((3, 40), 4, dtype=np.float32)
-    truth[:, 20:26] = 10
-    visible = visible_in_both(truth)
-    expected = np.ones(40, dtype=bool)
-    expected[:4] = False  # x - d < 0
-    expected[14:20] = False  # x - 4 = 10...15 are covered by 20...25 - 10
-    assert (visible == expected).all()
 
 
 def _write_scene(folder: Path, truth: np.ndarray, bits: int = 8) -> None:
@@ -77,8 +67,8 @@ def test_a_scene_is_loaded_from_8_and_16_bits_alike(tmp_path: Path) -> None:
     first, second = load_scenes(tmp_path)
     assert (first.pair.left == second.pair.left).all() and (first.pair.right == second.pair.right).all()
     assert first.candidates == DisparityRange(0, 16)
-    assert np.isnan(first.truth_px[0, 0]) and not first.nonocc[0, 0]
-    assert not first.nonocc[:, :8].any() and first.nonocc[:, 8:].all()
+    assert np.isnan(first.truth_px[0, 0]) and first.mask == "known"
+    assert (first.counted == np.isfinite(first.truth_px)).all()
 
 
 def test_nonocc_png_is_used_where_there_is_one(tmp_path: Path) -> None:
@@ -87,7 +77,8 @@ def test_nonocc_png_is_used_where_there_is_one(tmp_path: Path) -> None:
     mask = np.zeros((20, 60), dtype=np.uint8)
     mask[:, 30:] = 255
     assert cv2.imwrite(str(tmp_path / "a" / "nonocc.png"), mask)
-    assert (load_scene(tmp_path / "a").nonocc == (mask == 255)).all()
+    scene = load_scene(tmp_path / "a")
+    assert (scene.counted == (mask == 255)).all() and scene.mask == "nonocc.png"
 
 
 def test_a_missing_folder_and_a_torn_scene_are_named(tmp_path: Path) -> None:
@@ -114,6 +105,7 @@ def test_the_bench_prints_tables_and_writes_json(tmp_path: Path) -> None:
     (result,) = bench.methods
     assert [scene.score.bad1_pct for scene in result.scenes] == [0, 100]
     assert result.mean.bad1_pct == 50 and result.mean.average_px == pytest.approx(1)
+    assert [scene.mask for scene in result.scenes] == ["known", "known"]
     assert result.per_megapixel.repeats == 5
     assert (
         result.per_megapixel.fastest_ms <= result.per_megapixel.median_ms <= result.per_megapixel.slowest_ms

@@ -8,13 +8,14 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from barsight.core.arrays import Float64
 from barsight.core.files import atomic_path
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def timed(work: Callable[[], T], repeats: int = LEAST_REPEATS) -> tuple[T, list[
     return result, seconds
 
 
-def timing(seconds: list[float]) -> Timing:
+def timing(seconds: Sequence[float] | Float64) -> Timing:
     """The summary of `timed`'s seconds."""
     ms = 1e3 * np.array(seconds)
     return Timing(float(np.median(ms)), float(ms.min()), float(ms.max()), len(seconds))

@@ -19,13 +19,15 @@ _BRIGHTEST_16_BIT = 257
 @dataclass(frozen=True, eq=False)
 class StereoScene:
     """name. pair. truth_px: (H, W) true disparity of the left image, NaN where unknown.
-    nonocc: (H, W) bool, seen in both images. candidates: the range that every method is given.
+    counted: (H, W) bool, the pixels that scores count. mask: where that comes from, `nonocc.png` (what both
+    images see) or `known` (every pixel with truth). candidates: the range that every method is given.
     """
 
     name: str
     pair: RectifiedPair
     truth_px: Float32
-    nonocc: Bool
+    counted: Bool
+    mask: str
     candidates: DisparityRange
 
     @property
@@ -51,8 +53,8 @@ def load_scenes(data: Path) -> tuple[StereoScene, ...]:
 def load_scene(folder: Path) -> StereoScene:
     """One folder: left.png, right.png, disp.pfm [nonocc.png, white where both see it].
 
-    Without nonocc.png the mask comes from the truth by `visible_in_both`. The candidates run from 0 (or the
-    truth's lowest where that is negative) to the next multiple of 16 above the truth's highest.
+    Without nonocc.png every pixel with known truth counts. The candidates run from 0 (or the truth's lowest
+    where that is negative) to the next multiple of 16 above the truth's highest.
     """
     left, right = _read_gray(folder / "left.png"), _read_gray(folder / "right.png")
     if left.shape != right.shape:
@@ -65,36 +67,19 @@ def load_scene(folder: Path) -> StereoScene:
     if not np.isfinite(truth).any():
         raise InputError(folder / "disp.pfm", "has no known disparity", "fetch it again")
     mask_path = folder / "nonocc.png"
-    nonocc = _read_gray(mask_path) == 255 if mask_path.is_file() else visible_in_both(truth)
+    counted = np.isfinite(truth)
+    if mask_path.is_file():
+        counted &= _read_gray(mask_path) == 255
     lowest = min(0, int(np.floor(np.nanmin(truth))))
     count = int(np.floor(np.nanmax(truth))) + 2 - lowest
     return StereoScene(
         name=folder.name,
         pair=pair_from_images(left, right),
         truth_px=truth,
-        nonocc=nonocc & np.isfinite(truth),
+        counted=counted,
+        mask=mask_path.name if mask_path.is_file() else "known",
         candidates=DisparityRange(lowest, lowest + -(-count // 16) * 16),
     )
-
-
-def visible_in_both(truth_px: Float32) -> Bool:
-    """(H, W) True where the right image sees the left pixel's point: it lies inside, and nothing that is more
-    than 1 px nearer lands within half a pixel of it.
-    """
-    height, width = truth_px.shape
-    known = np.isfinite(truth_px)
-    filled = np.where(known, truth_px, -np.inf)
-    column = np.arange(width)[None, :]
-    target = column - np.where(known, truth_px, 0)
-    inside = known & (target >= 0) & (target <= width - 1)
-    nearest = np.full((height, width), -np.inf)
-    rows = np.broadcast_to(np.arange(height)[:, None], truth_px.shape)
-    for landing in (np.floor(target + 0.5), np.ceil(target - 0.5)):
-        cell = landing.clip(0, width - 1).astype(np.intp)
-        np.maximum.at(nearest, (rows[inside], cell[inside]), filled[inside])
-    there = np.take_along_axis(nearest, np.rint(target).clip(0, width - 1).astype(np.intp), axis=1)
-    visible: Bool = inside & (there <= filled + 1)
-    return visible
 
 
 def pair_from_images(left: UInt8, right: UInt8) -> RectifiedPair:

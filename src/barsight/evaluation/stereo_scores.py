@@ -14,33 +14,33 @@ from barsight.core.types import Disparity
 class StereoScore:
     """Percentages are of the pixels with known truth, a missing disparity counts as bad.
 
-    bad05, bad1, bad2: wrong by more than 0.5, 1 and 2 px, all known pixels. nonocc_bad05, nonocc_bad1,
-    nonocc_bad2: of those that both images see. average_px: mean absolute error and median_px: median, over
-    the known pixels that have a disparity. coverage_pct, nonocc_coverage_pct: pixels that have one.
-    within1_pct, within2_pct: of the non-occluded that have one, those within 1 and 2 of their sigma.
+    bad05, bad1, bad2: wrong by more than 0.5, 1 and 2 px, all known pixels. counted_bad05, counted_bad1,
+    counted_bad2: of those that the scene counts. average_px: mean absolute error and median_px: median, over
+    the known pixels that have a disparity. coverage_pct, counted_coverage_pct: pixels that have one.
+    within1_pct, within2_pct: of the counted that have one, those within 1 and 2 of their sigma.
     """
 
     bad05_pct: float
     bad1_pct: float
     bad2_pct: float
-    nonocc_bad05_pct: float
-    nonocc_bad1_pct: float
-    nonocc_bad2_pct: float
+    counted_bad05_pct: float
+    counted_bad1_pct: float
+    counted_bad2_pct: float
     average_px: float
     median_px: float
     coverage_pct: float
-    nonocc_coverage_pct: float
+    counted_coverage_pct: float
     within1_pct: float
     within2_pct: float
 
 
-def score_disparity(disparity: Disparity, truth_px: Float32, nonocc: Bool) -> StereoScore:
-    """Score against truth_px (NaN where unknown); nonocc: (H, W) bool, seen in both images.
+def score_disparity(disparity: Disparity, truth_px: Float32, counted: Bool) -> StereoScore:
+    """Score against truth_px (NaN where unknown); counted: (H, W) bool, seen in both images.
 
     A figure is NaN where no pixel could be counted.
     """
     known = np.isfinite(truth_px)
-    visible = nonocc & known
+    visible = counted & known
     has = np.isfinite(disparity.disparity_px)
     error = np.abs(disparity.disparity_px - truth_px)
     error[~has] = np.inf
@@ -51,13 +51,13 @@ def score_disparity(disparity: Disparity, truth_px: Float32, nonocc: Bool) -> St
         bad05_pct=_percent(error > 0.5, known),
         bad1_pct=_percent(error > 1, known),
         bad2_pct=_percent(error > 2, known),
-        nonocc_bad05_pct=_percent(error > 0.5, visible),
-        nonocc_bad1_pct=_percent(error > 1, visible),
-        nonocc_bad2_pct=_percent(error > 2, visible),
+        counted_bad05_pct=_percent(error > 0.5, visible),
+        counted_bad1_pct=_percent(error > 1, visible),
+        counted_bad2_pct=_percent(error > 2, visible),
         average_px=float(met.mean(dtype=np.float64)) if met.size else float("nan"),
         median_px=float(np.median(met)) if met.size else float("nan"),
         coverage_pct=_percent(has, known),
-        nonocc_coverage_pct=_percent(has, visible),
+        counted_coverage_pct=_percent(has, visible),
         within1_pct=100 * float((ratio <= 1).mean()) if ratio.size else float("nan"),
         within2_pct=100 * float((ratio <= 2).mean()) if ratio.size else float("nan"),
     )

@@ -87,7 +87,7 @@ def bench_subpixel(
         scene = load_scene(data / "motorcycle")
         for name, method in methods.items():
             found = method(scene.pair, scene.candidates)
-            errors = pixel_errors(found, scene.truth_px.astype(np.float64), scene.nonocc)
+            errors = pixel_errors(found, scene.truth_px.astype(np.float64), scene.counted)
             gathered[name]["motorcycle"] = [errors]
     results = tuple(
         SubpixelResult(name, {kind: fraction_bias(errors) for kind, errors in kinds.items()})
