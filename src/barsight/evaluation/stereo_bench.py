@@ -49,7 +49,8 @@ class StereoBench:
 
 _MASKS = (
     "bad: percent of the pixels, a missing disparity is bad; counted: those white in nonocc.png, seen "
-    "in both images, or where a scene has none every pixel with known truth; all: every pixel with known truth"
+    "in both images, or where a scene has none every pixel with known truth; "
+    "all: every pixel with known truth"
 )
 _CAPTION = (
     "Percent of pixels wrong by more than 0.5, 1, 2 px, missing ones counted: of those in nonocc.png, where "

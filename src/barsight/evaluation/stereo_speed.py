@@ -81,8 +81,8 @@ def speed_table(bench: SpeedBench) -> Table:
     """One row per method."""
     table = Table(
         title=f"{WIDTH_PX}x{HEIGHT_PX}, {CANDIDATES} candidates, {bench.provenance.cores} cores",
-        caption=f"Median (range) of {bench.reference.repeats} rounds, all in turn. times SGBM: wall time over "
-        "OpenCV's 5-path SGBM's of the same round; processor time: the same of all cores' together.",
+        caption=f"Median (range) of {bench.reference.repeats} rounds, all in turn. times SGBM: wall time "
+        "over OpenCV's 5-path SGBM's of the same round; processor time: the same of all cores' together.",
     )
     table.add_column("method")
     for heading in ("ms", "times SGBM", "processor time"):
