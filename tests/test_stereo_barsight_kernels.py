@@ -8,7 +8,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from barsight.core.errors import ConfigError
-from barsight.stereo.confidence import bend_around
+from barsight.stereo.confidence import bend_around, beside_edges, start_disagreement
 from barsight.stereo.consistency import agrees, without_islands
 from barsight.stereo.curvature import curvature_across
 from barsight.stereo.edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
@@ -284,3 +284,21 @@ def test_curvature_is_taken_across_the_axis_and_not_over_a_jump() -> None:
     np.testing.assert_allclose(along[inner], 0.0, atol=1e-5)
     stepped = np.where(columns > 35, np.float32(4), np.float32(0))
     assert not curvature_across(stepped, _axes(0.0, 1.0)).any()
+
+
+def test_disagreement_of_start_and_refinement_forgets_noise_and_holes() -> None:
+    refined = np.full((HEIGHT, WIDTH), 5, dtype=np.float32)
+    start = refined - 0.3
+    start[:, ::7] = np.nan
+    np.testing.assert_allclose(start_disagreement(start, refined), 0.3, atol=1e-5)
+    assert np.median(start_disagreement(refined + _noise(3, 0.3), refined)) < 0.03
+    assert not start_disagreement(np.full_like(refined, np.nan), refined).any()
+
+
+def test_only_jumps_between_known_neighbours_are_edges() -> None:
+    disparity = np.full((HEIGHT, WIDTH), 5, dtype=np.float32)
+    disparity[:, 40:] = 9
+    disparity[:, 20] = np.nan
+    beside = beside_edges(disparity, 1.0)
+    assert (beside[:, 39:41] == 1).all() and (beside[:, 18:23] < 0.01).all()
+    np.testing.assert_allclose(beside[20, 43], np.exp(-1.0), rtol=0.05)

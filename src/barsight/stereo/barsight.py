@@ -13,7 +13,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
-from barsight.stereo.confidence import bend_around, vertical_error_px
+from barsight.stereo.confidence import bend_around, beside_edges, start_disagreement, vertical_error_px
 from barsight.stereo.consistency import agrees, without_islands
 from barsight.stereo.edges import sharpen_edges
 from barsight.stereo.filling import fill
@@ -44,10 +44,14 @@ class BarsightSettings:
     """The least error of the method itself (1 sigma)."""
     vertical_share: float = 1.5
     """Error of the disparity per vertical error that the images show: parallax adds its own."""
-    edge_share: float = 0.9
+    edge_share: float = 0.6
     """Error per pixel by which the disparity bends within 3 px."""
     widest_edge_px: float = 0.5
     """A bend or an edge counts as no more than this."""
+    start_share: float = 0.12
+    """Error per pixel by which the start and its refinement disagree over a window."""
+    wrong_side_px: float = 0.4
+    """Error on a depth edge, where a pixel may belong to either side; it falls to 1 / e within 3 px."""
     max_sigma_px: float = 1.0
     """A match less sure than this is none."""
     semiglobal: SemiGlobalSettings = field(default_factory=SemiGlobalSettings)
@@ -56,8 +60,9 @@ class BarsightSettings:
     def __post_init__(self) -> None:
         if min(self.consistency_px, self.max_sigma_px) <= 0:
             raise ConfigError("consistency_px and max_sigma_px must be positive")
-        shares = (self.vertical_share, self.edge_share, self.widest_edge_px)
-        if min(self.model_sigma_px, self.island_px, *shares) < 0:
+        shares = (self.vertical_share, self.edge_share, self.start_share)
+        lengths = (self.widest_edge_px, self.wrong_side_px)
+        if min(self.model_sigma_px, self.island_px, *shares, *lengths) < 0:
             raise ConfigError("model_sigma_px, island_px and the shares of sigma can't be negative")
 
 
@@ -92,7 +97,7 @@ class BarsightStereo:
         if settings.preset == "fast":
             refinement = replace(refinement, steps=min(refinement.steps, _FAST_STEPS), short_px=0.0)
         refined = refine(pair.left, pair.right, _without_holes(start.left_px), matched, refinement)
-        sigma = self._sigma(pair, refined, matched)
+        sigma = self._sigma(pair, refined, start.left_px)
         kept = matched & (np.abs(refined.disparity_px - start.left_px) < _FURTHEST_FROM_START_PX)
         if not settings.fill_occlusions:
             kept &= sigma <= settings.max_sigma_px
@@ -103,17 +108,21 @@ class BarsightStereo:
             sigma = np.where(np.isfinite(guessed), guessed, sigma)
         if settings.preset == "best":
             disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
+        sigma = np.hypot(sigma, np.float32(settings.wrong_side_px) * beside_edges(disparity, _JUMP_PX))
         disparity, sigma = np.where(pair.left_valid, disparity, _NAN), np.where(pair.left_valid, sigma, _NAN)
         return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
 
-    def _sigma(self, pair: RectifiedPair, refined: Refined, matched: Bool) -> Float32:
-        """Noise, what noise doesn't explain, and what a bend or an edge costs."""
+    def _sigma(self, pair: RectifiedPair, refined: Refined, start_px: Float32) -> Float32:
+        """Noise, what noise doesn't explain, and what a bend costs. start_px: NaN where unmatched."""
         settings = self.settings
+        matched = np.isfinite(start_px)
         vertical_px = vertical_error_px(pair.left, pair.right, refined.disparity_px, matched)
         unexplained = settings.model_sigma_px**2 + (settings.vertical_share * vertical_px) ** 2
         bend = bend_around(refined.disparity_px, settings.widest_edge_px)
         bent = np.maximum(bend * bend - refined.variance_px2, 0)
         variance = refined.variance_px2 + np.float32(unexplained) + np.float32(settings.edge_share**2) * bent
+        moved = settings.start_share * start_disagreement(start_px, refined.disparity_px)
+        variance += np.square(moved, dtype=np.float32)
         sigma: Float32 = np.sqrt(variance, dtype=np.float32)
         return sigma
 

@@ -23,6 +23,9 @@ _LARGEST_VARIANCE_PX2 = 0.1
 _FEWEST_WINDOWS = 30
 _NOISE_SHARE = 4.5
 _BEND_PX = 3
+_START_WINDOW_PX = 9
+_EDGE_REACH_PX = 3.0
+_FAR_PX = 1e4
 
 
 def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bool) -> float:
@@ -49,6 +52,34 @@ def bend_around(disparity: Float32, widest_px: float) -> Float32:
     along_column = np.abs(disparity - np.float32(0.5) * (framed[:-side, inner] + framed[side:, inner]))
     bend: Float32 = np.minimum(np.maximum(along_row, along_column), np.float32(widest_px))
     return bend
+
+
+def start_disagreement(start: Float32, refined: Float32) -> Float32:
+    """(H, W) how far refinement moved the start in windows of 9 px, px. start: (H, W), NaN where unmatched.
+
+    Two estimates from the same images that gloss, blur and depth edges bend differently: where they disagree
+    over a whole window, noise isn't why, and either may be wrong.
+    """
+    side = (_START_WINDOW_PX, _START_WINDOW_PX)
+    known = np.isfinite(start)
+    moved = np.where(known, refined - start, np.float32(0))
+    share = cv2.boxFilter(known.astype(np.float32), -1, side)
+    disagreement: Float32 = np.abs(cv2.boxFilter(moved, -1, side)) / np.maximum(share, np.float32(1e-3))
+    return disagreement
+
+
+def beside_edges(disparity: Float32, jump_px: float) -> Float32:
+    """(H, W) 1 on jumps of more than jump_px between neighbours, falling to 1 / e within 3 px: where a pixel
+    may have been given to the wrong side. NaN in `disparity` is no jump.
+    """
+    three = np.ones((3, 3), dtype=np.uint8)
+    known = np.isfinite(disparity)
+    highest = cv2.dilate(np.where(known, disparity, np.float32(-_FAR_PX)), three)
+    lowest = cv2.erode(np.where(known, disparity, np.float32(_FAR_PX)), three)
+    level = (highest - lowest <= jump_px).astype(np.uint8)
+    distance = cv2.distanceTransform(level, cv2.DIST_L2, 5)
+    beside: Float32 = np.exp(-distance / np.float32(_EDGE_REACH_PX))
+    return beside
 
 
 def _vertical_shifts(

@@ -26,13 +26,15 @@ _SLOPE_LENGTH_PX = 50.0
 _GREY = 12.0
 _HIDDEN_QUANTILE = 0.3
 _SEEN_SHARE = 0.3
+_SPREAD_SHARE = 2.0
 
 
 def fill(
     disparity: Float32, grey: UInt8, right_px: Float32, lowest_px: float, highest_px: float
 ) -> tuple[Float32, Float32]:
     """`disparity` (H, W) with its NaN filled, as far as any ray finds a match, and the guesses' sigma (px;
-    NaN where nothing was guessed): the spread of the candidates, at least 1 px. Inputs stay as they are.
+    NaN where nothing was guessed): twice the spread of the candidates, since the truth may be none of them,
+    and at least 1 px. Inputs stay as they are.
 
     right_px: (H, W) the right image's disparity: a guess that would be seen there in front of what is there
     is less likely. Guesses stay within lowest_px...highest_px.
@@ -158,4 +160,4 @@ def _fill(
             spread = 0.0
             for i in range(found):
                 spread += weights[i] * (values[i] - filled[y, x]) ** 2
-            sigma[y, x] = math.sqrt(1.0 + spread / weights[:found].sum())
+            sigma[y, x] = math.sqrt(1.0 + _SPREAD_SHARE**2 * spread / weights[:found].sum())

@@ -41,9 +41,9 @@ _SHORT_STEP_PX = 3
 _BLOCK_PX = 3
 _HOLD = np.float32(0.1)
 _HOLD_UNMATCHED = np.float32(0.02)
-_SUPPORT = np.float32(0.5 * 2.15)
+_SUPPORT = np.float32(0.5 * 1.87)
 """Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
-and the noise in the gradients cost: measured on rendered planes."""
+cost: measured on rendered planes. What noise in the slopes costs grows with what a step falls short of."""
 _MOST_UNDAMPED = np.float32(1.5)
 _SPREAD_ACROSS_PX2 = np.float32(3)
 """Mean square distance across the axis that the supports average over: their own and the axis' error."""
@@ -115,7 +115,7 @@ def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: R
         short_of = _undamped(weight, trust, slope_noise, settings.window_px)
         if remaining > 0:
             pull *= short_of
-        power = _power(weight, pull, usable, settings.window_px)
+        power = short_of * _power(weight, pull, usable, settings.window_px)
         weight += _HOLD * (usable + _HOLD_UNMATCHED)
         fitted, variance = _fit(disparity, weight, pull, power, usable, axes, settings)
         sagged = _sag(fitted, axes)
