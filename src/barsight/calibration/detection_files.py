@@ -56,6 +56,11 @@ def _read(path: Path, board: Board) -> dict[int, Corners]:
             "give the board these corners were detected on",
         )
     pixels = np.column_stack([rows["u"], rows["v"]]).astype(np.float64)
+    if not np.isfinite(pixels).all():
+        count = int((~np.isfinite(pixels).all(axis=1)).sum())
+        raise CalibrationError(
+            path, f"{count} corners' pixels are NaN or infinite", "leave those corners out"
+        )
     views = {}
     for stamp in np.unique(rows["stamp_ns"]):
         chosen = np.flatnonzero(rows["stamp_ns"] == stamp)

@@ -5,6 +5,7 @@ docs/calibration.md describes the keys. Readers accept every version up to their
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,14 @@ VERSION_KEY = "barsight_rig"
 VERSION = 1
 
 
-def write_rig_file(path: Path, rig: StereoRig, calibration: StereoCalibration | None = None) -> None:
-    """Write a rig, with its sigmas and covariance where a calibration is given; reads back bit for bit."""
+def write_rig_file(
+    path: Path, rig: StereoRig, calibration: StereoCalibration | None = None,
+    section: Mapping[str, object] | None = None,
+) -> None:  # fmt: skip
+    """Write a rig, with its sigmas and covariance where a calibration is given; reads back bit for bit.
+
+    section: the key `calibration` of another kind of calibration than stereo.
+    """
     values: dict[str, object] = {
         VERSION_KEY: VERSION,
         "cam0": _camera(rig.cam0, rig.body_from_cam0),
@@ -44,6 +51,8 @@ def write_rig_file(path: Path, rig: StereoRig, calibration: StereoCalibration | 
             "sigmas": [float(value) for value in sigmas],
             "covariance": [[float(value) for value in row] for row in calibration.covariance],
         }
+    elif section is not None:
+        values["calibration"] = dict(section)
     write_document(path, values)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from barsight.calibration.board_adjustment import Observed, Solved, State, observe, solve
 from barsight.calibration.boards import Board
 from barsight.calibration.camera import Camera
+from barsight.calibration.covariance_widening import widened
 from barsight.calibration.lens_model import Lens
 from barsight.calibration.rig import StereoRig
 from barsight.calibration.stereo_removal import (
@@ -35,8 +36,6 @@ from barsight.core.pose import Pose
 
 HUBER_PX = 1.0
 MOST_ROUNDS = 12
-WIDENED_FROM = 3.0
-"""Standard deviations of its own scatter by which the views' correlation must stand out to widen sigmas."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,32 +130,14 @@ def rms(residuals: Float64) -> float:
 def covariance_of(solved: Solved, corners: int, views: int) -> tuple[Float64, float, float]:
     """(covariance (C, C), sigma_px, correlation) of the common parameters; see `StereoCalibration`.
 
-    A view's share g of the gradient pulls the parameters by S^-1 g, with S the whole and S_v the view's Schur
-    complement. Under independent noise these pulls add up to the covariance sigma^2 S^-1, but for the share
-    that the views' own leverage takes. Where they scatter clearly more, their own covariance takes its place
-    (the sandwich estimator over views), shrunk towards the multiple of sigma^2 S^-1 with the same trace
-    [Ledoit and Wolf 2004], as views are often fewer than parameters.
+    Widened where views hang together; see `covariance_widening`.
     """
     residuals = np.concatenate(solved.residuals_px)
-    size = solved.reduced.shape[0]
-    freedom = 2 * corners - size - 6 * views
+    freedom = 2 * corners - solved.reduced.shape[0] - 6 * views
     variance = float((residuals**2).sum() / max(freedom, 1))
     inverse = scaled_inverse(solved.reduced)
-    covariance = inverse * variance
-    scale = np.sqrt(np.diag(covariance))
-    factor = scale[:, None] * np.linalg.cholesky(covariance / scale[:, None] / scale)
-    shares = inverse @ solved.view_reduced
-    expected = float(np.trace(shares, axis1=1, axis2=2).sum() - np.einsum("vij,vji->", shares, shares))
-    pulls = np.linalg.solve(factor, inverse @ solved.scores.T).T * np.sqrt(views * size / max(expected, 1e-9))
-    spread = pulls.T @ pulls / views
-    correlation = float(np.trace(spread)) / size
-    if correlation <= 1 + WIDENED_FROM * np.sqrt(4 / (size * views)):
-        return covariance, float(np.sqrt(variance)), 1.0
-    apart = float(((spread - correlation * np.eye(size)) ** 2).sum())
-    noise = float(((pulls**2).sum(axis=1) ** 2).sum() / views - (spread**2).sum()) / views
-    shrink = min(max(noise / apart, 0.0), 1.0)
-    widened = shrink * correlation * np.eye(size) + (1 - shrink) * spread
-    return factor @ widened @ factor.T, float(np.sqrt(variance)), correlation
+    covariance, correlation = widened(inverse, variance, solved.scores, solved.view_reduced)
+    return covariance, float(np.sqrt(variance)), correlation
 
 
 def scaled_inverse(matrix: Float64) -> Float64:

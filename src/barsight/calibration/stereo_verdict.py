@@ -83,16 +83,16 @@ def assess(calibration: StereoCalibration, working_range_m: float) -> Assessment
     covered = [float(picture_grid(calibration, camera).covered.mean()) for camera in (0, 1)]
     both = sum(view.cam0 is not None and view.cam1 is not None for view in calibration.views)
     lines = (
-        _judge("views of both cameras", both, "", 10, 5, "more views average the corners' noise", above=True),
-        _judge("coverage", 100 * min(covered), "% of the picture", 75, 40,
+        judge("views of both cameras", both, "", 10, 5, "more views average the corners' noise", above=True),
+        judge("coverage", 100 * min(covered), "% of the picture", 75, 40,
                "beyond the corners the lens is extrapolated", above=True),
-        _judge("reprojection", calibration.rms_px, "px RMS", 0.3, 0.8,
+        judge("reprojection", calibration.rms_px, "px RMS", 0.3, 0.8,
                "larger means blur, a bent board or the wrong lens model"),
-        _judge("epipolar", float(np.sqrt((epipolar**2).mean())), "px RMS", 0.3, 0.7,
+        judge("epipolar", float(np.sqrt((epipolar**2).mean())), "px RMS", 0.3, 0.7,
                "matches must lie on one row"),
-        _judge("projection uncertainty", float(np.median(np.concatenate([s.ravel() for s in sigma]))),
+        judge("projection uncertainty", float(np.median(np.concatenate([s.ravel() for s in sigma]))),
                "px (median over the pictures)", 0.2, 0.6, "how far the lens may be off"),
-        _judge(f"depth at {working_range_m:g} m", 1e3 * float(depth[ranges.index(working_range_m), 0]), "mm",
+        judge(f"depth at {working_range_m:g} m", 1e3 * float(depth[ranges.index(working_range_m), 0]), "mm",
                10, 30, "what the calibration alone costs, the same in every picture"),
         _judge_cross(cross),
     )  # fmt: skip
@@ -121,9 +121,10 @@ def tilts(calibration: StereoCalibration) -> Float64:
     return np.degrees(np.arctan2(normal[:, :2], normal[:, 2:]))
 
 
-def _judge(
+def judge(
     name: str, value: float, unit: str, good: float, usable: float, why: str, *, above: bool = False
 ) -> Line:
+    """A line whose verdict follows from two limits; `above` where more is better."""
     sign = -1.0 if above else 1.0
     is_good, is_usable = sign * value <= sign * good, sign * value <= sign * usable
     verdict = Verdict.GOOD if is_good else Verdict.USABLE if is_usable else Verdict.REDO
@@ -138,7 +139,7 @@ def _judge_cross(cross: CrossValidation | Failed) -> Line:
     if isinstance(cross, Failed):
         return Line(name, "not possible", Verdict.USABLE, cross.reason)
     why = "halves that differ by more than their sigmas hide an error that the residuals don't show"
-    return _judge(name, cross.ratio, "sigma", 2, 3, why)
+    return judge(name, cross.ratio, "sigma", 2, 3, why)
 
 
 def _advice(calibration: StereoCalibration) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from barsight.core.errors import ConfigError
 
 KINDS = {
     "stereo": "Calibrate two cameras from pictures of a board: rig.yaml and a report that judges it",
+    "camera-imu": "Where the cameras sit on the IMU and the clocks' offset, from a recording with a board",
     "check": "Has the rig drifted? Ordinary crane travel shows it, with sigma and cost in mm",
     "export": "Write a rig in another format: ours, Kalibr, OpenCV, EuRoC",
     "imu-noise": "Noise densities and random walks of an IMU from a log at rest: imu.yaml",

@@ -76,7 +76,7 @@ def read_imu_log(
 
 def _file(path: Path) -> Path:
     if path.is_dir():
-        for name in ("mav0/imu0/data.csv", "imu0/data.csv", "data.csv"):
+        for name in ("mav0/imu0/data.csv", "imu0/data.csv", "imu0.csv", "data.csv"):
             if (path / name).is_file():
                 return path / name
         raise InputError(path, "holds no imu0/data.csv", "name the log file itself")

@@ -1,0 +1,115 @@
+"""The pose spline and the arrow system against slow references: finite differences and dense algebra."""
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.arrow_system import (
+    LOCAL,
+    ROWS,
+    Samples,
+    Walks,
+    assemble,
+    eliminate,
+    predicted,
+    projected,
+    pulled,
+    step,
+)
+from barsight.calibration.pose_spline import STATE, PoseSpline, inverse_right_jacobian, locate
+from barsight.calibration.spline_kernels import CUMULATIVE, DEGREE, ORDER, rotation_at, weights
+
+STEP_S = 0.1
+
+
+def some_spline(seed: int = 0, count: int = 9) -> PoseSpline:
+    rng = np.random.default_rng(seed)
+    rotations = [np.eye(3)]
+    for turn in rng.normal(0, 0.4, (count - 1, 3)):
+        rotations.append(rotations[-1] @ Rotation.from_rotvec(turn).as_matrix())
+    biases = rng.normal(size=(2, count, 3))
+    return PoseSpline(0, STEP_S, np.array(rotations), rng.normal(size=(count, 3)), biases[0], biases[1])
+
+
+def test_places_are_a_uniform_b_spline() -> None:
+    spline = some_spline()
+    times = np.linspace(0, spline.segments * STEP_S, 23)[:-1]
+    knots = (np.arange(len(spline.places_m) + ORDER) - DEGREE) * STEP_S
+    reference = BSpline(knots, spline.places_m, DEGREE)
+    motion = spline.at(times)
+    np.testing.assert_allclose(motion.place_m, reference(times), atol=1e-12)
+    np.testing.assert_allclose(motion.velocity_mps, reference(times, 1), atol=1e-10)
+    np.testing.assert_allclose(motion.acceleration_mps2, reference(times, 2), atol=1e-9)
+
+
+def test_rate_is_the_rotations_derivative() -> None:
+    spline, times, e = some_spline(), np.array([0.13, 0.2, 0.333]), 1e-5
+    before, after = spline.at(times - e).rotation, spline.at(times + e).rotation
+    slope = Rotation.from_matrix(before.transpose(0, 2, 1) @ after).as_rotvec() / (2 * e)
+    np.testing.assert_allclose(spline.at(times).rate_radps, slope, atol=1e-6)
+
+
+def test_jacobians_match_finite_differences() -> None:
+    spline, times, e = some_spline(), np.array([0.0, 0.13, 0.333]), 1e-6
+    steps, inverse = spline.turned_steps()
+    for segment, u, time in zip(*locate(times, STEP_S, spline.segments), times, strict=True):
+        share = np.empty((3, ORDER))
+        weights(u, STEP_S, CUMULATIVE, share)
+        turn_by, rate_by = np.empty((3, 3 * ORDER)), np.empty((3, 3 * ORDER))
+        own = slice(segment, segment + DEGREE)
+        rotation_at(
+            spline.rotations[segment], steps[own], inverse[own], share, np.empty((3, 3)), np.empty(3),
+            turn_by, rate_by,
+        )  # fmt: skip
+        for column in range(3 * ORDER):
+            change = np.zeros((len(spline.places_m), STATE))
+            change[segment + column // 3, column % 3] = e
+            there, here = (spline.moved(sign * change).at(np.array([time])) for sign in (1, -1))
+            turn = Rotation.from_matrix(here.rotation[0].T @ there.rotation[0]).as_rotvec() / (2 * e)
+            np.testing.assert_allclose(turn_by[:, column], turn, atol=1e-8)
+            slope = (there.rate_radps - here.rate_radps)[0] / (2 * e)
+            np.testing.assert_allclose(rate_by[:, column], slope, atol=1e-7)
+
+
+def test_the_inverse_jacobian_holds_for_tiny_and_large_turns() -> None:
+    for size in (0.0, 1e-7, 1e-3, 1.0, 3.0):
+        turn = np.array([0.6, -0.64, 0.48]) * size
+        change = np.array([1e-6, 2e-6, -1e-6])
+        moved = (Rotation.from_rotvec(turn) * Rotation.from_rotvec(change)).as_rotvec()
+        np.testing.assert_allclose(inverse_right_jacobian(turn[None])[0] @ change, moved - turn, atol=1e-11)
+
+
+def test_the_arrow_system_is_the_dense_one() -> None:
+    rng = np.random.default_rng(3)
+    points, width, count = 12, 4, 60
+    samples = Samples(
+        rng.integers(0, points - DEGREE, count), rng.normal(size=(count, ROWS)),
+        rng.normal(size=(count, ROWS, LOCAL)), rng.normal(size=(count, ROWS, width)),
+    )  # fmt: skip
+    walks = Walks(rng.normal(size=(points - 1, 6)), np.full(6, 0.5))
+    size = points * STATE
+    rows = np.zeros((count, ROWS, size + width))
+    for k, first in enumerate(samples.first):
+        rows[k, :, first * STATE : first * STATE + LOCAL] = samples.by_chain[k]
+    rows[:, :, size:] = samples.by_common
+    dense = [rows.reshape(-1, size + width)]
+    right = [samples.residual.ravel()]
+    for m in range(points - 1):
+        for axis in range(6):
+            row = np.zeros(size + width)
+            row[m * STATE + 6 + axis], row[(m + 1) * STATE + 6 + axis] = -2.0, 2.0
+            dense.append(row[None])
+            right.append(np.array([-2.0 * walks.difference[m, axis]]))
+    a, b = np.vstack(dense), np.concatenate(right)
+    system = assemble(samples, walks, points)
+    eliminated = eliminate(system)
+    chain, common = step(system, eliminated)
+    best = np.linalg.solve(a.T @ a, a.T @ b)
+    np.testing.assert_allclose(np.concatenate([chain, common]), best, atol=1e-7)
+    covariance = np.linalg.inv(a.T @ a)[size:, size:]
+    np.testing.assert_allclose(np.linalg.inv(eliminated.information), covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(predicted(samples, chain, common), rows @ best, atol=1e-6)
+    gradient = np.concatenate(pulled(samples, samples.residual, size))
+    np.testing.assert_allclose(gradient, np.einsum("krc,kr->c", rows, samples.residual), atol=1e-9)
+    through = rows[:, :, :size] @ eliminated.through
+    np.testing.assert_allclose(projected(samples, eliminated.through), samples.by_common - through, atol=1e-9)
