@@ -50,7 +50,9 @@ def test_mutual_matching_is_brute_force() -> None:
     noisy = descriptors ^ np.packbits(flips, axis=2)[..., 0]
     noisy = np.vstack([noisy[::-1][:30], noisy[15:17]])  # 10 left out; two stand twice
     places = np.zeros((40, 2), np.float32)
-    pairs = match_mutual(Features(places, descriptors), Features(places[:32], noisy))
+    pairs = match_mutual(
+        Features(places, descriptors, places[:, 0]), Features(places[:32], noisy, places[:32, 0])
+    )
     distance = np.unpackbits(descriptors[:, None] ^ noisy[None], axis=2).sum(axis=2)
     expected = []
     for i in range(40):

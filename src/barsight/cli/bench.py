@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from barsight.cli import bench_matching
 from barsight.cli.arguments import call
 from barsight.cli.bench_lifts import bench_lift_targets
 from barsight.cli.bench_yard import bench_yard
@@ -37,6 +38,8 @@ def run(arguments: Sequence[str]) -> None:
         "target-size": _target_size,
         "yard": bench_yard,
         "lifts": bench_lift_targets,
+        "features": bench_matching.features,
+        "matching": bench_matching.matching,
     }
     names = " | ".join(benches)
     if not arguments or arguments[0] in ("-h", "--help"):

@@ -1,27 +1,110 @@
-"""Matching of binary descriptors."""
+"""Matching of descriptors, one function a step: nearest, ratio, mutual, along the row, plane, trend."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
+from barsight.core.types import RectifiedCamera
+from barsight.features.guided import project_stereo
 from barsight.features.orb import Features
+
+ROW_PX = 1.5
+LEAST_FOR_PLANE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """Of each of N first descriptors: index (N,) of the nearest second one, its distance and the next one's.
+
+    The distance is Hamming's [paper Eq. 6] for bits, else L2.
+    """
+
+    index: Int64
+    distance: Float64
+    next_distance: Float64
+
+
+def nearest(first: UInt8 | Float32, second: UInt8 | Float32) -> Nearest:
+    """Brute force. next_distance is infinite where there is only one second descriptor."""
+    count = len(first)
+    index, distance = np.full(count, -1, np.int64), np.full((count, 2), np.inf)
+    if count and len(second):
+        matcher = cv2.BFMatcher(cv2.NORM_HAMMING if first.dtype == np.uint8 else cv2.NORM_L2)
+        for k, found in enumerate(matcher.knnMatch(first, second, k=2)):
+            index[k] = found[0].trainIdx
+            distance[k, : len(found)] = [match.distance for match in found]
+    return Nearest(index, distance[:, 0], distance[:, 1])
+
+
+def passes_ratio(found: Nearest, ratio: float = 0.9) -> Bool:
+    """(N,) whether the nearest is clearly nearer than the next [Lowe 2004]."""
+    kept: Bool = (found.index >= 0) & (found.distance < ratio * found.next_distance)
+    return kept
+
+
+def is_mutual(forward: Nearest, backward: Nearest) -> Bool:
+    """(N,) whether the nearest's own nearest is the first again."""
+    kept: Bool = forward.index >= 0
+    kept[kept] = backward.index[forward.index[kept]] == np.flatnonzero(kept)
+    return kept
 
 
 def match_mutual(first: Features, second: Features, ratio: float = 0.9) -> Int64:
-    """(M, 2) index pairs that are each other's nearest in Hamming distance [paper Eq. 6].
-
-    Pairs whose second best is nearly as good (Lowe's ratio test) are left out.
-    """
+    """(M, 2) index pairs that are each other's nearest and pass the ratio test."""
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), dtype=np.int64)
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    forward = matcher.knnMatch(first.descriptors, second.descriptors, k=2)
-    best = np.array([(m.trainIdx, m.distance, n.distance) for m, n in forward], dtype=np.float64)
-    backward = matcher.match(second.descriptors, first.descriptors)
-    back = np.array([m.trainIdx for m in backward], dtype=np.int64)
-    target = best[:, 0].astype(np.int64)
-    index = np.arange(len(first))
-    kept = (back[target] == index) & (best[:, 1] < ratio * best[:, 2])
-    return np.column_stack([index[kept], target[kept]])
+    forward = nearest(first.descriptors, second.descriptors)
+    backward = nearest(second.descriptors, first.descriptors)
+    kept = passes_ratio(forward, ratio) & is_mutual(forward, backward)
+    return np.column_stack([np.flatnonzero(kept), forward.index[kept]])
+
+
+def match_rows(
+    left: Float32, left_descriptors: UInt8 | Float32, right: Float32, right_descriptors: UInt8 | Float32,
+    camera: RectifiedCamera, depth_m: tuple[float, float],
+) -> Int64:  # fmt: skip
+    """(M, 2) pairs of left and right features (N, 2) on one row at a depth in the range, mutual nearest."""
+    disparity = left[:, None, 0] - right[None, :, 0] + camera.doffs_px
+    base = camera.focal_px * camera.baseline_m
+    fits = np.abs(left[:, None, 1] - right[None, :, 1]) < ROW_PX
+    fits &= (disparity > base / depth_m[1]) & (disparity < base / depth_m[0])
+    if not fits.any():
+        return np.empty((0, 2), np.int64)
+    row, column = np.nonzero(fits)
+    distance = np.full(fits.shape, np.inf)
+    one, other = left_descriptors[row], right_descriptors[column]
+    if one.dtype == np.uint8:
+        distance[row, column] = np.bitwise_count(np.bitwise_xor(one, other)).sum(axis=1)
+    else:
+        distance[row, column] = np.linalg.norm(one - other, axis=1)
+    best, back = distance.argmin(axis=1), distance.argmin(axis=0)
+    index = np.arange(len(left))
+    kept = np.isfinite(distance[index, best]) & (back[best] == index)
+    return np.column_stack([index[kept], best[kept]])
+
+
+def on_one_plane(first: Float64, second: Float64, reach_px: float = 3.0) -> Bool:
+    """(N,) matches that fit the best homography [paper Eq. 7], by MAGSAC++; true ones off the plane leave."""
+    if len(first) < LEAST_FOR_PLANE:
+        return np.zeros(len(first), np.bool_)
+    cv2.setRNGSeed(1)
+    _, inside = cv2.findHomography(first, second, cv2.USAC_MAGSAC, reach_px, maxIters=5000, confidence=0.999)
+    return np.zeros(len(first), np.bool_) if inside is None else inside.ravel().astype(np.bool_)
+
+
+def follows_trend(
+    points: Float64, second: Float64, rotation: Float64, translation: Float64, camera: RectifiedCamera,
+    reach_px: float,
+) -> Bool:  # fmt: skip
+    """(N,) matches that lie within `reach_px` of where the motion takes their points [paper Eq. 12].
+
+    points: (N, 3) in the first `rect0`, rotation and translation new_from_old, from Eq. 11.
+    """
+    expected = project_stereo(points @ rotation.T + translation, camera)[:, :2]
+    with np.errstate(invalid="ignore"):
+        kept: Bool = np.linalg.norm(second - expected, axis=1) < reach_px
+    return kept

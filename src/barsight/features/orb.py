@@ -14,17 +14,18 @@ _PATCH_PX = 31
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """pixels: (N, 2) float32, x and y. descriptors: (N, 32) uint8."""
+    """pixels: (N, 2) float32, x and y. descriptors: (N, 32) uint8. scale: (N,) px of the pyramid's pixel."""
 
     pixels: Float32
     descriptors: UInt8
+    scale: Float32
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def chosen(self, kept: Bool) -> Features:
         """The features for which `kept` (N,) is true."""
-        return Features(self.pixels[kept], self.descriptors[kept])
+        return Features(self.pixels[kept], self.descriptors[kept], self.scale[kept])
 
 
 def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Features:
@@ -53,8 +54,9 @@ def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Fea
     return Features(
         np.array([k.pt for k in described], dtype=np.float32),
         descriptors,
+        (np.array([k.size for k in described]) / _PATCH_PX).astype(np.float32),
     )
 
 
 def _no_features() -> Features:
-    return Features(np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8))
+    return Features(np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty(0, np.float32))

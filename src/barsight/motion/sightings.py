@@ -115,14 +115,14 @@ def _see(
             view = None if isinstance(rough, Failed) else rough
     else:
         tracks = state.tracks
-        found = None if prediction is None else _consensus(tracks, pair, prediction, settings)
+        found = None if prediction is None else consensus(tracks, pair, prediction, settings)
         if found is None or isinstance(found, Failed):
             rough_motion = _rough(state, tracks, pair, settings)
             if isinstance(rough_motion, Failed):
                 return rough_motion
             step, view = rough_motion
             prediction = PredictedMotion(step.rotation, step.translation, 4 * step.covariance)
-            found = _consensus(tracks, pair, prediction, settings)
+            found = consensus(tracks, pair, prediction, settings)
             if isinstance(found, Failed):
                 return found
         kept, matches, motion = found
@@ -160,7 +160,7 @@ def _rough(
     return step if isinstance(step, Failed) else (step, new)
 
 
-def _consensus(
+def consensus(
     tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings
 ) -> tuple[Bool, GuidedMatches, PredictedMotion] | Failed:
     """Points found again in their ellipses that agree on one motion in 3D, and that motion."""

@@ -1,0 +1,57 @@
+"""`barsight bench features|matching`: detectors and filters against true poses and depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from barsight.evaluation.matching_bench import bench_features, bench_matching, feature_table, match_table
+from barsight.evaluation.stereo_provenance import write_json
+from barsight.features.detectors import DETECTORS, DetectorName
+
+Json = Annotated[Path | None, tyro.conf.arg(name="json")]
+
+
+def features(
+    recordings: tyro.conf.Positional[tuple[Path, ...]],
+    detectors: tuple[DetectorName, ...] = DETECTORS,
+    count: int = 2000,
+    repeats: int = 5,
+    save: Json = None,
+) -> None:
+    """The paper's Table 2: number and time of features.
+
+    Args:
+        recordings: Recordings with stored true depth, as `barsight simulate` makes them.
+        detectors: Any of sift, surf, orb.
+        count: Features asked for.
+        repeats: Runs per detector; times are medians and ranges.
+        save: JSON file for all figures, with commit and machine.
+    """
+    bench = bench_features(recordings, detectors, count, repeats)
+    Console().print(feature_table(bench))
+    if save is not None:
+        write_json(save, bench)
+
+
+def matching(
+    recordings: tyro.conf.Positional[tuple[Path, ...]],
+    detectors: tuple[DetectorName, ...] = DETECTORS,
+    count: int = 2000,
+    save: Json = None,
+) -> None:
+    """The paper's Table 3 with the precision and recall of every filter.
+
+    Args:
+        recordings: Recordings with stored true depth, encoders and IMU.
+        detectors: Any of sift, surf, orb.
+        count: Features asked for.
+        save: JSON file for all figures, with commit and machine.
+    """
+    bench = bench_matching(recordings, detectors, count)
+    Console().print(match_table(bench))
+    if save is not None:
+        write_json(save, bench)

@@ -1,0 +1,100 @@
+"""SIFT, ORB and SURF behind one Protocol, spread over the image, each place with its sigma."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, get_args
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Int64, UInt8
+from barsight.features.orb import detect_orb
+
+DetectorName = Literal["sift", "surf", "orb"]
+DETECTORS: tuple[DetectorName, ...] = get_args(DetectorName)
+CELLS = (6, 8)
+WHOLE_PIXEL_SIGMA = 12**-0.5
+"""Sigma of a place known to one pixel of its pyramid level."""
+SIFT_SIGMA = 0.015
+SURF_SIGMA = 0.3
+"""Sigma of a place as a share of the feature's scale; a test holds them against known shifts."""
+SURF_FEWEST = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """pixels: (N, 2) float32 x, y. sigma_px: (N,) each. descriptors: (N, D), uint8 bits (ORB) or float32."""
+
+    pixels: Float32
+    sigma_px: Float32
+    descriptors: UInt8 | Float32
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def is_binary(self) -> bool:
+        """Whether descriptors are compared by Hamming distance; otherwise L2."""
+        return self.descriptors.dtype == np.uint8
+
+
+class Detector(Protocol):
+    """At most `count` features of an (H, W) picture, the strongest of each cell of a grid."""
+
+    def __call__(self, image: UInt8, count: int) -> Keypoints: ...
+
+
+def make_detector(name: DetectorName) -> Detector:
+    """The detector of that name."""
+    return {"sift": _sift, "surf": _surf, "orb": _orb}[name]
+
+
+def spread(pixels: Float32, strength: Float32, shape: tuple[int, ...], count: int) -> Int64:
+    """Indices, ascending, of the strongest features of each cell, so that a bright label doesn't take all."""
+    height, width = shape
+    row = (pixels[:, 1] * CELLS[0] / height).astype(int).clip(0, CELLS[0] - 1)
+    column = (pixels[:, 0] * CELLS[1] / width).astype(int).clip(0, CELLS[1] - 1)
+    cell = row * CELLS[1] + column
+    order = np.lexsort((-strength, cell))
+    first = np.searchsorted(cell[order], cell[order], side="left")
+    kept: Bool = np.arange(len(order)) - first < max(1, count // (CELLS[0] * CELLS[1]))
+    return np.sort(order[kept])
+
+
+def _orb(image: UInt8, count: int) -> Keypoints:
+    found = detect_orb(image, count, CELLS)
+    sigma = WHOLE_PIXEL_SIGMA * found.scale
+    return Keypoints(found.pixels, sigma.astype(np.float32), found.descriptors)
+
+
+def _sift(image: UInt8, count: int) -> Keypoints:
+    sift = cv2.SIFT.create(nfeatures=4 * count, contrastThreshold=0.02)
+    points = sift.detect(image, None)
+    if not points:
+        return _none(128)
+    pixels = np.array([p.pt for p in points], np.float32)
+    kept = spread(pixels, np.array([p.response for p in points], np.float32), image.shape, count)
+    described, descriptors = sift.compute(image, [points[i] for i in kept])
+    scale = np.array([p.size for p in described], np.float32) / 2
+    places = np.array([p.pt for p in described], np.float32)
+    return Keypoints(places, (SIFT_SIGMA * scale).astype(np.float32), np.asarray(descriptors, np.float32))
+
+
+def _surf(image: UInt8, count: int) -> Keypoints:
+    from mahotas.features import surf  # OpenCV's wheels leave SURF out
+
+    found: Any = surf.surf(
+        image, nr_octaves=4, nr_scales=6, initial_step_size=1, threshold=0.05, max_points=4 * count
+    )
+    if len(found) < SURF_FEWEST:
+        return _none(64)
+    pixels = found[:, [1, 0]].astype(np.float32)
+    kept = spread(pixels, found[:, 3].astype(np.float32), image.shape, count)
+    scale = found[kept, 2].astype(np.float32)
+    sigma = (SURF_SIGMA * scale).astype(np.float32)
+    return Keypoints(pixels[kept], sigma, found[kept, 6:].astype(np.float32))
+
+
+def _none(width: int) -> Keypoints:
+    return Keypoints(np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, width), np.float32))
