@@ -11,6 +11,7 @@ from rich.console import Console
 
 from barsight.cli import bench_matching
 from barsight.cli.arguments import call
+from barsight.cli.bench_bundles import bench_found_bundles
 from barsight.cli.bench_lifts import bench_lift_targets
 from barsight.cli.bench_yard import bench_yard
 from barsight.core.errors import ConfigError
@@ -37,6 +38,7 @@ def run(arguments: Sequence[str]) -> None:
         "subpixel": _subpixel,
         "target-size": _target_size,
         "yard": bench_yard,
+        "bundles": bench_found_bundles,
         "lifts": bench_lift_targets,
         "features": bench_matching.features,
         "matching": bench_matching.matching,

@@ -108,7 +108,7 @@ class YardSettings:
     gap_m: float = 0.02
     """Mean clearance between neighbouring bundles, over what their skew needs."""
     skew_deg: float = 0.3
-    """Standard deviation of the bundles' yaw; 1 degree is the limit."""
+    """Standard deviation of the bundles' yaw; they stay within 1 degree, or within twice this."""
     uneven_ends_m: float = 0.03
     """How far the ends of a bundle's bars stand apart."""
     missing_share: float = 0.08
@@ -125,7 +125,7 @@ class YardSettings:
     def __post_init__(self) -> None:
         _expect(1 <= self.max_layers <= 5, "yard max_layers must lie between 1 and 5")
         _expect(1 <= self.bar_length_m <= 20, "yard bar_length_m must lie between 1 and 20 m")
-        _expect(0 <= self.skew_deg <= 1, "yard skew_deg must lie between 0 and 1")
+        _expect(0 <= self.skew_deg <= 2, "yard skew_deg must lie between 0 and 2")
         _expect(0 <= self.missing_share <= 0.6, "yard missing_share must lie between 0 and 0.6")
         _expect(0.02 <= self.dunnage_m <= 0.3, "yard dunnage_m must lie between 0.02 and 0.3 m")
         _expect(0 <= self.ribbed_share <= 1, "yard ribbed_share must lie between 0 and 1")

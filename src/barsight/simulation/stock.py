@@ -158,12 +158,20 @@ def _needed(radius: float, difference_rad: float, length: float) -> float:
 
 
 def _skew(skew_deg: float, rng: np.random.Generator) -> float:
-    return float(np.radians(np.clip(rng.normal(0, skew_deg), -1, 1))) if skew_deg > 0 else 0.0
+    if skew_deg == 0:
+        return 0.0
+    limit = _limit(skew_deg)
+    return float(np.radians(np.clip(rng.normal(0, skew_deg), -limit, limit)))
+
+
+def _limit(skew_deg: float) -> float:
+    return max(1.0, 2 * skew_deg)
 
 
 def _above(below: tuple[float, float], skew_deg: float, rng: np.random.Generator) -> tuple[float, float]:
     """A place on the column below, a little beside it and turned a little otherwise."""
-    yaw = np.clip(below[1] + rng.normal(0, 0.3) * np.radians(skew_deg), -np.radians(1), np.radians(1))
+    limit = np.radians(_limit(skew_deg))
+    yaw = np.clip(below[1] + rng.normal(0, 0.3) * np.radians(skew_deg), -limit, limit)
     return below[0] + float(rng.normal(0, 0.006)), float(yaw)
 
 

@@ -119,7 +119,7 @@ def _bar(
     carry[0, 2] = carry[1, 3] = along
     whole[:4, :4] = carry @ covariance @ carry.T
     whole[0, 0] += settings.shared_lateral_m**2
-    whole[1, 1] += fit.sigma_m**2
+    whole[1, 1] += (settings.shared_height_share * fit.sigma_m) ** 2
     whole[4, 4] = fit.covariance[DIAMETER, DIAMETER]
     return Bar(
         centre_m=np.append(place, z + figures[1] + figures[3] * along),

@@ -16,7 +16,7 @@ _LOOK_M = 1.3
 _PROOF_M = 0.1
 _RAGGED_M = 0.2
 _SOME, _MOST = 0.3, 0.6
-_SEEN_SIGMA_M = 0.015
+_SEEN_SIGMA_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End
     """The end at the fit's first (step -1) or last row (step 1).
 
     It is seen where, over most of the bundle's width and for 0.1 m, the surface beyond lies lower than half
-    the bundle's height. The bars end unevenly, so the end is put in the middle between the last row that
-    agrees and the last that lies little lower.
+    the bundle's height. The bars end unevenly, so the end is put a quarter of the way from the last row that
+    agrees to the last that lies little lower: a map also grows a little over edges.
     """
     row = fit.first if step < 0 else fit.last
     known, misfit = _beyond(sheet, fit, row, step, settings)
@@ -55,7 +55,7 @@ def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End
             lower += 1
             if lower * cell >= _PROOF_M:
                 spread = ragged * cell
-                return End(v + step * spread / 2, float(np.hypot(_SEEN_SIGMA_M, spread / 4)), False)
+                return End(v + step * spread / 4, float(np.hypot(_SEEN_SIGMA_M, spread / 6)), False)
     return End(v, float("nan"), True, "the map doesn't show what lies beyond")
 
 

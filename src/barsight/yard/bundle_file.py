@@ -65,6 +65,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "length_m": bundle.length_m,
         "ends_m": bundle.ends_m,
         "ends_open": list(bundle.ends_open),
+        "ends_sigma_m": list(bundle.ends_sigma_m),
         "width_m": bundle.width_m,
         "top_z_m": bundle.top_z_m,
         "bar_diameter_m": bundle.bar_diameter_m,
@@ -101,7 +102,10 @@ def _record(bundle: Bundle) -> dict[str, Any]:
 
 
 def _bundle(record: dict[str, Any]) -> Bundle:
-    figures = {name: np.nan if value is None else value for name, value in record["sigma"].items()}
+    def figure(value: float | None) -> float:
+        return float("nan") if value is None else value
+
+    figures = {name: figure(value) for name, value in record["sigma"].items()}
     yaw_rad = float(np.radians(figures.pop("yaw_deg")))
     return Bundle(
         id=record["id"],
@@ -123,6 +127,7 @@ def _bundle(record: dict[str, Any]) -> Bundle:
         known_share=record["known_share"],
         confidence=record["confidence"],
         reasons=tuple(record["reasons"]),
+        ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
         bar_axes=tuple(
             Bar(
                 np.array(bar["centre_m"]), np.array(bar["direction"]), bar["diameter_m"], bar["length_m"],

@@ -18,12 +18,7 @@ UNKNOWN, AGREES, ABOVE, BELOW, MIXED = range(5)
 _ROLL_STEP_RAD = np.radians(1.0)
 _DIAMETER_STEP = 0.01
 _RIM_M = 0.008
-_KNOWN_SHARE = 0.3
-_AGREE_SHARE = 0.55
-_MOST_BELOW_M = 0.04
-_MOST_ABOVE_M = 0.8
-_MOST_UNKNOWN_M = 0.6
-_MOST_MIXED_M = 0.2
+_STEEPEST = 4.0
 _ROWS_ENOUGH = 150
 """Neighbouring rows err alike, so more of them than this only cost time."""
 
@@ -64,21 +59,21 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Tables:
+class OutlineTables:
     """(4, N) outline by sideways place, STEP_M apart: height, slope, change by roll and by diameter."""
 
     reach_m: float
     rows: Float64
 
 
-def _tables(rings: int, values: Float64, settings: BundleSettings) -> _Tables:
+def outline_tables(rings: int, values: Float64, settings: BundleSettings) -> OutlineTables:
     diameter, roll = float(values[DIAMETER]), float(values[ROLL])
     middle = make_outline(rings, diameter, roll, settings.smoothing_m)
     rolled = make_outline(rings, diameter, roll + _ROLL_STEP_RAD, settings.smoothing_m)
     grown = make_outline(rings, diameter * (1 + _DIAMETER_STEP), roll, settings.smoothing_m)
     by_roll = (_fit_to(rolled.seen_m, middle.seen_m.size) - middle.seen_m) / _ROLL_STEP_RAD
     by_diameter = (_fit_to(grown.seen_m, middle.seen_m.size) - middle.seen_m) / (diameter * _DIAMETER_STEP)
-    return _Tables(middle.reach_m, np.stack([middle.seen_m, middle.slope, by_roll, by_diameter]))
+    return OutlineTables(middle.reach_m, np.stack([middle.seen_m, middle.slope, by_roll, by_diameter]))
 
 
 def _fit_to(row: Float64, size: int) -> Float64:
@@ -90,12 +85,17 @@ def _fit_to(row: Float64, size: int) -> Float64:
 
 
 def refine(
-    sheet: Sheet, start: Fit, settings: BundleSettings, steps: int = 6, gate_m: float | None = None
+    sheet: Sheet,
+    start: Fit,
+    settings: BundleSettings,
+    steps: int = 6,
+    gate_m: float | None = None,
+    common: tuple[float, float] | None = None,
 ) -> Fit | None:
     """Gauss-Newton over the rows first ... last; None where the outline leaves the map or degenerates.
 
     The weight of a height falls with its sigma, with the outline's slope (it may lie beside its place) and,
-    by Tukey's biweight, with its misfit over `gate_m`.
+    by Tukey's biweight, with its misfit over `gate_m`. common: diameter and sigma known from elsewhere.
     """
     rows = (max(start.first, 0), min(start.last, sheet.z_m.shape[0] - 1))
     v_m = sheet.v0_m + sheet.cell_m * (rows[0] + rows[1]) / 2
@@ -109,20 +109,23 @@ def refine(
     half = (rows[1] - rows[0]) * sheet.cell_m / 2
     free[SLOPE_U] = free[SLOPE_Z] = half > 2 * settings.slice_m
     stride = 1 + (rows[1] - rows[0]) // _ROWS_ENOUGH
-    normal = np.eye(6)
-    moments = np.zeros(4)
+    alike = alike_rows = settings.correlated_along_m * settings.correlated_across_m / sheet.cell_m**2 / stride
+    normal, moments = np.eye(6), np.zeros(4)
     for _ in range(steps):
-        tables = _tables(start.rings, values, settings)
+        tables = outline_tables(start.rings, values, settings)
         normal, right, moments = _normal_equations(
             sheet.z_m, sheet.sigma_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, rows[0], rows[1], stride, v_m,
             values, tables.rows, tables.reach_m, gate, settings.placing_m,
         )  # fmt: skip
         if moments[0] < 30:
             return None
+        alike = alike_rows * max(1.0, moments[2] / moments[0])
+        if common is not None:
+            normal[DIAMETER, DIAMETER] += alike / common[1] ** 2
+            right[DIAMETER] += alike * (common[0] - values[DIAMETER]) / common[1] ** 2
+        normal += np.diag(_prior(values, half))
         change = np.zeros(6)
-        damped = normal[np.ix_(free, free)]
-        damped = damped + np.diag(_prior(values, half)[free])
-        change[free] = np.linalg.solve(damped, right[free])
+        change[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free])
         change[ROLL] = np.clip(change[ROLL], -0.1, 0.1)
         change[DIAMETER] = (
             np.clip(change[DIAMETER], -0.05, 0.05 * values[DIAMETER] + 1e-3) if free[5] else 0.0
@@ -135,12 +138,7 @@ def refine(
         if abs(change[U]) < 1e-5 and abs(change[DIAMETER]) < 1e-5 and abs(change[SLOPE_U]) * half < 1e-5:
             break
     covariance = np.zeros((6, 6))
-    alike = settings.correlated_along_m * settings.correlated_across_m / sheet.cell_m**2
-    misfit = moments[2] / max(moments[0], 1)
-    scale = alike / stride * max(1.0, misfit)
-    covariance[np.ix_(free, free)] = scale * np.linalg.inv(
-        normal[np.ix_(free, free)] + np.diag(_prior(values, half)[free])
-    )
+    covariance[np.ix_(free, free)] = alike * np.linalg.inv(normal[np.ix_(free, free)])
     rms, sigma = float(np.sqrt(moments[3] / moments[1])), float(np.sqrt(moments[0] / moments[1]))
     return replace(
         start, v_m=v_m, values=values, covariance=covariance, first=rows[0], last=rows[1], rms_m=rms,
@@ -186,7 +184,9 @@ def _normal_equations(
             h = tables[0, k] * (1 - share) + tables[0, k + 1] * share
             slope = tables[1, k] * (1 - share) + tables[1, k + 1] * share
             by_roll, by_diameter = tables[2, k], tables[3, k]
-            if not (h == h and slope == slope and by_roll == by_roll and by_diameter == by_diameter):
+            if abs(slope) > _STEEPEST or not (
+                h == h and slope == slope and by_roll == by_roll and by_diameter == by_diameter
+            ):
                 continue
             r = z[j, i] - values[2] - values[3] * along - h
             if abs(r) >= gate:
@@ -204,112 +204,3 @@ def _normal_equations(
             moments[2] += w * r * r
             moments[3] += w * r * r
     return normal, right, moments
-
-
-def follow(sheet: Sheet, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
-    """How far the outline follows the map from the fit's rows on, at most reach_m further to either side."""
-    tables = _tables(fit.rings, fit.values, settings)
-    more = int(reach_m / sheet.cell_m)
-    bounds = max(fit.first - more, 0), min(fit.last + more, sheet.z_m.shape[0] - 1)
-    state, gain = _row_states(
-        sheet.z_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, fit.v_m, fit.values, tables.rows,
-        tables.reach_m, settings.agreement_m,
-    )  # fmt: skip
-    runs = np.array([_MOST_UNKNOWN_M, 0.0, _MOST_ABOVE_M, _MOST_BELOW_M, _MOST_MIXED_M]) / sheet.cell_m
-    agreeing = np.flatnonzero(state[fit.first : fit.last + 1] == AGREES)
-    if agreeing.size < 0.5 * (fit.last + 1 - fit.first):
-        return None
-    low = _walk(state, fit.first + int(agreeing[0]), -1, bounds[0], runs)
-    high = _walk(state, fit.first + int(agreeing[-1]), 1, bounds[1], runs)
-    gain[:low] = 0
-    gain[high + 1 :] = 0
-    return replace(fit, first=low, last=high, state=state, gain=gain)
-
-
-@kernel()
-def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int:
-    """The last agreeing row before a run of others gets too long for its kind."""
-    last = start
-    waiting = np.zeros(5)
-    row = start
-    while row != limit:
-        row += step
-        if state[row] == AGREES:
-            last = row
-            waiting[:] = 0
-            continue
-        waiting[state[row]] += 1
-        if (waiting > runs).any():
-            break
-    return last
-
-
-@kernel()
-def _row_states(
-    z: Float32, u0: float, v0: float, cell: float, first: int, last: int, v_middle: float, values: Float64,
-    tables: Float64, reach: float, agreement: float,
-) -> tuple[UInt8, Float32]:  # fmt: skip
-    """Each row's state and the cells it explains, over the parts of the outline that aren't steep."""
-    rows, columns = z.shape
-    state, gain = np.zeros(rows, np.uint8), np.zeros(rows, np.float32)
-    cosine = 1.0 / np.sqrt(1.0 + values[1] * values[1])
-    size = tables.shape[1]
-    for j in range(first, last + 1):
-        along = v0 + cell * j - v_middle
-        u = values[0] + values[1] * along
-        base = values[2] + values[3] * along
-        low = int(np.ceil((u - reach / cosine - u0) / cell))
-        high = int((u + reach / cosine - u0) / cell)
-        count = known = agree = above = below = 0
-        total = 0.0
-        for i in range(low, high + 1):
-            k = int(((u0 + cell * i - u) * cosine + reach) / STEP_M + 0.5)
-            if k < 0 or k >= size or tables[0, k] != tables[0, k] or not abs(tables[1, k]) < 2.0:
-                continue
-            count += 1
-            if i < 0 or i >= columns or z[j, i] != z[j, i]:
-                continue
-            known += 1
-            r = z[j, i] - base - tables[0, k]
-            total += max(1.0 - (r / agreement) ** 2, -1.0)
-            if abs(r) <= agreement:
-                agree += 1
-            elif r > 0:
-                above += 1
-            else:
-                below += 1
-        if known < _KNOWN_SHARE * count or known == 0:
-            continue
-        if agree >= _AGREE_SHARE * known:
-            state[j] = AGREES
-            gain[j] = total
-        elif above > below and above >= 0.4 * known:
-            state[j] = ABOVE
-        elif below >= 0.4 * known:
-            state[j] = BELOW
-        else:
-            state[j] = MIXED
-    return state, gain
-
-
-def grow(sheet: Sheet, seed: Fit, settings: BundleSettings) -> Fit | None:
-    """From a short piece to the whole bundle: fit, follow, fit again until both ends stand still."""
-    fit = refine(sheet, seed, settings, steps=8, gate_m=3 * settings.agreement_m)
-    if fit is None:
-        return None
-    reach = 0.4
-    limit = np.tan(np.radians(settings.max_skew_deg) * 1.5)
-    for _ in range(12):
-        longer = follow(sheet, fit, settings, reach)
-        if longer is None:
-            return None
-        settled = longer.first == fit.first and longer.last == fit.last
-        refined = refine(sheet, longer, settings, steps=6 if settled else 3)
-        if refined is None or abs(refined.values[SLOPE_U]) > limit:
-            return None
-        fit = refined
-        if settled and reach >= sheet.z_m.shape[0] * sheet.cell_m:
-            return follow(sheet, fit, settings, 0.05)
-        reach = reach * 2 if not settled else np.inf if reach > 1.5 else reach * 2
-        reach = min(reach, sheet.z_m.shape[0] * sheet.cell_m)
-    return follow(sheet, fit, settings, 0.05)

@@ -12,12 +12,11 @@ from barsight.yard.bundle_ends import End, find_end
 from barsight.yard.bundle_fit import ABOVE, AGREES, BELOW, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.layers import find_layers, neighbours_of, on_top_of
-from barsight.yard.outline import LOOSENESS, make_outline
+from barsight.yard.outline import BARS_OF_RINGS, LOOSENESS, make_outline
 from barsight.yard.sheet import Sheet
 from barsight.yard.types import Bundle, BundleSigma
 
-_SAME_WEIGHT = 0.04
-_NARROW_M = 0.2
+_NARROW_M = 0.3
 _SURE_KNOWN = 0.7
 
 
@@ -31,12 +30,16 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """A chosen outline with its weight (cells explained) and the strongest other reading of its place."""
+    """A chosen outline with its weight (cells explained) and the strongest other reading of its place.
+
+    other_packing: rings of another packing that explains the bundles of this kind as well, if any does.
+    """
 
     found: Found
     weight: float
     rival: Found | None
     rival_weight: float
+    other_packing: int | None
 
 
 def describe(readings: list[Reading], floor_m: float | None, settings: BundleSettings) -> tuple[Bundle, ...]:
@@ -90,6 +93,7 @@ def _bundle(reading: Reading, settings: BundleSettings) -> Bundle:
         confidence=_confidence(reading, rows),
         reasons=reasons,
         bar_axes=fit_bars(sheet, fit, settings),
+        ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
     )
 
 
@@ -107,15 +111,16 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings, shee
     at_middle[1, [Z, SLOPE_Z]] = 1, along
     at_middle[1, ROLL], at_middle[1, DIAMETER] = _top_changes(fit, top)
     lateral, height = np.sqrt(np.maximum(np.diag(at_middle @ covariance @ at_middle.T), 0))
-    diameter = float(np.sqrt(covariance[DIAMETER, DIAMETER]))
+    share = settings.packing_share if fit.rings else settings.single_share
+    diameter = float(np.hypot(np.sqrt(covariance[DIAMETER, DIAMETER]), share * fit.values[DIAMETER]))
     sigmas = np.array([end.sigma_m for end in ends])
     return BundleSigma(
         lateral_m=float(np.hypot(lateral, settings.shared_lateral_m)),
         along_m=float(np.linalg.norm(sigmas) / 2),
         yaw_rad=float(np.hypot(np.sqrt(covariance[SLOPE_U, SLOPE_U]), np.radians(settings.shared_yaw_deg))),
         length_m=float(np.linalg.norm(sigmas)),
-        width_m=float((2 * LOOSENESS * fit.rings + 1) * diameter),
-        top_z_m=float(np.hypot(height, fit.sigma_m)),
+        width_m=(2 * LOOSENESS * fit.rings + 1) * diameter,
+        top_z_m=float(np.hypot(height, settings.shared_height_share * fit.sigma_m)),
         bar_diameter_m=diameter,
     )
 
@@ -131,18 +136,14 @@ def _top_changes(fit: Fit, top: float) -> tuple[float, float]:
 
 
 def _count(reading: Reading) -> tuple[int, tuple[str, ...]]:
-    """Bars by the outline; 0 and a sentence where another packing explains it as well."""
-    fit, rival = reading.found.fit, reading.rival
-    if rival is None or rival.fit.rings == fit.rings:
+    """Bars by the outline; 0 and a sentence where another packing explains its kind as well."""
+    fit, other = reading.found.fit, reading.other_packing
+    if other is None:
         return fit.bars, ()
-    if reading.rival_weight < (1 - _SAME_WEIGHT) * reading.weight:
-        return fit.bars, ()
-    if abs(rival.fit.width_m - fit.width_m) > 0.15 * fit.width_m:
-        return fit.bars, ()
-    other, own = rival.fit, fit
+    diameter = fit.width_m / (2 * LOOSENESS * other + 1)
     return 0, (
-        f"{own.bars} bars of {1e3 * own.values[DIAMETER]:.0f} mm or {other.bars} of "
-        f"{1e3 * other.values[DIAMETER]:.0f} mm: the outline fits both",
+        f"{fit.bars} bars of {1e3 * fit.values[DIAMETER]:.0f} mm or {BARS_OF_RINGS[other]} of "
+        f"{1e3 * diameter:.0f} mm: the outline fits both",
     )
 
 

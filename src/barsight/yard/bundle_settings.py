@@ -42,11 +42,17 @@ class BundleSettings:
     """Errors of heights along a bar are alike over this distance."""
     correlated_across_m: float = 0.03
     """Errors of heights across the bars are alike over this distance."""
-    shared_lateral_m: float = 0.0015
+    shared_lateral_m: float = 0.0012
     """Error of place that all of the map shares (one standard deviation)."""
 
     shared_yaw_deg: float = 0.01
     """Error of direction that all of the map shares (one standard deviation)."""
+    shared_height_share: float = 0.5
+    """Share of the map's stated sigma that all heights of a bundle have in common."""
+    packing_share: float = 0.025
+    """Error of a bundle's width that the map's smoothing leaves, as a share."""
+    single_share: float = 0.05
+    """The same for a single bar, whose flanks a map shows too wide."""
     coarsest_cell_m: float = 0.025
     """In a map of larger cells no bundles are looked for."""
     least_rise_m: float = 0.03

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.types import Source
-from barsight.yard.bundle_fit import AGREES, Fit, U, Z, grow
+from barsight.yard.bundle_fit import AGREES, Fit, U, Z, refine
+from barsight.yard.bundle_growth import grow
 from barsight.yard.bundle_record import Found, Reading, describe
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.floor import find_floor
 from barsight.yard.headings import find_headings
+from barsight.yard.kinds import common_diameter, other_packings, with_company
 from barsight.yard.matching import Guess, Templates, guess, make_templates
 from barsight.yard.outline import bundle_width
-from barsight.yard.selection import choose, strongest_rivals
+from barsight.yard.selection import choose, overlaps, strongest_rivals
 from barsight.yard.sheet import Sheet, turn
 from barsight.yard.types import Bundle, HeightMap
 
 _EDGE_CELLS = 3.0
 """What a bundle costs per row: its edges explain nothing."""
-_CLAIM_M = 0.025
+_CLAIM_M = 0.02
 _RIVAL_SHARE = 0.8
 _SUNKEN_M = 0.04
 
@@ -41,13 +45,41 @@ def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundl
         found += [Found(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
     weights = np.array([_weight(one.fit) for one in found])
     claims = [_claims(one) for one in found]
-    chosen = choose(weights, claims)
-    rivals = strongest_rivals(chosen, weights, claims)
-    readings = [
-        Reading(found[k], float(weights[k]), *((None, 0.0) if r is None else (found[r], float(weights[r]))))
-        for k, r in zip(chosen.tolist(), rivals, strict=True)
-    ]
+    readings = _settled(found, weights, claims, settings)
     return describe(readings, floor, settings)
+
+
+def _settled(
+    found: list[Found], weights: Float64, claims: list[Int64], settings: BundleSettings
+) -> list[Reading]:
+    """The best set of readings, once by itself and once more with regard to the kinds of bundles in it."""
+    fits = [one.fit for one in found]
+    first = choose(weights, claims)
+    raised = with_company(fits, weights, first, overlaps(first, claims))
+    chosen = choose(raised, claims)
+    wanted = overlaps(chosen, claims)
+    kept = [fits[k] for k in chosen]
+    readings = []
+    for k, rival, other in zip(
+        chosen.tolist(),
+        strongest_rivals(chosen, raised, wanted),
+        other_packings(fits, weights, chosen, wanted),
+        strict=True,
+    ):
+        one = _with_common_diameter(found[k], kept, settings)
+        weight = 0.0 if rival is None else float(raised[rival])
+        against = None if rival is None else found[rival]
+        readings.append(Reading(one, float(raised[k]), against, weight, other))
+    return readings
+
+
+def _with_common_diameter(one: Found, kept: list[Fit], settings: BundleSettings) -> Found:
+    """Fitted again with the diameter that the bundles of its kind have in common."""
+    common = common_diameter(one.fit, kept)
+    if common is None or settings.catalogue_mm:
+        return one
+    again = refine(one.sheet, one.fit, settings, common=common)
+    return one if again is None else replace(one, fit=again)
 
 
 def _on(floor_m: float | None, fit: Fit) -> bool:
@@ -135,13 +167,13 @@ def _weight(fit: Fit) -> float:
 
 
 def _claims(reading: Found) -> Int64:
-    """Numbers of the map's patches of 25 mm that lie well inside the outline."""
+    """Numbers of the map's patches of 20 mm that lie well inside the outline."""
     sheet, fit = reading.sheet, reading.fit
     rows = np.arange(fit.first, fit.last + 1)
     rows = rows[fit.state[rows] == AGREES]
     v = sheet.v0_m + sheet.cell_m * rows
     middle = fit.values[U] + fit.values[1] * (v - fit.v_m)
-    across = np.linspace(-0.42, 0.42, max(int(fit.width_m / 0.02), 3)) * fit.width_m
+    across = np.linspace(-0.35, 0.35, max(int(fit.width_m / 0.02), 3)) * fit.width_m
     uv = np.stack(np.broadcast_arrays(middle[:, None] + across, v[:, None]), axis=-1).reshape(-1, 2)
     xy = sheet.to_map(uv)
     patch = np.floor(xy / _CLAIM_M).astype(np.int64) + (1 << 20)

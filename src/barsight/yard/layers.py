@@ -52,7 +52,7 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
     """Whether `upper` is higher and its footprint covers a place on `lower`."""
     if upper.centre_m[2] - lower.centre_m[2] < _HIGHER_SHARE * (upper.width_m + lower.width_m) / 2:
         return False
-    return _common_length(lower, upper, -0.1 * lower.width_m) > _OVERLAP_M
+    return _common_length(lower, upper, -0.2 * lower.width_m) > _OVERLAP_M
 
 
 def neighbours_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:

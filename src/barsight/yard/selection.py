@@ -35,15 +35,22 @@ def choose(weights: Float64, claims: list[Int64]) -> Int64:
     return np.array(useful, np.int64)[np.flatnonzero(solved.x > 0.5)]
 
 
-def strongest_rivals(chosen: Int64, weights: Float64, claims: list[Int64]) -> list[int | None]:
+def overlaps(chosen: Int64, claims: list[Int64]) -> Float64:
+    """(chosen, N) share of each chosen reading's place that every reading wants."""
+    if chosen.size == 0:
+        return np.empty((0, len(claims)))
+    owner, place = _owners(claims)
+    takes = csc_matrix((np.ones(owner.size), (owner, place)), shape=(len(claims), int(place.max()) + 1))
+    sizes = np.array([claims[k].size for k in chosen])
+    shares: Float64 = (takes[chosen] @ takes.T).toarray() / sizes[:, None]
+    return shares
+
+
+def strongest_rivals(chosen: Int64, weights: Float64, wanted: Float64) -> list[int | None]:
     """For each chosen reading the one that weighs most of those that want most of its place."""
     if chosen.size == 0:
         return []
-    owner, place = _owners(claims)
-    takes = csc_matrix((np.ones(owner.size), (owner, place)), shape=(len(claims), int(place.max()) + 1))
-    common = (takes[chosen] @ takes.T).toarray()
-    sizes = np.array([claims[k].size for k in chosen])
-    wants = common > 0.5 * sizes[:, None]
+    wants = wanted > 0.5
     wants[np.arange(chosen.size), chosen] = False
     rated = np.where(wants & (weights > 0), weights, 0.0)
     best = rated.argmax(axis=1)

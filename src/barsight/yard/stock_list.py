@@ -132,7 +132,7 @@ def match_stock(listed: tuple[Expected, ...], bundles: tuple[Bundle, ...]) -> St
     """
     cost = np.array([[_distance(one, bundle) for bundle in bundles] for one in listed])
     cost = cost.reshape(len(listed), len(bundles))
-    pairs = zip(*linear_sum_assignment(np.minimum(cost, 10 * _REACH_M)), strict=True)
+    pairs = zip(*linear_sum_assignment(np.minimum(cost, 2 * _REACH_M)), strict=True)
     partner = {int(i): int(k) for i, k in pairs if cost[i, k] <= _REACH_M}
     matched, moved = [], []
     for i, k in partner.items():
@@ -163,8 +163,13 @@ def _across_along(shift: tuple[float, float, float], bundle: Bundle) -> tuple[fl
 
 
 def _distance(one: Expected, bundle: Bundle) -> float:
-    """Across and up count fully; along the axis a shift of 1 m is no further than 0.3 m across."""
+    """Across and up count fully; along the axis a shift of 1 m is no further than 0.3 m across.
+
+    What lies higher or lower than listed by half its width is another bundle.
+    """
     shift = _shift(one, bundle)
+    if abs(shift[2]) > bundle.width_m / 2:
+        return float(2 * _REACH_M)
     across, along = _across_along(shift, bundle)
     if any(bundle.ends_open) and abs(along) < bundle.length_m / 2:
         along = 0.0

@@ -74,7 +74,8 @@ class Bundle:
 
     id: its number in the result, from 0. centre_m: (3,) the axis at mid-length. yaw_rad, pitch_rad: of the
     axis. ends_m: (2, 3) the axis at its low-y and high-y end. ends_open: (2,) True where that end was not
-    seen (out of view or covered), so the bundle may be longer. top_z_m: the highest line at mid-length.
+    seen (out of view or covered), so the bundle may be longer. ends_sigma_m: (2,) of the ends along the axis,
+    NaN where open. top_z_m: the highest line at mid-length.
     visible_bars: bars seen from above. bars: bars in the bundle by its outline, 0 where unknown.
     layer: 0 lies on the floor or on dunnage. on_top: nothing lies on it; None where that can't be seen.
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
@@ -101,6 +102,7 @@ class Bundle:
     confidence: float
     reasons: tuple[str, ...]
     bar_axes: tuple[Bar, ...] = ()
+    ends_sigma_m: tuple[float, float] = (float("nan"), float("nan"))
 
     @property
     def direction(self) -> Float64:

@@ -1,0 +1,161 @@
+"""A height map as the cameras would measure it, drawn from the exact surface: a minute for thirty yards.
+
+What goes wrong in a measured map is put on the exact heights: the cameras' field, places that no pair sees,
+edges that grow over what they hide, smoothing by the matching window, noise that is alike along the bars,
+a shared error, flying cells. docs/yard.md holds its errors against those of rendered and measured yards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from barsight.core.arrays import Bool, Float64, kernel
+from barsight.core.types import Source
+from barsight.simulation.scene import Scene
+from barsight.simulation.sensors import heights
+from barsight.simulation.settings import CameraSettings
+from barsight.yard.types import HeightMap
+
+CELL_M = 0.01
+_HALF_WIDTH_M = 3.8
+_MARGIN_M = 0.5
+
+
+@dataclass(frozen=True)
+class Defects:
+    """Standard deviations and shares of what is wrong with a measured map."""
+
+    white_m: float = 0.002
+    short_m: float = 0.0025
+    """Alike over 10 mm across and 0.1 m along the bars."""
+    long_m: float = 0.004
+    """Alike over 10 mm across and 1.5 m along the bars: gloss and shading of each bar."""
+    shared_m: float = 0.002
+    """The same over the whole map."""
+    stated_m: float = 0.0045
+    """The sigma that the map states."""
+    window_m: tuple[float, float] = (0.005, 0.014)
+    """Smoothing across the bars: least and most, drawn for each yard."""
+    window_along_m: float = 0.015
+    growth_cells: float = 1.2
+    """Mean growth of an edge over what it hides."""
+    frame_step_m: float = 0.4
+    """Travel from frame to frame: a gully must be open to a pair somewhere along it."""
+    flying_share: float = 0.008
+    hole_share: float = 0.01
+
+
+def degraded_map(
+    scene: Scene, length_m: float, camera: CameraSettings, rng: np.random.Generator, defects: Defects
+) -> HeightMap:
+    """The map of a yard `length_m` long in X, 10 mm cells."""
+    xs = CELL_M * np.arange(round(-_MARGIN_M / CELL_M), round((length_m + _MARGIN_M) / CELL_M) + 1)
+    ys = CELL_M * np.arange(round(-_HALF_WIDTH_M / CELL_M), round(_HALF_WIDTH_M / CELL_M) + 1)
+    x, y = np.meshgrid(xs, ys)
+    exact = heights(scene, x.ravel(), y.ravel()).reshape(x.shape)
+    seen = _seen(exact, y, camera, defects)
+    z = _windowed(exact, seen, (rng.uniform(*defects.window_m), defects.window_along_m))
+    z, seen = _grown(z, seen, rng, defects)
+    z = z + _noise(z.shape, rng, defects)
+    z, seen = _flying(z, seen, rng, defects)
+    seen &= ~_patches(z.shape, rng, defects.hole_share)
+    sigma = np.where(seen, defects.stated_m * rng.uniform(0.9, 1.2, z.shape), np.nan)
+    return HeightMap(
+        x0_m=float(xs[0]),
+        y0_m=float(ys[0]),
+        cell_m=CELL_M,
+        z_m=np.where(seen, z, np.nan).astype(np.float32),
+        sigma_m=sigma.astype(np.float32),
+        views=np.where(seen, 6, 0).astype(np.float32),
+        source=np.where(seen, Source.VISION, Source.UNKNOWN).astype(np.uint8),
+    )
+
+
+def _seen(exact: Float64, y: Float64, camera: CameraSettings, defects: Defects) -> Bool:
+    """Cells in the field of view that nothing hides: towards the trolley's line, and from two places on X."""
+    depth = camera.above_floor_m - exact
+    side = (y - camera.trolley_y_m) / depth
+    field = np.abs(side) < 0.5 * camera.height_px / camera.focal_px
+    middle = int(np.argmin(np.abs(y[:, 0] - camera.trolley_y_m)))
+    outward = np.maximum.accumulate(side[middle:], axis=0) <= side[middle:] + 1e-9
+    inward = np.minimum.accumulate(side[: middle + 1][::-1], axis=0) >= side[: middle + 1][::-1] - 1e-9
+    open_y = np.vstack([inward[::-1][:-1], outward])
+    opening = _opening(exact, CELL_M)
+    return field & open_y & (opening > (camera.baseline_m + defects.frame_step_m) / depth)
+
+
+@kernel()
+def _opening(exact: Float64, cell: float) -> Float64:
+    """How wide each cell sees the sky along X: the sum of the tangents to either side, at most 4."""
+    rows, columns = exact.shape
+    opening = np.empty((rows, columns))
+    for j in range(rows):
+        for i in range(columns):
+            total = 0.0
+            for step in (-1, 1):
+                least = 2.0
+                for k in range(1, 41):
+                    n = i + step * k
+                    if n < 0 or n >= columns:
+                        break
+                    rise = exact[j, n] - exact[j, i]
+                    if rise > 0:
+                        least = min(least, (k - 0.5) * cell / rise)
+                total += least
+            opening[j, i] = total
+    return opening
+
+
+def _windowed(exact: Float64, seen: Bool, window_m: tuple[float, float]) -> Float64:
+    """The mean of seen heights under the matching window, of the same surface (within 80 mm) only."""
+    z = np.where(seen, exact, np.nan)
+    total, weight = np.zeros_like(z), np.zeros_like(z)
+    across, along = (int(2 * s / CELL_M + 0.5) for s in window_m)
+    for j in range(-along, along + 1):
+        for i in range(-across, across + 1):
+            w = np.exp(-0.5 * CELL_M**2 * ((i / window_m[0]) ** 2 + (j / window_m[1]) ** 2))
+            other = np.roll(z, (j, i), axis=(0, 1))
+            near = np.abs(other - z) < 0.08
+            total += np.where(near, w * other, 0.0)
+            weight += np.where(near, w, 0.0)
+    return np.where(weight > 0, total / np.maximum(weight, 1e-12), z)
+
+
+def _grown(z: Float64, seen: Bool, rng: np.random.Generator, defects: Defects) -> tuple[Float64, Bool]:
+    """Edges grow over hidden cells and lower ones beside them, ends of bars half as far."""
+    steps = rng.poisson(defects.growth_cells, (z.shape[0] // 8 + 1, z.shape[1])).repeat(8, axis=0)[
+        : z.shape[0]
+    ]
+    out, known = z.copy(), seen.copy()
+    for k in (1, 2, 3):
+        for axis, step in ((1, k), (1, -k), (0, k), (0, -k)):
+            source = np.roll(np.where(seen, z, -np.inf), step, axis=axis)
+            level = source > np.where(known, out, -np.inf) + 0.05
+            take = level & (steps >= (k if axis == 1 else 2 * k))
+            out[take] = source[take] - 0.004 * k
+            known |= take
+    return out, known
+
+
+def _noise(shape: tuple[int, ...], rng: np.random.Generator, defects: Defects) -> Float64:
+    noise = rng.normal(0, defects.white_m, shape) + rng.normal(0, defects.shared_m)
+    for size, along_m in ((defects.short_m, 0.1), (defects.long_m, 1.5)):
+        field = ndimage.gaussian_filter(rng.normal(0, 1, shape), (along_m / CELL_M / 2, 0.7))
+        noise += size * field / field.std()
+    return noise
+
+
+def _flying(z: Float64, seen: Bool, rng: np.random.Generator, defects: Defects) -> tuple[Float64, Bool]:
+    wrong = _patches(z.shape, rng, defects.flying_share) & seen
+    rise = ndimage.gaussian_filter(rng.normal(0, 1, z.shape), 2.0)
+    return np.where(wrong, z + 0.3 * rise / rise.std(), z), seen
+
+
+def _patches(shape: tuple[int, ...], rng: np.random.Generator, share: float) -> Bool:
+    """Blobs of about 3 x 3 cells over a share of the map."""
+    field = ndimage.gaussian_filter(rng.normal(0, 1, shape), 1.5)
+    blobs: Bool = field > np.quantile(field[::3, ::3], 1 - share)
+    return blobs

@@ -1,0 +1,138 @@
+"""The stock list against found bundles, bundles.json against its schema, and bad files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from barsight.core.errors import InputError
+from barsight.yard.bundle_file import read_bundles, schema, write_bundles
+from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.bundles import find_bundles
+from barsight.yard.stock_list import Expected, match_stock, read_stock
+from barsight.yard.types import Bundle
+from yard_maps import Laid, draw
+
+LAID = (Laid(0.3, 0.0, 0.2, 0.2), Laid(0.9, 0.0, 0.2, -0.3), Laid(1.5, 0.1, 0.2, 0.0))
+
+
+@pytest.fixture(scope="module")
+def bundles() -> tuple[Bundle, ...]:
+    return find_bundles(draw(list(LAID)), BundleSettings())
+
+
+def test_a_list_that_fits_has_nothing_missing_moved_or_extra(bundles: tuple[Bundle, ...]) -> None:
+    listed = tuple(
+        Expected(f"B{k}", one.x_m, one.y_m, one.top_z_m, bars=7, width_m=one.width_m)
+        for k, one in enumerate(LAID)
+    )
+    match = match_stock(listed, bundles)
+    assert [(m.name, m.bundle, m.disagrees) for m in match.matched] == [
+        ("B0", 0, ()),
+        ("B1", 1, ()),
+        ("B2", 2, ()),
+    ]
+    assert (match.moved, match.missing, match.hidden, match.extra) == ((), (), (), ())
+
+
+def test_a_list_that_contradicts_the_map_is_told_so(bundles: tuple[Bundle, ...]) -> None:
+    listed = (
+        Expected("shifted", 0.42, 0.0, LAID[0].top_z_m),
+        Expected("thinner", 0.9, 0.0, LAID[1].top_z_m, bar_diameter_m=0.02, length_m=5.0),
+        Expected("gone", 4.0, 0.0),
+        Expected("under", 1.5, 0.1, 0.1),
+    )
+    match = match_stock(listed, bundles)
+    assert match.moved == ("shifted",)
+    assert match.missing == ("gone",)
+    by_name = {m.name: m for m in match.matched}
+    assert by_name["shifted"].moved_m[0] == pytest.approx(-0.12, abs=0.01)
+    assert len(by_name["thinner"].disagrees) == 2
+    assert match.hidden == ("under",)
+    assert match.extra == (2,)
+
+
+def test_an_empty_yard_lacks_everything_and_an_empty_list_makes_all_extra(
+    bundles: tuple[Bundle, ...],
+) -> None:
+    assert match_stock((Expected("a", 0.0, 0.0),), ()).missing == ("a",)
+    assert match_stock((), bundles).extra == (0, 1, 2)
+
+
+def test_csv_and_json_say_the_same(tmp_path: Path) -> None:
+    (tmp_path / "stock.csv").write_text("name,x_m,y_m,bars,top_z_m\nA,1.0,-0.5,7,\n", encoding="utf-8")
+    rows = [{"name": "A", "x_m": 1.0, "y_m": -0.5, "bars": 7}]
+    (tmp_path / "stock.json").write_text(json.dumps({"bundles": rows}), encoding="utf-8")
+    assert read_stock(tmp_path / "stock.csv") == read_stock(tmp_path / "stock.json")
+    assert read_stock(tmp_path / "stock.csv") == (Expected("A", 1.0, -0.5, bars=7),)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name,x_m\nA,1\n", "no column y_m"),
+        ("name,x_m,y_m\nA,1,far\n", "y_m can't be 'far'"),
+        ("name,x_m,y_m\nA,1,\n", "has no y_m"),
+        ("name,x_m,y_m\n,1,2\n", "has no name"),
+        ("name,x_m,y_m\nA,1,2\nA,3,2\n", "lists 'A' 2 times"),
+        ("name,x_m,y_m,width_m\nA,1,2,-3\n", "width_m can't be '-3'"),
+        ("name,x_m,y_m\nA,nan,2\n", "x_m can't be 'nan'"),
+    ],
+)
+def test_a_wrong_list_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "stock.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_stock(path)
+    assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_stock(tmp_path / "none.csv")
+    (tmp_path / "torn.json").write_text("[{", encoding="utf-8")
+    with pytest.raises(InputError, match="can't be read"):
+        read_stock(tmp_path / "torn.json")
+    (tmp_path / "number.json").write_text("3", encoding="utf-8")
+    with pytest.raises(InputError, match="no list of bundles"):
+        read_stock(tmp_path / "number.json")
+
+
+def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ...], tmp_path: Path) -> None:
+    path = tmp_path / "bundles.json"
+    match = match_stock((Expected("gone", 9.0, 0.0),), bundles)
+    write_bundles(bundles, match, "yard", path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema())
+    jsonschema.validate(content, schema())
+    assert content["stock"]["missing"] == ["gone"]
+    for one, back in zip(bundles, read_bundles(path), strict=True):
+        assert np.allclose(one.centre_m, back.centre_m, atol=1e-6)
+        assert np.allclose(one.ends_m, back.ends_m, atol=1e-6)
+        assert back.yaw_rad == pytest.approx(one.yaw_rad, abs=1e-8)
+        assert np.isclose(back.sigma.length_m, one.sigma.length_m, equal_nan=True)
+        assert back.reasons == one.reasons and back.neighbours == one.neighbours
+        assert len(back.bar_axes) == len(one.bar_axes)
+
+
+def test_no_bundles_make_a_valid_file(tmp_path: Path) -> None:
+    write_bundles((), None, "world", tmp_path / "bundles.json")
+    content = json.loads((tmp_path / "bundles.json").read_text(encoding="utf-8"))
+    jsonschema.validate(content, schema())
+    assert read_bundles(tmp_path / "bundles.json") == ()
+
+
+def test_a_torn_or_other_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bundles.json"
+    for text, says in (
+        ("{", "is torn"),
+        ('{"schema_version": 9}', "version 9"),
+        ('{"bundles": []}', "is torn"),
+    ):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match=says):
+            read_bundles(path)
