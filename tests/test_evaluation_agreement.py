@@ -82,3 +82,19 @@ def test_smooth_places() -> None:
     slope = smooth_places(np.array([0, 0.02, 0.04, 0.04, 0.04]))
     np.testing.assert_array_equal(slope, [False, True, False, True, True])
     assert smooth_places(np.array([0, 0.029, 0, 0.029])).all()
+
+
+@pytest.mark.parametrize(("x_shift_m", "z_shift_m"), [(0.0, 0.0), (0.0132, -0.004), (-0.0408, 0.011)])
+def test_a_shifted_laser_is_found(x_shift_m: float, z_shift_m: float) -> None:
+    """Bars with a step; a tenth of the contour is far off."""
+    rng = np.random.default_rng(1)
+    x = 0.01 * np.arange(600)
+    z = lambda at: 0.7 + 0.02 * np.abs(np.sin(at * 35)) + 0.3 * (at > 3)  # noqa: E731
+    seen = z(x) + rng.normal(0, 0.001, 600) + np.where(rng.uniform(size=600) < 0.1, 0.4, 0)
+    measured = Contour(0, x, x * 0, seen, x * 0 + 0.01, np.full(600, Source.VISION, np.uint8))
+    scanned = LaserProfile(0, x, x * 0, z(x - x_shift_m) + z_shift_m, 0.001)
+    figures = agree(measured, scanned, speed_mps=0.5)
+    assert isinstance(figures, Agreement)
+    assert figures.x_shift_mm == pytest.approx(1e3 * x_shift_m, abs=1.0)
+    assert figures.z_shift_mm == pytest.approx(1e3 * z_shift_m, abs=0.5)
+    assert figures.time_shift_s == pytest.approx(figures.x_shift_mm / 500)

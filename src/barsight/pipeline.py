@@ -16,14 +16,17 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.parallel import ordered_map
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
+from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
-from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame
+from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory
 from barsight.evaluation.agreement import agree
 from barsight.kept import keeping_folder, once
 from barsight.mapping.contours import cut_contours
@@ -165,7 +168,8 @@ def measure(
         laser = whole_laser if trajectory.reference == "yard" else ()
         contours = cut_contours(surface, laser, settings.map.profile_y_m, settings.map.contours)
         by_number = {contour.profile: contour for contour in contours}
-        agreed = [agree(by_number[p.profile], p) for p in laser if p.profile in by_number]
+        speed_mps = _speed_along_x(trajectory)
+        agreed = [agree(by_number[p.profile], p, speed_mps) for p in laser if p.profile in by_number]
 
     with watch("bundles"):
         heights = HeightMap.of(surface)
@@ -227,6 +231,14 @@ def _placed(
     for frame in source.frames():
         if frame.stamp_ns in poses:
             yield frame, poses[frame.stamp_ns]
+
+
+def _speed_along_x(trajectory: Trajectory) -> float:
+    """Mean velocity along X while travelling, signed, m/s: the median over the steps between frames."""
+    seconds = np.diff(trajectory.stamp_ns) / NS_PER_S
+    if seconds.size == 0:
+        return float("nan")
+    return float(np.median(np.diff(trajectory.positions_m[:, 0]) / seconds))
 
 
 def _counter(stage: str, total: int, advance: Advance) -> Callable[[], None]:

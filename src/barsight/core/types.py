@@ -270,6 +270,9 @@ class Agreement:
     bias is vision minus reference; loa_low, loa_high are Bland-Altman's 95 % limits of agreement. median and
     mae are of the absolute differences; smooth_mae is taken where the reference has no step over 30 mm within
     20 mm (NaN where it has steps everywhere): at a step the two methods may look past each other.
+    x_shift_mm, z_shift_mm: how far the laser's profile lies along x and above where it fits best (NaN where
+    too little is in common); time_shift_s: the delay of its clock that explains x_shift at the travel's
+    speed. They are reported only: no other figure is corrected by them.
     """
 
     profile: int
@@ -285,3 +288,6 @@ class Agreement:
     max_mm: float
     loa_low_mm: float
     loa_high_mm: float
+    x_shift_mm: float
+    z_shift_mm: float
+    time_shift_s: float
