@@ -13,6 +13,7 @@ KINDS = {
     "camera-imu": "Where the cameras sit on the IMU and the clocks' offset, from a recording with a board",
     "check": "Has the rig drifted? Ordinary crane travel shows it, with sigma and cost in mm",
     "export": "Write a rig in another format: ours, Kalibr, OpenCV, EuRoC",
+    "yard": "Where the world lies in the yard, from surveyed targets or crane moves in two axes",
     "imu-noise": "Noise densities and random walks of an IMU from a log at rest: imu.yaml",
 }
 

@@ -1,0 +1,101 @@
+"""Where the world, or the rig, lies in the yard: an alignment judged, with targets set apart to check it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import Failed
+from barsight.registration.rigid import Alignment, align
+
+DOUBTFUL = 0.001
+"""Residuals rarer than this under the stated sigmas: those are too small, or a point is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class YardCalibration:
+    """alignment: yard_from_<frame>, its covariance grown by `inflation` where the residuals ask for it.
+
+    names: (N,) of the points; checks: (N,) those that took no part. off_m: (N, 3) yard minus moved point;
+    sigma_m: (N,) what its length should be, one standard deviation per coordinate. doubts: sentences.
+    """
+
+    alignment: Alignment
+    inflation: float
+    names: tuple[str, ...]
+    checks: Bool
+    off_m: Float64
+    sigma_m: Float64
+    doubts: tuple[str, ...]
+
+    @property
+    def turn_sigma_deg(self) -> float:
+        """The worst axis' standard deviation."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.alignment.covariance[:3, :3])[-1])))
+
+    @property
+    def place_sigma_m(self) -> float:
+        """The frame's origin in the yard, worst axis."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.alignment.covariance[3:, 3:])[-1]))
+
+
+def calibrate_yard(
+    names: tuple[str, ...], measured: Float64, yard: Float64, covariance_m2: Float64 | None, checks: Bool,
+    frame: str, independent_share: float = 1.0,
+) -> YardCalibration | Failed:  # fmt: skip
+    """`yard_from_<frame>` from points measured in `frame` (N, 3) and known in the yard (N, 3), m.
+
+    covariance_m2: (N, 3, 3) of each pair's difference, yard axes; None takes one sigma from the residuals.
+    checks: (N,) points that are only compared. independent_share: how many of the points count, where
+    neighbours err alike. Failed `few-points`, `collinear`.
+    """
+    used = ~checks
+    covariance = None if covariance_m2 is None else covariance_m2[used]
+    found = align(measured[used], yard[used], ("yard", frame), covariance)
+    if isinstance(found, Failed):
+        return found
+    doubts: list[str] = []
+    inflation = 1 / independent_share
+    free = found.degrees_of_freedom
+    if covariance is not None and free > 0 and chi2.sf(found.chi2, free) < DOUBTFUL:
+        inflation *= found.chi2 / free
+        doubts.append(
+            f"the points disagree {(found.chi2 / free) ** 0.5:.1f} times as much as their sigmas say: "
+            "a target is mistaken or moved; the stated sigma grows by that"
+        )
+    scaled = Alignment(
+        found.target_from_source, inflation * found.covariance, found.residuals_m, found.scale,
+        inflation**0.5 * found.scale_sigma, found.sigma_m, found.chi2,
+    )  # fmt: skip
+    if abs(scaled.scale - 1) > 3 * scaled.scale_sigma:
+        doubts.append(
+            f"the measured points are {100 * (1 / scaled.scale - 1):+.3f} ± {100 * scaled.scale_sigma:.3f} % "
+            "too large: baseline or survey has a wrong metre (the scale is not corrected)"
+        )
+    off = yard - scaled.target_from_source.apply(measured)
+    sigma = _predicted(scaled, measured, covariance_m2, checks)
+    length = np.linalg.norm(off, axis=1)
+    doubts += [
+        f"check {names[k]} is {1e3 * length[k]:.1f} mm off, its sigma is {1e3 * sigma[k]:.1f} mm"
+        for k in np.flatnonzero(checks & (length > 4 * sigma))
+    ]
+    return YardCalibration(scaled, inflation, names, checks, off, sigma, tuple(doubts))
+
+
+def _predicted(
+    alignment: Alignment, measured: Float64, covariance_m2: Float64 | None, checks: Bool
+) -> Float64:
+    """(N,) RMS over the axes of a point's own noise and, for checks, of where the alignment puts it."""
+    own = np.full(len(measured), alignment.sigma_m**2)
+    if covariance_m2 is not None:
+        own = np.trace(covariance_m2, axis1=1, axis2=2) / 3
+    x, y, z = (measured @ alignment.target_from_source.rotation.T).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    design = np.concatenate([cross, np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
+    placed = np.einsum("nij,jk,nik->n", design, alignment.covariance, design) / 3
+    sigma: Float64 = np.sqrt(own + np.where(checks, placed, 0.0))
+    return sigma

@@ -1,0 +1,63 @@
+"""`barsight calibrate yard`: from a CSV of targets to a pose, and one line for what can't be."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from barsight.cli.main import run
+
+HEADER = "name,yard_x,yard_y,yard_z,x,y,z,sigma_m,check\n"
+ROWS = (
+    "a,10,0,0,0,0,-8,0.003,0\n", "b,16,0,0,6,0,-8,0.003,0\n", "c,10,5,0,0,5,-8,0.003,0\n",
+    "d,16,5,1,6,5,-7,0.003,1\n",
+)  # fmt: skip
+
+
+def test_targets_place_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "t.csv").write_text(HEADER + "".join(ROWS))
+    assert run(["calibrate", "yard", str(tmp_path / "t.csv"), "-o", str(tmp_path / "yard.yaml")]) == 0
+    found = yaml.safe_load((tmp_path / "yard.yaml").read_text())
+    expected = np.eye(4)
+    expected[:3, 3] = (10, 0, 8)
+    np.testing.assert_allclose(found["yard_from_world"], expected, atol=1e-9)
+    assert np.array(found["covariance"]).shape == (6, 6)
+    assert found["points"] == 3
+    assert "check d" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "reason"),
+    [
+        (HEADER + ROWS[0] + ROWS[1], 5, "2 pairs of points; 3 are the least"),
+        (HEADER + ROWS[0] + ROWS[1] + "c,13,0,0,3,0,-8,,\n", 5, "lie on a line"),
+        (HEADER + ROWS[0] + ROWS[0], 3, "target a is there twice"),
+        (HEADER + "a,1,2,x,0,0,0,,\n", 3, "line 2: a number is missing or is none"),
+        (HEADER + "a,1,2\n", 3, "line 2: a number is missing"),
+        (HEADER + "a,1,2,3,0,0,0,-1,\n", 3, "line 2: a value can't be"),
+        ("name,x,y,z\n", 3, "has no column yard_x"),
+        ("", 3, "has no column name"),
+    ],
+)
+def test_wrong_targets(
+    tmp_path: Path, text: str, code: int, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    assert run(["calibrate", "yard", str(tmp_path / "t.csv"), "-o", str(tmp_path / "yard.yaml")]) == code
+    assert reason in capsys.readouterr().err
+    assert not (tmp_path / "yard.yaml").exists()
+
+
+def test_other_mistakes(tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "yard.yaml")
+    for arguments, code, reason in (
+        (["no.csv", "-o", out], 3, "no such file"),
+        (["no", "-o", out], 3, "no such file or folder"),
+        (["no.csv", "-o", str(tmp_path / "yard.txt")], 4, "ends in .yaml"),
+        (["no.csv", "-o", out, "--sigma-m", "0"], 2, "give metres"),
+        ([str(data / "kitti_odometry_a"), "-o", out], 5, "no crane encoders"),
+        ([str(data / "yard_dev"), "-o", out], 5, "the roll about it can't be seen"),
+    ):
+        assert run(["calibrate", "yard", *arguments]) == code
+        assert reason in capsys.readouterr().err
