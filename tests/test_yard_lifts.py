@@ -15,6 +15,8 @@ import pytest
 from scipy.optimize import linprog
 
 from barsight.core.types import Source
+from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.bundles import find_bundles
 from barsight.yard.contact import touch
 from barsight.yard.footprint import BundleTable, Placement, grip
 from barsight.yard.lift import map_vetoes, plan_lifts
@@ -353,3 +355,24 @@ def test_the_documents_list_every_veto_with_the_test_that_trips_it() -> None:
         assert code in inspect.getsource(globals()[test]) or code in str(
             getattr(globals()[test], "pytestmark", "")
         )
+
+
+@pytest.mark.parametrize(
+    ("stock", "place", "code"),
+    [
+        ([laid(0.3)], Placement(0.38, 0.0, 0.0), "off-centre"),
+        ([laid(0.3), laid(0.58)], Placement(0.44, 0.0, 0.0), "straddles-neighbour"),
+        ([laid(0.0), laid(0.1, z=0.56)], Placement(0.1, 0.0, 0.0), "overhanging"),
+        ([laid(0.05 * k, z=0.2 + 0.36 * k) for k in range(3)], Placement(0.1, 0.0, 0.0), "unstable-side"),
+    ],
+)
+def test_the_accidents_are_vetoed_with_bundles_as_they_are_found(
+    stock: list[Laid], place: Placement, code: str
+) -> None:
+    heights = map_of(stock, sigma_m=0.005)
+    bundles = find_bundles(heights, BundleSettings())
+    assert code in codes(judged(stock, bundles, place, heights=heights))
+    # Straight over the top bundle of a sound yard the same steps find nothing to say.
+    sound = map_of([laid(0.3)], sigma_m=0.005)
+    found = find_bundles(sound, BundleSettings())
+    assert codes(judged([laid(0.3)], found, Placement(0.3, 0.0, 0.0), heights=sound)) == set()

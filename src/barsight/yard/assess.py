@@ -19,7 +19,7 @@ from barsight.yard.stability import Footing, footing_vetoes
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
-SCALES = (1.0, 1.5, 2.0, 3.0)
+SCALES = (1.0, 1.5, 2.5)
 """Multiples of the crane's tolerance that are tried for the box within which a lift stays as checked."""
 
 
@@ -163,7 +163,7 @@ def _tolerance(
         )  # fmt: skip
         sure = grip(place, magnet, box, near, contact.z_m).probability
         if sure < settings.least_count_probability:
-            return found, f"{len(held.gripped)} bundles have probability {sure:.4f} only"
+            return found, f"a count of {len(held.gripped)} has the probability {sure:.4f} only"
         changed = _change(place, box, yard, magnet, near, held, needed_n, settings)
         if changed:
             return found, changed

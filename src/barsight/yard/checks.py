@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, frozen
 from barsight.yard.contact import Contact
 from barsight.yard.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.lift_settings import LiftSettings
@@ -19,6 +20,7 @@ from barsight.yard.vetoes import Veto
 MARGIN_M = 0.02
 """How far beyond its stated outline a bundle may show."""
 TALL_CELLS = 5
+STEP_M = 0.02
 
 
 def count_vetoes(
@@ -49,8 +51,8 @@ def count_vetoes(
     elif held.probability < settings.least_count_probability:
         worst = near.bundles[int(np.argmax(held.flips))].id
         vetoes.append(
-            Veto("count-uncertain", f"{count} bundles with probability {held.probability:.4f} only: bundle "
-                 f"{worst} is too near an edge of the footprint")
+            Veto("count-uncertain", f"a count of {count} has the probability {held.probability:.4f} only: "
+                 f"bundle {worst} may be in or out")
         )  # fmt: skip
     share = _unexplained(place, heights, magnet, near, contact)
     if share > settings.max_unexplained_share:
@@ -76,7 +78,9 @@ def face_vetoes(contact: Contact, needed_n: float, magnet: Magnet, settings: Lif
             Veto("tilt", f"the faces rest {1e3 * contact.rests_off_m:.0f} mm beside their middle and would "
                  f"lean further than the {magnet.limits.roll_deg:g} deg that the suspension allows")
         )  # fmt: skip
-    if not contact.widest_gap_m <= magnet.limits.gap_m:
+    if math.isinf(contact.widest_gap_m):
+        vetoes.append(Veto("gap", "under one of the poles no steel is known"))
+    elif contact.widest_gap_m > magnet.limits.gap_m:
         vetoes.append(
             Veto("gap", f"a pole hangs {1e3 * contact.widest_gap_m:.0f} mm above the steel, "
                  f"{1e3 * magnet.limits.gap_m:.0f} mm are allowed")
@@ -146,17 +150,32 @@ def load_vetoes(
     return vetoes
 
 
-def _pole_points(place: Placement, magnet: Magnet, grow: tuple[float, float], step: float) -> Float64:
-    """(N, 3) x, y and pole of places over the faces, grown by (along, across)."""
+@lru_cache(maxsize=64)
+def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
+    """(N, 3) along, across and pole of places over the faces, made wider to either side."""
     points = []
     for number, pole in enumerate(magnet.poles):
-        long, wide = pole.length_m / 2 + grow[0], pole.width_m / 2 + grow[1]
-        v = np.linspace(-long, long, max(int(2 * long / (2 * step)), 2)) + pole.along_m
-        u = np.linspace(-wide, wide, max(int(2 * wide / step), 2)) + pole.across_m
+        long, wide = pole.length_m / 2, pole.width_m / 2 + wider_mm / 1e3
+        v = np.linspace(-long, long, max(int(long / STEP_M), 2)) + pole.along_m
+        u = np.linspace(-wide, wide, max(int(2 * wide / STEP_M), 2)) + pole.across_m
         vv, uu = (a.ravel() for a in np.meshgrid(v, u))
-        xy = np.array([place.x_m, place.y_m]) + vv[:, None] * place.along + uu[:, None] * place.across
-        points.append(np.column_stack([xy, np.full(len(xy), number)]))
-    return np.concatenate(points)
+        points.append(np.column_stack([vv, uu, np.full(len(vv), number)]))
+    return frozen(np.concatenate(points))
+
+
+@lru_cache(maxsize=8)
+def _beam_grid(magnet: Magnet) -> Float64:
+    """(N, 2) along and across of places under the beam and as far beside it as the crane may miss."""
+    tolerance = magnet.tolerance
+    long, wide = magnet.beam.length_m / 2, magnet.beam.width_m / 2
+    grow = max(tolerance.x_m, tolerance.y_m) + math.radians(tolerance.yaw_deg) * long
+    v, u = np.arange(-long - grow, long + grow, STEP_M), np.arange(-wide - grow, wide + grow, STEP_M)
+    return frozen(np.stack([a.ravel() for a in np.meshgrid(v, u)], axis=1))
+
+
+def _in_yard(place: Placement, grid: Float64) -> Float64:
+    """(N, 2) x and y of places given along and across the beam."""
+    return np.array([place.x_m, place.y_m]) + grid[:, :1] * place.along + grid[:, 1:2] * place.across
 
 
 def _unexplained(
@@ -164,12 +183,13 @@ def _unexplained(
 ) -> float:
     """Share of the places under the poles, within reach, that lie outside all bundles' outlines."""
     across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
-    points = _pole_points(place, magnet, (0.0, float(across)), 0.02)
+    grid = _face_grid(magnet, round(1e3 * float(across)))
+    points = _in_yard(place, grid)
     z = look_up(heights, points[:, 0], points[:, 1])
-    reached = z > contact.z_m[points[:, 2].astype(np.int64)] - magnet.reach_m
+    reached = z > contact.z_m[grid[:, 2].astype(np.int64)] - magnet.reach_m
     if not reached.any():
         return 0.0
-    away = points[reached, None, :2] - near.centre
+    away = points[reached, None, :] - near.centre
     beside = np.abs(away[..., 0] * near.along[:, 1] - away[..., 1] * near.along[:, 0])
     beyond = np.abs((away * near.along).sum(axis=-1))
     wide = near.half[:, 0] + MARGIN_M + 2 * np.hypot(near.sigma[:, 0], near.sigma[:, 3])
@@ -181,14 +201,10 @@ def _unexplained(
 
 def tall_veto(place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact) -> list[Veto]:
     """Whether anything under the beam, or within the tolerance beside it, is higher than its underside."""
-    tolerance = magnet.tolerance
-    long, wide = magnet.beam.length_m / 2, magnet.beam.width_m / 2
-    grow = max(tolerance.x_m, tolerance.y_m) + math.radians(tolerance.yaw_deg) * long
-    v, u = np.arange(-long - grow, long + grow, 0.02), np.arange(-wide - grow, wide + grow, 0.02)
-    vv, uu = (a.ravel() for a in np.meshgrid(v, u))
-    xy = np.array([place.x_m, place.y_m]) + vv[:, None] * place.along + uu[:, None] * place.across
+    grid = _beam_grid(magnet)
+    xy = _in_yard(place, grid)
     z = look_up(heights, xy[:, 0], xy[:, 1])
-    under = contact.centre_z_m + vv * math.tan(contact.pitch_rad) + magnet.beam.above_faces_m
+    under = contact.centre_z_m + grid[:, 0] * math.tan(contact.pitch_rad) + magnet.beam.above_faces_m
     rises = z - under
     if int((rises > 0).sum()) < TALL_CELLS:
         return []

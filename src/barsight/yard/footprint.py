@@ -20,6 +20,8 @@ BEYOND_OPEN_END_M = 20.0
 LEAST_SIGMA_M = 0.001
 HEIGHT_SIGMA_M = 0.005
 """How well a bundle's top line stands for its height under a pole, beside its own sigma."""
+MOST_TOP_SIGMA_M = 0.008
+"""Faces rest on the same map: what all places share of a top's sigma says nothing of heights between them."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class BundleTable:
             np.array([b.top_z_m for b in bundles]),
             np.tan([b.pitch_rad for b in bundles]),
             np.where(np.isfinite(sigma), sigma, unknown),
-            np.where(np.isfinite(sigma_top), sigma_top, 0.05),
+            np.where(np.isfinite(sigma_top), np.minimum(sigma_top, MOST_TOP_SIGMA_M), 0.05),
             np.array([b.ends_open for b in bundles], dtype=np.bool_).reshape(-1, 2),
         )
 

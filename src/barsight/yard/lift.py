@@ -16,7 +16,7 @@ from barsight.yard.stability import Footing, footings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
-ACROSS_M = (0.0, 0.012, -0.012, 0.024, -0.024, 0.036, -0.036)
+ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
 FINALISTS = 3
 SAME_TOP_M = 0.03
