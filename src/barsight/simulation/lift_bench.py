@@ -19,6 +19,7 @@ import numpy as np
 from rich.table import Table
 
 from barsight.core.arrays import Float64
+from barsight.evaluation.stereo_provenance import Provenance, provenance
 from barsight.simulation.known_yards import KnownYard, known_yard, seen_bundles, seen_heights
 from barsight.simulation.settings import SimulationSettings, YardSettings
 from barsight.simulation.stock import stack_yard
@@ -52,6 +53,7 @@ class LiftBench:
     reasons: dict[str, int]
     codes: dict[str, int]
     seconds: float
+    provenance: Provenance
 
 
 def bench_yard(number: int) -> tuple[KnownYard, np.random.Generator]:
@@ -100,7 +102,7 @@ def bench_lifts(
         advance(number + 1)
     return LiftBench(
         yards, placements, wrong, counted, fine, vetoed, dict(reasons.most_common()),
-        dict(codes.most_common()), seconds,
+        dict(codes.most_common()), seconds, provenance(),
     )  # fmt: skip
 
 
