@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.any_rig_file import RigFormat, read_rig_file, write_any_rig
+from barsight.calibration.any_rig_file import RigFormat, chosen_rig, read_rig_file, write_any_rig
+from barsight.calibration.calibration_uncertainty import depth_sigma
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.documents import canonical_pose
 from barsight.calibration.lens_model import Lens
 from barsight.calibration.rig import StereoRig
 from barsight.calibration.rig_file import read_covariance, write_rig_file
+from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.calibration.stereo_calibration import calibrate_stereo
 from barsight.cli.main import run
 from barsight.core.errors import CalibrationError
@@ -107,3 +109,32 @@ def test_export_command(tmp_path: Path) -> None:
         run(["calibrate", "export", str(tmp_path / "no.yaml"), "-o", str(tmp_path / "x"), "--to", "euroc"])
         == 3
     )
+
+
+def test_a_covariance_gives_the_shared_disparity_error(tmp_path: Path) -> None:
+    """As the calibration's own depth uncertainty has it, and None where nothing is known."""
+    calibration = calibrate_stereo(simulated(3), BOARD, Lens.RADTAN4, (SIZE, SIZE), Path("views"), [])
+    write_rig_file(tmp_path / "rig.yaml", calibration.rig, calibration)
+    write_rig_file(tmp_path / "bare.yaml", calibration.rig)
+    sigma_m = depth_sigma(calibration, [2.0])[0, 0]
+    expected = sigma_m * calibration.rig.cam0.fx_px * calibration.rig.baseline_m / 2.0**2
+    found = disparity_sigma_px(tmp_path / "rig.yaml", 2.0)
+    assert found == pytest.approx(expected, rel=0.02)
+    assert disparity_sigma_px(tmp_path / "bare.yaml", 2.0) is None
+    assert disparity_sigma_px(None, 2.0) is None
+
+
+def test_a_rig_of_two_cameras_keeps_the_recordings_mounting(tmp_path: Path) -> None:
+    mount = Pose("body", "cam0", np.diag([1.0, -1, -1]), np.array([0.1, 0.2, 0.3]))
+    bare = rig()
+    own = StereoRig(bare.cam0, bare.cam1, mount, mount @ bare.cam0_from_cam1, 7)
+    write_rig_file(tmp_path / "cameras.yaml", bare)
+    write_rig_file(tmp_path / "whole.yaml", StereoRig(bare.cam0, bare.cam1, mount, own.body_from_cam1, 9))
+    assert chosen_rig(None, own) is own
+    kept = chosen_rig(tmp_path / "cameras.yaml", own)
+    assert kept.body_from_cam0.distance_to(mount) == 0
+    assert kept.timeshift_cam_imu_ns == 7
+    assert kept.cam0_from_cam1.distance_to(bare.cam0_from_cam1) < 1e-12
+    assert chosen_rig(tmp_path / "whole.yaml", own).timeshift_cam_imu_ns == 9
+    with pytest.raises(CalibrationError):
+        chosen_rig(tmp_path / "none.yaml", own)

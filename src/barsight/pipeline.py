@@ -20,6 +20,7 @@ import numpy as np
 
 import barsight
 from barsight.calibration.rectification import Rectifier
+from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.parallel import ordered_map
 from barsight.core.pose import Pose
@@ -105,6 +106,8 @@ def measure(
         imu = source.imu()
         hints = imu_hints(imu) if imu is not None else ()
         cell_m = settings.map.cell_m or choose_cell(first, has_crane=source.crane() is not None)
+    shared_px = disparity_sigma_px(settings.recording.rig, first.range_m)
+    stereo = settings.stereo.with_calibration(shared_px)
     total = len(source.index.stamps_ns)
     configuration, inputs = plain(asdict(settings)), source.digests()
     kept = None
@@ -126,9 +129,7 @@ def measure(
     method = make_method(settings.stereo.for_map())
     turn = threading.Lock() if method.uses_all_cores else nullcontext()
     per_pixel = points_per_pixel(first, cell_m)
-    viewer = Viewer(
-        settings.stereo, method, turn, rectifier, cell_m, per_pixel, settings.map.max_sigma_m, watch
-    )
+    viewer = Viewer(stereo, method, turn, rectifier, cell_m, per_pixel, settings.map.max_sigma_m, watch)
 
     def look(placed: tuple[StereoFrame | RefusedFrame, PosedFrame]) -> View | Refusal:
         frame, posed = placed

@@ -45,6 +45,13 @@ def read_rig_file(path: Path) -> StereoRig:
     raise CalibrationError(path, "holds no stereo rig", f"give {KNOWN}")
 
 
+def holds_own_rig(path: Path) -> bool:
+    """Whether a rig file is of our own format, the one with a covariance."""
+    if path.is_dir() or path.suffix.lower() == ".xml" or _is_opencv(path):
+        return False
+    return VERSION_KEY in read_document(path).values
+
+
 def chosen_rig(path: Path | None, own: StereoRig) -> StereoRig:
     """The rig of a file that the user names, or the recording's `own` where none is named.
 

@@ -21,11 +21,13 @@ class FirstLook:
     """The first usable pair: disparity range and the size of its pixels on the surface (median, m).
 
     off_rows_px: how far matches lie off their rows (see `vertical_offset`), NaN where it can't be told.
+    range_m: the depth in the middle of the disparities.
     """
 
     candidates: DisparityRange
     pixel_on_surface_m: float
     off_rows_px: float
+    range_m: float
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -56,7 +58,8 @@ def first_look(source: Recording, rectifier: Rectifier) -> FirstLook:
             middle = (found.lowest_px + found.highest_px) / 2 + camera.doffs_px
             offset = vertical_offset(pair.left, pair.right)
             off_rows = math.nan if isinstance(offset, Failed) else offset
-            return FirstLook(found, camera.baseline_m / max(middle, 1.0), off_rows)
+            pixel_m = camera.baseline_m / max(middle, 1.0)
+            return FirstLook(found, pixel_m, off_rows, camera.focal_px * pixel_m)
         assert isinstance(found, Failed)
         reasons.append(found.reason)
         swapped += found.code == "swapped"

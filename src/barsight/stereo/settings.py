@@ -29,7 +29,8 @@ class StereoSettings:
     highest_disparity_px: int | None = None
     """End of the candidates; found from the images when not given."""
     calibration_sigma_px: float = 0.05
-    """Disparity error that the calibration may cause everywhere alike (1 sigma)."""
+    """Disparity error that the calibration may cause everywhere alike (1 sigma), where no rig file's
+    covariance says it."""
     max_depth_m: float = 40.0
     """Points further away are left out."""
     max_sigma_px: float = 0.99
@@ -54,6 +55,10 @@ class StereoSettings:
             raise ConfigError(f"max_sigma_px must be positive, not {self.max_sigma_px}")
         if not 0 <= self.gap_darkness < 1:
             raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
+
+    def with_calibration(self, sigma_px: float | None) -> StereoSettings:
+        """The same with the calibration's own sigma, where it is known."""
+        return self if sigma_px is None else replace(self, calibration_sigma_px=sigma_px)
 
     def for_map(self) -> StereoSettings:
         """The same without the time that guesses take, since no map takes them."""
