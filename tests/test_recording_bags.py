@@ -14,6 +14,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from barsight.calibration.any_rig_file import read_rig_file
+from barsight.calibration.rig_file import write_rig_file
 from barsight.core.errors import CalibrationError, InputError
 from barsight.core.types import RefusedFrame, StereoFrame
 from barsight.recording import bag
@@ -298,6 +300,18 @@ def test_calibration_is_found_or_named(tmp_path: Path) -> None:
         (path / "camchain-imucam.yaml").rename(path / f"{name}-camchain-imucam.yaml")
     with pytest.raises(InputError, match=r"several calibrations: one-camchain-imucam\.yaml, two-"):
         open_recording(path)
+
+
+def test_another_rig_takes_the_camchains_place(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bags" / "a", "ros2-mcap", messages())
+    write_kalibr(tmp_path / "calibration")
+    rig = read_rig_file(tmp_path / "calibration" / "camchain-imucam.yaml")
+    write_rig_file(tmp_path / "rig.yaml", rig)
+    recording = open_recording(path, RecordingSettings(rig=tmp_path / "rig.yaml"))
+    assert recording.rig.baseline_m == pytest.approx(rig.baseline_m)
+    assert len(list(recording.frames())) == len(recording.index.stamps_ns)
+    with pytest.raises(CalibrationError, match="no such file"):
+        open_recording(path, RecordingSettings(rig=tmp_path / "none.yaml"))
 
 
 def test_a_camchain_without_imu(tmp_path: Path) -> None:
