@@ -86,8 +86,8 @@ def yard_row(method: str, flags: tuple[str, ...], recording: Path, out: Path) ->
 def yard_table(bench: YardBench) -> Table:
     """Like the paper's Table 4, with what it leaves out.
 
-    all, cells, laser: MAE of whole contours, of all cells that two frames see, and against the laser on smooth
-    places.
+    all, cells, laser: MAE of whole contours, of all cells that two frames see, and against the laser on
+    smooth places.
     """
     title = f"{bench.what}; mm against truth on smooth places, commit {bench.provenance.commit}"
     table = Table("method", title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
