@@ -177,6 +177,17 @@ def test_what_cannot_be_calibrated_is_said(recorded: Recorded) -> None:
     assert "hardly turns" in refusal(still, imu)
 
 
+def test_a_knock_is_said_and_counts_less(recorded: Recorded) -> None:
+    views, imu, truth = recorded
+    accel = imu.accel_mps2.copy()
+    ring = 4.0 * np.sin(2 * np.pi * 66.0 * np.arange(60) / 200.0) * np.exp(-np.arange(60) / 20.0)
+    accel[600:660] += ring[:, None]
+    calibration = calibrated(views, replace(imu, accel_mps2=accel))
+    assert any("knocks or vibration near 2 s" in note for note in calibration.notes)
+    assert calibration.spreads[2].factor < 1.2
+    assert (np.abs(errors(calibration, truth)) < 4 * calibration.sigma[:14]).all()
+
+
 def test_only_the_stretch_without_gaps_is_used(recorded: Recorded) -> None:
     views, imu, truth = recorded
     kept = np.ones(imu.stamp_ns.size, np.bool_)

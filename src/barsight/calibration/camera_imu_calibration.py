@@ -29,6 +29,7 @@ from barsight.core.types import ImuSamples
 
 HUBER = 3.0
 CORNER_SIGMAS = 4.5
+KNOCK_SAMPLES, KNOCK_FACTOR = 15, 2.0
 WEIGHT_ROUNDS = 5
 SETTLED = 0.03
 LEAST_INFLATION = 1.02
@@ -84,6 +85,7 @@ def calibrate_camera_imu(
     try:
         solution = solve(problem, setup.start, HUBER)
         problem, corner_px, removed = _without_outliers(problem, solution)
+        problem, knocks = _without_knocks(problem, solution)
         problem, solution, spreads = _weighted(problem, solution.state, corner_px)
         known = uncertainty(problem, solution)
         solved = _rig(rig, solution.state)
@@ -99,7 +101,17 @@ def calibrate_camera_imu(
             source, "the calibration doesn't converge", "record again with the board in sight throughout"
         )
     return CameraImuCalibration(
-        source, board, solved, noise, problem, solution, spreads, known, corner_px, removed, setup.notes
+        source,
+        board,
+        solved,
+        noise,
+        problem,
+        solution,
+        spreads,
+        known,
+        corner_px,
+        removed,
+        (*setup.notes, *knocks),
     )
 
 
@@ -114,6 +126,26 @@ def _without_outliers(problem: Problem, solution: Solution) -> tuple[Problem, fl
         kept.append(_chosen(sightings, good))
     sigmas = replace(problem.sigmas, corner_px=sigma)
     return replace(problem, sightings=tuple(kept), sigmas=sigmas), sigma, removed
+
+
+def _without_knocks(problem: Problem, solution: Solution) -> tuple[Problem, tuple[str, ...]]:
+    """With the IMU's readings loosened where they scatter twice as much as usual; a sentence on where."""
+    track = problem.imu
+    rows = solution.linearised.samples.residual[-track.time_s.size :]
+    window = np.ones(KNOCK_SAMPLES) / KNOCK_SAMPLES
+    factors = []
+    for own in (slice(0, 3), slice(3, 6)):
+        scatter = np.sqrt(np.convolve((rows[:, own] ** 2).mean(axis=1), window, mode="same"))
+        ratio = scatter / np.median(scatter)
+        factors.append(np.where(ratio > KNOCK_FACTOR, ratio, 1.0))
+    problem = replace(problem, imu=replace(track, gyro_loose=factors[0], accel_loose=factors[1]))
+    shaken = np.maximum(*factors) > 1
+    if not shaken.any():
+        return problem, ()
+    seconds = sorted({int(time) for time in track.time_s[shaken]})
+    places = ", ".join(f"{second} s" for second in seconds[:6]) + (" ..." if len(seconds) > 6 else "")
+    note = f"knocks or vibration near {places}: {int(shaken.sum())} readings of the IMU count less"
+    return problem, (note,)
 
 
 def _chosen(sightings: Sightings, good: np.typing.NDArray[np.bool_]) -> Sightings:

@@ -39,11 +39,16 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class ImuTrack:
-    """time_s: (S,) since the spline's start. gyro_radps, accel_mps2: (S, 3) as measured."""
+    """time_s: (S,) since the spline's start. gyro_radps, accel_mps2: (S, 3) as measured.
+
+    gyro_loose, accel_loose: (S,) factors on the sigmas of readings that shake more than the spline follows.
+    """
 
     time_s: Float64
     gyro_radps: Float64
     accel_mps2: Float64
+    gyro_loose: Float64
+    accel_loose: Float64
 
 
 @dataclass(frozen=True)
@@ -159,7 +164,8 @@ def linearise(problem: Problem, state: State, huber: float | None) -> Linearised
     rows = imu_rows(
         segment, u, *chain, spline.gyro_bias_radps, spline.accel_bias_mps2, problem.imu.gyro_radps,
         problem.imu.accel_mps2, state.gravity_mps2, tangent(state.gravity_mps2), state.gyro_matrix,
-        state.accel_matrix, sigmas.gyro_radps, sigmas.accel_mps2, gravity_at, problem.scales, width,
+        state.accel_matrix, sigmas.gyro_radps * problem.imu.gyro_loose,
+        sigmas.accel_mps2 * problem.imu.accel_loose, gravity_at, problem.scales, width,
     )  # fmt: skip
     parts.append(rows)
     samples = Samples(*(np.concatenate([part[k] for part in parts]) for k in range(4)))

@@ -143,8 +143,8 @@ def frame_rows(
 def imu_rows(
     segment: Int64, u: Float64, step_s: float, rotations: Float64, places: Float64, steps: Float64,
     inverse: Float64, gyro_bias: Float64, accel_bias: Float64, gyro: Float64, accel: Float64,
-    gravity: Float64, axes: Float64, gyro_matrix: Float64, accel_matrix: Float64, gyro_sigma: float,
-    accel_sigma: float, at: int, scales: bool, width: int,
+    gravity: Float64, axes: Float64, gyro_matrix: Float64, accel_matrix: Float64, gyro_sigmas: Float64,
+    accel_sigmas: Float64, at: int, scales: bool, width: int,
 ) -> Rows:  # fmt: skip
     """Samples of the IMU's readings: three rows of the gyro, then three of the accelerometer [Eq. 9-10]."""
     count = segment.size
@@ -158,6 +158,7 @@ def imu_rows(
     gravity_by = -(cross @ axes)
     for k in range(count):
         i = segment[k]
+        gyro_sigma, accel_sigma = gyro_sigmas[k], accel_sigmas[k]
         weights(u[k], step_s, BLENDING, weight)
         weights(u[k], step_s, CUMULATIVE, share)
         rotation_at(

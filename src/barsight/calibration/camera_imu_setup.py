@@ -94,7 +94,8 @@ def prepare(
     _expect_rig(ways, rig, source)
     aligned = [_aligned(way, time_s, imu.gyro_radps, camera, source) for camera, way in enumerate(ways)]
     within = (time_s >= 0) & (time_s <= end_s)
-    track = ImuTrack(time_s[within], imu.gyro_radps[within], imu.accel_mps2[within])
+    even = np.ones(int(within.sum()))
+    track = ImuTrack(time_s[within], imu.gyro_radps[within], imu.accel_mps2[within], even, even)
     sigmas = _sigmas(noise, rate)
     step_s = 1 / knot_rate(track, sigmas, rate)
     sightings = tuple(
