@@ -180,5 +180,5 @@ def test_eurocs_calibration_recording(data: Path, tmp_path: Path) -> None:
     shifts = [d for d, name in zip(halves["difference"], halves["parameters"], strict=True) if "time" in name]
     assert np.abs(shifts).max() < 2e-4
     assert halves["ratio"] < 2
-    assert report["residuals"]["gyro"]["scatter_in_sigma"] == pytest.approx(1, abs=0.1)
+    assert 0.8 < report["residuals"]["gyro"]["scatter_in_sigma"] < 1.1
     assert report["sigmas_used"]["gyro_radps"] == pytest.approx(1.6968e-4 * 200**0.5, rel=0.1)
