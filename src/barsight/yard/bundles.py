@@ -26,6 +26,7 @@ _EDGE_CELLS = 3.0
 _CLAIM_M = 0.02
 _RIVAL_SHARE = 0.8
 _SUNKEN_M = 0.04
+_RESOLVED_CELLS = 4.0
 
 
 def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundle, ...]:
@@ -59,11 +60,13 @@ def _settled(
     chosen = choose(raised, claims)
     wanted = overlaps(chosen, claims)
     kept = [fits[k] for k in chosen]
+    cell_m = found[0].sheet.cell_m if found else 0.0
+    resolved = 0.0 if settings.catalogue_mm else _RESOLVED_CELLS * cell_m
     readings = []
     for k, rival, other in zip(
         chosen.tolist(),
         strongest_rivals(chosen, raised, wanted),
-        other_packings(fits, weights, chosen, wanted),
+        other_packings(fits, weights, chosen, wanted, resolved),
         strict=True,
     ):
         one = _with_common_diameter(found[k], kept, settings)

@@ -15,7 +15,7 @@ _PRIOR_SHARE = 0.015
 """How much bars of one kind differ, as a share of the diameter."""
 _LEAST_MEMBERS = 3
 _SAME_WIDTH = 0.2
-_AS_WELL = 0.95
+_AS_WELL, _AS_WELL_SINGLE, _AS_WELL_THIN = 0.95, 0.85, 0.6
 
 
 def with_company(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64) -> Float64:
@@ -38,10 +38,13 @@ def with_company(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Flo
     return raised
 
 
-def other_packings(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64) -> list[int | None]:
+def other_packings(
+    fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64, resolved_m: float
+) -> list[int | None]:
     """For each chosen reading the rings of another packing that explains the places of its kind as well.
 
-    weights: as explained, without company. As well: not 5 % less over all those places together.
+    weights: as explained, without company. As well: not 5 % less over all those places together; a single
+    bar must lead by 15 %, and bars thinner than resolved_m by 40 %, since a smoothed map flatters them.
     """
     rings = np.array([fit.rings for fit in fits])
     width = np.array([fit.width_m for fit in fits])
@@ -56,7 +59,9 @@ def other_packings(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: F
         same = np.array([_alike(fits[k], fits[j]) for j in chosen])
         share = best[same].sum(axis=0) / own[same].sum()
         share[rings[k]] = 0.0
-        out.append(int(share.argmax()) if share.max() > _AS_WELL else None)
+        thin = fits[k].values[DIAMETER] < resolved_m
+        limit = _AS_WELL_THIN if thin else _AS_WELL_SINGLE if rings[k] == 0 else _AS_WELL
+        out.append(int(share.argmax()) if share.max() > limit else None)
     return out
 
 
