@@ -12,8 +12,9 @@ from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.parallel import ordered_map
 from barsight.core.types import RefusedFrame, StereoFrame
-from barsight.features.guided import GuidedMatches, PredictedMotion, triangulate
+from barsight.features.guided import GuidedMatches, PredictedMotion, predict_places, triangulate
 from barsight.features.patches import PatchPair, patch_pair
+from barsight.features.repeat import repeat_px
 from barsight.features.tracks import Tracks, TrackSettings, carry_on, find_again
 from barsight.motion.odometry import OdometrySettings, Step, StereoOdometry, View, ransac, refine
 from barsight.recording.base import Recording
@@ -21,6 +22,8 @@ from barsight.stereo.disparity_range import coarse_disparity
 
 PREPARED = 1
 """Pairs that are rectified ahead while the one before is followed."""
+LEAST_SHARE = 0.3
+"""One bar off, a twentieth of the points find one alike and agree; at the true place most do."""
 LEAST_KNOWN = 200
 SPAN = 1.6
 """New points are sought up to this much nearer and further than the known ones."""
@@ -164,11 +167,15 @@ def consensus(
     tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings
 ) -> tuple[Bool, GuidedMatches, PredictedMotion] | Failed:
     """Points found again in their ellipses that agree on one motion in 3D, and that motion."""
-    matches = find_again(tracks, pair, prediction, settings.tracks)
+    assert tracks.last is not None
+    repeats = repeat_px(tracks.last.left, tracks.stereo[:, :2])
+    matches = find_again(tracks, pair, prediction, settings.tracks, repeats)
     index = np.flatnonzero(matches.found)
     least = settings.rough.least_inliers
     if index.size < least:
-        return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again")
+        alike = int(matches.ambiguous.sum())
+        why = f", {alike} can't be told from the next bar's" if alike else ""
+        return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again{why}")
     camera = pair.pair.camera
     points, target = triangulate(tracks.stereo[index], camera), matches.stereo[index]
     start = ransac(points, target[:, :2], camera, settings.rough)
@@ -179,4 +186,14 @@ def consensus(
         return step
     kept = np.zeros(len(tracks.track), np.bool_)
     kept[index[step.kept]] = True
+    camera = pair.pair.camera
+    expected = predict_places(
+        triangulate(tracks.stereo, camera), settings.tracks.sigma_px, prediction, camera
+    )
+    share = kept.sum() / max(1, int((expected.inside & ~matches.ambiguous).sum()))
+    if share < LEAST_SHARE:
+        return Failed(
+            "ambiguous",
+            f"only {100 * share:.0f} % of the points are found where they are expected: another bar may be",
+        )
     return kept, matches, PredictedMotion(step.rotation, step.translation, step.covariance)

@@ -1,0 +1,53 @@
+"""How far off a picture's pattern is like itself along the rows: bars side by side."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Float64, UInt8
+
+TILES = (4, 4)
+NEAREST_PX = 5
+ROW_STEP = 8
+"""Rows taken: those between show the same bars."""
+LEAST_LIKENESS = 0.35
+"""Autocorrelation of a tile's rows, at its first peak, from which the tile repeats."""
+
+
+def repeat_px(image: UInt8, places: Float64) -> Float64:
+    """(N,) px after which the tile around each place (N, 2) repeats along the row; infinite where it doesn't.
+
+    The first peak of the mean autocorrelation of the tile's rows, the slow changes of light taken off.
+    """
+    detail = cv2.blur(image.astype(np.float32) - cv2.blur(image, (81, 81)), (1, 9))[::ROW_STEP]
+    places = places / (1, ROW_STEP)
+    rows = np.linspace(0, detail.shape[0], TILES[0] + 1).astype(int)
+    columns = np.linspace(0, image.shape[1], TILES[1] + 1).astype(int)
+    table = np.full(TILES, np.inf)
+    for i in range(TILES[0]):
+        for j in range(TILES[1]):
+            table[i, j] = _first_peak(detail[rows[i] : rows[i + 1], columns[j] : columns[j + 1]])
+    row = (places[:, 1] * TILES[0] / detail.shape[0]).astype(int).clip(0, TILES[0] - 1)
+    column = (places[:, 0] * TILES[1] / image.shape[1]).astype(int).clip(0, TILES[1] - 1)
+    result: Float64 = table[row, column]
+    return result
+
+
+def _first_peak(tile: Float64) -> float:
+    """The lag of the first peak after the autocorrelation has fallen, or infinity."""
+    width = tile.shape[1]
+    centred = tile - tile.mean(axis=1, keepdims=True)
+    power = (np.abs(np.fft.rfft(centred, 2 * width, axis=1)) ** 2).mean(axis=0)
+    likeness = np.fft.irfft(power)[: width // 2]
+    if likeness[0] <= 0:
+        return float("inf")
+    likeness = likeness / likeness[0] * width / (width - np.arange(width // 2))
+    fallen = np.flatnonzero(likeness < LEAST_LIKENESS / 2)
+    if fallen.size == 0:
+        return float("inf")
+    start = max(NEAREST_PX, int(fallen[0]))
+    inner = likeness[start:-1]
+    peaks = np.flatnonzero((inner > likeness[start - 1 : -2]) & (inner >= likeness[start + 1 :]))
+    high = peaks[inner[peaks] > LEAST_LIKENESS]
+    return float(start + high[0]) if high.size else float("inf")
