@@ -39,6 +39,17 @@ def test_stereo_methods_side_by_side(
     assert methods["barsight"]["scenes"][0]["scene"] == "wall"
 
 
+def test_ablation_leaves_out_one_part_at_a_time(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    saved = tmp_path / "ablation.json"
+    assert run(["bench", "ablation", str(scenes), "--scenes", "1", "--json", str(saved)]) == 0
+    assert "no refinement" in capsys.readouterr().out
+    errors = {m["method"]: m["mean"]["average_px"] for m in json.loads(saved.read_text())["methods"]}
+    assert len(errors) == 7 and errors["whole"] < 0.02
+
+
 def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["bench", "everything"]) == 2
     assert capsys.readouterr().err.count("\n") == 1

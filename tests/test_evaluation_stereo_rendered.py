@@ -15,8 +15,10 @@ from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.evaluation.stereo_bar_edges import bar_diameter, find_outlines, tangent_planes
 from barsight.evaluation.stereo_bar_fit import BarFit, BarGuess, fit_bar
 from barsight.evaluation.stereo_bar_scenes import PosedScene, bar_over_floor, tilted_floor
+from barsight.evaluation.stereo_limit import noise_limit_px
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.evaluation.stereo_render import BAR, FLOOR, Bar, Rendered, render
+from barsight.evaluation.stereo_scenes import pair_from_images
 from barsight.evaluation.stereo_subpixel import (
     bench_subpixel,
     fraction_bias,
@@ -253,3 +255,15 @@ def test_bench_target_size_measures_a_bar(tmp_path: Path) -> None:
     stored = json.loads((tmp_path / "out.json").read_text())
     assert stored["methods"][1]["ranges"][0]["size"]["mean_pct"] is None
     assert stored["diameter_mm"] == 90
+
+
+def test_the_noise_limit_is_that_of_a_sine() -> None:
+    """The mean squared slope of a sine of amplitude A and frequency w is (A w)^2 / 2."""
+    rng = np.random.default_rng(0)
+    clean = 120 + 30 * np.sin(0.3 * np.arange(400))
+    images = [np.rint(clean + rng.normal(0, 2, (300, 400))).clip(0, 255).astype(np.uint8) for _ in range(2)]
+    where = np.zeros((300, 400), dtype=bool)
+    where[30:-30, 30:-30] = True
+    limit = noise_limit_px(pair_from_images(images[0], images[1]), where)
+    slope = (30 * np.sin(0.3)) ** 2 / 2
+    assert limit == pytest.approx(np.sqrt(2 * 2.0**2 / (4 * np.pi * 16 * 1.5 * slope)), rel=0.1)

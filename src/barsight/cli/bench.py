@@ -15,6 +15,7 @@ from barsight.cli.bench_bundles import bench_found_bundles
 from barsight.cli.bench_lifts import bench_lift_targets
 from barsight.cli.bench_yard import bench_yard
 from barsight.core.errors import ConfigError
+from barsight.evaluation.stereo_ablation import without_one_part
 from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.evaluation.stereo_speed import bench_speed, speed_table
@@ -35,6 +36,7 @@ def run(arguments: Sequence[str]) -> None:
     benches: dict[str, Callable[..., None]] = {
         "stereo": _stereo,
         "stereo-speed": _stereo_speed,
+        "ablation": _ablation,
         "subpixel": _subpixel,
         "target-size": _target_size,
         "yard": bench_yard,
@@ -94,6 +96,23 @@ def _stereo_speed(methods: tuple[MethodName, ...] = METHODS, repeats: int = 5, s
             made[name] = make_method(StereoSettings(barsight=settings))
     bench = bench_speed(made, repeats)
     Console().print(speed_table(bench))
+    if save is not None:
+        write_json(save, bench)
+
+
+def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = None) -> None:
+    """Our own stereo with one part left out at a time: accuracy, bias and sigma.
+
+    Args:
+        data: A folder of scenes, each with left.png, right.png, disp.pfm and perhaps nonocc.png.
+        scenes: Rendered scenes of each kind.
+        save: JSON file for all figures of the folder of scenes, with commit and machine.
+    """
+    variants = without_one_part()
+    bench = bench_stereo(data, variants, repeats=1)
+    console = Console()
+    console.print(stereo_table(bench))
+    console.print(subpixel_table(bench_subpixel(variants, None, scenes)))
     if save is not None:
         write_json(save, bench)
 

@@ -19,6 +19,7 @@ from rich.table import Table
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.core.types import Disparity
 from barsight.evaluation.stereo_bar_scenes import PosedScene, bar_over_floor, tilted_floor
+from barsight.evaluation.stereo_limit import noise_limit_px
 from barsight.evaluation.stereo_provenance import Provenance, provenance
 from barsight.evaluation.stereo_render import BAR, FLOOR, Rendered, render
 from barsight.evaluation.stereo_scenes import load_scene
@@ -60,10 +61,11 @@ class SubpixelResult:
 
 @dataclass(frozen=True)
 class SubpixelBench:
-    """The whole run. scenes: rendered per kind."""
+    """The whole run. scenes: rendered per kind. limit_px: per kind the median of `noise_limit_px`."""
 
     provenance: Provenance
     scenes: int
+    limit_px: dict[str, float]
     methods: tuple[SubpixelResult, ...]
 
 
@@ -74,12 +76,14 @@ def bench_subpixel(
     `data`/motorcycle, where there is one, for sigma alone (its fractions are those of one geometry).
     """
     gathered: dict[str, dict[str, list[PixelErrors]]] = {name: {} for name in methods}
+    limits: dict[str, list[float]] = {kind: [] for kind in _KINDS}
     for kind, make in _KINDS.items():
         for index in range(scenes):
             rng = np.random.default_rng([seed, index, len(kind)])
             posed = make(rng)
             rendered = render(posed.scene, seed=1000 * seed + index)
             where = inner(rendered, BAR if posed.scene.bar else FLOOR)
+            limits[kind].append(noise_limit_px(rendered.pair, where))
             for name, method in methods.items():
                 found = method(rendered.pair, posed.candidates)
                 gathered[name].setdefault(kind, []).append(pixel_errors(found, rendered.truth_px, where))
@@ -93,7 +97,8 @@ def bench_subpixel(
         SubpixelResult(name, {kind: fraction_bias(errors) for kind, errors in kinds.items()})
         for name, kinds in gathered.items()
     )
-    return SubpixelBench(provenance(), scenes, results)
+    limit_px = {kind: float(np.median(limit)) for kind, limit in limits.items()}
+    return SubpixelBench(provenance(), scenes, limit_px, results)
 
 
 def inner(rendered: Rendered, surface: int) -> Bool:
@@ -110,7 +115,8 @@ def subpixel_table(bench: SubpixelBench) -> Table:
     table = Table(
         title="Below the pixel",
         caption="bias: median error per tenth of a pixel of the true disparity's fraction; "
-        f"{bench.scenes} rendered scenes of each kind",
+        f"{bench.scenes} rendered scenes of each kind. Limit that noise sets over the long support, 1 sigma: "
+        + ", ".join(f"{kind} {limit:.3f} px" for kind, limit in bench.limit_px.items()),
     )
     for heading in ("method", "scene"):
         table.add_column(heading)
