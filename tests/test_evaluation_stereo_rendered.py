@@ -19,6 +19,7 @@ from barsight.evaluation.stereo_limit import noise_limit_px
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.evaluation.stereo_render import BAR, FLOOR, Bar, Rendered, render
 from barsight.evaluation.stereo_scenes import pair_from_images
+from barsight.evaluation.stereo_steps import steps_picture
 from barsight.evaluation.stereo_subpixel import (
     bench_subpixel,
     fraction_bias,
@@ -267,3 +268,12 @@ def test_the_noise_limit_is_that_of_a_sine() -> None:
     limit = noise_limit_px(pair_from_images(images[0], images[1]), where)
     slope = (30 * np.sin(0.3)) ** 2 / 2
     assert limit == pytest.approx(np.sqrt(2 * 2.0**2 / (4 * np.pi * 16 * 1.5 * slope)), rel=0.1)
+
+
+def test_the_picture_of_the_steps_shows_less_error_after_refinement() -> None:
+    picture = steps_picture()
+    height, width = picture.shape[0] // 2, picture.shape[1] // 3
+    start, refined = (picture[height:, k * width : (k + 1) * width] for k in (0, 1))
+    middle = cv2.applyColorMap(np.full((1, 1), 128, np.uint8), cv2.COLORMAP_VIRIDIS)[0, 0].astype(int)
+    far = [np.abs(panel.astype(int) - middle).sum(axis=2).mean() for panel in (start, refined)]
+    assert far[1] < 0.9 * far[0]

@@ -19,6 +19,7 @@ from barsight.evaluation.stereo_ablation import without_one_part
 from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.evaluation.stereo_speed import bench_speed, speed_table
+from barsight.evaluation.stereo_steps import write_steps
 from barsight.evaluation.stereo_subpixel import bench_subpixel, subpixel_table
 from barsight.evaluation.stereo_target_size import (
     bench_target_size,
@@ -36,6 +37,7 @@ def run(arguments: Sequence[str]) -> None:
     benches: dict[str, Callable[..., None]] = {
         "stereo": _stereo,
         "stereo-speed": _stereo_speed,
+        "stereo-steps": _stereo_steps,
         "ablation": _ablation,
         "subpixel": _subpixel,
         "target-size": _target_size,
@@ -98,6 +100,15 @@ def _stereo_speed(methods: tuple[MethodName, ...] = METHODS, repeats: int = 5, s
     Console().print(speed_table(bench))
     if save is not None:
         write_json(save, bench)
+
+
+def _stereo_steps(out: Annotated[Path, tyro.conf.arg(aliases=("-o",))]) -> None:
+    """A picture of what each step of our own stereo does to a rendered bar.
+
+    Args:
+        out: PNG to write.
+    """
+    write_steps(out)
 
 
 def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = None) -> None:
