@@ -24,8 +24,7 @@ _ERROR_PX, _SIGMA_PX = 0.5, 0.5
 
 def steps_picture(seed: int = 3) -> UInt8:
     """(0.9 H, 1.35 W, 3) BGR. Above: left image; disparity; sigma. Below, error of the disparity: as
-    started, as
-    refined, with edges sharpened and guesses.
+    started, as refined, with edges sharpened and guesses.
     """
     posed = bar_over_floor(np.random.default_rng(seed), _RANGE_M, _GLOSS, raised_m=0.15)
     rendered = render(posed.scene, seed)
