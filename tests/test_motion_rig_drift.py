@@ -9,7 +9,7 @@ from barsight.calibration.rectification import Rectifier
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, RigDrift
 from barsight.features.guided import project_stereo
-from barsight.motion import fusion, rig_drift
+from barsight.motion import fusion
 from barsight.motion.crane import CraneSettings
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
 from barsight.motion.rig_drift import MATCHING_BIAS_PX
@@ -74,14 +74,13 @@ def drift_of(recording: MemoryRecording, sightings: list[Sighting], patch: pytes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bias_px", [0.0, MATCHING_BIAS_PX])
-def test_errors_are_as_large_as_stated(bias_px: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rig_drift, "MATCHING_BIAS_PX", bias_px)
+def test_errors_are_as_large_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Matching biases and scale drawn as the stated sigma has them; noise alone would be understated."""
     squares = []
     for seed in range(40):
         rng = np.random.default_rng((seed, 1))
         truth = rng.normal(0, [np.deg2rad(0.03), FusionSettings().scale_sigma])
-        found = drift_of(*travel(seed, *truth, bias_px), monkeypatch)
+        found = drift_of(*travel(seed, *truth, MATCHING_BIAS_PX), monkeypatch)
         error = np.array([found.yaw_rad, found.scale]) - truth
         squares.append(error @ np.linalg.solve(found.covariance, error) / 2)
     assert 0.75 < np.mean(squares) < 1.3
