@@ -21,8 +21,9 @@ from barsight.motion.problem import Placed, Problem
 from barsight.motion.rig_drift import HUBER_SIGMAS
 
 FARTHEST_SIGMAS = 5.0
-LEAST_SIGMA_M = 0.001
-"""What a parabola through the readings may be off by while the crane jerks."""
+LEAST_SIGMA_M = 0.0003
+LEAST_AGREEING_SIGMA_M = 0.001
+"""What a parabola through the readings may be off by while the crane jerks, which isn't a disagreement."""
 NOTED_LATENCY_SIGMAS = 5.0
 NOTED_LATENCY_S = 0.005
 
@@ -61,7 +62,7 @@ def disagreement(values: Any, problem: Problem) -> Float64:
 
 def agreeing(values: Any, problem: Problem) -> Bool:
     """(P,) places within 5 sigma of the poses."""
-    sigma = np.array([max(place.sigma_m, LEAST_SIGMA_M) for place in problem.placed])
+    sigma = np.array([max(place.sigma_m, LEAST_AGREEING_SIGMA_M) for place in problem.placed])
     kept: Bool = np.linalg.norm(disagreement(values, problem), axis=1) < FARTHEST_SIGMAS * sigma
     return kept
 
