@@ -27,15 +27,18 @@ class Placed:
     translation_m: np.ndarray
 
 
-def place(rng: np.random.Generator) -> Placed:
+def place(rng: np.random.Generator, points_m: np.ndarray = BOARD.points_m) -> Placed:
     rotation = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
     z = rng.uniform(0.7, 1.2)
     centre = np.array([rng.uniform(-0.35, 0.35) * z, rng.uniform(-0.3, 0.3) * z, z])
-    return Placed(rotation, centre - rotation @ BOARD.points_m.mean(axis=0))
+    return Placed(rotation, centre - rotation @ points_m.mean(axis=0))
 
 
-def seen(placed: Placed, name: str, rng: np.random.Generator, sigma: float, scale: float = 1.0) -> BoardView:
-    points = scale * BOARD.points_m @ placed.rotation.T + placed.translation_m
+def seen(
+    placed: Placed, name: str, rng: np.random.Generator, sigma: float, scale: float = 1.0,
+    points_m: np.ndarray = BOARD.points_m,
+) -> BoardView:  # fmt: skip
+    points = scale * points_m @ placed.rotation.T + placed.translation_m
     pixels = [CAM0.project(points), CAM1.project(points @ ROTATION.T + TRANSLATION_M)]
     corners = []
     for projected in pixels:
@@ -45,11 +48,14 @@ def seen(placed: Placed, name: str, rng: np.random.Generator, sigma: float, scal
     return BoardView(name, corners[0], corners[1])
 
 
-def simulated(seed: int, sigma: float = 0.2, count: int = 16) -> list[BoardView]:
+def simulated(
+    seed: int, sigma: float = 0.2, count: int = 16, points_m: np.ndarray = BOARD.points_m
+) -> list[BoardView]:
+    """points_m: where the board's points truly lie."""
     rng = np.random.default_rng(seed)
     views: list[BoardView] = []
     while len(views) < count:
-        view = seen(place(rng), f"{len(views):02d}", rng, sigma)
+        view = seen(place(rng, points_m), f"{len(views):02d}", rng, sigma, points_m=points_m)
         if min(corners.ids.size for corners in view.cameras if corners) >= 20:
             views.append(view)
     return views

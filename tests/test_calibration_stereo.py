@@ -86,6 +86,30 @@ def test_errors_over_sigma_over_24_seeds() -> None:
     assert 0.4 <= np.mean(np.square(depth)) <= 1.8
 
 
+def test_a_bowed_board_with_small_tags_is_recovered_with_honest_sigmas() -> None:
+    board, truth = parse_board("aprilgrid:4x4:0.06:0.3"), np.array([1.5e-3, -0.8e-3, -0.01])
+    points = board.points_m
+    across = (points[:, :2] - points[:, :2].mean(axis=0)) / np.ptp(points[:, :2], axis=0) * 2
+    points[:, 2] = (1 - across**2) @ truth[:2]
+    tags = points.reshape(-1, 4, 3)
+    middle = tags.mean(axis=1, keepdims=True)[:, :, :2]
+    tags[:, :, :2] = middle + (1 + truth[2]) * (tags[:, :, :2] - middle)
+    shapes, rigs, flat = [], [], []
+    for seed in range(12):
+        views = simulated(seed, points_m=points)
+        calibration = calibrate_stereo(views, board, Lens.RADTAN4, (SIZE, SIZE), Path("simulated"))
+        off = error(calibration)
+        rigs.append(off @ np.linalg.solve(calibration.covariance, off) / off.size)
+        shape = calibration.shape
+        shapes.append((shape.values - truth) / shape.sigma)
+        flat.append(truth / shape.sigma)
+    assert np.abs(shapes).max() < 3.5
+    assert np.abs(np.mean(shapes, axis=0)).max() < 1
+    assert np.abs(flat).min() > 10
+    assert 0.8 <= np.mean(rigs) <= 1.25
+    assert 0.5 <= np.mean(np.square(shapes)) <= 1.7
+
+
 def test_halves_agree_within_their_sigmas() -> None:
     ratios = []
     for seed in range(6):

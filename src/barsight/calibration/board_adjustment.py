@@ -1,4 +1,4 @@
-"""The least squares of a calibration: lenses, the rig's extrinsics and every view's board pose at once.
+"""The least squares of a calibration: lenses, the rig, the board's shape and every view's board pose at once.
 
 A board point P_W is seen as P_L = R_L P_W + T_L by cam0 and as P_R = R P_L + T by cam1 [paper Eq. 1-3]; the
 residuals are its pixels. Board poses only meet the common parameters, so the normal equations are solved by
@@ -20,16 +20,22 @@ from barsight.core.arrays import Float64, Int64
 MOST_STEPS = 100
 COST_TOLERANCE = 1e-12
 NEAREST_Z_M = 1e-3
+SHAPE_PX = 0.2
+"""The corner noise at which the board's shape is expected as `shape_basis` says."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """One camera's corners, sorted by view. view, ids: (N,). points_m: (N, 3). pixels: (N, 2)."""
+    """One camera's corners, sorted by view. view, ids: (N,). points_m: (N, 3). pixels: (N, 2).
+
+    by_shape: (N, 3, S) how the points move with the board's shape.
+    """
 
     view: Int64
     ids: Int64
     points_m: Float64
     pixels: Float64
+    by_shape: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +43,7 @@ class State:
     """lenses: a parameter vector per camera. cam1_from_cam0, cam0_from_board: rotations and translations.
 
     rotation (3, 3), translation_m (3,) of the rig; board_rotation (V, 3, 3), board_translation_m (V, 3).
+    shape: (S,) steps of the board's shape, none for a flat one.
     """
 
     lenses: tuple[Float64, ...]
@@ -44,6 +51,7 @@ class State:
     translation_m: Float64
     board_rotation: Float64
     board_translation_m: Float64
+    shape: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +68,13 @@ class Solved:
     steps: int
     converged: bool
 
+    @property
+    def rig_information(self) -> Float64:
+        """`reduced` of lenses and rig alone, the board's shape eliminated."""
+        own = self.reduced.shape[0] - self.state.shape.size
+        mixed = self.reduced[:own, own:]
+        return self.reduced[:own, :own] - mixed @ np.linalg.solve(self.reduced[own:, own:], mixed.T)
+
 
 @dataclass(frozen=True, eq=False)
 class _Normal:
@@ -74,8 +89,10 @@ class _Normal:
     view_gradient: Float64
 
 
-def observe(views: Sequence[BoardView], board_points_m: Float64, cameras: int) -> tuple[Observed, ...]:
-    """The corners of all views as flat arrays, for the first `cameras` cameras."""
+def observe(
+    views: Sequence[BoardView], board_points_m: Float64, basis: Float64, cameras: int
+) -> tuple[Observed, ...]:
+    """The corners of all views as flat arrays, for the first `cameras` cameras. basis: as of `shape_basis`."""
     gathered = []
     for camera in range(cameras):
         seen = [(number, view.cameras[camera]) for number, view in enumerate(views)]
@@ -83,14 +100,14 @@ def observe(views: Sequence[BoardView], board_points_m: Float64, cameras: int) -
         index = [np.full(corners.ids.size, number) for number, corners in known]
         ids = np.concatenate([corners.ids for _, corners in known]).astype(np.int64)
         pixels = np.concatenate([corners.pixels for _, corners in known])
-        gathered.append(Observed(np.concatenate(index), ids, board_points_m[ids], pixels))
+        gathered.append(Observed(np.concatenate(index), ids, board_points_m[ids], pixels, basis[ids]))
     return tuple(gathered)
 
 
 def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float | None) -> Solved:
     """Levenberg-Marquardt from `start`; huber_px is where a residual's weight begins to fall, None for never.
 
-    One camera: its lens and the boards. Two: the rig too. `converged` is False where the steps ran out.
+    One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one. `converged` is False where the steps ran out.
     """
     state, damping, steps, converged = start, 1e-3, 0, False
     normal = _linearise(lens, seen, state, huber_px)
@@ -110,7 +127,7 @@ def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float 
     scores = plain.view_gradient - np.einsum("vci,vij,vj->vc", plain.mixed, inverse, plain.board_gradient)
     view_reduced = plain.view_common - lost
     return Solved(
-        state, plain.residuals, view_reduced.sum(axis=0), view_reduced, scores, steps,
+        state, plain.residuals, plain.common - lost.sum(axis=0), view_reduced, scores, steps,
         converged and damping <= 1e10,
     )  # fmt: skip
 
@@ -118,11 +135,12 @@ def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float 
 def _linearise(lens: Lens, seen: tuple[Observed, ...], state: State, huber_px: float | None) -> _Normal:
     width = len(lens.parameter_names)
     count = state.board_rotation.shape[0]
-    size = width * len(seen) + (6 if len(seen) == 2 else 0)
+    shape = state.shape.size
+    size = width * len(seen) + (6 if len(seen) == 2 else 0) + shape
     common, gradient = np.zeros((count, size, size)), np.zeros((count, size))
     mixed = np.zeros((count, size, 6))
     boards, board_gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    cost, residuals = 0.0, []
+    cost, residuals = SHAPE_PX**2 * float(state.shape @ state.shape), []
     for camera, observed in enumerate(seen):
         residual, by_common, by_board = _derivatives(lens, observed, state, camera)
         length = np.linalg.norm(residual, axis=1)
@@ -135,6 +153,7 @@ def _linearise(lens: Lens, seen: tuple[Observed, ...], state: State, huber_px: f
         columns = np.arange(width) + camera * width
         if camera == 1:
             columns = np.concatenate([columns, 2 * width + np.arange(6)])
+        columns = np.concatenate([columns, size - shape + np.arange(shape)])
         starts = np.flatnonzero(np.diff(observed.view, prepend=-1))
         ends = np.append(starts[1:], observed.view.size)
         for first, last in zip(starts, ends, strict=True):
@@ -150,8 +169,12 @@ def _linearise(lens: Lens, seen: tuple[Observed, ...], state: State, huber_px: f
             gradient[view][columns] += wa.T @ r
             board_gradient[view] += wb.T @ r
         residuals.append(residual)
+    whole, pull = common.sum(axis=0), gradient.sum(axis=0)
+    own = np.arange(size - shape, size)
+    whole[own, own] += SHAPE_PX**2
+    pull[own] -= SHAPE_PX**2 * state.shape
     return _Normal(
-        cost, tuple(residuals), common.sum(axis=0), gradient.sum(axis=0), mixed, boards,
+        cost, tuple(residuals), whole, pull, mixed, boards,
         board_gradient, common, gradient,
     )  # fmt: skip
 
@@ -160,19 +183,22 @@ def _derivatives(
     lens: Lens, observed: Observed, state: State, camera: int
 ) -> tuple[Float64, Float64, Float64]:
     """Residuals (N, 2) and the projection's derivatives by the common (N, 2, C) and board (N, 2, 6) steps."""
-    turned = np.einsum("nij,nj->ni", state.board_rotation[observed.view], observed.points_m)
+    rotation = state.board_rotation[observed.view]
+    turned = np.einsum("nij,nj->ni", rotation, observed.points_m + observed.by_shape @ state.shape)
+    by_shape = rotation @ observed.by_shape
     point = turned + state.board_translation_m[observed.view]
     by_board = np.concatenate([-_cross(turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
     if camera == 1:
         rig_turned = point @ state.rotation.T
         point = rig_turned + state.translation_m
-        by_board = state.rotation @ by_board
+        by_board, by_shape = state.rotation @ by_board, state.rotation @ by_shape
     point = np.column_stack([point[:, :2], np.maximum(point[:, 2], NEAREST_Z_M)])
     projected = project(lens, state.lenses[camera], point)
     by_common = projected.by_lens
     if camera == 1:
         by_rig = np.concatenate([-_cross(rig_turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
         by_common = np.concatenate([by_common, projected.by_point @ by_rig], axis=2)
+    by_common = np.concatenate([by_common, projected.by_point @ by_shape], axis=2)
     return observed.pixels - projected.pixels, by_common, projected.by_point @ by_board
 
 
@@ -193,7 +219,10 @@ def _move(state: State, normal: _Normal, damping: float) -> State | None:
 
 
 def move(state: State, common: Float64, boards: Float64 | None = None) -> State:
-    """`state` after a step (C,) of the common parameters and (V, 6) of the boards, turned from the left."""
+    """`state` after a step (C,) of the common parameters and (V, 6) of the boards, turned from the left.
+
+    A step without the board's shape leaves it as it is.
+    """
     width = state.lenses[0].size
     lenses = tuple(
         lens + common[camera * width : (camera + 1) * width] for camera, lens in enumerate(state.lenses)
@@ -202,8 +231,11 @@ def move(state: State, common: Float64, boards: Float64 | None = None) -> State:
     if len(lenses) == 2:
         turn = Rotation.from_rotvec(common[2 * width : 2 * width + 3]).as_matrix()
         moved = replace(
-            moved, rotation=turn @ state.rotation, translation_m=state.translation_m + common[2 * width + 3 :]
-        )
+            moved, rotation=turn @ state.rotation,
+            translation_m=state.translation_m + common[2 * width + 3 : 2 * width + 6],
+        )  # fmt: skip
+        if common.size > 2 * width + 6:
+            moved = replace(moved, shape=state.shape + common[2 * width + 6 :])
     if boards is not None:
         turns = Rotation.from_rotvec(boards[:, :3]).as_matrix()
         moved = replace(

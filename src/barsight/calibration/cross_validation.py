@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.calibration.board_adjustment import Solved, observe, solve
+from barsight.calibration.board_shape import shape_basis
 from barsight.calibration.calibration_uncertainty import (
     depth_derivatives,
     picture_grid,
@@ -75,7 +76,7 @@ def _solve_half(calibration: StereoCalibration, half: list[BoardView]) -> Solved
         board_rotation=calibration.state.board_rotation[rows],
         board_translation_m=calibration.state.board_translation_m[rows],
     )
-    seen = observe(half, calibration.board.points_m, 2)
+    seen = observe(half, calibration.board.points_m, shape_basis(calibration.board), 2)
     return solve(calibration.lens, seen, state, None)
 
 
@@ -89,7 +90,7 @@ def _half_covariance(calibration: StereoCalibration, half: Solved) -> Float64:
     unit = scale[:, None] * scale
     root = _power(calibration.information * unit, 0.5)
     widening = root @ (calibration.covariance / unit) @ root
-    inverse_root = _power(half.reduced * unit, -0.5)
+    inverse_root = _power(half.rig_information * unit, -0.5)
     covariance: Float64 = inverse_root @ widening @ inverse_root * unit
     return covariance
 

@@ -47,6 +47,12 @@ def write_rig_file(
             "rms_px": calibration.rms_px,
             "corner_sigma_px": calibration.sigma_px,
             "baseline_sigma_m": calibration.baseline_sigma_m,
+            "board_shape": {
+                name: {"value": float(value), "sigma": float(sigma)}
+                for name, value, sigma in zip(
+                    calibration.shape.names, calibration.shape.values, calibration.shape.sigma, strict=True
+                )
+            },
             "parameters": list(calibration.parameter_names),
             "sigmas": [float(value) for value in sigmas],
             "covariance": [[float(value) for value in row] for row in calibration.covariance],

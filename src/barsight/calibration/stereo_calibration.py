@@ -2,7 +2,7 @@
 
 Blurred pictures, corners and views that don't fit are taken out one kind after the other, each with its
 reason. The covariance is that of the least squares, widened where the residuals of a view hang together more
-than independent corner noise would (a bent board, cameras not triggered at once).
+than independent corner noise would (a warped board, cameras not triggered at once).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.calibration.board_adjustment import Observed, Solved, State, observe, solve
+from barsight.calibration.board_shape import BoardShape, board_shape, shape_basis
 from barsight.calibration.boards import Board
 from barsight.calibration.camera import Camera
 from barsight.calibration.covariance_widening import widened
@@ -46,8 +47,9 @@ class StereoCalibration:
     residuals_px: per camera (N, 2), seen minus projected, in the order of `observed`. sigma_px: one corner
     coordinate's noise. correlation: the factor on the variances by which views scatter more than
     independent corners would (1: none). parameter_names: (C,), covariance: (C, C); the rig's rotation is a
-    small turn (rad) of cam1_from_cam0 from the left. information: (C, C), the inverse covariance at unit
-    noise. alone_rms_px: each camera solved alone.
+    small turn (rad) of cam1_from_cam0 from the left; what the board's shape leaves open is counted.
+    information: (C, C), the inverse covariance at unit noise. shape: the board's, solved with the rest.
+    alone_rms_px: each camera solved alone, with a flat board.
     """
 
     source: Path
@@ -64,6 +66,7 @@ class StereoCalibration:
     parameter_names: tuple[str, ...]
     covariance: Float64
     information: Float64
+    shape: BoardShape
     alone_rms_px: tuple[float, float]
 
     @property
@@ -88,7 +91,7 @@ def calibrate_stereo(
     Raises CalibrationError where too few views are left, the cameras are swapped, or the equations leave
     something undetermined.
     """
-    points = board.points_m
+    points, basis = board.points_m, shape_basis(board)
     kept, small = drop_small(views)
     removed = [*left_out, *small]
     _expect_views(kept, source, removed)
@@ -103,8 +106,9 @@ def calibrate_stereo(
     cameras = (_camera(lens, lenses[0], sizes[0], source), _camera(lens, lenses[1], sizes[1], source))
     before = {view.name: view for view in kept}
     start = _start(cameras, (lenses[0], lenses[1]), kept, points, source, removed)
+    start = replace(start, shape=np.zeros(basis.shape[2]))
     for _ in range(MOST_ROUNDS):
-        observed = observe(kept, points, 2)
+        observed = observe(kept, points, basis, 2)
         solved = solve(lens, observed, start, HUBER_PX)
         _expect_order(solved.state, source)
         remaining, out = drop_misfits(kept, observed, solved, start, cameras, points)
@@ -128,7 +132,7 @@ def rms(residuals: Float64) -> float:
 
 
 def covariance_of(solved: Solved, corners: int, views: int) -> tuple[Float64, float, float]:
-    """(covariance (C, C), sigma_px, correlation) of the common parameters; see `StereoCalibration`.
+    """(covariance (C, C), sigma_px, correlation) of the common parameters, the board's shape last.
 
     Widened where views hang together; see `covariance_widening`.
     """
@@ -199,10 +203,11 @@ def _solve_alone(
     guess = lens.camera(start, *size)
     poses = [board_pose(guess, c, points) for c in corners]
     state = State(
-        (start,), np.eye(3), np.zeros(3), np.array([p[0] for p in poses]), np.array([p[1] for p in poses])
-    )
+        (start,), np.eye(3), np.zeros(3), np.array([p[0] for p in poses]), np.array([p[1] for p in poses]),
+        np.zeros(0),
+    )  # fmt: skip
     single = [BoardView(view.name, c, None) for view, c in zip(views, corners, strict=True)]
-    return solve(lens, observe(single, points, 1), state, HUBER_PX)
+    return solve(lens, observe(single, points, np.zeros((*points.shape, 0)), 1), state, HUBER_PX)
 
 
 def _camera(lens: Lens, parameters: Float64, size: tuple[int, int], source: Path) -> Camera:
@@ -254,7 +259,10 @@ def _finish(
         ) from None
     except ValueError as error:
         raise CalibrationError(source, str(error), "check the pictures' order and --board") from None
+    names = parameter_names(lens)
+    own = len(names)
     return StereoCalibration(
         source, board, lens, rig, solved.state, tuple(kept), observed, tuple(removed),
-        solved.residuals_px, sigma, correlation, parameter_names(lens), covariance, solved.reduced, alone,
+        solved.residuals_px, sigma, correlation, names, covariance[:own, :own], solved.rig_information,
+        board_shape(board, solved.state.shape, covariance[own:, own:]), alone,
     )  # fmt: skip

@@ -105,7 +105,7 @@ def start_rig(
         elif right is not None:
             board_rotation[number] = rotation.T @ right[0]
             board_translation[number] = rotation.T @ (right[1] - translation)
-    return State(lenses, rotation, translation, board_rotation, board_translation)
+    return State(lenses, rotation, translation, board_rotation, board_translation, np.zeros(0))
 
 
 def _middle_rotation(rotations: Float64) -> Float64:

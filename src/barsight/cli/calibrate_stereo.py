@@ -174,3 +174,4 @@ def _print(console: Console, calibration: StereoCalibration, out: Path, html: Pa
         f"{escape(str(html))}",
         soft_wrap=True, highlight=False,
     )  # fmt: skip
+    console.print(f"board: {calibration.shape}", soft_wrap=True, highlight=False)

@@ -40,6 +40,13 @@ def calibration_summary(calibration: StereoCalibration, assessment: Assessment) 
         "software": {"name": "barsight", "version": barsight.__version__},
         "source": calibration.source.name,
         "board": str(calibration.board),
+        "board_shape": [
+            {"name": name, "value": float(value), "sigma": float(sigma)}
+            for name, value, sigma in zip(
+                calibration.shape.names, calibration.shape.values, calibration.shape.sigma, strict=True
+            )
+        ],
+        "board_shape_words": str(calibration.shape),
         "lens": str(calibration.lens),
         "verdict": str(assessment.verdict),
         "lines": [

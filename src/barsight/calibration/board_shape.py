@@ -1,0 +1,75 @@
+"""The shape of a board that is neither flat nor printed quite as stated, in a few numbers [mrcal].
+
+A parabola along each of its axes, zero at the ends, and for an AprilGrid the tags' size about their centres.
+The pitch from tag to tag (square to square) stays the stated one: it is the calibration's metre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.calibration.boards import Board, BoardKind
+from barsight.core.arrays import Float64
+
+BOW_SIGMA_M = 2e-3
+TAG_SIGMA = 0.01
+"""What is expected of boards before any is seen: weak, so that only few views are held by it."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardShape:
+    """A board's shape as found. values: (S,) bow_x_m and bow_y_m, the middle's height along the board's z over
+    its ends; tag_share, by how much the tags are larger than stated. covariance: (S, S)."""
+
+    names: tuple[str, ...]
+    values: Float64
+    covariance: Float64
+
+    @property
+    def sigma(self) -> Float64:
+        """(S,) one standard deviation each."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def __str__(self) -> str:
+        words = {"bow_x_m": ("bow along x", 1e3, "mm"), "bow_y_m": ("along y", 1e3, "mm"),
+                 "tag_share": ("tags larger by", 1e2, "%")}  # fmt: skip
+        parts = []
+        for name, value, sigma in zip(self.names, self.values, self.sigma, strict=True):
+            text, factor, unit = words[name]
+            parts.append(f"{text} {factor * value:+.2f} ± {factor * sigma:.2f} {unit}")
+        return ", ".join(parts)
+
+
+def board_shape(board: Board, steps: Float64, covariance: Float64) -> BoardShape:
+    """The shape of (S,) steps along `shape_basis` and their covariance (S, S)."""
+    unit = _units(board)
+    names = ("bow_x_m", "bow_y_m", "tag_share")[: unit.size]
+    return BoardShape(names, unit * steps, covariance * unit[:, None] * unit)
+
+
+def shape_basis(board: Board) -> Float64:
+    """(N, 3, S) m: how the board's points move with each number of its shape, by what is expected of it."""
+    points = board.points_m
+    low, high = points.min(axis=0), points.max(axis=0)
+    across = (2 * points - low - high)[:, :2] / (high - low)[:2]
+    unit = _units(board)
+    basis = np.zeros((len(points), 3, unit.size))
+    basis[:, 2, :2] = 1 - across**2
+    if board.kind is BoardKind.APRILGRID:
+        tags = points.reshape(-1, 4, 3)
+        basis[:, :, 2] = (tags - tags.mean(axis=1, keepdims=True)).reshape(-1, 3)
+    scaled: Float64 = basis * unit
+    return scaled
+
+
+def shaped_points(board: Board, shape: BoardShape) -> Float64:
+    """(N, 3) the points of a board of that shape."""
+    points: Float64 = board.points_m + shape_basis(board) @ (shape.values / _units(board))
+    return points
+
+
+def _units(board: Board) -> Float64:
+    tag = [TAG_SIGMA] if board.kind is BoardKind.APRILGRID else []
+    return np.array([BOW_SIGMA_M, BOW_SIGMA_M, *tag])
