@@ -92,7 +92,7 @@ class _Normal:
 def observe(
     views: Sequence[BoardView], board_points_m: Float64, basis: Float64, cameras: int
 ) -> tuple[Observed, ...]:
-    """The corners of all views as flat arrays, for the first `cameras` cameras. basis: as of `shape_basis`."""
+    """The corners of all views as flat arrays, for the first `cameras` cameras; basis: of `shape_basis`."""
     gathered = []
     for camera in range(cameras):
         seen = [(number, view.cameras[camera]) for number, view in enumerate(views)]
@@ -107,7 +107,8 @@ def observe(
 def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float | None) -> Solved:
     """Levenberg-Marquardt from `start`; huber_px is where a residual's weight begins to fall, None for never.
 
-    One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one. `converged` is False where the steps ran out.
+    One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one.
+    `converged` is False where the steps ran out.
     """
     state, damping, steps, converged = start, 1e-3, 0, False
     normal = _linearise(lens, seen, state, huber_px)

@@ -1,7 +1,8 @@
 """The shape of a board that is neither flat nor printed quite as stated, in a few numbers [mrcal].
 
-A parabola along each of its axes, zero at the ends, and for an AprilGrid the tags' size about their centres.
-The pitch from tag to tag (square to square) stays the stated one: it is the calibration's metre.
+A parabola along each of its axes, zero at the ends; the print's stretch and skew; for an AprilGrid the tags'
+size about their centres. The mean pitch from tag to tag (square to square) stays the stated one: it is the
+calibration's metre.
 """
 
 from __future__ import annotations
@@ -15,13 +16,18 @@ from barsight.core.arrays import Float64
 
 BOW_SIGMA_M = 2e-3
 TAG_SIGMA = 0.01
+PRINT_SIGMA = 3e-3
 """What is expected of boards before any is seen: weak, so that only few views are held by it."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardShape:
-    """A board's shape as found. values: (S,) bow_x_m and bow_y_m, the middle's height along the board's z over
-    its ends; tag_share, by how much the tags are larger than stated. covariance: (S, S)."""
+    """A board's shape as found.
+
+    values: (S,) bow_x_m and bow_y_m, the middle's height along the board's z over its ends; stretch_share, by
+    how much x is longer than y; skew_rad, by how much the angle between x and y is less than a right one;
+    tag_share, by how much the tags are larger than stated. covariance: (S, S).
+    """
 
     names: tuple[str, ...]
     values: Float64
@@ -34,6 +40,7 @@ class BoardShape:
 
     def __str__(self) -> str:
         words = {"bow_x_m": ("bow along x", 1e3, "mm"), "bow_y_m": ("along y", 1e3, "mm"),
+                 "stretch_share": ("x longer than y by", 1e2, "%"), "skew_rad": ("skewed by", 1e3, "mrad"),
                  "tag_share": ("tags larger by", 1e2, "%")}  # fmt: skip
         parts = []
         for name, value, sigma in zip(self.names, self.values, self.sigma, strict=True):
@@ -45,7 +52,7 @@ class BoardShape:
 def board_shape(board: Board, steps: Float64, covariance: Float64) -> BoardShape:
     """The shape of (S,) steps along `shape_basis` and their covariance (S, S)."""
     unit = _units(board)
-    names = ("bow_x_m", "bow_y_m", "tag_share")[: unit.size]
+    names = ("bow_x_m", "bow_y_m", "stretch_share", "skew_rad", "tag_share")[: unit.size]
     return BoardShape(names, unit * steps, covariance * unit[:, None] * unit)
 
 
@@ -57,9 +64,12 @@ def shape_basis(board: Board) -> Float64:
     unit = _units(board)
     basis = np.zeros((len(points), 3, unit.size))
     basis[:, 2, :2] = 1 - across**2
+    middle = points[:, :2] - (low + high)[:2] / 2
+    basis[:, :2, 2] = middle * [0.5, -0.5]
+    basis[:, :2, 3] = middle[:, ::-1] / 2
     if board.kind is BoardKind.APRILGRID:
         tags = points.reshape(-1, 4, 3)
-        basis[:, :, 2] = (tags - tags.mean(axis=1, keepdims=True)).reshape(-1, 3)
+        basis[:, :, 4] = (tags - tags.mean(axis=1, keepdims=True)).reshape(-1, 3)
     scaled: Float64 = basis * unit
     return scaled
 
@@ -72,4 +82,4 @@ def shaped_points(board: Board, shape: BoardShape) -> Float64:
 
 def _units(board: Board) -> Float64:
     tag = [TAG_SIGMA] if board.kind is BoardKind.APRILGRID else []
-    return np.array([BOW_SIGMA_M, BOW_SIGMA_M, *tag])
+    return np.array([BOW_SIGMA_M, BOW_SIGMA_M, PRINT_SIGMA, PRINT_SIGMA, *tag])
