@@ -159,7 +159,7 @@ def measure(
 
     with watch("surface"):
         min_views = settings.map.min_views if used > 1 else 1
-        sights = Sights.of(placed, rectifier.camera)
+        sights = Sights.of(placed, rectifier.camera, per_pixel)
         surface = finish(store, scratch, cell_m, min_views, settings.map, sights)
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")

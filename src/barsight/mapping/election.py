@@ -9,7 +9,7 @@ votes alone would have it. A height that fewer than `min_views` views can see at
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -32,20 +32,22 @@ _NOTHING = np.float32(-1e6)
 @dataclass(frozen=True, eq=False)
 class Sights:
     """Where K views were taken from: rect0_from_reference as rotation (K, 3, 3) and translation (K, 3), and
-    the places of both cameras (K, 2, 3) in the reference frame."""
+    the places of both cameras (K, 2, 3) in the reference frame. spacing_rad: angle between points."""
 
     camera: RectifiedCamera
+    spacing_rad: float
     rotation: Float64
     translation: Float64
     eyes: Float64
 
     @classmethod
-    def of(cls, poses: Sequence[Pose], camera: RectifiedCamera) -> Sights:
+    def of(cls, poses: Sequence[Pose], camera: RectifiedCamera, points_per_pixel: int = 1) -> Sights:
         """From the views' reference_from_rect0."""
         inverses = [pose.inverse() for pose in poses]
         both = np.array([[0.0, 0.0, 0.0], [camera.baseline_m, 0.0, 0.0]])
         return cls(
             camera,
+            1 / (camera.focal_px * points_per_pixel),
             np.array([pose.rotation for pose in inverses]).reshape(-1, 3, 3),
             np.array([pose.translation for pose in inverses]).reshape(-1, 3),
             np.array([pose.apply(both) for pose in poses]).reshape(-1, 2, 3),
@@ -60,7 +62,12 @@ class Sights:
             u, v = camera.focal_px * x / depth + camera.cx_px, camera.focal_px * y / depth + camera.cy_px
         touched = (u.max(1) >= 0) & (u.min(1) <= camera.width) & (v.max(1) >= 0) & (v.min(1) <= camera.height)
         chosen = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
-        return Sights(camera, self.rotation[chosen], self.translation[chosen], self.eyes[chosen])
+        return replace(
+            self,
+            rotation=self.rotation[chosen],
+            translation=self.translation[chosen],
+            eyes=self.eyes[chosen],
+        )
 
 
 def first_heights(tile: Float32, min_views: int, top_share: float) -> Float32:
@@ -95,11 +102,13 @@ def elect(
     box = np.array([[*corner, held.min() / cell_m], [*(corner + TILE_CELLS), held.max() / cell_m]]) * cell_m
     sights = sights.near(*box)
     around = np.where(known, around, _NOTHING)
-    share = _supported(
+    share, expected = _supported(
         tile, corner, around, ceiling, lens, size, sights.rotation, sights.translation, sights.eyes,
-        cell_m, float(min_views),
+        cell_m, float(min_views), cell_m / sights.spacing_rad,
     )  # fmt: skip
-    return _elected(tile, share, around, cell_m, settings.inner_share, settings.rim_share)
+    return _elected(
+        tile, share, expected, around, cell_m, float(min_views), settings.inner_share, settings.rim_share
+    )
 
 
 @kernel(parallel=True)
@@ -115,11 +124,17 @@ def _supported(
     eyes: Float64,
     cell_m: float,
     min_views: float,
-) -> Float32:
-    """(rows, columns, SLOTS) the share of those views that can see a height which do see it in the cell's
-    middle; -1 where fewer than min_views see or can see it."""
+    one_point_m: float,
+) -> tuple[Float32, Float32]:
+    """Two arrays (rows, columns, SLOTS): the share of the votes that a height can expect which it has, -1
+    where fewer than min_views see or can see it; and how many it can expect.
+
+    A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
+    further apart than cells: at ranges over one_point_m, and where it looks along the ground.
+    """
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
+    expected = np.zeros((rows, columns, SLOTS), np.float32)
     for i in prange(rows):
         for j in range(columns):
             for s in range(SLOTS):
@@ -127,20 +142,29 @@ def _supported(
                     continue
                 z = float(tile[i, j, s, Z])
                 point = np.array([(corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z])
-                able = 0
+                able, votes = 0, 0.0
                 for k in range(rotation.shape[0]):
                     if _inside(point, lens, size, rotation[k], translation[k]):
                         free = _free(point, i, j, eyes[k, 0], around, ceiling, cell_m)
                         if free and _free(point, i, j, eyes[k, 1], around, ceiling, cell_m):
                             able += 1
+                            votes += _density(point, eyes[k, 0], one_point_m)
                 if able >= min_views:
-                    share[i, j, s] = min(tile[i, j, s, CENTRAL] / able, 1.0)
-    return share
+                    share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
+                    expected[i, j, s] = votes
+    return share, expected
 
 
 @kernel(parallel=True)
 def _elected(
-    tile: Float32, share: Float32, around: Float32, cell_m: float, inner_share: float, rim_share: float
+    tile: Float32,
+    share: Float32,
+    expected: Float32,
+    around: Float32,
+    cell_m: float,
+    min_views: float,
+    inner_share: float,
+    rim_share: float,
 ) -> Int8:
     rows, columns = tile.shape[:2]
     winner = np.full((rows, columns), -1, np.int8)
@@ -151,7 +175,8 @@ def _elected(
                 z = float(tile[i, j, s, Z])
                 if share[i, j, s] < 0 or (best >= 0 and z <= tile[i, j, best, Z]):
                     continue
-                if _at_rim(z, i, j, around, cell_m):
+                # Where views expect less than min_views points a cell, an empty neighbour says nothing.
+                if expected[i, j, s] >= min_views and _at_rim(z, i, j, around, cell_m):
                     enough = _share_along(tile, share, i, j, z, cell_m) >= rim_share
                 else:
                     enough = share[i, j, s] >= inner_share
@@ -182,6 +207,14 @@ def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float,
         if alike > most:
             most, result = alike, total / inside
     return result
+
+
+@kernel()
+def _density(point: Float64, eye: Float64, one_point_m: float) -> float:
+    """Points that a view has in a level cell, at most 1."""
+    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
+    squared = x * x + y * y + z * z
+    return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
 
 
 @kernel()
