@@ -10,10 +10,18 @@ import tyro
 from rich.console import Console
 
 from barsight.core.errors import ConfigError
-from barsight.evaluation.bundle_scores import bundle_report, bundle_table, read_true_bundles, score_bundles
+from barsight.evaluation.bundle_scores import (
+    bundle_report,
+    bundle_table,
+    read_true_bundles,
+    reliability,
+    score_bundles,
+)
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.simulation.bundle_bench import bench_bundles
+from barsight.simulation.yard_speed import time_yard
 from barsight.yard.bundle_file import read_bundles
+from barsight.yard.magnet import load_magnet
 
 Json = Annotated[Path | None, tyro.conf.arg(name="json")]
 
@@ -48,7 +56,10 @@ def bench_found_bundles(
         scores, seconds = bench.scores, bench.seconds
     console = Console()
     console.print(bundle_table(scores))
+    console.print(reliability(scores))
     if seconds:
         console.print(f"CPU time per yard of {length_m:g} m: median {np.median(seconds):.1f} s")
+    if recording is None:
+        console.print(str(time_yard(load_magnet(None), seed)))
     if save is not None:
         write_json(save, bundle_report(scores, seconds))

@@ -12,9 +12,12 @@ from barsight.cli.progress import stages
 from barsight.core.errors import ConfigError
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.simulation.lift_bench import bench_lifts, lift_table
+from barsight.simulation.yard_speed import time_yard
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
 from barsight.yard.magnet import load_magnet
+
+_TIMED_SEED = 7
 
 
 def bench_lift_targets(
@@ -45,5 +48,6 @@ def bench_lift_targets(
             lambda done: advance("yards", done, yards),
         )
     Console().print(lift_table(bench))
+    Console().print(str(time_yard(load_magnet(magnet), _TIMED_SEED)))
     if save is not None:
         write_json(save, bench)

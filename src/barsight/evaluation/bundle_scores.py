@@ -176,6 +176,16 @@ def bundle_table(scores: BundleErrors) -> Table:
     return table
 
 
+def reliability(scores: BundleErrors) -> str:
+    """Stated confidence of the bundles said to be free against the share that is right."""
+    out = []
+    for name, part in (("0.9 or more", scores.confidence >= 0.9), ("less", scores.confidence < 0.9)):
+        if part.any():
+            stated, right = scores.confidence[part].mean(), scores.is_right[part].mean()
+            out.append(f"{name}: {part.sum()} bundles, stated {stated:.2f}, right {right:.2f}")
+    return f"confidence {'; '.join(out) or '-'}"
+
+
 def _axes(true: TrueBundle) -> tuple[Float64, Float64]:
     c, s = np.cos(true.yaw_rad), np.sin(true.yaw_rad)
     return np.array([c, s, 0.0]), np.array([-s, c, 0.0])

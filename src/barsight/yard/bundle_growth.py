@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
-from barsight.yard.bundle_fit import ABOVE, AGREES, BELOW, MIXED, SLOPE_U, Fit, outline_tables, refine
+from barsight.yard.bundle_fit import ABOVE, AGREES, BELOW, DIAMETER, MIXED, ROLL, SLOPE_U, Fit, refine
 from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.outline import STEP_M
+from barsight.yard.outline import STEP_M, make_outline
 from barsight.yard.sheet import Sheet
 
 _AGREE_SHARE = 0.55
@@ -22,12 +22,14 @@ _MOST_UNKNOWN_M = 0.6
 
 def follow(sheet: Sheet, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
     """How far the outline follows the map from the fit's rows on, at most reach_m further to either side."""
-    tables = outline_tables(fit.rings, fit.values, settings)
+    outline = make_outline(
+        fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
+    )
     more = int(reach_m / sheet.cell_m)
     bounds = max(fit.first - more, 0), min(fit.last + more, sheet.z_m.shape[0] - 1)
     state, gain = _row_states(
-        sheet.z_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, fit.v_m, fit.values, tables.rows,
-        tables.reach_m, settings.agreement_m,
+        sheet.z_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, fit.v_m, fit.values,
+        outline.seen_m, outline.slope, outline.reach_m, settings.agreement_m,
     )  # fmt: skip
     runs = np.array([_MOST_UNKNOWN_M, 0.0, _MOST_ABOVE_M, _MOST_BELOW_M, _MOST_MIXED_M]) / sheet.cell_m
     agreeing = np.flatnonzero(state[fit.first : fit.last + 1] == AGREES)
@@ -61,13 +63,13 @@ def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int
 @kernel()
 def _row_states(
     z: Float32, u0: float, v0: float, cell: float, first: int, last: int, v_middle: float, values: Float64,
-    tables: Float64, reach: float, agreement: float,
+    seen: Float64, slope: Float64, reach: float, agreement: float,
 ) -> tuple[UInt8, Float32]:  # fmt: skip
     """Each row's state and the cells it explains, over the parts of the outline that aren't steep."""
     rows, columns = z.shape
     state, gain = np.zeros(rows, np.uint8), np.zeros(rows, np.float32)
     cosine = 1.0 / np.sqrt(1.0 + values[1] * values[1])
-    size = tables.shape[1]
+    size = seen.size
     for j in range(first, last + 1):
         along = v0 + cell * j - v_middle
         u = values[0] + values[1] * along
@@ -78,13 +80,13 @@ def _row_states(
         total = 0.0
         for i in range(low, high + 1):
             k = int(((u0 + cell * i - u) * cosine + reach) / STEP_M + 0.5)
-            if k < 0 or k >= size or tables[0, k] != tables[0, k] or not abs(tables[1, k]) < 2.0:
+            if k < 0 or k >= size or seen[k] != seen[k] or not abs(slope[k]) < 2.0:
                 continue
             count += 1
             if i < 0 or i >= columns or z[j, i] != z[j, i]:
                 continue
             known += 1
-            r = z[j, i] - base - tables[0, k]
+            r = z[j, i] - base - seen[k]
             total += max(1.0 - (r / agreement) ** 2, -1.0)
             if abs(r) <= agreement:
                 agree += 1

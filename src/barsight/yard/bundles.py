@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
+from barsight.core.parallel import ordered_map
 from barsight.core.types import Source
 from barsight.yard.bundle_fit import AGREES, Fit, U, Z, refine
 from barsight.yard.bundle_growth import grow
@@ -25,8 +26,10 @@ _EDGE_CELLS = 3.0
 """What a bundle costs per row: its edges explain nothing."""
 _CLAIM_M = 0.02
 _RIVAL_SHARE = 0.8
-_SUNKEN_M = 0.04
+_SUNKEN_M, _SUNKEN_SHARE = 0.04, 0.2
+"""How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
 _RESOLVED_CELLS = 4.0
+_THREADS = 2
 
 
 def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundle, ...]:
@@ -86,8 +89,9 @@ def _with_common_diameter(one: Found, kept: list[Fit], settings: BundleSettings)
 
 
 def _on(floor_m: float | None, fit: Fit) -> bool:
-    """Whether the whole packing lies over the floor."""
-    return floor_m is None or fit.values[Z] - fit.width_m / 2 > floor_m - _SUNKEN_M
+    """Whether the whole packing lies over the floor: its top rises from it by about its own height."""
+    sunken = min(_SUNKEN_M, _SUNKEN_SHARE * fit.width_m)
+    return floor_m is None or fit.values[Z] - fit.width_m / 2 > floor_m - sunken
 
 
 def _readings(sheet: Sheet, templates: Templates, settings: BundleSettings) -> list[Fit]:
@@ -100,11 +104,14 @@ def _readings(sheet: Sheet, templates: Templates, settings: BundleSettings) -> l
         return []
     for row in range(int(known[0]) + min(step, known.size) // 2, int(known[-1]) + 1, step):
         v = sheet.v0_m + row * sheet.cell_m
-        for candidate in _worth_growing(guess(sheet, templates, v, settings)):
-            if any(_same(candidate, fit, row) for fit in fits):
+        candidates = _worth_growing(guess(sheet, templates, v, settings))
+        fresh = [one for one in candidates if not any(_same(one, fit, row) for fit in fits)]
+        seeds = (_seed(one, row, rows, sheet, settings) for one in fresh)
+        grown = ordered_map(lambda seed: grow(sheet, seed, settings), seeds, _THREADS)
+        for one, fit in zip(fresh, grown, strict=True):
+            if fit is None or any(_same(one, earlier, row) for earlier in fits):
                 continue
-            fit = grow(sheet, _seed(candidate, row, rows, sheet, settings), settings)
-            if fit is not None and (fit.last - fit.first + 1) * sheet.cell_m >= settings.least_length_m:
+            if (fit.last - fit.first + 1) * sheet.cell_m >= settings.least_length_m:
                 fits.append(fit)
     return fits
 

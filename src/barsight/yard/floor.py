@@ -25,10 +25,14 @@ def find_floor(height_map: HeightMap) -> float | None:
     z = np.where(height_map.source == Source.VISION, height_map.z_m, np.nan)
     cut = z[: rows * block, : columns * block].reshape(rows, block, columns, block)
     blocks = cut.transpose(0, 2, 1, 3).reshape(rows * columns, -1)
-    blocks = blocks[np.isfinite(blocks).mean(axis=1) >= _KNOWN_SHARE]
-    if blocks.size == 0:
+    known = np.isfinite(blocks).sum(axis=1)
+    enough = known >= _KNOWN_SHARE * blocks.shape[1]
+    if not enough.any():
         return None
-    low, middle, high = np.nanpercentile(blocks, (10, 50, 90), axis=1)
+    ordered, last = np.sort(blocks[enough], axis=1), known[enough] - 1  # NaN last
+    low, middle, high = (
+        ordered[np.arange(last.size), np.rint(q * last).astype(int)] for q in (0.1, 0.5, 0.9)
+    )
     level = np.sort(middle[high - low < 2 * _FLAT_M])
     if level.size == 0:
         return None

@@ -68,6 +68,10 @@ def neighbours_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
 
 def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:
     """Length of `bundle` over which the two footprints, grown by margin_m in all, meet."""
+    skew = abs(np.sin(bundle.yaw_rad - other.yaw_rad))
+    reach = (other.width_m + bundle.width_m + skew * bundle.length_m) / 2 + max(margin_m, 0.0)
+    if _beside(bundle.centre_m[:2], other)[0] > reach:
+        return 0.0
     along = np.arange(-bundle.length_m / 2, bundle.length_m / 2, 0.02)
     across = np.array([-0.5, -0.25, 0.0, 0.25, 0.5]) * bundle.width_m
     c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)

@@ -25,6 +25,9 @@ _PHASES = 2
 _SPREAD_M = 0.06
 _KNOWN = 0.55
 _RIM_M = 0.004
+_BEYOND_M = 0.01
+_BLOCK = 64
+"""Columns that one thread compares with all outlines: they stay in its nearest cache."""
 
 
 @dataclass(frozen=True)
@@ -152,47 +155,70 @@ def _match(
     gain = np.full((classes, columns), -np.inf, np.float32)
     height = np.full((classes, columns), np.nan, np.float32)
     which = np.full((classes, columns), -1, np.int64)
-    for column in numba.prange(columns):
-        for t in range(offsets.size):
-            n, first = lengths[t], column + offsets[t]
-            if first < 0 or first + n > columns:
-                continue
-            k = of_class[t]
-            if n <= gain[k, column]:
-                continue
-            low, high = np.inf, -np.inf
-            for q in range(5):
-                i = q * (n - 1) // 4
-                r = profile[first + i] - heights[t, i]
-                if r == r:
-                    low, high = min(low, r), max(high, r)
-            if high - low > _SPREAD_M or high < low:
-                continue
-            total, known = 0.0, 0
-            for i in range(n):
-                r = profile[first + i] - heights[t, i]
-                if r == r:
-                    total += min(max(r, low - 0.01), high + 0.01)
-                    known += 1
-            if known < _KNOWN * n:
-                continue
-            z = total / known
-            for _ in range(2):
-                total, near = 0.0, 0
-                for i in range(n):
-                    r = profile[first + i] - heights[t, i] - z
-                    if abs(r) < 1.5 * agreement:
-                        total += r
-                        near += 1
-                if near > 0:
-                    z += total / near
-            score = 0.0
-            for i in range(n):
-                r = (profile[first + i] - heights[t, i] - z) / agreement
-                if r == r:
-                    score += max(1.0 - r * r, -1.0)
-            if score > gain[k, column]:
-                gain[k, column] = score
-                height[k, column] = z
-                which[k, column] = t
+    seen = np.where(np.isnan(profile), np.float32(0.0), np.float32(1.0))
+    surface = np.where(np.isnan(profile), np.float32(0.0), profile)
+    known_before = np.zeros(columns + 1, np.int64)
+    known_before[1:] = np.cumsum(seen)
+    for block in numba.prange((columns + _BLOCK - 1) // _BLOCK):
+        for t in range(offsets.size - 1, -1, -1):
+            k, n, template = of_class[t], lengths[t], heights[t]
+            start = max(block * _BLOCK, -offsets[t])
+            for column in range(start, min((block + 1) * _BLOCK, columns - n - offsets[t] + 1)):
+                first = column + offsets[t]
+                known = known_before[first + n] - known_before[first]
+                if known < _KNOWN * n or known <= gain[k, column]:
+                    continue
+                low, high = _bounds(profile[first : first + n], template)
+                if high - low > _SPREAD_M or high < low:
+                    continue
+                z, score = _compare(
+                    surface[first : first + n], seen[first : first + n], template, known,
+                    low - _BEYOND_M, high + _BEYOND_M, agreement,
+                )  # fmt: skip
+                if score > gain[k, column]:
+                    gain[k, column] = score
+                    height[k, column] = z
+                    which[k, column] = t
     return gain, height, which
+
+
+@kernel()
+def _bounds(profile: Float32, template: Float32) -> tuple[float, float]:
+    """Least and greatest height of the profile over the template at five places; inf, -inf where unknown."""
+    low, high = np.inf, -np.inf
+    for q in range(5):
+        i = q * (profile.size - 1) // 4
+        r = profile[i] - template[i]
+        if r == r:
+            low, high = min(low, r), max(high, r)
+    return low, high
+
+
+@kernel(fastmath=True)
+def _compare(
+    surface: Float32, seen: Float32, template: Float32, known: int, low: float, high: float, agreement: float
+) -> tuple[float, float]:
+    """Height of the axis and gain of a template laid on a piece of the profile.
+
+    surface: 0 where unknown; seen: 1 where known, else 0. All is finite, so sums may run in any order.
+    """
+    one, nothing = np.float32(1.0), np.float32(0.0)
+    least, most, gate = np.float32(low), np.float32(high), np.float32(1.5 * agreement)
+    total = nothing
+    for i in range(surface.size):
+        total += seen[i] * min(max(surface[i] - template[i], least), most)
+    z = np.float32(total / known)
+    for _ in range(2):
+        total, near = nothing, nothing
+        for i in range(surface.size):
+            r = surface[i] - template[i] - z
+            counts = seen[i] if abs(r) < gate else nothing
+            total += counts * r
+            near += counts
+        if near > 0:
+            z += total / near
+    score, scale = nothing, np.float32(1.0 / agreement)
+    for i in range(surface.size):
+        r = (surface[i] - template[i] - z) * scale
+        score += seen[i] * max(one - r * r, -one)
+    return float(z), float(score)

@@ -16,6 +16,8 @@ LOOSENESS = 1.003
 PERIOD_RAD = np.pi / 3
 """A hexagon looks the same after this turn."""
 STEP_M = 0.001
+_ROLL_STEP_RAD = float(np.radians(1.0))
+_DIAMETER_STEP = 0.01
 
 
 @lru_cache(maxsize=8)
@@ -32,9 +34,7 @@ def hexagon(rings: int) -> Float64:
 
 def turned_hexagon(rings: int, diameter_m: float, roll_rad: float) -> Float64:
     """(bars, 2) axes in m, the packing rolled clockwise by roll_rad as seen along the bundle."""
-    c, s = np.cos(roll_rad), np.sin(roll_rad)
-    turned: Float64 = diameter_m * (hexagon(rings) @ np.array([[c, s], [-s, c]]))
-    return turned
+    return _turned(hexagon(rings), diameter_m, roll_rad)
 
 
 def bundle_width(rings: int, diameter_m: float) -> float:
@@ -58,13 +58,14 @@ class Outline:
 def make_outline(rings: int, diameter_m: float, roll_rad: float, smoothing_m: float) -> Outline:
     """The upper outline of a bundle."""
     axes = turned_hexagon(rings, diameter_m, roll_rad)
-    half = int(np.ceil((np.abs(axes[:, 0]).max() + diameter_m / 2) / STEP_M)) + 1
-    return Outline(half * STEP_M, *_trace(axes, diameter_m / 2, half, smoothing_m))
+    exact, seen, slope = _trace(axes, diameter_m / 2, smoothing_m)
+    return Outline(exact.size // 2 * STEP_M, exact, seen, slope)
 
 
 @kernel()
-def _trace(axes: Float64, radius: float, half: int, sigma: float) -> tuple[Float64, Float64, Float64]:
+def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64, Float64]:
     """Outline, its Gaussian mean over the part that is there, and that mean's slope, at -half ... half."""
+    half = int(np.ceil((np.abs(axes[:, 0]).max() + radius) / STEP_M)) + 1
     size = 2 * half + 1
     exact, seen, slope = np.full(size, np.nan), np.full(size, np.nan), np.full(size, np.nan)
     for b in range(axes.shape[0]):
@@ -76,18 +77,46 @@ def _trace(axes: Float64, radius: float, half: int, sigma: float) -> tuple[Float
             if not exact[i] >= height:
                 exact[i] = height
     reach = int(3 * sigma / STEP_M)
-    weight = np.ones(reach + 1)
-    for k in range(1, reach + 1):
-        weight[k] = np.exp(-0.5 * (STEP_M * k / sigma) ** 2)
+    there = np.where(np.isnan(exact), 0.0, 1.0)
+    height = np.where(np.isnan(exact), 0.0, exact)
+    total, share = np.zeros(size), np.zeros(size)
+    for k in range(-reach, reach + 1):
+        weight = np.exp(-0.5 * (STEP_M * k / sigma) ** 2) if k != 0 else 1.0
+        for i in range(max(-k, 0), min(size - k, size)):
+            total[i] += weight * height[i + k]
+            share[i] += weight * there[i + k]
     for i in range(size):
-        if exact[i] != exact[i]:
-            continue
-        total = share = 0.0
-        for k in range(max(i - reach, 0), min(i + reach, size - 1) + 1):
-            if exact[k] == exact[k]:
-                total += weight[abs(k - i)] * exact[k]
-                share += weight[abs(k - i)]
-        seen[i] = total / share
+        if there[i] > 0:
+            seen[i] = total[i] / share[i]
     for i in range(1, size - 1):
         slope[i] = (seen[i + 1] - seen[i - 1]) / (2 * STEP_M)
     return exact, seen, slope
+
+
+@kernel()
+def trace_with_changes(packing: Float64, diameter: float, roll: float, sigma: float) -> Float64:
+    """(4, N) seen outline of `packing` (see `hexagon`), its slope, its change by roll and by diameter."""
+    _, seen, slope = _trace(_turned(packing, diameter, roll), diameter / 2, sigma)
+    _, rolled, _ = _trace(_turned(packing, diameter, roll + _ROLL_STEP_RAD), diameter / 2, sigma)
+    wide = diameter * (1 + _DIAMETER_STEP)
+    _, grown, _ = _trace(_turned(packing, wide, roll), wide / 2, sigma)
+    tables = np.full((4, seen.size), np.nan)
+    tables[0], tables[1] = seen, slope
+    for i in range(seen.size):
+        k = i + (rolled.size - seen.size) // 2
+        if 0 <= k < rolled.size:
+            tables[2, i] = (rolled[k] - seen[i]) / _ROLL_STEP_RAD
+        k = i + (grown.size - seen.size) // 2
+        if 0 <= k < grown.size:
+            tables[3, i] = (grown[k] - seen[i]) / (diameter * _DIAMETER_STEP)
+    return tables
+
+
+@kernel()
+def _turned(packing: Float64, diameter: float, roll: float) -> Float64:
+    turned = np.empty_like(packing)
+    c, s = np.cos(roll), np.sin(roll)
+    for b in range(packing.shape[0]):
+        turned[b, 0] = diameter * (packing[b, 0] * c - packing[b, 1] * s)
+        turned[b, 1] = diameter * (packing[b, 0] * s + packing[b, 1] * c)
+    return turned

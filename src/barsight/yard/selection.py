@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 
 from barsight.core.arrays import Float64, Int64
 
@@ -18,14 +18,9 @@ def choose(weights: Float64, claims: list[Int64]) -> Int64:
     if not useful:
         return np.empty(0, np.int64)
     owner, place = _owners([claims[k] for k in useful])
-    order = np.lexsort((owner, place))
-    groups = np.split(owner[order], np.flatnonzero(np.diff(place[order])) + 1)
-    rivals = sorted({tuple(g.tolist()) for g in groups if len(g) > 1})
-    if not rivals:
+    table = _rivals(owner, place, len(useful))
+    if table.shape[0] == 0:
         return np.array(useful, np.int64)
-    rows = np.repeat(np.arange(len(rivals)), [len(r) for r in rivals])
-    columns = np.concatenate([np.array(r) for r in rivals])
-    table = csc_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(rivals), len(useful)))
     solved = milp(
         -weights[useful], integrality=np.ones(len(useful), np.int64), bounds=Bounds(0, 1),
         constraints=LinearConstraint(table, -np.inf, 1),
@@ -33,6 +28,19 @@ def choose(weights: Float64, claims: list[Int64]) -> Int64:
     if solved.x is None:
         raise RuntimeError(f"no choice of readings: {solved.message}")
     return np.array(useful, np.int64)[np.flatnonzero(solved.x > 0.5)]
+
+
+def _rivals(owner: Int64, place: Int64, readings: int) -> csc_matrix:
+    """A row for each set of two or more readings that want the same places, 1 for those in it.
+
+    Places are told apart by the sum of random numbers, one drawn for each reading: 64 bits don't collide.
+    """
+    takes = csr_matrix((np.ones(owner.size), (place, owner)), shape=(int(place.max()) + 1, readings))
+    mark = np.random.default_rng(0).integers(1 << 62, size=readings)
+    marks = np.zeros(takes.shape[0], np.int64)
+    np.add.at(marks, place, mark[owner])
+    first = np.unique(marks, return_index=True)[1]
+    return csc_matrix(takes[first[np.diff(takes.indptr)[first] > 1]])
 
 
 def overlaps(chosen: Int64, claims: list[Int64]) -> Float64:

@@ -1,0 +1,113 @@
+"""The compiled inner loops of finding bundles against slow ones written plainly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from barsight.yard.bundle_newton import Heights, _normal_equations
+from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.matching import _KNOWN, _SPREAD_M, _match, make_templates
+from barsight.yard.outline import STEP_M, hexagon, make_outline, trace_with_changes
+from barsight.yard.selection import choose
+
+SMOOTHING_M = 0.006
+
+
+def test_an_outline_is_the_smoothed_upper_edge_of_its_bars() -> None:
+    outline = make_outline(1, 0.09, 0.2, SMOOTHING_M)
+    c, s = np.cos(0.2), np.sin(0.2)
+    axes = 0.09 * hexagon(1) @ np.array([[c, s], [-s, c]])
+    u = STEP_M * (np.arange(outline.exact_m.size) - outline.exact_m.size // 2)
+    inside = 0.045**2 - (u[:, None] - axes[:, 0]) ** 2
+    exact = np.where(inside >= 0, axes[:, 1] + np.sqrt(inside.clip(0)), -np.inf).max(axis=1)
+    there = np.isfinite(exact)
+    np.testing.assert_allclose(outline.exact_m[there], exact[there], atol=1e-9)
+    weight = np.exp(-0.5 * ((u[there][:, None] - u[there]) / SMOOTHING_M) ** 2)
+    weight[np.abs(u[there][:, None] - u[there]) > 0.0185] = 0
+    seen = (weight * exact[there]).sum(axis=1) / weight.sum(axis=1)
+    np.testing.assert_allclose(outline.seen_m[there], seen, atol=1e-9)
+
+
+def test_matching_gains_what_a_plain_comparison_gains() -> None:
+    settings = BundleSettings(catalogue_mm=(60.0, 90.0))
+    templates = make_templates(settings, 0.01)
+    rng = np.random.default_rng(3)
+    outline = make_outline(1, 0.09, 0.1, SMOOTHING_M)
+    u = 0.01 * np.arange(120) - 0.6
+    place = np.rint((u + outline.reach_m) / STEP_M).astype(int)
+    inside = (place >= 0) & (place < outline.seen_m.size)
+    profile = np.where(inside, 0.4 + outline.seen_m[place.clip(0, outline.seen_m.size - 1)], 0.2)
+    profile = (profile + rng.normal(0, 0.004, u.size)).astype(np.float32)
+    profile[rng.random(u.size) < 0.1] = np.nan
+    classes = np.unique(templates.kinds[:, 0])
+    of_class = np.searchsorted(classes, templates.kinds[:, 0])
+    gain, height, which = _match(
+        profile, templates.heights, templates.offsets, templates.lengths, of_class, classes.size, 0.015
+    )
+    best = np.full(gain.shape, -np.inf)
+    for t, (first, n) in enumerate(zip(templates.offsets, templates.lengths, strict=True)):
+        for column in range(max(-first, 0), min(u.size, u.size - n - first + 1)):
+            score = plain_gain(profile[column + first : column + first + n], templates.heights[t, :n])
+            best[of_class[t], column] = max(best[of_class[t], column], score)
+    np.testing.assert_allclose(gain, best, rtol=1e-3, atol=1e-3)
+    assert best[:, 55:66].max() > 15
+    found = int(gain[1].argmax())
+    assert abs(u[found]) < 0.015 and height[1, found] == pytest.approx(0.4, abs=0.005)
+    assert templates.kinds[which[1, found], 1] == 0.09
+
+
+def plain_gain(profile: np.ndarray, template: np.ndarray) -> float:
+    rest = (profile - template).astype(np.float64)
+    probes = rest[np.arange(5) * (rest.size - 1) // 4]
+    known = np.isfinite(rest)
+    if (
+        known.mean() < _KNOWN
+        or not np.isfinite(probes).any()
+        or np.ptp(probes[np.isfinite(probes)]) > _SPREAD_M
+    ):
+        return -np.inf
+    rest = rest[known]
+    z = rest.clip(np.nanmin(probes) - 0.01, np.nanmax(probes) + 0.01).mean()
+    for _ in range(2):
+        near = np.abs(rest - z) < 0.0225
+        z = rest[near].mean() if near.any() else z
+    return float(np.maximum(1 - ((rest - z) / 0.015) ** 2, -1).sum())
+
+
+def test_the_normal_equations_are_those_of_the_outlines_derivatives() -> None:
+    rng = np.random.default_rng(5)
+    values = np.array([0.013, 0.02, 0.3, -0.01, 0.1, 0.09])
+    tables = trace_with_changes(hexagon(1), 0.09, 0.1, SMOOTHING_M)
+    z = (0.4 + rng.normal(0, 0.005, (40, 60))).astype(np.float32)
+    z[rng.random(z.shape) < 0.1] = np.nan
+    heights = Heights(z, np.full_like(z, 0.004), -0.3, 1.0, 0.01, 0, 39, 3, 1.2)
+    gate, placing = 0.05, 0.004
+    normal, right, moments = _normal_equations(heights, values, tables, gate, placing)
+    rows, columns = np.mgrid[0:40:3, 0:60]
+    along = 1.0 + 0.01 * rows.ravel() - 1.2
+    cosine = 1 / np.hypot(1, values[1])
+    across = (-0.3 + 0.01 * columns.ravel() - values[0] - values[1] * along) * cosine
+    middle = tables.shape[1] // 2
+    at = across / STEP_M + middle
+    usable = (np.abs(across) <= middle * STEP_M - 0.008) & np.isfinite(z[rows, columns].ravel())
+    h, slope = (np.interp(at, np.arange(tables.shape[1]), row) for row in tables[:2])
+    k = at.astype(int).clip(0, tables.shape[1] - 1)
+    rest = z[rows, columns].ravel() - values[2] - values[3] * along - h
+    jacobian = np.stack([
+        -slope * cosine, -slope * cosine * along, np.ones_like(h), along, tables[2, k], tables[3, k]
+    ])  # fmt: skip
+    usable &= np.isfinite(jacobian).all(axis=0) & (np.abs(slope) <= 4) & (np.abs(rest) < gate)
+    jacobian, rest, slope = jacobian[:, usable], rest[usable], slope[usable]
+    tukey = (1 - (rest / gate) ** 2) ** 2
+    weight = tukey / (np.float32(0.004) ** 2 + (slope * placing) ** 2)
+    np.testing.assert_allclose(normal, (jacobian * weight) @ jacobian.T, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(right, (jacobian * weight) @ rest, rtol=1e-4, atol=1e-3)
+    assert moments[0] == pytest.approx(tukey.sum(), rel=1e-5) and usable.sum() > 100
+
+
+def test_the_set_that_weighs_most_is_chosen_and_no_place_twice() -> None:
+    claims = [np.array([1, 2, 3]), np.array([3, 4, 5]), np.array([5, 6]), np.array([9]), np.array([9])]
+    assert choose(np.array([3.0, 5.0, 3.0, 1.0, 2.0]), claims).tolist() == [0, 2, 4]
+    assert choose(np.array([3.0, 7.0, 3.0, 1.0, -2.0]), claims).tolist() == [1, 3]
+    assert choose(np.array([3.0]), claims[:1]).tolist() == [0]
