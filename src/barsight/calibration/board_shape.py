@@ -74,12 +74,6 @@ def shape_basis(board: Board) -> Float64:
     return scaled
 
 
-def shaped_points(board: Board, shape: BoardShape) -> Float64:
-    """(N, 3) the points of a board of that shape."""
-    points: Float64 = board.points_m + shape_basis(board) @ (shape.values / _units(board))
-    return points
-
-
 def _units(board: Board) -> Float64:
     tag = [TAG_SIGMA] if board.kind is BoardKind.APRILGRID else []
     return np.array([BOW_SIGMA_M, BOW_SIGMA_M, PRINT_SIGMA, PRINT_SIGMA, *tag])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from barsight.calibration.board_adjustment import Solved
 from barsight.core.arrays import Float64
 
 WIDENED_FROM = 3.0
@@ -39,3 +40,30 @@ def widened(
     shrink = min(max(noise / apart, 0.0), 1.0)
     wide = shrink * correlation * np.eye(size) + (1 - shrink) * spread
     return factor @ wide @ factor.T, correlation
+
+
+def covariance_of(solved: Solved, corners: int, views: int) -> tuple[Float64, float, float]:
+    """(covariance (C, C), sigma_px, correlation) of the common parameters, the board's shape last.
+
+    Widened where views hang together.
+    """
+    residuals = np.concatenate(solved.residuals_px)
+    freedom = 2 * corners - solved.reduced.shape[0] - 6 * views
+    variance = float((residuals**2).sum() / max(freedom, 1))
+    inverse = scaled_inverse(solved.reduced)
+    covariance, correlation = widened(inverse, variance, solved.scores, solved.view_reduced)
+    return covariance, float(np.sqrt(variance)), correlation
+
+
+def scaled_inverse(matrix: Float64) -> Float64:
+    """The inverse of a symmetric positive matrix whose parameters have very different sizes.
+
+    Raises LinAlgError where a direction is not determined.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    unit = matrix * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(unit)
+    if values[0] < 1e-13 * values[-1]:
+        raise np.linalg.LinAlgError("undetermined")
+    inverse: Float64 = (vectors / values) @ vectors.T * scale[:, None] * scale
+    return inverse

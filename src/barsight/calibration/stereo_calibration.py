@@ -18,7 +18,7 @@ from barsight.calibration.board_adjustment import Observed, Solved, State, obser
 from barsight.calibration.board_shape import BoardShape, board_shape, shape_basis
 from barsight.calibration.boards import Board
 from barsight.calibration.camera import Camera
-from barsight.calibration.covariance_widening import widened
+from barsight.calibration.covariance_widening import covariance_of
 from barsight.calibration.lens_model import Lens
 from barsight.calibration.rig import StereoRig
 from barsight.calibration.stereo_removal import (
@@ -129,33 +129,6 @@ def calibrate_stereo(
 def rms(residuals: Float64) -> float:
     """Root mean square length of (N, 2) residuals."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
-
-
-def covariance_of(solved: Solved, corners: int, views: int) -> tuple[Float64, float, float]:
-    """(covariance (C, C), sigma_px, correlation) of the common parameters, the board's shape last.
-
-    Widened where views hang together; see `covariance_widening`.
-    """
-    residuals = np.concatenate(solved.residuals_px)
-    freedom = 2 * corners - solved.reduced.shape[0] - 6 * views
-    variance = float((residuals**2).sum() / max(freedom, 1))
-    inverse = scaled_inverse(solved.reduced)
-    covariance, correlation = widened(inverse, variance, solved.scores, solved.view_reduced)
-    return covariance, float(np.sqrt(variance)), correlation
-
-
-def scaled_inverse(matrix: Float64) -> Float64:
-    """The inverse of a symmetric positive matrix whose parameters have very different sizes.
-
-    Raises LinAlgError where a direction is not determined.
-    """
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    unit = matrix * scale[:, None] * scale
-    values, vectors = np.linalg.eigh(unit)
-    if values[0] < 1e-13 * values[-1]:
-        raise np.linalg.LinAlgError("undetermined")
-    inverse: Float64 = (vectors / values) @ vectors.T * scale[:, None] * scale
-    return inverse
 
 
 def parameter_names(lens: Lens) -> tuple[str, ...]:
