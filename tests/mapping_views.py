@@ -59,7 +59,7 @@ def fused(
 
 HEIGHT_M = 5000.0
 FAR_CAMERA = RectifiedCamera(
-    focal_px=1e5, cx_px=1000.0, cy_px=1000.0, baseline_m=0.001, doffs_px=0.0, width=2000, height=2000
+    focal_px=1e6, cx_px=1e4, cy_px=1e4, baseline_m=0.001, doffs_px=0.0, width=20000, height=20000
 )
 
 

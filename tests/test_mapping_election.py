@@ -1,5 +1,6 @@
 """The election against lines of sight: a wall of 1 m on a floor, seen from a crane that passes over it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import Layers, finish
 from barsight.mapping.tiles import TileStore
-from mapping_views import block, view
+from mapping_views import FAR_CAMERA, block, high_above, view
 
 CELL_M = 0.01
 CAMERA = RectifiedCamera(
@@ -113,3 +114,21 @@ def test_views_far_from_a_box_are_left_out(low: float, high: float, held: bool) 
     sights = Sights.of([pose_at(0.0)], CAMERA)
     near = sights.near(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0]))
     assert len(near.eyes) == held
+
+
+def test_views_with_few_points_a_cell_owe_few_votes(tmp_path: Path) -> None:
+    """Forty views whose points lie five cells apart: a cell has a point in one view of ten or so."""
+    far = replace(FAR_CAMERA, focal_px=1e5, cx_px=1e3, cy_px=1e3, width=2000, height=2000)
+    x, y = (a.ravel() for a in block(60, 60))
+    store, poses = TileStore(tmp_path, 64), []
+    votes = np.zeros(x.size)
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        hit = rng.random(x.size) < 0.1
+        votes += hit
+        one = view(x[hit], y[hit], np.zeros(int(hit.sum())))
+        fuse(store, one, MapSettings())
+        poses.append(high_above(one, 0.01))
+    surface = finish(store, tmp_path, 0.01, 2, MapSettings(fill_m=0.0), Sights.of(poses, far))
+    known = surface.window(0, 0, 60, 60).source == Source.VISION
+    np.testing.assert_array_equal(known.ravel(), votes >= 2)
