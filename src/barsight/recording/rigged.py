@@ -2,57 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
-from barsight.calibration.documents import ImuNoise
 from barsight.calibration.rig import StereoRig
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
-from barsight.recording.base import FrameIndex, Recording
+from barsight.recording.forwarded import Forwarded
 
 
 @dataclass(frozen=True, eq=False)
-class Rigged:
-    """`whole` with the calibration `rig`."""
+class Rigged(Forwarded):
+    """`whole` with the calibration `own_rig`."""
 
-    whole: Recording
-    rig: StereoRig
-
-    @property
-    def path(self) -> Path:
-        return self.whole.path
+    own_rig: StereoRig
 
     @property
-    def format(self) -> str:
-        return self.whole.format
-
-    @property
-    def is_simulated(self) -> bool:
-        return self.whole.is_simulated
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return self.whole.notes
-
-    @property
-    def index(self) -> FrameIndex:
-        return self.whole.index
-
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
-        return self.whole.frames()
-
-    def imu(self) -> ImuSamples | None:
-        return self.whole.imu()
-
-    def imu_noise(self) -> ImuNoise | None:
-        return self.whole.imu_noise()
-
-    def crane(self) -> CraneSamples | None:
-        return self.whole.crane()
-
-    def laser(self) -> tuple[LaserProfile, ...]:
-        return self.whole.laser()
-
-    def digests(self) -> dict[str, str]:
-        return self.whole.digests()
+    def rig(self) -> StereoRig:
+        return self.own_rig
