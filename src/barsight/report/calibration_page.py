@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plotly.offline import get_plotlyjs
 
 import barsight
 from barsight.calibration.calibration_uncertainty import picture_grid
@@ -16,8 +14,7 @@ from barsight.calibration.stereo_removal import view_rms
 from barsight.calibration.stereo_verdict import Assessment, tilts
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.files import atomic_path
-from barsight.report.page import Figure, environment, number, plot_json, resource
+from barsight.report.page import Figure, number, write_summary_page
 from barsight.report.plots import Plot, numbers
 
 SCHEMA = 1
@@ -93,16 +90,14 @@ def write_calibration_report(
 ) -> None:
     """Write the page to `html` and its numbers to `data`, each whole or not at all."""
     summary = calibration_summary(calibration, assessment)
-    with atomic_path(data) as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    plots = calibration_plots(calibration, assessment)
-    page = environment().get_template("calibration_page.html.jinja").render(
-        summary=summary, figures=_figures(summary), plots={plot.name: plot for plot in plots},
-        plot_data=plot_json(plots), plotly_js=get_plotlyjs(), css=resource("page.css"),
-        script=resource("page_script.js.jinja"),
-    )  # fmt: skip
-    with atomic_path(html) as path:
-        path.write_text(page, encoding="utf-8")
+    write_summary_page(
+        "calibration_page.html.jinja",
+        summary,
+        _figures(summary),
+        calibration_plots(calibration, assessment),
+        html,
+        data,
+    )
 
 
 def calibration_plots(calibration: StereoCalibration, assessment: Assessment) -> list[Plot]:

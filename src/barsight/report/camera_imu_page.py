@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plotly.offline import get_plotlyjs
 
 import barsight
 from barsight.calibration.camera_imu_calibration import CameraImuCalibration
@@ -15,8 +13,7 @@ from barsight.calibration.camera_imu_problem import MOUNT
 from barsight.calibration.camera_imu_verdict import CameraImuAssessment
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.files import atomic_path
-from barsight.report.page import Figure, environment, number, plot_json, resource
+from barsight.report.page import Figure, number, write_summary_page
 from barsight.report.plots import SERIES, Plot, keep_extremes, numbers
 
 MOST_POINTS = 6000
@@ -98,16 +95,9 @@ def write_camera_imu_report(
 ) -> None:
     """Write the page to `html` and its numbers to `data`, each whole or not at all."""
     summary = camera_imu_summary(calibration, assessment)
-    with atomic_path(data) as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    plots = camera_imu_plots(calibration)
-    page = environment().get_template("camera_imu_page.html.jinja").render(
-        summary=summary, figures=_figures(summary), plots={plot.name: plot for plot in plots},
-        plot_data=plot_json(plots), plotly_js=get_plotlyjs(), css=resource("page.css"),
-        script=resource("page_script.js.jinja"),
-    )  # fmt: skip
-    with atomic_path(html) as path:
-        path.write_text(page, encoding="utf-8")
+    write_summary_page(
+        "camera_imu_page.html.jinja", summary, _figures(summary), camera_imu_plots(calibration), html, data
+    )
 
 
 def camera_imu_plots(calibration: CameraImuCalibration) -> list[Plot]:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plotly.offline import get_plotlyjs
 
 import barsight
 from barsight.calibration.imu_noise import AxisNoise, ImuNoiseFit
-from barsight.core.files import atomic_path
-from barsight.report.page import Figure, environment, number, plot_json, resource
+from barsight.report.page import Figure, number, write_summary_page
 from barsight.report.plots import Plot
 
 UNITS = {"gyro": "rad/s", "accel": "m/s²"}
@@ -44,8 +41,6 @@ def write_imu_noise_report(
 ) -> None:
     """Write the page to `html` and its numbers to `data`, each whole or not at all."""
     summary = imu_noise_summary(fit, source, notes)
-    with atomic_path(data) as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     plots = [_allan_plot("gyro", fit.axes[:3]), _allan_plot("accel", fit.axes[3:])]
     noise = fit.noise
     figures = [
@@ -55,12 +50,7 @@ def write_imu_noise_report(
         Figure("Accel walk", f"{noise.accel_walk:.3e}", "m/s³/√Hz"),
         Figure("Log", number(fit.duration_s, 0, "s"), f"{number(fit.rate_hz, 2, 'Hz')}, {fit.gaps} gaps"),
     ]
-    page = environment().get_template("imu_noise_page.html.jinja").render(
-        summary=summary, figures=figures, plots=plots, plot_data=plot_json(plots), plotly_js=get_plotlyjs(),
-        css=resource("page.css"), script=resource("page_script.js.jinja"),
-    )  # fmt: skip
-    with atomic_path(html) as path:
-        path.write_text(page, encoding="utf-8")
+    write_summary_page("imu_noise_page.html.jinja", summary, figures, plots, html, data)
 
 
 def _allan_plot(name: str, axes: tuple[AxisNoise, ...]) -> Plot:

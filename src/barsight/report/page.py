@@ -51,6 +51,22 @@ def write_report(out_dir: Path, target: Path) -> None:
         path.write_text(page, encoding="utf-8", errors="replace")
 
 
+def write_summary_page(
+    template: str, summary: dict[str, Any], figures: list[Figure], plots: list[Plot], html: Path, data: Path
+) -> None:
+    """Write a page of key figures and plots to `html`, and its summary as JSON to `data`, each whole or not
+    at all. The template finds the plots in `plots`, by name."""
+    with atomic_path(data) as path:
+        path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    page = environment().get_template(template).render(
+        summary=summary, figures=figures, plots={plot.name: plot for plot in plots},
+        plot_data=plot_json(plots), plotly_js=get_plotlyjs(), css=resource("page.css"),
+        script=resource("page_script.js.jinja"),
+    )  # fmt: skip
+    with atomic_path(html) as path:
+        path.write_text(page, encoding="utf-8")
+
+
 def render_page(out_dir: Path) -> str:
     """The page's HTML; see `write_report`."""
     result = read_summary(out_dir)
