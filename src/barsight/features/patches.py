@@ -18,6 +18,8 @@ from barsight.core.types import RectifiedPair
 
 HALF_PX = 5
 """A patch is 2 * HALF_PX + 1 wide."""
+MOST_ROWS = 64
+"""A patch that covers more rows of its source isn't looked for."""
 MOST_STEPS = 15
 CLOSE_PX = 0.01
 COARSE_REACH_PX = 6.0
@@ -25,6 +27,7 @@ COARSE_REACH_PX = 6.0
 FINE_REACH_PX = 2.5
 LEAST_LIKENESS = 0.7
 LEAST_CONTRAST_DN = 1.0
+_SIZE = 2 * HALF_PX + 1
 _POLE = 3.0**0.5 - 2.0
 _PREFILTER = (3.0**0.5 * _POLE ** np.abs(np.arange(-8, 9))).astype(np.float32)
 
@@ -107,43 +110,128 @@ def _coefficients(image: UInt8) -> Float32:
 
 
 @kernel(fastmath=True)
-def _weights(t: float, weights: Float64) -> None:
+def _weights(t: float, weights: Float32) -> None:
     """The four B-spline weights at a fraction t of a pixel."""
     t2, rest = t * t, 1 - t
     weights[0] = rest * rest * rest / 6
     weights[3] = t2 * t / 6
-    weights[1] = (4 - 6 * t2) / 6 + 3 * weights[3]
+    weights[1] = (4 - 6 * t2) / 6 + t2 * t / 2
     weights[2] = 1 - weights[0] - weights[1] - weights[3]
 
 
 @kernel(fastmath=True)
-def _read(image: Float32, x: float, y: float, half: int, step: float, patch: Float64, room: Float64) -> bool:
-    """The (2 half + 1)^2 patch around (x, y), `step` px between its pixels; false where it leaves it.
+def _inside(image: Float32, x: float, y: float, reach: float) -> bool:
+    return (
+        x - reach >= 1
+        and y - reach >= 1
+        and x + reach <= image.shape[1] - 3
+        and y + reach <= image.shape[0] - 3
+    )
 
-    room: (2, at least 2 half + 1, 4) scratch.
+
+@kernel(fastmath=True)
+def _read(
+    image: Float32, x: float, y: float, half: int, step: float, patch: Float32, rows: Float32, room: Float32
+) -> None:
+    """The (2 half + 1)^2 patch around (x, y), `step` px between its pixels, all of it inside.
+
+    rows: (at least 2 half step + 5, 2 half + 1) and room: (2, at least 2 half + 1, 4) are scratch.
     """
-    reach = half * step
-    if x - reach < 1 or y - reach < 1 or x + reach > image.shape[1] - 3 or y + reach > image.shape[0] - 3:
-        return False
     size = 2 * half + 1
     for j in range(size):
         px, py = x + (j - half) * step, y + (j - half) * step
         _weights(px - np.floor(px), room[0, j])
         _weights(py - np.floor(py), room[1, j])
+    top, bottom = int(np.floor(y - half * step)) - 1, int(np.floor(y + half * step)) + 2
+    for j in range(size):
+        left = int(np.floor(x + (j - half) * step)) - 1
+        a = room[0, j]
+        for i in range(bottom - top + 1):
+            line = image[top + i]
+            rows[i, j] = (
+                a[0] * line[left] + a[1] * line[left + 1] + a[2] * line[left + 2] + a[3] * line[left + 3]
+            )
     for i in range(size):
-        top = int(np.floor(y + (i - half) * step)) - 1
+        first = int(np.floor(y + (i - half) * step)) - 1 - top
         b = room[1, i]
-        first, second, third, fourth = image[top], image[top + 1], image[top + 2], image[top + 3]
         for j in range(size):
-            left = int(np.floor(x + (j - half) * step)) - 1
-            value = 0.0
-            for k in range(4):
-                c = left + k
-                value += room[0, j, k] * (
-                    b[0] * first[c] + b[1] * second[c] + b[2] * third[c] + b[3] * fourth[c]
-                )
-            patch[i, j] = value
-    return True
+            patch[i, j] = (
+                b[0] * rows[first, j] + b[1] * rows[first + 1, j] + b[2] * rows[first + 2, j]
+                + b[3] * rows[first + 3, j]
+            )  # fmt: skip
+
+
+@kernel(fastmath=True)
+def _read_whole(image: Float32, x: float, y: float, patch: Float32, rows: Float32, room: Float32) -> None:
+    """`_read` of a whole patch at full size: all its pixels share their weights, so rows go before columns.
+
+    rows: (at least _SIZE + 3, _SIZE) scratch.
+    """
+    left, top = int(np.floor(x)) - HALF_PX - 1, int(np.floor(y)) - HALF_PX - 1
+    a, b = room[0, 0], room[1, 0]
+    _weights(x - np.floor(x), a)
+    _weights(y - np.floor(y), b)
+    for i in range(_SIZE + 3):
+        line = image[top + i, left : left + _SIZE + 3]
+        for j in range(_SIZE):
+            rows[i, j] = a[0] * line[j] + a[1] * line[j + 1] + a[2] * line[j + 2] + a[3] * line[j + 3]
+    for i in range(_SIZE):
+        for j in range(_SIZE):
+            patch[i, j] = (
+                b[0] * rows[i, j] + b[1] * rows[i + 1, j] + b[2] * rows[i + 2, j] + b[3] * rows[i + 3, j]
+            )
+
+
+@kernel(fastmath=True)
+def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
+    """The design (5, _SIZE^2) of a patch: columns' and rows' slope, gain, offset and the patch itself; the
+    normal matrix (4, 4) of the first four. Returns the patch's standard deviation.
+    """
+    mean = wide[1:-1, 1:-1].sum() / np.float32(_SIZE * _SIZE)
+    half = np.float32(0.5)
+    for i in range(_SIZE):
+        for j in range(_SIZE):
+            k = i * _SIZE + j
+            design[0, k] = (wide[i + 1, j + 2] - wide[i + 1, j]) * half
+            design[1, k] = (wide[i + 2, j + 1] - wide[i, j + 1]) * half
+            design[2, k] = wide[i + 1, j + 1] - mean
+            design[3, k] = 1
+            design[4, k] = wide[i + 1, j + 1]
+    for k in range(4):
+        for m in range(k, 4):
+            total = np.float32(0)
+            for i in range(_SIZE * _SIZE):
+                total += design[k, i] * design[m, i]
+            normal[k, m] = normal[m, k] = total
+    return np.sqrt(normal[2, 2] / (_SIZE * _SIZE))
+
+
+@kernel(fastmath=True)
+def _step(other: Float32, design: Float32, inverse: Float64, step: Float64) -> None:
+    """The Gauss-Newton step (4,) that the other patch (_SIZE^2,) asks for."""
+    along, down, gain, offset = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    for k in range(_SIZE * _SIZE):
+        off = other[k] - design[4, k]
+        along += design[0, k] * off
+        down += design[1, k] * off
+        gain += design[2, k] * off
+        offset += off
+    for k in range(4):
+        step[k] = inverse[k, 0] * along + inverse[k, 1] * down + inverse[k, 2] * gain + inverse[k, 3] * offset
+
+
+@kernel(fastmath=True)
+def _misfit(other: Float32, design: Float32, step: Float64) -> tuple[float, float]:
+    """Sums of squares over the patch: what the step leaves, and the other patch about its mean."""
+    mean = other.sum() / np.float32(_SIZE * _SIZE)
+    left, spread = np.float32(0), np.float32(0)
+    a, b, c, d = np.float32(step[0]), np.float32(step[1]), np.float32(step[2]), np.float32(step[3])
+    for k in range(_SIZE * _SIZE):
+        off = other[k] - design[4, k]
+        off -= a * design[0, k] + b * design[1, k] + c * design[2, k] + d
+        left += off * off
+        spread += (other[k] - mean) * (other[k] - mean)
+    return left, spread
 
 
 @kernel()
@@ -151,26 +239,22 @@ def _locate(
     source: Float32, target: Float32, places: Float64, pixels: Float64, grown: Float64, sigma: Float64,
     likeness: Float64, reach: float,
 ) -> None:  # fmt: skip
-    half, size = HALF_PX, 2 * HALF_PX + 1
-    wide = np.empty((size + 2, size + 2))
-    room = np.empty((2, size + 2, 4))
-    other = np.empty((size, size))
-    design = np.empty((size * size, 4))
-    residual = np.empty(size * size)
+    wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
+    room = np.empty((2, _SIZE + 2, 4), np.float32)
+    rows = np.empty((MOST_ROWS, _SIZE + 2), np.float32)
+    other = np.empty((_SIZE, _SIZE), np.float32)
+    flat = other.ravel()
+    design = np.empty((5, _SIZE * _SIZE), np.float32)
+    normal, step = np.empty((4, 4)), np.empty(4)
     for n in range(places.shape[0]):
-        if not _read(source, places[n, 0], places[n, 1], half + 1, 1 / grown[n], wide, room):
+        size = 1 / grown[n]
+        if (_SIZE + 2) * size + 5 > MOST_ROWS or not _inside(
+            source, places[n, 0], places[n, 1], (HALF_PX + 1) * size
+        ):
             continue
-        mean = wide[1:-1, 1:-1].mean()
-        for i in range(size):
-            for j in range(size):
-                k = i * size + j
-                design[k, 0] = (wide[i + 1, j + 2] - wide[i + 1, j]) / 2
-                design[k, 1] = (wide[i + 2, j + 1] - wide[i, j + 1]) / 2
-                design[k, 2] = wide[i + 1, j + 1] - mean
-                design[k, 3] = 1.0
-        if design[:, 2].std() < LEAST_CONTRAST_DN:
+        _read(source, places[n, 0], places[n, 1], HALF_PX + 1, size, wide, rows, room)
+        if _prepare(wide, design, normal) < LEAST_CONTRAST_DN:
             continue
-        normal = design.T @ design
         if normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2 < 1e-3 * normal[0, 0] * normal[1, 1] + 1e-9:
             continue
         inverse = np.linalg.inv(normal)
@@ -178,12 +262,10 @@ def _locate(
         x, y = x0, y0
         settled = False
         for _ in range(MOST_STEPS):
-            if not _read(target, x, y, half, 1.0, other, room):
+            if not _inside(target, x, y, HALF_PX):
                 break
-            for i in range(size):
-                for j in range(size):
-                    residual[i * size + j] = other[i, j] - wide[i + 1, j + 1]
-            step = inverse @ (design.T @ residual)
+            _read_whole(target, x, y, other, rows, room)
+            _step(flat, design, inverse, step)
             x -= step[0]
             y -= step[1]
             if abs(x - x0) > reach or abs(y - y0) > reach:
@@ -193,11 +275,10 @@ def _locate(
                 break
         if not settled:
             continue
-        misfit = residual - design @ step
-        variance = (misfit**2).sum() / (size * size - 4)
-        spread = variance * inverse
-        middle = (spread[0, 0] + spread[1, 1]) / 2
-        swing = np.sqrt(((spread[0, 0] - spread[1, 1]) / 2) ** 2 + spread[0, 1] ** 2)
-        sigma[n] = np.sqrt(middle + swing)
+        left, spread = _misfit(flat, design, step)
+        variance = left / (_SIZE * _SIZE - 4)
+        middle = variance * (inverse[0, 0] + inverse[1, 1]) / 2
+        swing = np.sqrt(((inverse[0, 0] - inverse[1, 1]) / 2) ** 2 + inverse[0, 1] ** 2)
+        sigma[n] = np.sqrt(middle + variance * swing)
         pixels[n, 0], pixels[n, 1] = x, y
-        likeness[n] = 1 - (misfit**2).mean() / max(other.var(), 1e-9)
+        likeness[n] = 1 - left / max(spread, 1e-9)

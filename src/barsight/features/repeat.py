@@ -20,7 +20,9 @@ def repeat_px(image: UInt8, places: Float64) -> Float64:
 
     The first peak of the mean autocorrelation of the tile's rows, the slow changes of light taken off.
     """
-    detail = cv2.blur(image.astype(np.float32) - cv2.blur(image, (81, 81)), (1, 9))[::ROW_STEP]
+    bands = max(1, image.shape[0] // ROW_STEP)
+    rows_of = cv2.resize(image, (image.shape[1], bands), interpolation=cv2.INTER_AREA).astype(np.float32)
+    detail = rows_of - cv2.blur(rows_of, (81, 11))
     places = places / (1, ROW_STEP)
     rows = np.linspace(0, detail.shape[0], TILES[0] + 1).astype(int)
     columns = np.linspace(0, image.shape[1], TILES[1] + 1).astype(int)

@@ -253,14 +253,15 @@ def refine(
         spread = by_point @ rotation @ by_old_places
         covariance = variance * (spread @ spread.transpose(0, 2, 1) + np.eye(3))
         information = np.linalg.inv(covariance)
-        distance = np.sqrt(np.einsum("ni,nij,nj->n", residual, information, residual))
+        distance = np.sqrt(((information @ residual[:, :, None])[:, :, 0] * residual).sum(axis=1))
         kept = (distance < 5.0) & in_front
         if kept.sum() < settings.least_inliers:
             return Failed("no-consensus", f"only {int(kept.sum())} of {len(points)} points agree in 3D")
         weight = np.where(kept, np.minimum(1.0, 1.5 / np.maximum(distance, 1e-9)), 0.0)
         weighted = information * weight[:, None, None]
-        normal = np.einsum("nki,nkl,nlj->ij", jacobian, weighted, jacobian)
-        gradient = np.einsum("nki,nkl,nl->i", jacobian, weighted, residual)
+        rows = jacobian.reshape(-1, 6)
+        normal = rows.T @ (weighted @ jacobian).reshape(-1, 6)
+        gradient = rows.T @ (weighted @ residual[:, :, None]).reshape(-1)
         update = np.linalg.solve(normal, gradient)
         rotation = Rotation.from_rotvec(update[:3]).as_matrix() @ rotation
         translation = Rotation.from_rotvec(update[:3]).as_matrix() @ translation + update[3:]
