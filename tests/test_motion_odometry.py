@@ -11,16 +11,10 @@ from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame, Trajectory
-from barsight.motion.odometry import (
-    OdometrySettings,
-    Step,
-    StereoOdometry,
-    _by_old_places,
-    _carried,
-    _in_world,
-    _triangulated,
-    refine,
-)
+from barsight.features.guided import project_stereo, triangulate
+from barsight.motion.odometry import StereoOdometry
+from barsight.motion.step import Step, _by_old_places, carried, in_world, refine
+from barsight.motion.views import OdometrySettings
 from barsight.recording.open import open_recording
 from barsight.recording.truth import read_ground_truth
 from motion_recordings import MemoryRecording, ideal_rig
@@ -33,17 +27,6 @@ HALL = RectifiedCamera(457.0, 363.0, 252.0, 0.11, 12.9, 752, 480)
 TURN, MOVE = np.array([0.01, 0.02, -0.005]), np.array([0.1, -0.02, 0.3])
 
 
-def seen(points: np.ndarray, camera: RectifiedCamera) -> np.ndarray:
-    """(N, 3): u and v in the left picture, u in the right one."""
-    x, y, z = points.T
-    u, v = camera.focal_px * x / z + camera.cx_px, camera.focal_px * y / z + camera.cy_px
-    return np.column_stack([u, v, u - camera.focal_px * camera.baseline_m / z + camera.doffs_px])
-
-
-def triangulated(places: np.ndarray, camera: RectifiedCamera) -> np.ndarray:
-    return _triangulated(places[:, :2], places[:, 0] - places[:, 2], camera)
-
-
 def refined(
     rng: np.random.Generator, camera: RectifiedCamera, depth_m: tuple[float, float], count: int, wild: int = 0
 ) -> tuple[Step, np.ndarray]:
@@ -54,9 +37,9 @@ def refined(
     points /= camera.focal_px
     rotation = Rotation.from_rotvec(TURN).as_matrix()
     noise = rng.normal(0, SETTINGS.pixel_sigma_px, (2, count, 3))
-    target = seen(points @ rotation.T + MOVE, camera) + noise[1]
+    target = project_stereo(points @ rotation.T + MOVE, camera) + noise[1]
     target[:wild] += rng.uniform(-30, 30, (wild, 3))
-    old = triangulated(seen(points, camera) + noise[0], camera)
+    old = triangulate(project_stereo(points, camera) + noise[0], camera)
     start = Rotation.from_rotvec(TURN + 2e-4).as_matrix()
     step = refine(old, target, start, MOVE + 0.002, camera, SETTINGS)
     assert isinstance(step, Step)
@@ -94,7 +77,7 @@ def test_a_step_without_agreement_fails() -> None:
     rng = np.random.default_rng(2)
     places = rng.uniform(50, 300, (60, 3))
     places[:, 2] = places[:, 0] - rng.uniform(20, 40, 60)
-    failed = refine(triangulated(places, STREET), places[::-1], np.eye(3), np.zeros(3), STREET, SETTINGS)
+    failed = refine(triangulate(places, STREET), places[::-1], np.eye(3), np.zeros(3), STREET, SETTINGS)
     assert isinstance(failed, Failed)
     assert failed.code == "no-consensus"
 
@@ -105,9 +88,9 @@ def test_how_points_move_with_their_places() -> None:
     expected = np.empty((3, 3, 3))
     for k in range(3):
         moved = np.eye(3)[k] * 1e-5
-        expected[:, :, k] = (triangulated(places + moved, HALL) - triangulated(places - moved, HALL)) / 2e-5
+        expected[:, :, k] = (triangulate(places + moved, HALL) - triangulate(places - moved, HALL)) / 2e-5
     np.testing.assert_allclose(
-        _by_old_places(triangulated(places, HALL), HALL), expected, rtol=1e-6, atol=1e-9
+        _by_old_places(triangulate(places, HALL), HALL), expected, rtol=1e-6, atol=1e-9
     )
 
 
@@ -127,8 +110,8 @@ def test_covariances_add_up_along_a_chain() -> None:
         world_from_new = pose @ mount @ step.inverse()
         following = world_from_new @ mount.inverse()
         lever = following.translation - world_from_new.translation
-        stated = _carried(stated, following.translation - pose.translation)
-        stated += _carried(_in_world(sigma, world_from_new.rotation), lever)
+        stated = carried(stated, following.translation - pose.translation)
+        stated += carried(in_world(sigma, world_from_new.rotation), lever)
         pose = following
     errors = []
     for _ in range(1000):

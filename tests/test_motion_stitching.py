@@ -7,8 +7,8 @@ from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError
 from barsight.core.types import RefusedFrame, StereoFrame
 from barsight.motion.crane import CraneSettings
-from barsight.motion.odometry import OdometrySettings
 from barsight.motion.stitching import PaperStitching, StitchingSettings
+from barsight.motion.views import OdometrySettings
 from motion_recordings import MemoryRecording, ideal_rig
 from test_motion_odometry import picture_pair
 

@@ -9,6 +9,7 @@ any fraction of a pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -203,11 +204,11 @@ def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
             for i in range(_SIZE * _SIZE):
                 total += design[k, i] * design[m, i]
             normal[k, m] = normal[m, k] = total
-    return np.sqrt(normal[2, 2] / (_SIZE * _SIZE))
+    return float(np.sqrt(normal[2, 2] / (_SIZE * _SIZE)))
 
 
 @kernel(fastmath=True)
-def _step(other: Float32, design: Float32, inverse: Float64, step: Float64) -> None:
+def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
     """The Gauss-Newton step (4,) that the other patch (_SIZE^2,) asks for."""
     along, down, gain, offset = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
     for k in range(_SIZE * _SIZE):
@@ -231,7 +232,7 @@ def _misfit(other: Float32, design: Float32, step: Float64) -> tuple[float, floa
         off -= a * design[0, k] + b * design[1, k] + c * design[2, k] + d
         left += off * off
         spread += (other[k] - mean) * (other[k] - mean)
-    return left, spread
+    return float(left), float(spread)
 
 
 @kernel()

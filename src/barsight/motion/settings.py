@@ -8,8 +8,9 @@ from typing import Literal
 from barsight.motion.crane import CraneSettings, CraneTrajectory
 from barsight.motion.estimator import TrajectoryEstimator
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
-from barsight.motion.odometry import OdometrySettings, StereoOdometry
+from barsight.motion.odometry import StereoOdometry
 from barsight.motion.stitching import PaperStitching, StitchingSettings
+from barsight.motion.views import OdometrySettings
 
 
 @dataclass(frozen=True)

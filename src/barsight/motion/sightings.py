@@ -16,7 +16,8 @@ from barsight.features.guided import GuidedMatches, PredictedMotion, predict_pla
 from barsight.features.patches import PatchPair, patch_pair
 from barsight.features.repeat import repeat_px
 from barsight.features.tracks import Tracks, TrackSettings, carry_on, find_again
-from barsight.motion.odometry import OdometrySettings, Step, StereoOdometry, View, ransac, refine
+from barsight.motion.step import Step, move, ransac, refine
+from barsight.motion.views import OdometrySettings, View, look
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import coarse_disparity
 
@@ -114,7 +115,7 @@ def _see(
         tracks = Tracks(next_track=0 if state is None else state.next_track)
         motion = None
         if prediction is None:
-            rough = StereoOdometry(settings.rough).look(pair)
+            rough = look(pair, settings.rough)
             view = None if isinstance(rough, Failed) else rough
     else:
         tracks = state.tracks
@@ -151,15 +152,14 @@ def _rough(
     state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
 ) -> tuple[Step, View] | Failed:
     """The motion by ORB features of both pairs, without any prediction."""
-    odometry = StereoOdometry(settings.rough)
     assert tracks.last is not None
-    old = state.view or odometry.look(patch_pair(tracks.last))
-    new = odometry.look(pair)
+    old = state.view or look(patch_pair(tracks.last), settings.rough)
+    new = look(pair, settings.rough)
     if isinstance(old, Failed):
         return old
     if isinstance(new, Failed):
         return new
-    step = odometry.move(old, new, pair.pair.camera)
+    step = move(old, new, settings.rough)
     return step if isinstance(step, Failed) else (step, new)
 
 

@@ -19,10 +19,10 @@ from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
 from barsight.features.guided import project_stereo
 from barsight.features.matching import match_mutual
-from barsight.features.patches import patch_pair
 from barsight.motion.crane import CraneSettings, CraneTrajectory
 from barsight.motion.gravity import level_attitude
-from barsight.motion.odometry import OdometrySettings, StereoOdometry, View, _carried, _in_world
+from barsight.motion.step import carried, in_world
+from barsight.motion.views import OdometrySettings, View, views
 from barsight.recording.base import Recording
 from barsight.registration.rigid import Alignment, align
 
@@ -58,42 +58,35 @@ class PaperStitching:
     def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
         """Frames without enough matches are refused; the next one is tied to the last good one."""
         predicted = self._predicted(recording, rectifier)
-        look = StereoOdometry(self.features).look
         placed: list[PosedFrame] = []
         refused: list[RefusedFrame] = []
-        last: tuple[int, View] | None = None
+        last: View | None = None
         noise = np.diag([1e-12] * 6)
-        for frame in recording.frames():
-            advance()
-            if isinstance(frame, RefusedFrame):
-                refused.append(frame)
-                continue
-            pair = rectifier(frame)
-            view = pair if isinstance(pair, Failed) else look(patch_pair(pair))
-            if isinstance(view, Failed):
-                refused.append(RefusedFrame(frame.stamp_ns, view.reason))
+        for view in views(recording, rectifier, self.features, advance):
+            if isinstance(view, RefusedFrame):
+                refused.append(view)
                 continue
             if last is None:
-                first = predicted.get(frame.stamp_ns)
+                first = predicted.get(view.stamp_ns)
                 if predicted and first is None:
-                    refused.append(RefusedFrame(frame.stamp_ns, "the encoders don't cover the first frame"))
+                    refused.append(RefusedFrame(view.stamp_ns, "the encoders don't cover the first frame"))
                     continue
                 pose = level_attitude(recording).world_from_body if first is None else first
             else:
-                trend = _between(predicted.get(last[0]), predicted.get(frame.stamp_ns), rectifier)
-                step = self._step(last[1], view, rectifier.camera, trend)
+                trend = _between(predicted.get(last.stamp_ns), predicted.get(view.stamp_ns), rectifier)
+                step = self._step(last, view, rectifier.camera, trend)
                 if isinstance(step, Failed):
-                    refused.append(RefusedFrame(frame.stamp_ns, step.reason))
+                    refused.append(RefusedFrame(view.stamp_ns, step.reason))
                     continue
                 old = placed[-1].reference_from_body
                 old_rect0 = old @ rectifier.body_from_rect0
                 new_rect0 = old_rect0 @ step.target_from_source
                 pose = new_rect0 @ rectifier.body_from_rect0.inverse()
-                added = _in_world(step.covariance, old_rect0.rotation)
+                added = in_world(step.covariance, old_rect0.rotation)
                 lever = pose.translation - new_rect0.translation
-                noise = _carried(noise, pose.translation - old.translation) + _carried(added, lever)
-            placed.append(PosedFrame(frame.stamp_ns, pose, noise))
-            last = frame.stamp_ns, view
+                noise = carried(noise, pose.translation - old.translation) + carried(added, lever)
+            placed.append(PosedFrame(view.stamp_ns, pose, noise))
+            last = view
         reference = "yard" if predicted else "world"
         sensors = ("stereo", "crane") if predicted else ("stereo",)
         return Trajectory(reference, tuple(placed), tuple(refused), sensors)

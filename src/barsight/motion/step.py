@@ -1,0 +1,173 @@
+"""One step of stereo odometry: metric PnP with RANSAC, refined on both pictures, and how steps add up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import Failed
+from barsight.core.types import RectifiedCamera
+from barsight.features.guided import match_across
+from barsight.features.matching import match_mutual
+from barsight.features.patches import locate
+from barsight.motion.views import OdometrySettings, View
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """new_from_old: pose of the old `rect0` in the new one, and its covariance (6, 6).
+
+    scale_sigma: relative error of the step's length that the calibration may cause; it doesn't average out.
+    kept: (N,) which points agree.
+    """
+
+    rotation: Float64
+    translation: Float64
+    covariance: Float64
+    scale_sigma: float
+    kept: Bool
+
+
+def move(old: View, new: View, settings: OdometrySettings) -> Step | Failed:
+    """The motion between two views by the features that match mutually."""
+    camera = new.pair.pair.camera
+    pairs = match_mutual(old.features, new.features)
+    if len(pairs) < settings.least_inliers:
+        return Failed("no-matches", f"only {len(pairs)} features match the frame before")
+    places = old.features.pixels[pairs[:, 0]].astype(np.float64)
+    guesses = new.features.pixels[pairs[:, 1]].astype(np.float64)
+    again = locate(old.pair.left, new.pair.left, places, guesses)
+    right = match_across(new.pair, again.pixels, new.disparity[pairs[:, 1]], sure=True)
+    kept = again.found & right.found
+    pairs, target = pairs[kept], np.column_stack([again.pixels, right.pixels[:, 0]])[kept]
+    if len(pairs) < settings.least_inliers:
+        return Failed("no-matches", f"only {len(pairs)} features can be followed from the frame before")
+    points = old.points[pairs[:, 0]]
+    start = ransac(points, target[:, :2], camera, settings)
+    if isinstance(start, Failed):
+        return start
+    rotation, translation = start
+    return refine(points, target, rotation, translation, camera, settings)
+
+
+def _by_old_places(points: Float64, camera: RectifiedCamera) -> Float64:
+    """(N, 3, 3) how triangulated points move with the u, v and u_right that they were seen at, m per px."""
+    depth = points[:, 2]
+    along_ray = points * (depth / (camera.focal_px * camera.baseline_m))[:, None]
+    by_places = np.stack([-along_ray, np.zeros_like(points), along_ray], axis=2)
+    by_places[:, 0, 0] += depth / camera.focal_px
+    by_places[:, 1, 1] += depth / camera.focal_px
+    return by_places
+
+
+def ransac(
+    points: Float64,
+    pixels: Float64,
+    camera: RectifiedCamera,
+    settings: OdometrySettings,
+) -> tuple[Float64, Float64] | Failed:
+    matrix = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
+    cv2.setRNGSeed(1)
+    good, turn, shift, inliers = cv2.solvePnPRansac(
+        points,
+        np.ascontiguousarray(pixels),
+        matrix,
+        None,
+        iterationsCount=500,
+        reprojectionError=settings.ransac_px,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    count = 0 if inliers is None else len(inliers)
+    if not good or count < settings.least_inliers:
+        return Failed("no-consensus", f"only {count} of {len(points)} matches agree on one motion")
+    return Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel()
+
+
+def refine(
+    points: Float64,
+    target: Float64,
+    rotation: Float64,
+    translation: Float64,
+    camera: RectifiedCamera,
+    settings: OdometrySettings,
+) -> Step | Failed:
+    """Gauss-Newton on u, v and u_right of the new pair, each residual whitened by its own covariance.
+
+    The noise of the three places that the old point was triangulated from, most of it along its ray, is
+    projected into the new pair and widens the residual's covariance. Huber's weights; outliers beyond 5
+    sigma leave. The step's covariance is that of a small motion that follows it, in the new frame's axes.
+    """
+    focal, base = camera.focal_px, camera.focal_px * camera.baseline_m
+    variance = settings.pixel_sigma_px**2
+    by_old_places = _by_old_places(points, camera)
+    kept: Bool = np.ones(len(points), dtype=np.bool_)
+    normal = np.eye(6)
+    for _ in range(10):
+        moved = points @ rotation.T + translation
+        in_front = moved[:, 2] > 0.1
+        x, y, z = np.where(in_front[:, None], moved, 1.0).T
+        u, v = focal * x / z + camera.cx_px, focal * y / z + camera.cy_px
+        predicted = np.column_stack([u, v, u - base / z + camera.doffs_px])
+        residual = target - predicted
+        zero = np.zeros_like(z)
+        by_point = np.stack(
+            [
+                np.stack([focal / z, zero, -focal * x / z**2], axis=1),
+                np.stack([zero, focal / z, -focal * y / z**2], axis=1),
+                np.stack([focal / z, zero, -focal * x / z**2 + base / z**2], axis=1),
+            ],
+            axis=1,
+        )
+        by_turn = -by_point @ _cross(moved)
+        jacobian = np.concatenate([by_turn, by_point], axis=2)
+        spread = by_point @ rotation @ by_old_places
+        covariance = variance * (spread @ spread.transpose(0, 2, 1) + np.eye(3))
+        information = np.linalg.inv(covariance)
+        distance = np.sqrt(((information @ residual[:, :, None])[:, :, 0] * residual).sum(axis=1))
+        kept = (distance < 5.0) & in_front
+        if kept.sum() < settings.least_inliers:
+            return Failed("no-consensus", f"only {int(kept.sum())} of {len(points)} points agree in 3D")
+        weight = np.where(kept, np.minimum(1.0, 1.5 / np.maximum(distance, 1e-9)), 0.0)
+        weighted = information * weight[:, None, None]
+        rows = jacobian.reshape(-1, 6)
+        normal = rows.T @ (weighted @ jacobian).reshape(-1, 6)
+        gradient = rows.T @ (weighted @ residual[:, :, None]).reshape(-1)
+        update = np.linalg.solve(normal, gradient)
+        rotation = Rotation.from_rotvec(update[:3]).as_matrix() @ rotation
+        translation = Rotation.from_rotvec(update[:3]).as_matrix() @ translation + update[3:]
+        if np.abs(update).max() < 1e-9:
+            break
+    depth = float(np.median(points[kept, 2]))
+    scale_sigma = settings.calibration_sigma_px * depth / base
+    return Step(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
+
+
+def _cross(vectors: Float64) -> Float64:
+    """(N, 3) to (N, 3, 3) with `_cross(v) @ w = v x w`."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    rows = [np.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return np.stack(rows, axis=1)
+
+
+def carried(covariance: Float64, way: Float64) -> Float64:
+    """(6, 6) of a pose, rotation then translation in the reference's axes, for a point `way` (m) further on
+    that is fixed to it: what the attitude is off by swings the point.
+    """
+    further = np.eye(6)
+    further[3:, :3] = -_cross(way[None])[0]
+    result: Float64 = further @ covariance @ further.T
+    return result
+
+
+def in_world(covariance: Float64, rotation: Float64) -> Float64:
+    """(6, 6) of a pose, turned by (3, 3) to other axes."""
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = rotation
+    result: Float64 = turned @ covariance @ turned.T
+    return result

@@ -1,0 +1,95 @@
+"""Pictures one by one as stereo odometry looks at them: ORB features with a depth, or why there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float64
+from barsight.core.errors import ConfigError, Failed
+from barsight.core.types import RefusedFrame
+from barsight.features.guided import match_across, triangulate
+from barsight.features.orb import Features, detect_orb
+from barsight.features.patches import PatchPair, patch_pair
+from barsight.recording.base import Recording
+from barsight.stereo.disparity_range import coarse_disparity
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """Stereo visual odometry."""
+
+    features: int = 3000
+    """Features a picture."""
+    nearest_m: float = 0.5
+    """Points nearer than this aren't used."""
+    farthest_baselines: float = 60.0
+    """Points further than this many baselines aren't used for motion."""
+    least_inliers: int = 25
+    """A frame with fewer agreeing points is refused."""
+    pixel_sigma_px: float = 0.3
+    """The noise of a feature's place (1 sigma)."""
+    calibration_sigma_px: float = 0.1
+    """Disparity error common to all features: it makes every step too long or too short alike (1 sigma)."""
+    ransac_px: float = 1.0
+    """Points further off than this are outliers."""
+
+    def __post_init__(self) -> None:
+        if not 100 <= self.features <= 100_000 or self.least_inliers < 6:
+            raise ConfigError("features must lie in 100...100000, least_inliers be at least 6")
+        if min(self.nearest_m, self.farthest_baselines, self.pixel_sigma_px, self.ransac_px) <= 0:
+            raise ConfigError("the odometry's distances and tolerances must be positive")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One frame's features with a stereo disparity. points: (N, 3) in `rect0`."""
+
+    pair: PatchPair
+    features: Features
+    disparity: Float64
+    points: Float64
+
+    @property
+    def stamp_ns(self) -> int:
+        """The frame's."""
+        return self.pair.pair.stamp_ns
+
+
+def views(
+    recording: Recording, rectifier: Rectifier, settings: OdometrySettings, advance: Callable[[], None]
+) -> Iterator[View | RefusedFrame]:
+    """Of each frame its features, or why it shows none. `advance` is called once a frame."""
+    for frame in recording.frames():
+        advance()
+        if isinstance(frame, RefusedFrame):
+            yield frame
+            continue
+        pair = rectifier(frame)
+        view = pair if isinstance(pair, Failed) else look(patch_pair(pair), settings)
+        yield RefusedFrame(frame.stamp_ns, view.reason) if isinstance(view, Failed) else view
+
+
+def look(pair: PatchPair, settings: OdometrySettings) -> View | Failed:
+    """The ORB features of a pair that have a depth; Failed `no-features` where too few do."""
+    camera = pair.pair.camera
+    features = detect_orb(pair.pair.left, settings.features)
+    coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px)
+    row = (features.pixels[:, 1] * coarse.shape[0] / camera.height).astype(int)
+    column = (features.pixels[:, 0] * coarse.shape[1] / camera.width).astype(int)
+    guess = coarse[row, column]
+    near = np.isfinite(guess)
+    features, guess = features.chosen(near), guess[near]
+    places = features.pixels.astype(np.float64)
+    right = match_across(pair, places, guess.astype(np.float64))
+    points = triangulate(np.column_stack([places, right.pixels[:, 0]]), camera)
+    with np.errstate(invalid="ignore"):
+        kept = right.found & (points[:, 2] > settings.nearest_m)
+        kept &= points[:, 2] < settings.farthest_baselines * camera.baseline_m
+    if kept.sum() < settings.least_inliers:
+        return Failed("no-features", f"only {int(kept.sum())} features have a depth")
+    disparity = places[kept, 0] - right.pixels[kept, 0]
+    return View(pair, features.chosen(kept), disparity, points[kept])
