@@ -18,6 +18,7 @@ from barsight.result_folder import read_heights
 from barsight.viewer.yard_lines import yard_lines
 from barsight.yard.bundle_file import write_bundles
 from barsight.yard.lift_file import read_lifts
+from barsight.yard.travel import Travel
 from lift_yards import laid, map_of, record
 from mapping_views import block, fused, view
 from result_folders import summary
@@ -45,7 +46,10 @@ def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **ch
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
     write_bundles(bundles, None, "yard", folder / "bundles.json")
     measured = datetime.now(UTC) - timedelta(seconds=age_s)
-    content = summary() | {"measured_at": measured.isoformat(), "agreement": []} | changes
+    way = Travel(np.zeros((3, 2)), np.full((3, 3), 0.001), np.zeros(3), np.empty((0, 2)), 5.0)
+    content = (
+        summary() | {"measured_at": measured.isoformat(), "agreement": [], "travel": way.content()} | changes
+    )
     (folder / "result.json").write_text(json.dumps(content), encoding="utf-8")
     return folder
 
@@ -78,6 +82,7 @@ def test_lifts_are_chosen_shown_and_drawn(tmp_path: Path, capsys: pytest.Capture
     [
         ({"age_s": 7200.0}, "map-too-old"),
         ({"reference": "world"}, "no-yard-frame"),
+        ({"travel": None}, "trajectory-degraded"),
         ({"warnings": [{"code": "calibration", "message": "rows off"}]}, "calibration-drift"),
     ],
 )

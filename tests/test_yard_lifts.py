@@ -26,6 +26,7 @@ from barsight.yard.load import mass_of
 from barsight.yard.magnet import Beam, Magnet, Tolerance
 from barsight.yard.set_down import CLEARANCE_M, COARSE_M, free_places
 from barsight.yard.settle import rest
+from barsight.yard.travel import Travel
 from barsight.yard.vetoes import VETOES, Veto
 from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
 from yard_maps import Laid
@@ -268,7 +269,6 @@ def test_a_bundle_above_its_stanchion() -> None:
     [
         ("calibration", "yard", 1.0, "calibration-drift"),
         ("calibration-drift", "yard", 1.0, "calibration-drift"),
-        ("trajectory", "yard", 1.0, "trajectory-degraded"),
         ("one-view", "yard", 1.0, "one-view"),
         ("assumed", "world", 1.0, "no-yard-frame"),
         ("assumed", "yard", 4000.0, "map-too-old"),
@@ -284,7 +284,19 @@ def test_what_forbids_every_lift(warning: str, reference: str, age_s: float | No
 
 
 def test_a_sound_map_forbids_nothing() -> None:
-    assert map_vetoes([("frames-refused", "1 of 9")], "yard", 10.0, SETTINGS) == ()
+    harmless = [("frames-refused", "1 of 9"), ("trajectory", "the encoders are 20 ms late")]
+    assert map_vetoes(harmless, "yard", 10.0, SETTINGS) == ()
+
+
+def test_a_trajectory_less_sure_than_the_magnet_needs() -> None:
+    stock = [laid(0.3)]
+    bundles = (record(stock[0]),)
+    sure = Travel(np.zeros((3, 2)), np.full((3, 3), 0.001), np.zeros(3), np.empty((0, 2)), 5.0)
+    assert plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), sure).offered
+    unsure = Travel.read({"travel": replace(sure, sigma_m=sure.sigma_m * 30).content()})
+    assert unsure is not None and Travel.read({}) is None
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), unsure)
+    assert plan.offered == () and codes(plan.refused[0]) == {"trajectory-degraded"}
 
 
 def test_an_empty_yard_and_one_without_a_free_bundle_offer_nothing() -> None:

@@ -15,6 +15,7 @@ from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, 
 from barsight.mapping.surface import Surface
 from barsight.yard.lift import LiftPlan
 from barsight.yard.stock_list import StockMatch
+from barsight.yard.travel import Travel
 from barsight.yard.types import Bundle
 
 
@@ -82,6 +83,7 @@ class Measurement:
     bundles: tuple[Bundle, ...]
     lifts: LiftPlan
     stock: StockMatch | None
+    travel: Travel
 
 
 def plain(value: Any) -> Any:

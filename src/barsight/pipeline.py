@@ -25,7 +25,7 @@ from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.parallel import ordered_map
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
-from barsight.core.stamps import NS_PER_S
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory
 from barsight.evaluation.agreement import agree
@@ -51,6 +51,7 @@ from barsight.yard.lift import map_vetoes, plan_lifts
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet, load_magnet
 from barsight.yard.stock_list import match_stock, read_stock
+from barsight.yard.travel import Travel
 from barsight.yard.types import HeightMap
 
 Advance = Callable[[str, int, int], None]
@@ -97,6 +98,7 @@ def measure(
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
     """
+    expected = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
     source = SelectedSensors(recording, settings.use)
     watch = Stopwatch()
     start = time.perf_counter()
@@ -175,7 +177,6 @@ def measure(
     with watch("bundles"):
         heights = HeightMap.of(surface)
         bundles = find_bundles(heights, settings.bundles)
-        expected = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
         stock = match_stock(expected, bundles) if expected and trajectory.reference == "yard" else None
 
     warnings = [Notice("assumed", text) for text in source.notes]
@@ -196,7 +197,10 @@ def measure(
     with watch("lifts"):
         told = [(notice.code, notice.message) for notice in warnings]
         forbidden = map_vetoes(told, trajectory.reference, 0.0, settings.lift)
-        lifts = plan_lifts(heights, bundles, magnet or load_magnet(None), settings.lift, forbidden)
+        window_ns = seconds_to_ns(settings.motion.crane.window_s)
+        shift_ns = source.rig.timeshift_cam_imu_ns
+        travel = Travel.of(trajectory, source.crane(), shift_ns, window_ns, first.range_m, rectifier.camera)
+        lifts = plan_lifts(heights, bundles, magnet or load_magnet(None), settings.lift, forbidden, travel)
     return Measurement(
         recording_path=source.path,
         recording_format=source.format,
@@ -222,6 +226,7 @@ def measure(
         bundles=bundles,
         lifts=lifts,
         stock=stock,
+        travel=travel,
     )
 
 

@@ -21,6 +21,8 @@ from barsight.yard.lift import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lift_file import write_lifts
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import load_magnet
+from barsight.yard.travel import Travel
+from barsight.yard.vetoes import Veto
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -47,9 +49,13 @@ def run(arguments: Sequence[str]) -> None:
         summary = read_summary(out)
         warnings = [(str(w.get("code")), str(w.get("message"))) for w in summary.get("warnings") or []]
         reference = str(summary.get("reference", "world"))
+        travel = Travel.read(summary)
         vetoes = map_vetoes(warnings, reference, age_s(summary), settings)
+        if travel is None:
+            unknown = "result.json doesn't say how sure the trajectory is: measure again"
+            vetoes = (*vetoes, Veto("trajectory-degraded", unknown))
         bundles = read_bundles(out / "bundles.json")
-        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes)
+        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes, travel)
         write_lifts(plan, reference, out / "lifts.json")
         write_report(out, out / "report.html")
         print_lifts(plan, Console(stderr=True))

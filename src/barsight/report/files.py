@@ -207,6 +207,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
             "length_m": trajectory.length_m,
             "duration_s": float(stamps[-1] - stamps[0]) / NS_PER_S if stamps.size else 0.0,
         },
+        "travel": measurement.travel.content(),
         "stages": [asdict(stage) for stage in measurement.stages],
         "seconds": measurement.seconds,
         "peak_memory_mib": measurement.peak_memory_mib,

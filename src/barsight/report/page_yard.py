@@ -17,7 +17,7 @@ from barsight.yard.bundle_file import read_bundles
 from barsight.yard.lift_file import read_lifts
 from barsight.yard.types import Bundle
 
-FREE_RGB, COVERED_RGB, LIFT_RGB, REFUSED_RGB = "#39d353", "#f2b134", "#ff2fb3", "#ff5a4f"
+FREE_RGB, COVERED_RGB, LIFT_RGB = "#39d353", "#f2b134", "#ff2fb3"
 
 
 @dataclass(frozen=True)

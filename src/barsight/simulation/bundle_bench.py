@@ -11,7 +11,7 @@ import numpy as np
 from barsight.evaluation.bundle_scores import BundleErrors, TrueBundle, joined, score_bundles
 from barsight.simulation.degraded_map import Defects, degraded_map
 from barsight.simulation.scene import build_scene
-from barsight.simulation.settings import SimulationSettings, YardSettings
+from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.stock import Bundle, stack_yard
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
@@ -20,6 +20,9 @@ from barsight.yard.types import HeightMap
 _KINDS = (
     "90mm:7", "40mm:37", "20mm:61", "60mm:19", "90mm:7,40mm:37,20mm:61", "160mm:1", "60mm:7",
     "40mm:19,90mm:7",
+)  # fmt: skip
+_RENDERED_KINDS = (
+    "90mm:7", "40mm:37", "20mm:61", "60mm:19", "40mm:19", "60mm:7", "90mm:7,40mm:37", "20mm:37",
 )  # fmt: skip
 
 
@@ -46,7 +49,7 @@ def bench_bundles(yards: int, seed: int, length_m: float) -> BundleBench:
 
 
 def drawn_yards(yards: int, seed: int, length_m: float) -> Iterator[SimulationSettings]:
-    """Yards of 1 to 5 layers with all kinds of bars, gaps, skews, missing bundles and dunnage."""
+    """Yards of 1 to 5 layers with all kinds of bars: gaps, skews, missing and crossed bundles, dunnage."""
     rng = np.random.default_rng(seed)
     for k in range(yards):
         bars = _KINDS[k % len(_KINDS)]
@@ -57,8 +60,35 @@ def drawn_yards(yards: int, seed: int, length_m: float) -> Iterator[SimulationSe
             missing_share=float(rng.choice([0, 0.1, 0.3])),
             dunnage_m=float(rng.choice([0.05, 0.09, 0.12])),
             bar_length_m=float(rng.choice([4, 5, 6, 7.5])),
+            crossed_share=0.5 if k % 3 == 2 else 0.0,
         )
         yield SimulationSettings(length_m=length_m, seed=1000 * seed + k, bars=bars, yard=yard)
+
+
+def rendered_yards(yards: int, seed: int) -> Iterator[SimulationSettings]:
+    """Short yards for small pictures, half a minute each to render and measure; of as many sorts as drawn.
+
+    The pictures are cut to a quarter, the resolution stays. Short bars have both ends in view, long ones one.
+    """
+    rng = np.random.default_rng((seed, 1))
+    for k in range(yards):
+        bars = _RENDERED_KINDS[k % len(_RENDERED_KINDS)]
+        mixed = "," in bars
+        bar_length = float(rng.choice([2.0, 2.3, 4.0]))
+        yard = YardSettings(
+            max_layers=1 + k % 5,
+            gap_m=float(rng.choice([0, 0.01, 0.03, 0.1])),
+            skew_deg=float(rng.choice([0, 0.3, 0.6, 1.5])),
+            missing_share=float(rng.choice([0, 0.1, 0.3])),
+            dunnage_m=float(rng.choice([0.05, 0.09, 0.12])),
+            bar_length_m=bar_length,
+            crossed_share=1.0 if k % 3 == 2 else 0.0,
+        )
+        camera = CameraSettings(width_px=640, height_px=512, trolley_y_m=-1.0 if bar_length > 3 else 0.0)
+        yield SimulationSettings(
+            length_m=4.6 if mixed else 2.6, frames=10 if mixed else 7, seed=1000 * seed + k, bars=bars,
+            depth_views=0, camera=camera, yard=yard,
+        )  # fmt: skip
 
 
 def drawn_map(settings: SimulationSettings) -> tuple[HeightMap, tuple[TrueBundle, ...]]:

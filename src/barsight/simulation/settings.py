@@ -113,6 +113,8 @@ class YardSettings:
     """How far the ends of a bundle's bars stand apart."""
     missing_share: float = 0.08
     """Share of places on the lowest layer that are empty (gullies)."""
+    crossed_share: float = 0.0
+    """Share of sections with a bundle lying across the others, or over them turned by 6 to 20 degrees."""
     dunnage_m: float = 0.09
     """Height and width of the wooden beams between the layers."""
     strap_spacing_m: float = 1.7
@@ -127,6 +129,7 @@ class YardSettings:
         _expect(1 <= self.bar_length_m <= 20, "yard bar_length_m must lie between 1 and 20 m")
         _expect(0 <= self.skew_deg <= 2, "yard skew_deg must lie between 0 and 2")
         _expect(0 <= self.missing_share <= 0.6, "yard missing_share must lie between 0 and 0.6")
+        _expect(0 <= self.crossed_share <= 1, "yard crossed_share must lie between 0 and 1")
         _expect(0.02 <= self.dunnage_m <= 0.3, "yard dunnage_m must lie between 0.02 and 0.3 m")
         _expect(0 <= self.ribbed_share <= 1, "yard ribbed_share must lie between 0 and 1")
         _expect(0 <= self.gap_m <= 1, "yard gap_m must lie between 0 and 1 m")
@@ -241,9 +244,10 @@ class SimulationSettings:
         _expect(2 <= self.frames <= 100_000, "frames must lie between 2 and 100000")
         _expect(self.seed >= 0, "seed can't be negative")
         _expect(0 <= self.depth_views <= self.frames, "depth_views must lie between 0 and frames")
+        layers = self.yard.max_layers + (self.yard.crossed_share > 0)
         tallest = max(2 * k.diameter_m * (k.rings + 0.5) for k in self.kinds) + self.yard.dunnage_m
         _expect(
-            self.camera.above_floor_m > self.yard.max_layers * tallest + 1,
+            self.camera.above_floor_m > layers * tallest + 1,
             "camera above_floor_m must be at least 1 m over the highest possible stack",
         )
 

@@ -12,6 +12,9 @@ from barsight.simulation.settings import BarKind, SimulationSettings
 PACKING = 1.003
 """Distance of neighbouring bars' axes over their diameter."""
 END_CLEARANCE_M = 0.004
+OVER_EDGE_M = 0.25
+"""How far a crossed bundle may reach beyond those that carry it: sections lie further apart."""
+LEAST_CROSSED_M = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +133,11 @@ def _section(
             placed.append(_bundle((section, layer, column), kind, (x, y, base), yaw, length, ribbed, rng))
         layers.append(placed)
         base = max(bundle.top_z_m for bundle in placed)
-    return [_covered(b, layers) for placed in layers for b in placed], beams
+    bundles = [_covered(b, layers) for placed in layers for b in placed]
+    if yard.crossed_share > 0 and rng.random() < yard.crossed_share:
+        over = _crossed(layers[-1], base, rng)
+        bundles = [replace(b, on_top=b.on_top and not _overlap(b, over)) for b in bundles] + [over]
+    return bundles, beams
 
 
 def _columns(
@@ -211,6 +218,34 @@ def _bundle(
     lowest = cross[:, 1].min() - kind.diameter_m / 2
     centre = np.array([place[0], place[1], place[2] - lowest])
     return Bundle(*number, kind, centre, yaw, float(roll), cross, length, ribbed)
+
+
+def _crossed(carriers: list[Bundle], base: float, rng: np.random.Generator) -> Bundle:
+    """A bundle of the same bars over the highest layer: across it, or turned by 6 to 20 degrees."""
+    first = carriers[0]
+    low, high = (float(b.centre_m[0]) + s * b.radius_m for b, s in ((first, -1), (carriers[-1], 1)))
+    reach = (high - low) / 2 + OVER_EDGE_M
+    yaw = float(rng.choice([-1, 1]) * np.radians(rng.uniform(6, 20)))
+    length = min(rng.uniform(0.5, 0.9) * first.length_m, 2 * (reach - first.radius_m) / np.sin(abs(yaw)))
+    if rng.random() < 0.5 or length < LEAST_CROSSED_M:
+        yaw = float(np.pi / 2 - abs(rng.normal(0, np.radians(3))))
+        length = min(max(2 * reach - rng.uniform(0, OVER_EDGE_M), LEAST_CROSSED_M), first.length_m)
+    y = float(rng.uniform(-0.2, 0.2)) * first.length_m
+    number = (first.section, first.layer + 1, -1)
+    place = ((low + high) / 2, y, base)
+    return replace(_bundle(number, first.kind, place, yaw, length, first.ribbed, rng), on_top=True)
+
+
+def _overlap(one: Bundle, other: Bundle) -> bool:
+    """Whether the outlines meet, seen from above: no axis of either separates them."""
+    away = one.centre_m - other.centre_m
+    for axis in (*one.axes[:2], *other.axes[:2]):
+        reach = sum(
+            abs(axis @ b.axes[0]) * b.radius_m + abs(axis @ b.axes[1]) * b.length_m / 2 for b in (one, other)
+        )
+        if abs(away @ axis) >= reach:
+            return False
+    return True
 
 
 def _covered(bundle: Bundle, layers: list[list[Bundle]]) -> Bundle:

@@ -16,6 +16,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.load import Mass, mass_of
 from barsight.yard.magnet import Magnet, Tolerance
 from barsight.yard.stability import Footing, footing_vetoes
+from barsight.yard.travel import Travel, travel_vetoes
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
@@ -25,12 +26,15 @@ SCALES = (1.0, 1.5, 2.5)
 
 @dataclass(frozen=True, eq=False)
 class Yard:
-    """All that lifts are chosen from. vetoes: those that hold for the whole map."""
+    """All that lifts are chosen from. vetoes: those that hold for the whole map. travel: None where the map
+    is not measured but given.
+    """
 
     heights: HeightMap
     table: BundleTable
     footings: tuple[Footing, ...]
     vetoes: tuple[Veto, ...]
+    travel: Travel | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +88,7 @@ def assess(
     overhang = _overhang(place, load, magnet)
     vetoes = [
         *yard.vetoes,
+        *(travel_vetoes(yard.travel, place, magnet, settings) if yard.travel else ()),
         *count_vetoes(place, yard.heights, magnet, near, contact, held, settings),
         *face_vetoes(contact, needed, magnet, settings),
         *tall_veto(place, yard.heights, magnet, contact),

@@ -13,6 +13,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet
 from barsight.yard.set_down import FreePlace, free_places
 from barsight.yard.stability import Footing, footings
+from barsight.yard.travel import Travel
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
@@ -28,8 +29,6 @@ RULE = (
 FROM_WARNINGS = {
     "calibration": "calibration-drift",
     "calibration-drift": "calibration-drift",
-    "trajectory": "trajectory-degraded",
-    "trajectory-degraded": "trajectory-degraded",
     "one-view": "one-view",
 }
 """Which of a result's warnings forbid every lift."""
@@ -73,11 +72,11 @@ def map_vetoes(
 
 def plan_lifts(
     heights: HeightMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
-    vetoes: tuple[Veto, ...],
+    vetoes: tuple[Veto, ...], travel: Travel | None = None,
 ) -> LiftPlan:  # fmt: skip
-    """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`)."""
+    """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames."""
     standing = footings(heights, bundles, settings)
-    yard = Yard(heights, BundleTable.of(bundles), standing, ())
+    yard = Yard(heights, BundleTable.of(bundles), standing, (), travel)
     offered, refused = [], []
     for group in _groups(bundles, settings.bundles):
         lift = _best(group, yard, magnet, settings)

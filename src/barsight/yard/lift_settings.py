@@ -23,6 +23,8 @@ class LiftSettings:
     """A bundle less sure than this is not lifted."""
     contact_gap_m: float = 0.003
     """A face nearer than this to steel lies on it."""
+    max_refused_share: float = 0.5
+    """Of the frames that see the place of the lift."""
     max_age_s: float = 3600.0
     """A map older than this is not lifted from."""
     max_overhang_share: float = 0.25
@@ -45,7 +47,7 @@ class LiftSettings:
             raise ConfigError(f"lift bundles must lie in 1...10, not {self.bundles}")
         shares = (
             self.max_unknown_share, self.max_unexplained_share, self.least_confidence,
-            self.max_overhang_share, self.least_count_probability,
+            self.max_overhang_share, self.least_count_probability, self.max_refused_share,
         )  # fmt: skip
         if not all(0 <= share <= 1 for share in shares):
             raise ConfigError("lift shares, least_confidence and least_count_probability lie in 0...1")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 VETOES = {
     "map-too-old": "The map is older than the settings allow, or its age is unknown.",
     "calibration-drift": "The cameras' calibration doesn't fit the pictures any more.",
-    "trajectory-degraded": "The trajectory came from less than the recording's sensors should give.",
+    "trajectory-degraded": "Near the lift trajectory or encoders aren't as sure as the magnet needs.",
     "one-view": "One frame made the map: no height is confirmed by another.",
     "no-yard-frame": "The map isn't in the crane's yard frame, so the crane can't go there.",
     "no-bundle": "No bundle lies under the footprint within the magnet's reach.",

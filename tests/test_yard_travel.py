@@ -1,0 +1,91 @@
+"""`trajectory-degraded`: only where the trajectory, near the lift, isn't as sure as the magnet needs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.pose import Pose
+from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
+from barsight.yard.footprint import Placement
+from barsight.yard.travel import Travel, travel_vetoes
+from lift_yards import MAGNET, SETTINGS
+
+CAMERA = RectifiedCamera(1250.0, 320.0, 256.0, 0.5, 0.0, 640, 512)
+RANGE_M, SPEED, FRAMES = 7.5, 0.5, 21
+STAMPS = (np.arange(FRAMES) * 1e9).astype(np.int64)
+X_M = SPEED * np.arange(FRAMES)
+HERE, THERE = Placement(2.0, 0.0, 0.0), Placement(8.0, 0.0, 0.0)
+
+
+def travel(
+    sigma_m: float = 0.001, sigma_rad: float = 1e-4, unsure_beyond_m: float = np.inf, encoders: object = None,
+    refused: tuple[int, ...] = (),
+) -> Travel:  # fmt: skip
+    """21 frames over 10 m, one a second; their sigmas are 30 times as large beyond `unsure_beyond_m`."""
+    frames = []
+    for k in set(range(FRAMES)) - set(refused):
+        scale = 30.0 if X_M[k] > unsure_beyond_m else 1.0
+        covariance = np.diag([(scale * sigma_rad) ** 2] * 3 + [(scale * sigma_m) ** 2] * 3)
+        pose = Pose("yard", "body", np.eye(3), np.array([X_M[k], 0.0, 8.0]))
+        frames.append(PosedFrame(int(STAMPS[k]), pose, covariance))
+    gone = tuple(RefusedFrame(int(STAMPS[k]), "blurred") for k in refused)
+    trajectory = Trajectory("yard", tuple(frames), gone, ("crane", "stereo"))
+    return Travel.of(trajectory, encoders, 0, int(0.35e9), RANGE_M, CAMERA)  # type: ignore[arg-type]
+
+
+def encoders(
+    slip_m: float = 0.0, first_m: float = 0.0, last_m: float = np.inf, late_s: float = 0.0
+) -> CraneSamples:
+    """Readings at 20 Hz that are off by slip_m in x between two places."""
+    stamps = np.arange(int(-1e9), int(STAMPS[-1] + 1e9), int(5e7))
+    x = SPEED * (stamps / 1e9 - late_s)
+    x = x + np.where((x >= first_m) & (x <= last_m), slip_m, 0.0)
+    places = np.stack([x, np.zeros_like(x), np.full_like(x, 8.0)], axis=1)
+    return CraneSamples(stamps, places, np.zeros(3), np.eye(3), 0.001)
+
+
+def reasons(one: Travel, place: Placement) -> list[str]:
+    vetoes = travel_vetoes(one, place, MAGNET, SETTINGS)
+    assert {veto.code for veto in vetoes} <= {"trajectory-degraded"}
+    return [veto.reason for veto in vetoes]
+
+
+def test_a_sure_trajectory_and_agreeing_encoders_forbid_nothing() -> None:
+    one = travel(encoders=encoders())
+    assert one.off_m.max() < 0.001
+    assert reasons(one, HERE) == reasons(one, THERE) == []
+
+
+def test_place_and_height_must_be_as_sure_as_the_magnet_needs_there() -> None:
+    one = travel(unsure_beyond_m=5.0)
+    assert reasons(one, HERE) == []
+    said = reasons(one, THERE)
+    assert [" x " in s for s in said] == [True, False, False]
+    assert ["y to" in s for s in said] == [False, True, False]
+    # Straight below, what turns the body moves the ground sideways only.
+    lateral = np.hypot(0.03, 0.003 * RANGE_M)
+    assert f"knows x to {1e3 * 1.645 * lateral:.0f} mm (95 %), 15 mm are allowed" in said[0]
+    assert f"knows height to {1e3 * 1.645 * 0.03:.0f} mm (95 %), 8 mm are allowed" in said[2]
+
+
+def test_a_lift_under_refused_frames_is_forbidden_and_one_beside_them_is_not() -> None:
+    one = travel(refused=tuple(range(13, 21)))
+    assert reasons(one, HERE) == []
+    assert any("frames that see it were refused" in s for s in reasons(one, THERE))
+    assert any("no frame was placed" in s for s in reasons(one, Placement(30.0, 0.0, 0.0)))
+
+
+def test_a_slip_of_the_encoders_forbids_lifts_beside_it() -> None:
+    one = travel(encoders=encoders(0.08, 7.4, 8.6))
+    assert reasons(one, HERE) == []
+    assert any("disagree by 80 mm within 1 m" in s for s in reasons(one, THERE))
+    assert reasons(travel(encoders=encoders(0.008, 7.4, 8.6)), THERE) == []
+
+
+def test_a_slip_that_stays_forbids_all_lifts_since_the_crane_would_go_beside() -> None:
+    one = travel(encoders=encoders(0.08, 7.0))
+    assert any("at the end of the way" in s for s in reasons(one, HERE))
+
+
+def test_late_encoders_stand_right_when_the_crane_stands() -> None:
+    assert reasons(travel(encoders=encoders(late_s=0.2)), HERE) == []
