@@ -24,6 +24,7 @@ _FEWEST_PIXELS = 200
 _REACH_RADII = 2.0
 _CLEAR_RADII = 1.6
 _CAUCHY_SIGMAS = 2.4
+_LARGEST_PRODUCT = 1e100
 
 
 _Problem = tuple[Float64, float, Float64, Float64, float, float, Float64, Float64]
@@ -219,14 +220,18 @@ def _cauchy(
     found: Float64,
     weight: Float64,
 ) -> float:
-    total = 0.0
+    total, product = 0.0, 1.0
     for index in range(rays.shape[0]):
         predicted = _disparity_of_ray(
             centre, axis, radius, rays[index, 0], rays[index, 1], behind[index], scale, doffs
         )
         away = (found[index] - predicted) * weight[index]
-        total += math.log1p(away * away)
-    return float(total / rays.shape[0])
+        product *= 1 + away * away
+        # One logarithm for many factors: logarithms are what takes the time.
+        if product > _LARGEST_PRODUCT:
+            total += math.log(product)
+            product = 1.0
+    return float((total + math.log(product)) / rays.shape[0])
 
 
 @kernel()

@@ -107,12 +107,13 @@ def _best_line(stretches: _Stretches, line: Float64) -> Float64:
     place = stretches.place_px
     centre, half = (place.max() + place.min()) / 2, max((place.max() - place.min()) / 2, 1.0)
     along = (place - centre) / half
+    curves = [CubicSpline(stretches.shifts_px, misfit) for misfit in stretches.misfit]
     shift, turn = 0.0, 0.0
     reach = float(stretches.shifts_px[-1])
     for step in (reach / 20, reach / 80, reach / 320):
         shifts = shift + np.arange(-reach, reach + step / 2, step)
         turns = turn + np.arange(-reach, reach + step / 2, step)
-        total = _total_misfit(stretches, along, shifts, turns)
+        total = _total_misfit(stretches, curves, along, shifts, turns)
         row, column = np.unravel_index(int(total.argmin()), total.shape)
         shift, turn = float(shifts[row]), float(turns[column])
         reach = 8 * step
@@ -124,15 +125,18 @@ def _best_line(stretches: _Stretches, line: Float64) -> Float64:
     return points
 
 
-def _total_misfit(stretches: _Stretches, along: Float64, shifts: Float64, turns: Float64) -> Float64:
-    """(len(shifts), len(turns)) the sum of the stretches' misfits; outside the search the worst."""
+def _total_misfit(
+    stretches: _Stretches, curves: list[CubicSpline], along: Float64, shifts: Float64, turns: Float64
+) -> Float64:
+    """(len(shifts), len(turns)) the sum of the stretches' misfits, each read from its curve; outside the
+    search the worst.
+    """
     total = np.zeros((len(shifts), len(turns)))
-    for where, misfit in zip(along, stretches.misfit, strict=True):
+    low, high = stretches.shifts_px[[0, -1]]
+    for where, curve, worst in zip(along, curves, stretches.misfit.max(axis=1), strict=True):
         outline = shifts[:, None] + turns[None, :] * where
-        low, high = stretches.shifts_px[[0, -1]]
         inside = (outline >= low) & (outline <= high)
-        smooth = CubicSpline(stretches.shifts_px, misfit)(outline.clip(low, high))
-        total += np.where(inside, smooth, misfit.max())
+        total += np.where(inside, curve(outline.clip(low, high)), worst)
     return total
 
 

@@ -191,9 +191,10 @@ def _noise(table: Float32, x: float, y: float) -> float:
     across, down = _spline(x - column), _spline(y - row)
     total = 0.0
     for j in range(4):
+        there = table[(row + j) & (_TABLE - 1)]
         line = 0.0
         for i in range(4):
-            line += across[i] * table[(row + j) & (_TABLE - 1), (column + i) & (_TABLE - 1)]
+            line += across[i] * there[(column + i) & (_TABLE - 1)]
         total += down[j] * line
     return total
 
@@ -239,12 +240,14 @@ def _shade(
         gloss, sharpness = looks[1, 4], looks[1, 5]
         lit = 1.0
     facing = max(0.0, nx * lamp[0] + ny * lamp[1] + nz * lamp[2])
+    matt = albedo * (ambient + (1 - ambient) * facing * lit)
+    if gloss == 0 or facing == 0:
+        return float(matt)
     length = math.sqrt(dx * dx + dy * dy + 1)
     hx, hy, hz = lamp[0] - dx / length, lamp[1] - dy / length, lamp[2] - 1 / length
     half = math.sqrt(hx * hx + hy * hy + hz * hz)
     mirrored = max(0.0, (nx * hx + ny * hy + nz * hz) / half)
-    highlight = gloss * mirrored**sharpness if facing > 0 else 0.0
-    return float(albedo * (ambient + (1 - ambient) * facing * lit) + highlight * lit)
+    return float(matt + gloss * mirrored**sharpness * lit)
 
 
 @kernel(parallel=True)

@@ -13,7 +13,7 @@ measured, both from the same rough guess as a person's click would give (15 % of
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from rich.table import Table
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.core.parallel import ordered_map
 from barsight.core.types import Disparity, RectifiedPair
 from barsight.evaluation.stereo_bar_edges import bar_diameter
 from barsight.evaluation.stereo_bar_fit import BarGuess, fit_bar
@@ -34,6 +35,7 @@ LEAST_POSES = 10
 _RAISED_M = 0.3
 _MOST_GLOSS = 40.0
 _GUESS_ERROR = 0.15
+_FITS_AT_ONCE = 2
 
 
 @dataclass(frozen=True)
@@ -82,33 +84,35 @@ def bench_target_size(
     seed: int = 1,
 ) -> TargetSizeBench:
     """Render `poses` poses at each range and measure the bar in every method's disparities."""
-    sizes: dict[str, list[tuple[Float64, Float64]]] = {name: [] for name in methods}
-    for range_mm in ranges_mm:
-        measured: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
-        for pose in range(poses):
-            rng = np.random.default_rng([seed, range_mm, pose])
-            posed = bar_over_floor(rng, range_mm / 1000, rng.uniform(0, _MOST_GLOSS), _RAISED_M)
-            rendered = render(posed.scene, seed=seed * 100_000 + range_mm + pose)
-            if posed.scene.bar is None:
-                continue
-            guess = _rough_guess(rng, posed.scene.bar)
-            for name, method in methods.items():
-                found = method(rendered.pair, posed.candidates)
-                measured[name].append(measure_bar(found, rendered.pair, guess))
-        for name in methods:
-            both = np.array(measured[name], dtype=np.float64).reshape(-1, 2)
-            sizes[name].append((both[:, 0], both[:, 1]))
+    poses_at = [(range_mm, pose) for range_mm in ranges_mm for pose in range(poses)]
+    jobs = (job for range_mm, pose in poses_at for job in _matched(methods, range_mm, pose, seed))
+    # Rendering and matching use all cores, but the fits behind them one each: so two run beside them.
+    measured = np.array(list(ordered_map(lambda job: measure_bar(*job), jobs, _FITS_AT_ONCE)))
+    found = measured.reshape(len(ranges_mm), poses, len(methods), 2)
     results = tuple(
         TargetSizeResult(
             name,
             tuple(
-                RangeResult(range_mm, _errors(size), _errors(alone))
-                for range_mm, (size, alone) in zip(ranges_mm, sizes[name], strict=True)
+                RangeResult(range_mm, _errors(at_range[:, place, 0]), _errors(at_range[:, place, 1]))
+                for range_mm, at_range in zip(ranges_mm, found, strict=True)
             ),
         )
-        for name in methods
+        for place, name in enumerate(methods)
     )
     return TargetSizeBench(provenance(), 1000 * BAR_DIAMETER_M, poses, results)
+
+
+def _matched(
+    methods: Mapping[str, StereoMethod], range_mm: int, pose: int, seed: int
+) -> Iterator[tuple[Disparity, RectifiedPair, BarGuess]]:
+    """One pose's disparities by each method, its pair and the guess that the fit starts from."""
+    rng = np.random.default_rng([seed, range_mm, pose])
+    posed = bar_over_floor(rng, range_mm / 1000, rng.uniform(0, _MOST_GLOSS), _RAISED_M)
+    assert posed.scene.bar is not None
+    pair = render(posed.scene, seed=seed * 100_000 + range_mm + pose).pair
+    guess = _rough_guess(rng, posed.scene.bar)
+    for method in methods.values():
+        yield method(pair, posed.candidates), pair, guess
 
 
 def measure_bar(disparity: Disparity, pair: RectifiedPair, guess: BarGuess) -> tuple[float, float]:
