@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.boards import parse_board
+from barsight.calibration.boards import Board, parse_board
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.documents import ImuNoise
 from barsight.calibration.euroc import write_imu, write_rig
@@ -73,7 +73,7 @@ class Way:
 def simulated(
     seed: int, seconds: float = 6.0, corner_px: float = 0.25, swing: float = 1.0,
     shift_s: tuple[float, float] = (0.0031, 0.0026), noise: ImuNoise = NOISE,
-    gyro_scale: float = 1.0, camera_hz: float = 20.0, one_axis: bool = False,
+    gyro_scale: float = 1.0, camera_hz: float = 20.0, one_axis: bool = False, board: Board = BOARD,
 ) -> tuple[list[BoardView], ImuSamples, Truth]:  # fmt: skip
     """Views named by their stamps, the IMU's samples, the truth. The IMU covers 0.2 s more at each end."""
     rng = np.random.default_rng(seed)
@@ -101,7 +101,7 @@ def simulated(
         ):  # fmt: skip
             at = np.array([(stamp - START_NS) / 1e9 + shift])
             place = way.place + way.waves(1, at, 0)[0]
-            points = mount.inverse().apply((BOARD.points_m - place) @ way.rotation(at)[0])
+            points = mount.inverse().apply((board.points_m - place) @ way.rotation(at)[0])
             plane = points[:, :2] / np.maximum(points[:, 2:], 0.01)
             ahead = np.flatnonzero((points[:, 2] > 0.05) & (np.abs(plane).max(axis=1) < 1.2))
             pixels = camera.project(points[ahead])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from barsight.calibration.arrow_system import predicted
+from barsight.calibration.board_shape import bent
 from barsight.calibration.boards import Board
 from barsight.calibration.camera_imu_calibration import (
     CameraImuCalibration,
@@ -57,6 +58,17 @@ def mean_square(seeds: range) -> float:
         error, covariance = errors(calibration, truth), calibration.uncertainty.covariance[:14, :14]
         found.append(float(error @ np.linalg.solve(covariance, error)) / 14)
     return float(np.mean(found))
+
+
+def test_a_bent_board_of_known_shape_is_no_error() -> None:
+    board = bent(BOARD, {"bow_x_m": 2e-3, "bow_y_m": -1e-3, "stretch_share": 3e-3, "skew_rad": 0.0,
+                         "tag_share": -9e-3})  # fmt: skip
+    views, imu, truth = simulated(3, board=board)
+    flat, known = calibrated(views, imu), calibrated(views, imu, board=board)
+    assert known.problem.sigmas.corner_px == pytest.approx(0.25, abs=0.01)
+    assert flat.problem.sigmas.corner_px > 0.32
+    ratio = errors(known, truth) / known.sigma[:14]
+    assert np.mean(ratio**2) < 2
 
 
 def test_derivatives_match_finite_differences(recorded: Recorded) -> None:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from barsight.calibration.any_rig_file import RigFormat, chosen_rig, read_rig_file, write_any_rig
+from barsight.calibration.board_shape import BentBoard
 from barsight.calibration.calibration_uncertainty import depth_sigma
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.documents import canonical_pose
 from barsight.calibration.lens_model import Lens
 from barsight.calibration.rig import StereoRig
-from barsight.calibration.rig_file import read_covariance, write_rig_file
+from barsight.calibration.rig_file import read_board, read_covariance, write_rig_file
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.calibration.stereo_calibration import calibrate_stereo
 from barsight.cli.main import run
@@ -53,7 +54,11 @@ def test_a_calibrations_covariance_comes_back(tmp_path: Path) -> None:
     assert found is not None
     assert found[0] == calibration.parameter_names
     assert np.array_equal(found[1], calibration.covariance)
+    board = read_board(tmp_path / "rig.yaml", calibration.board)
+    assert isinstance(board, BentBoard)
+    np.testing.assert_array_equal(board.shape, calibration.shape.values)
     write_rig_file(tmp_path / "plain.yaml", calibration.rig)
+    assert read_board(tmp_path / "plain.yaml", calibration.board) is calibration.board
     assert read_covariance(tmp_path / "plain.yaml") is None
 
 

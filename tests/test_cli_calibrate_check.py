@@ -25,6 +25,9 @@ def test_a_turned_camera_is_found(data: Path, tmp_path: Path) -> None:
     assert abs(lines["roll"]["value"] + 0.03) < 0.003
     assert lines["yaw"]["state"] == lines["pitch"]["state"] == check["state"] == "recalibrate"
     assert lines["yaw, rows minus travel"]["state"] == "good"
+    page = (tmp_path / "check.html").read_text()
+    assert '"rows-seen"' in page
+    assert '"depth"' in page
     assert abs(lines["yaw"]["cost_mm"] + 1e3 * np.deg2rad(0.01) * check["range_m"] ** 2 / 0.5) < 6
 
 

@@ -1,5 +1,6 @@
 """`barsight calibrate yard`: from a CSV of targets to a pose, and one line for what can't be."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,10 @@ def test_targets_place_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert np.array(found["covariance"]).shape == (6, 6)
     assert found["points"] == 3
     assert "check d" in " ".join(capsys.readouterr().err.split())
+    report = json.loads((tmp_path / "yard.json").read_text())
+    assert [row["kind"] for row in report["table"]] == ["target", "target", "target", "check"]
+    assert max(abs(np.array([row["off_mm"] for row in report["table"]])).ravel()) < 1e-6
+    assert "<h1>Yard calibration</h1>" in (tmp_path / "yard.html").read_text()
 
 
 @pytest.mark.parametrize(

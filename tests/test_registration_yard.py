@@ -97,13 +97,13 @@ def moved(seed: int, trolley_m: float, walk_m: float = 0.0) -> MovedYard | Faile
     return yard_from_moves(Trajectory("world", frames, (), ("stereo",)), crane, 0)
 
 
-@pytest.mark.parametrize(("walk_m", "most"), [(0.0, 1.25), (0.002, 2.5)])
-def test_moves_in_two_axes_give_the_error_they_state(walk_m: float, most: float) -> None:
-    """Errors of the odometry that go together over seconds are partly taken up by the fit: understated."""
+@pytest.mark.parametrize("walk_m", [0.0, 0.002])
+def test_moves_in_two_axes_give_the_error_they_state(walk_m: float) -> None:
+    """Errors of the odometry that go together over seconds included."""
     found = [moved(seed, 4.0, walk_m) for seed in range(24)]
     values = [nees(f.calibration) for f in found if isinstance(f, MovedYard)]
     assert len(values) == 24
-    assert 0.8 < np.mean(values) < most
+    assert 0.8 < np.mean(values) < 1.25
     first = found[0]
     assert isinstance(first, MovedYard)
     off = Rotation.from_matrix(first.yard_from_body @ np.diag([1.0, -1, -1])).magnitude()

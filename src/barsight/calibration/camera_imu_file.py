@@ -13,6 +13,7 @@ from barsight.calibration.kalibr import write_camchain
 from barsight.calibration.rig_file import write_rig_file
 from barsight.core.arrays import Float64
 from barsight.core.files import atomic_path
+from barsight.core.pose import skew
 
 PAIR_NAMES = tuple(
     f"cam1_from_cam0.{part}" for part in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
@@ -60,11 +61,9 @@ def mounting_covariance(calibration: CameraImuCalibration) -> tuple[tuple[str, .
     own = calibration.uncertainty.covariance[: 2 * MOUNT, : 2 * MOUNT]
     first, second = calibration.solution.state.mounts
     back = second.rotation.T
-    x, y, z = first.place_m - second.place_m
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     pair = np.zeros((6, 2 * MOUNT))
     pair[:3, :3], pair[:3, MOUNT : MOUNT + 3] = back, -back
     pair[3:, 3:6], pair[3:, MOUNT + 3 : MOUNT + 6] = back, -back
-    pair[3:, MOUNT : MOUNT + 3] = back @ cross
+    pair[3:, MOUNT : MOUNT + 3] = back @ skew(first.place_m - second.place_m)
     whole = np.vstack([np.eye(2 * MOUNT), pair])
     return (*names, *PAIR_NAMES), whole @ own @ whole.T

@@ -10,12 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from barsight.calibration.board_shape import bent
+from barsight.calibration.boards import Board
 from barsight.calibration.camera import Camera
 from barsight.calibration.documents import Document, read_document, write_document
 from barsight.calibration.euroc import build_rig, read_camera
 from barsight.calibration.rig import StereoRig
 from barsight.calibration.stereo_calibration import StereoCalibration
 from barsight.core.arrays import Float64
+from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 
@@ -92,6 +95,17 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
     if matrix.shape != (len(names), len(names)):
         raise section.error("covariance", f"is not {len(names)}x{len(names)}", "take the original file")
     return names, matrix
+
+
+def read_board(path: Path, board: Board) -> Board:
+    """`board` with the shape that `calibrate stereo` found of it, where the rig file comes from the same."""
+    section = read_document(path).values.get("calibration")
+    if not isinstance(section, dict) or section.get("board") != str(board):
+        return board
+    try:
+        return bent(board, {name: float(entry["value"]) for name, entry in section["board_shape"].items()})
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise CalibrationError(path, "board_shape can't be read", "take the original file") from None
 
 
 def _camera(camera: Camera, body_from_cam: Pose) -> dict[str, object]:

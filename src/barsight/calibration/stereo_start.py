@@ -59,8 +59,10 @@ def board_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[Flo
     inside = np.isfinite(rays).all(axis=1) & (np.abs(rays[:, :2]).max(axis=1) < 10)
     if inside.sum() < 4:
         return np.eye(3), np.array([0.0, 0.0, 1.0]), np.inf
+    # The start is a flat board's; a bow of millimetres moves it by little.
+    flat = points_m[corners.ids[inside]] * [1.0, 1.0, 0.0]
     found, rotations, translations, _ = cv2.solvePnPGeneric(
-        points_m[corners.ids[inside]], rays[inside, :2], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        flat, rays[inside, :2], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
     best: tuple[Float64, Float64, float] = (np.eye(3), np.array([0.0, 0.0, 1.0]), np.inf)
     for vector, place in zip(rotations, translations, strict=True) if found else ():

@@ -20,12 +20,13 @@ from barsight.calibration.camera_imu_verdict import assess_camera_imu, cross_hal
 from barsight.calibration.detection_files import NAMES, has_detections, read_detections
 from barsight.calibration.documents import ImuNoise
 from barsight.calibration.kalibr import read_imu_file
-from barsight.calibration.rig_file import read_covariance
+from barsight.calibration.rig_file import read_board, read_covariance
 from barsight.calibration.stereo_verdict import Verdict, summary_sentence
 from barsight.calibration.views import BoardView, Corners
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
-from barsight.core.errors import ConfigError, InputError, OutputError
+from barsight.core.errors import ConfigError, InputError
+from barsight.core.files import expect_output
 from barsight.core.parallel import ordered_map
 from barsight.core.types import ImuSamples, RefusedFrame, StereoFrame
 from barsight.recording.base import RecordingSettings
@@ -58,7 +59,8 @@ def run(arguments: Sequence[str]) -> None:
         Args:
             recording: An EuRoC folder or bag taken while the rig was waved in front of the board, or a folder
                 of detections (cam0_detections.npz, cam1_detections.npz) with imu0.csv.
-            rig: The stereo rig whose lenses are taken, of any format (of `calibrate stereo`).
+            rig: The stereo rig whose lenses are taken, of any format; of `calibrate stereo` with the same
+                board, the board's shape too.
             board: checkerboard:9x6:0.025, charuco:11x8:0.03:0.022[:DICTIONARY] or aprilgrid:6x6:0.088:0.3.
             out: The rig file to write (.yaml); report (.html, .json) and Kalibr's camchain go beside it.
             imu: The IMU's noise: imu.yaml of `calibrate imu-noise`, Kalibr's, or EuRoC's sensor.yaml. The
@@ -71,7 +73,9 @@ def run(arguments: Sequence[str]) -> None:
         """
         _expect(out, most_views)
         console = Console(stderr=True)
-        target, lenses = parse_board(board), read_rig_file(rig)
+        lenses = read_rig_file(rig)
+        own_file = rig.is_file() and rig.suffix in (".yaml", ".yml")
+        target = read_board(rig, parse_board(board)) if own_file else parse_board(board)
         with stages(console) as advance:
             if any((recording / name).is_file() for name in NAMES):
                 views, samples, stated = _from_detections(
@@ -95,7 +99,7 @@ def run(arguments: Sequence[str]) -> None:
             advance("solve", 3, 3)
         assessment = assess_camera_imu(calibration, halves)
         camchain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
-        own = read_covariance(rig) if rig.is_file() and rig.suffix in (".yaml", ".yml") else None
+        own = read_covariance(rig) if own_file else None
         write_camera_imu(calibration, out, camchain, own)
         html = out.with_suffix(".html")
         write_camera_imu_report(calibration, assessment, html, out.with_suffix(".json"))
@@ -110,10 +114,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _expect(out: Path, most_views: int) -> None:
-    if out.suffix not in (".yaml", ".yml"):
-        raise OutputError(f"{out}: a rig file's name ends in .yaml")
-    if not out.absolute().parent.is_dir():
-        raise OutputError(f"{out}: there is no folder {out.parent}; make it or name another")
+    expect_output(out, ".yaml", ".yml")
     if most_views < 60:
         raise ConfigError(f"--most-views {most_views} is too few; give 60 or more")
 

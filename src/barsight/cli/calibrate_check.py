@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-import barsight
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
-from barsight.core.errors import OutputError
-from barsight.core.files import atomic_path
+from barsight.core.files import expect_output
 from barsight.motion.fusion import FusionSettings
 from barsight.motion.rig_check import CheckSettings, RigCheck, State, check_rig
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
+from barsight.report.rig_check_page import write_rig_check_report
 
 COLOURS = {
     State.GOOD: "green",
@@ -48,13 +45,14 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             recording: The recording, with encoders for yaw and baseline.
-            out: A .json file for the figures; nothing is written where it is not given.
+            out: A .json file for the figures, the report (.html) goes beside it; nothing is written where it
+                is not given.
             settings: When a drift matters.
             reading: How to read the recording; --recording.rig checks another calibration.
             fusion: The estimate's settings.
         """
-        if out is not None and out.suffix != ".json":
-            raise OutputError(f"{out}: the check's file ends in .json")
+        if out is not None:
+            expect_output(out, ".json")
         source = open_recording(recording, reading)
         total, done = len(source.index.stamps_ns), 0
         with stages(Console(stderr=True)) as advance:
@@ -66,25 +64,10 @@ def run(arguments: Sequence[str]) -> None:
 
             check = check_rig(source, fusion, settings, count)
         if out is not None:
-            with atomic_path(out) as path:
-                path.write_text(json.dumps(_summary(check), indent=2) + "\n", encoding="utf-8")
+            write_rig_check_report(check, str(recording), out.with_suffix(".html"), out)
         _print(check, Console())
 
     call(command, "calibrate check", arguments)
-
-
-def _summary(check: RigCheck) -> dict[str, Any]:
-    lines = [
-        {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
-        for row in map(asdict, check.lines)
-    ]
-    return {
-        "schema": 1,
-        "software": {"name": "barsight", "version": barsight.__version__},
-        "state": check.state,
-        "range_m": None if math.isnan(check.range_m) else check.range_m,
-        "lines": lines,
-    }
 
 
 def _print(check: RigCheck, console: Console) -> None:

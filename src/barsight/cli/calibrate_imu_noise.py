@@ -13,8 +13,8 @@ from rich.markup import escape
 from barsight.calibration.imu_noise import fit_imu_noise
 from barsight.calibration.kalibr import write_imu_file
 from barsight.cli.arguments import call
-from barsight.core.errors import Failed, InputError, OutputError
-from barsight.core.files import atomic_path
+from barsight.core.errors import Failed, InputError
+from barsight.core.files import atomic_path, expect_output
 from barsight.recording.imu_log import AccelUnit, GyroUnit, read_imu_log
 from barsight.report.imu_noise_page import write_imu_noise_report
 
@@ -41,8 +41,7 @@ def run(arguments: Sequence[str]) -> None:
             accel_unit: The accelerometer's unit; auto goes by gravity.
             topic: The rostopic to state in the file.
         """
-        if out.suffix not in (".yaml", ".yml"):
-            raise OutputError(f"{out}: an IMU file's name ends in .yaml")
+        expect_output(out, ".yaml", ".yml")
         console = Console(stderr=True)
         read = read_imu_log(log, gyro_unit, accel_unit)
         fit = fit_imu_noise(read.samples)

@@ -21,8 +21,8 @@ from barsight.calibration.stereo_verdict import Verdict, assess, summary_sentenc
 from barsight.calibration.views import BoardView, Corners, Removed
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
-from barsight.core.errors import ConfigError, Failed, InputError, OutputError
-from barsight.core.files import atomic_path
+from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.files import atomic_path, expect_output
 from barsight.core.parallel import ordered_map
 from barsight.core.types import RefusedFrame
 from barsight.recording.open import BAG_KINDS, open_recording
@@ -83,10 +83,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _expect(out: Path, range_m: float, most_views: int) -> None:
-    if out.suffix not in (".yaml", ".yml"):
-        raise OutputError(f"{out}: a rig file's name ends in .yaml")
-    if not out.absolute().parent.is_dir():
-        raise OutputError(f"{out}: there is no folder {out.parent}; make it or name another")
+    expect_output(out, ".yaml", ".yml")
     if not 0.05 <= range_m <= 1000:
         raise ConfigError(f"--range-m {range_m:g} can't be; give the working distance in metres")
     if most_views < 6:

@@ -16,8 +16,8 @@ from barsight.calibration.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.core.arrays import Float64
-from barsight.core.errors import ConfigError, Failed, MeasurementError, OutputError
-from barsight.core.files import atomic_path
+from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.files import atomic_path, expect_output
 from barsight.motion.crane import CraneSettings
 from barsight.motion.crane_moves import MovedYard, yard_from_moves
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
@@ -25,6 +25,7 @@ from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.recording.targets import read_targets
 from barsight.registration.yard import YardCalibration, calibrate_yard
+from barsight.report.yard_calibration_page import write_yard_report
 
 MOST_TURN_DEG = 0.05
 MOST_PLACE_M = 0.01
@@ -45,14 +46,13 @@ def run(arguments: Sequence[str]) -> None:
         Args:
             source: A .csv of targets (name,yard_x,yard_y,yard_z,x,y,z in m; optionally sigma_m, and check = 1
                 for targets set apart), or a recording in which bridge and trolley move.
-            out: The .yaml file to write.
+            out: The .yaml file to write; its report goes beside it (.html and .json).
             frame: What x, y, z of the targets are measured in; body gives how the rig is mounted.
             sigma_m: One coordinate's error of a target, survey and measurement together, where no sigma_m
                 column says it.
             reading: How to read the recording.
         """
-        if out.suffix not in (".yaml", ".yml"):
-            raise OutputError(f"{out}: the yard's file ends in .yaml")
+        expect_output(out, ".yaml", ".yml")
         if not 0 < sigma_m < 10:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
         console = Console(stderr=True)
@@ -64,7 +64,9 @@ def run(arguments: Sequence[str]) -> None:
             found, hangs = moved.calibration, moved.yard_from_body
         with atomic_path(out) as path:
             write_document(path, _content(found, hangs))
-        _print(found, out, console)
+        verdict = "good" if _is_good(found) else "usable with care"
+        write_yard_report(found, verdict, str(source), out.with_suffix(".html"), out.with_suffix(".json"))
+        _print(found, verdict, out, console)
 
     call(command, "calibrate yard", arguments)
 
@@ -119,7 +121,11 @@ def _content(found: YardCalibration, hangs: Float64 | None) -> dict[str, Any]:
     return content
 
 
-def _print(found: YardCalibration, out: Path, console: Console) -> None:
+def _is_good(found: YardCalibration) -> bool:
+    return found.turn_sigma_deg <= MOST_TURN_DEG and found.place_sigma_m <= MOST_PLACE_M and not found.doubts
+
+
+def _print(found: YardCalibration, verdict: str, out: Path, console: Console) -> None:
     for k, name in enumerate(found.names if len(found.names) <= 30 else ()):
         off = " ".join(f"{1e3 * value:+7.1f}" for value in found.off_m[k])
         kind = "check " if found.checks[k] else "target"
@@ -134,9 +140,8 @@ def _print(found: YardCalibration, out: Path, console: Console) -> None:
     )  # fmt: skip
     for doubt in found.doubts:
         console.print(f"[yellow]{escape(doubt)}[/yellow]", soft_wrap=True, highlight=False)
-    good = found.turn_sigma_deg <= MOST_TURN_DEG and found.place_sigma_m <= MOST_PLACE_M and not found.doubts
-    if good:
+    if verdict == "good":
         console.print("[green]good[/green]")
     else:
         limits = f"{MOST_TURN_DEG:g} deg and {1e3 * MOST_PLACE_M:g} mm without doubts are good"
-        console.print(f"[yellow]usable with care[/yellow]: {limits}; more points, further apart, help")
+        console.print(f"[yellow]{verdict}[/yellow]: {limits}; more points, further apart, help")

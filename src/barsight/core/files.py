@@ -13,6 +13,14 @@ from pathlib import Path
 from barsight.core.errors import InputError, OutputError
 
 
+def expect_output(target: Path, *suffixes: str) -> None:
+    """Raise `OutputError` early for a file that couldn't be written, or whose name ends otherwise."""
+    if target.suffix not in suffixes:
+        raise OutputError(f"{target}: the name of this file ends in {suffixes[0]}")
+    if not target.absolute().parent.is_dir():
+        raise OutputError(f"{target}: there is no folder {target.parent}; make it or name another")
+
+
 @contextlib.contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
     """Yield a temporary path beside `target`; on success it becomes `target`, on any failure it is gone.

@@ -131,3 +131,10 @@ class Pose:
             raise FrameMismatchError(
                 f"{self.target}_from_{self.source} can't be compared with {other.target}_from_{other.source}"
             )
+
+
+def skew(vectors: Float64) -> Float64:
+    """(..., 3) to (..., 3, 3) with `skew(v) @ w = v x w`."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)

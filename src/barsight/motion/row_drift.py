@@ -35,6 +35,8 @@ class RowDrift:
     """values: (4,) pitch, roll (rad), ratio of the focal lengths minus 1, yaw (rad): what cam1 has turned and
     zoomed against its calibration, rectified axes. covariance: (4, 4). pattern_px: what they leave over the
     picture (standard deviation, noise taken off). matches, frames: how many. rms_px: of single matches.
+    seen_px, left_px: (ROWS * COLUMNS,) means of the picture's cells, as matched and less the fit; NaN where
+    matches are few.
     """
 
     values: Float64
@@ -43,6 +45,8 @@ class RowDrift:
     rms_px: float
     matches: int
     frames: int
+    seen_px: Float64
+    left_px: Float64
 
     @property
     def sigmas(self) -> Float64:
@@ -100,7 +104,7 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
         middle = float(np.median(off[kept]))
         spread = 1.4826 * float(np.median(np.abs(off[kept] - middle)))
         kept = np.abs(off - middle) < TRIM_SIGMAS * max(spread, 0.01)
-    rows, means, variances = _cells(matches[kept], design[kept], camera)
+    cells, rows, means, variances = _cells(matches[kept], design[kept], camera)
     if len(means) < LEAST_CELLS:
         return Failed(
             "few-matches", f"matches fill only {len(means)} of {COLUMNS * ROWS} parts of the picture"
@@ -117,7 +121,9 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
         pattern = max(0.0, pattern + (excess - 1) / float(weight.mean()))
     covariance[0, 0] += (MATCHING_BIAS_PX / camera.focal_px) ** 2
     rms = float(np.sqrt(((matches[kept, 2] - design[kept] @ values) ** 2).mean()))
-    return RowDrift(values, covariance, float(pattern**0.5), rms, int(kept.sum()), frames)
+    seen, left = np.full((2, COLUMNS * ROWS), np.nan)
+    seen[cells], left[cells] = means, means - rows @ values
+    return RowDrift(values, covariance, float(pattern**0.5), rms, int(kept.sum()), frames, seen, left)
 
 
 def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
@@ -128,15 +134,18 @@ def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
     return f * np.column_stack([1 + y**2, -x, y, -x * y])
 
 
-def _cells(matches: Float64, design: Float64, camera: RectifiedCamera) -> tuple[Float64, Float64, Float64]:
-    """Design (C, 4), mean (C,) and the mean's variance (C,) of the cells that hold enough matches."""
+def _cells(
+    matches: Float64, design: Float64, camera: RectifiedCamera
+) -> tuple[list[int], Float64, Float64, Float64]:
+    """The cells that hold enough matches, their design (C, 4), mean (C,) and the mean's variance (C,)."""
     column = np.clip(matches[:, 0] * COLUMNS / camera.width, 0, COLUMNS - 1).astype(int)
     row = np.clip(matches[:, 1] * ROWS / camera.height, 0, ROWS - 1).astype(int)
-    rows, means, variances = [], [], []
+    cells, rows, means, variances = [], [], [], []
     for cell in range(COLUMNS * ROWS):
         inside = row * COLUMNS + column == cell
         if (count := int(inside.sum())) >= LEAST_IN_CELL:
+            cells.append(cell)
             rows.append(design[inside].mean(0))
             means.append(matches[inside, 2].mean())
             variances.append(matches[inside, 2].var(ddof=1) / count + LEAST_SIGMA_PX**2)
-    return np.array(rows).reshape(-1, 4), np.array(means), np.array(variances)
+    return cells, np.array(rows).reshape(-1, 4), np.array(means), np.array(variances)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Float64, expect_shape
 from barsight.core.errors import ConfigError, Failed
-from barsight.core.pose import Pose
+from barsight.core.pose import Pose, skew
 
 LEAST_INLIERS = 100
 
@@ -96,7 +96,7 @@ def refine(
     move = np.r_[Rotation.from_matrix(moved[:3, :3] @ prior.rotation.T).as_rotvec(), moved[:3, 3]]
 
     carry = np.eye(6)
-    carry[3:, :3] = -_cross(at - prior.translation)
+    carry[3:, :3] = -skew(at - prior.translation)
     root = np.linalg.cholesky(carry @ covariance @ carry.T)
     gain, axes = np.linalg.eigh(root.T @ information @ root)
     along = axes.T @ np.linalg.solve(root, move)
@@ -107,11 +107,7 @@ def refine(
     rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ prior.rotation
     pose = Pose(prior.target, prior.source, rotation, at + step[3:] - rotation @ middle)
     back = np.eye(6)
-    back[3:, :3] = _cross(at - prior.translation)
+    back[3:, :3] = skew(at - prior.translation)
     spread = back @ root @ axes
     warning = f"ICP moved the pose by {furthest:.1f} sigma of its prediction" if furthest > 3 else None
     return Refined(pose, (spread * (1 - share)) @ spread.T, axes[:, ~free].T, furthest, warning)
-
-
-def _cross(v: Float64) -> Float64:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

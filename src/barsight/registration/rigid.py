@@ -8,7 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, expect_shape
 from barsight.core.errors import Failed
-from barsight.core.pose import Pose
+from barsight.core.pose import Pose, skew
 
 LEAST_POINTS = 3
 LEAST_WIDTH = 0.01
@@ -55,8 +55,10 @@ def align(
     if len(source) < LEAST_POINTS:
         return Failed("few-points", f"{len(source)} pairs of points; {LEAST_POINTS} are the least")
     weight = np.ones(len(source))
+    together = covariance_m2 is not None and covariance_m2.ndim == 2
     if covariance_m2 is not None:
-        expect_shape("covariance_m2", covariance_m2, (len(source), 3, 3))
+        expect_shape("covariance_m2", covariance_m2, (len(source),) * 2 if together else (len(source), 3, 3))
+    if covariance_m2 is not None and not together:
         weight = 3 / np.trace(covariance_m2, axis1=1, axis2=2)
     q, p = source - np.average(source, 0, weight), target - np.average(target, 0, weight)
     line = _line(q, weight)
@@ -73,17 +75,19 @@ def align(
 
     free = max(residuals.size - 6, 0)
     sigma = float(np.sqrt((weight[:, None] * residuals**2).sum() / free / weight.mean())) if free else np.nan
-    spread, chi2 = np.eye(3)[None] * sigma**2, np.nan
+    spread, chi2 = np.broadcast_to(np.eye(3) * sigma**2, (len(source), 3, 3)), np.nan
     if covariance_m2 is not None:
         spread = covariance_m2
-        chi2 = float(np.einsum("ni,nij,nj->", residuals, np.linalg.inv(spread), residuals))
-    along = np.einsum("ni,nij,nj->n", turned, np.broadcast_to(spread, (len(q), 3, 3)), turned)
+        solved = np.linalg.solve(spread, residuals if together else residuals[..., None])
+        chi2 = float((residuals * solved.reshape(residuals.shape)).sum())
+    weighted = weight[:, None] * turned
+    along = (weighted * _times(spread, weighted)).sum()
     return Alignment(
         Pose(*frames, rotation, translation),
         _covariance(turned, centre - translation, weight, spread),
         residuals,
         float(sign @ stretch) / extent,
-        float(np.sqrt((weight**2 * along).sum())) / extent,
+        float(np.sqrt(along)) / extent,
         sigma,
         chi2,
     )
@@ -102,18 +106,28 @@ def _line(centred: Float64, weight: Float64) -> Failed | None:
     )
 
 
+def design_rows(turned: Float64) -> Float64:
+    """(N, 3, 6): how points (N, 3), about their centre, move with a small turn and with a shift."""
+    return np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2)
+
+
+def _times(spread: Float64, values: Float64) -> Float64:
+    """A covariance, (N, 3, 3) or (N, N), times values (N, 3, ...)."""
+    if spread.ndim == 2:
+        return np.tensordot(spread, values, 1)
+    product: Float64 = np.einsum("nij,nj...->ni...", spread, values)
+    return product
+
+
 def _covariance(turned: Float64, centre: Float64, weight: Float64, spread: Float64) -> Float64:
     """(6, 6): A^-1 B A^-1 of weighted least squares. centre: (3,) from the source's origin, target axes."""
-    x, y, z = turned.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    design = np.concatenate([cross, np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
-    normal = np.einsum("n,nki,nkj->ij", weight, design, design)
-    noise = np.einsum("n,nki,nkl,nlj->ij", weight**2, design, np.broadcast_to(spread, (len(x), 3, 3)), design)
+    design = design_rows(turned)
+    weighted = weight[:, None, None] * design
+    normal = np.einsum("nki,nkj->ij", weighted, design)
+    noise = np.einsum("nki,nkj->ij", weighted, _times(spread, weighted))
     bread = np.linalg.inv(normal)
-    a, b, c = centre
     move = np.eye(6)
     # A turn about the points' centre carries the source's origin along.
-    move[3:, :3] = [[0, -c, b], [c, 0, -a], [-b, a, 0]]
+    move[3:, :3] = skew(centre)
     covariance: Float64 = move @ bread @ noise @ bread @ move.T
     return covariance

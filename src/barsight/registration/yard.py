@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
-from barsight.registration.rigid import Alignment, align
+from barsight.registration.rigid import Alignment, align, design_rows
 
 DOUBTFUL = 0.001
 """Residuals rarer than this under the stated sigmas: those are too small, or a point is wrong."""
@@ -19,13 +19,15 @@ DOUBTFUL = 0.001
 class YardCalibration:
     """alignment: yard_from_<frame>, its covariance grown by `inflation` where the residuals ask for it.
 
-    names: (N,) of the points; checks: (N,) those that took no part. off_m: (N, 3) yard minus moved point;
-    sigma_m: (N,) what its length should be, one standard deviation per coordinate. doubts: sentences.
+    names: (N,) of the points; yard_m: (N, 3) where they lie; checks: (N,) those that took no part.
+    off_m: (N, 3) yard minus moved point; sigma_m: (N,) what its length should be, one standard deviation per
+    coordinate. doubts: sentences.
     """
 
     alignment: Alignment
     inflation: float
     names: tuple[str, ...]
+    yard_m: Float64
     checks: Bool
     off_m: Float64
     sigma_m: Float64
@@ -44,24 +46,25 @@ class YardCalibration:
 
 def calibrate_yard(
     names: tuple[str, ...], measured: Float64, yard: Float64, covariance_m2: Float64 | None, checks: Bool,
-    frame: str, independent_share: float = 1.0,
+    frame: str,
 ) -> YardCalibration | Failed:  # fmt: skip
     """`yard_from_<frame>` from points measured in `frame` (N, 3) and known in the yard (N, 3), m.
 
-    covariance_m2: (N, 3, 3) of each pair's difference, yard axes; None takes one sigma from the residuals.
-    checks: (N,) points that are only compared. independent_share: how many of the points count, where
-    neighbours err alike. Failed `few-points`, `collinear`.
+    covariance_m2: as `align` takes it, yard axes; None takes one sigma from the residuals.
+    checks: (N,) points that are only compared. Failed `few-points`, `collinear`.
     """
     used = ~checks
-    covariance = None if covariance_m2 is None else covariance_m2[used]
+    covariance = covariance_m2
+    if covariance is not None:
+        covariance = covariance[np.ix_(used, used)] if covariance.ndim == 2 else covariance[used]
     found = align(measured[used], yard[used], ("yard", frame), covariance)
     if isinstance(found, Failed):
         return found
     doubts: list[str] = []
-    inflation = 1 / independent_share
+    inflation = 1.0
     free = found.degrees_of_freedom
     if covariance is not None and free > 0 and chi2.sf(found.chi2, free) < DOUBTFUL:
-        inflation *= found.chi2 / free
+        inflation = found.chi2 / free
         doubts.append(
             f"the points disagree {(found.chi2 / free) ** 0.5:.1f} times as much as their sigmas say: "
             "a target is mistaken or moved; the stated sigma grows by that"
@@ -82,7 +85,7 @@ def calibrate_yard(
         f"check {names[k]} is {1e3 * length[k]:.1f} mm off, its sigma is {1e3 * sigma[k]:.1f} mm"
         for k in np.flatnonzero(checks & (length > 4 * sigma))
     ]
-    return YardCalibration(scaled, inflation, names, checks, off, sigma, tuple(doubts))
+    return YardCalibration(scaled, inflation, names, yard, checks, off, sigma, tuple(doubts))
 
 
 def _predicted(
@@ -90,12 +93,11 @@ def _predicted(
 ) -> Float64:
     """(N,) RMS over the axes of a point's own noise and, for checks, of where the alignment puts it."""
     own = np.full(len(measured), alignment.sigma_m**2)
-    if covariance_m2 is not None:
+    if covariance_m2 is not None and covariance_m2.ndim == 2:
+        own = np.diag(covariance_m2)
+    elif covariance_m2 is not None:
         own = np.trace(covariance_m2, axis1=1, axis2=2) / 3
-    x, y, z = (measured @ alignment.target_from_source.rotation.T).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    design = np.concatenate([cross, np.broadcast_to(np.eye(3), (len(x), 3, 3))], axis=2)
+    design = design_rows(measured @ alignment.target_from_source.rotation.T)
     placed = np.einsum("nij,jk,nik->n", design, alignment.covariance, design) / 3
     sigma: Float64 = np.sqrt(own + np.where(checks, placed, 0.0))
     return sigma
