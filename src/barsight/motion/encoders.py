@@ -67,10 +67,9 @@ def agreeing(values: Any, problem: Problem) -> Bool:
     return kept
 
 
-def encoder_state(values: Any, marginals: Any) -> EncoderState:
+def encoder_state(values: Any, latency_sigma_s: float) -> EncoderState:
     """What was found of the encoders."""
-    sigma = float(np.sqrt(marginals.marginalCovariance(E(0))[0, 0]))
-    return EncoderState(float(values.atVector(E(0))[0]), sigma)
+    return EncoderState(float(values.atVector(E(0))[0]), latency_sigma_s)
 
 
 def encoder_warnings(

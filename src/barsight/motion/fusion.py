@@ -24,12 +24,10 @@ from barsight.motion.sightings import FrontEndSettings, Sighting, follow
 from barsight.recording.base import Recording
 
 if TYPE_CHECKING:
-    from barsight.motion.graph import Estimate
+    from barsight.motion.batch import Estimate
 
 SENSORS = ("stereo", "imu", "crane")
 PLACE_SPACING_S = 0.4
-LEAST_SIGMA_PX = 0.03
-"""What no patch is better than, however well it fits: rectification, splines and aliasing."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class FusedTrajectory:
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
             estimate, seen = self._solve(recording, rectifier, inputs, nodes, shift)
-        except RuntimeError as error:  # GTSAM's word for a system that the measurements leave undetermined
+        except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
             simple = self._simple(recording, rectifier, inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             return replace(simple, warnings=(*simple.warnings, f"{reason}: estimated one by one"))
@@ -169,8 +167,8 @@ class FusedTrajectory:
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
     ) -> tuple[Estimate, tuple[str, ...]]:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
+        from barsight.motion.batch import solve
         from barsight.motion.encoders import encoder_warnings
-        from barsight.motion.graph import solve
         from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
 
         start = start_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
@@ -199,12 +197,9 @@ class FusedTrajectory:
         seen = None
         if inputs.sightings:
             at = {int(nodes.stamp_ns[k]) - shift: int(k) for k in nodes.frame}
-            seen = StereoSightings(
-                np.concatenate([np.full(len(s.track), at[s.stamp_ns]) for s in inputs.sightings]),
-                np.concatenate([s.track for s in inputs.sightings]),
-                np.vstack([s.stereo for s in inputs.sightings]),
-                np.hypot(np.concatenate([s.sigma_px for s in inputs.sightings]), LEAST_SIGMA_PX),
-                rectifier.camera, rectifier.body_from_rect0,
+            seen = StereoSightings.of(
+                inputs.sightings, [at[s.stamp_ns] for s in inputs.sightings], rectifier.camera,
+                rectifier.body_from_rect0,
             )  # fmt: skip
         problem = Problem(
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, tuple(placed),

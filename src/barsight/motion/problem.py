@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.sightings import Sighting
+
+MOST_SIGHTINGS = 40
+LEAST_SIGMA_PX = 0.03
+"""What no patch is better than, however well it fits: rectification, splines and aliasing."""
 
 
 @dataclass(frozen=True, eq=False)
 class StereoSightings:
-    """Points seen: node, track (N,), stereo (N, 3) u, v, right u, px, sigma_px (N,) of each, and how the
-    camera is mounted.
+    """Points seen, N sightings of T points: track (N,) 0...T-1 ascending and within each node (N,)
+    ascending; stereo (N, 3) u, v, right u, px, sigma_px (N,) of each, and how the camera is mounted.
     """
 
     node: Int64
@@ -23,6 +32,38 @@ class StereoSightings:
     sigma_px: Float64
     camera: RectifiedCamera
     body_from_rect0: Pose
+
+    @classmethod
+    def of(
+        cls, sightings: Sequence[Sighting], node: Sequence[int], camera: RectifiedCamera,
+        body_from_rect0: Pose,
+    ) -> StereoSightings:  # fmt: skip
+        """From the front end's, each with its node. A point that is seen at more than `MOST_SIGHTINGS`
+        frames begins anew, which bounds what is tied together.
+        """
+        nodes = np.concatenate([np.full(len(s.track), k) for s, k in zip(sightings, node, strict=True)])
+        track = np.concatenate([s.track for s in sightings])
+        order = np.lexsort((nodes, track))
+        _, begin, count = np.unique(track[order], return_index=True, return_counts=True)
+        place = np.arange(len(order)) - np.repeat(begin, count)
+        _, named = np.unique(
+            track[order] * (len(sightings) // MOST_SIGHTINGS + 1) + place // MOST_SIGHTINGS,
+            return_inverse=True,
+        )
+        stereo = np.vstack([s.stereo for s in sightings])[order]
+        sigma = np.hypot(np.concatenate([s.sigma_px for s in sightings])[order], LEAST_SIGMA_PX)
+        return cls(nodes[order], named, stereo, sigma, camera, body_from_rect0)
+
+    @cached_property
+    def first(self) -> Int64:
+        """(T + 1,) where each point's sightings begin, and the end."""
+        return np.searchsorted(self.track, np.arange(self.track[-1] + 2)).astype(np.int64)
+
+    @cached_property
+    def reach(self) -> Int64:
+        """(T,) nodes between a point's first and last sighting."""
+        reach: Int64 = self.node[self.first[1:] - 1] - self.node[self.first[:-1]]
+        return reach
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,85 @@
+"""Symmetric band matrices: Cholesky's factor, its solutions, and the inverse within the band.
+
+A matrix (n, n) of half-width w lies in rows (n, w): `rows[i, w - 1 - (i - j)]` is its element (i, j), j <= i.
+Plain loops: the bands are a few hundred wide, where BLAS's threads cost more than they bring.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float64, kernel
+
+
+@kernel(fastmath=True)
+def factorise(rows: Float64) -> bool:
+    """Replaces the matrix by its lower factor; false where it isn't positive definite."""
+    n, width = rows.shape
+    for i in range(n):
+        first = max(0, i - width + 1)
+        for j in range(first, i + 1):
+            begin = max(first, j - width + 1)
+            mine = rows[i, begin - i + width - 1 : j - i + width - 1]
+            other = rows[j, begin - j + width - 1 : width - 1]
+            total = 0.0
+            for k in range(len(mine)):
+                total += mine[k] * other[k]
+            left = rows[i, j - i + width - 1] - total
+            if j < i:
+                rows[i, j - i + width - 1] = left / rows[j, width - 1]
+            elif left <= 0:
+                return False
+            else:
+                rows[i, width - 1] = np.sqrt(left)
+    return True
+
+
+@kernel(fastmath=True)
+def solve(factor: Float64, right: Float64) -> None:
+    """Replaces right (m, n), one right side a row, by the solutions."""
+    n, width = factor.shape
+    for m in range(len(right)):
+        x = right[m]
+        for i in range(n):
+            first = max(0, i - width + 1)
+            row = factor[i, first - i + width - 1 : width - 1]
+            total = 0.0
+            for k in range(len(row)):
+                total += row[k] * x[first + k]
+            x[i] = (x[i] - total) / factor[i, width - 1]
+        for i in range(n - 1, -1, -1):
+            x[i] /= factor[i, width - 1]
+            first = max(0, i - width + 1)
+            row = factor[i, first - i + width - 1 : width - 1]
+            for k in range(len(row)):
+                x[first + k] -= row[k] * x[i]
+
+
+@kernel(fastmath=True)
+def inverse_blocks(factor: Float64, size: int, blocks: Float64) -> None:
+    """blocks: (n / size, size, size) those on the inverse's diagonal, from the last column back [Takahashi
+    1973]: only the inverse's elements within the band are needed.
+    """
+    n, width = factor.shape
+    inverse = np.zeros((n, 2 * width - 1))  # element (i, j) at [i, j - i + width - 1], both halves
+    column, sums = np.empty(width), np.empty(width)
+    for j in range(n - 1, -1, -1):
+        own = factor[j, width - 1]
+        count = min(width - 1, n - 1 - j)
+        for k in range(count):
+            column[k] = factor[j + 1 + k, width - 2 - k] / own
+        for i in range(count):
+            row = inverse[j + 1 + i, width - 1 - i : width - 1 - i + count]
+            total = 0.0
+            for k in range(count):
+                total += column[k] * row[k]
+            sums[i] = -total
+        diagonal = 1 / own**2
+        for i in range(count):
+            inverse[j + 1 + i, width - 2 - i] = inverse[j, width + i] = sums[i]
+            diagonal -= column[i] * sums[i]
+        inverse[j, width - 1] = diagonal
+    for b in range(len(blocks)):
+        for i in range(size):
+            for j in range(size):
+                blocks[b, i, j] = inverse[b * size + i, j - i + width - 1]

@@ -1,0 +1,141 @@
+"""The batch estimate: one factor graph over a whole recording's poses, velocities, biases and points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from barsight.core.arrays import Bool, Float64
+from barsight.core.pose import Pose
+from barsight.core.types import RigDrift
+from barsight.inertial.model import ImuBias
+from barsight.motion import rig_drift
+from barsight.motion.encoders import EncoderState, agreeing, disagreement, encoder_state
+from barsight.motion.graph import factors, start_values
+from barsight.motion.marginals import Marginals, marginals
+from barsight.motion.problem import Problem, StereoSightings
+from barsight.motion.solver import State, System, optimise, sighting_residuals
+from barsight.motion.stereo_factors import often, persistence, start_points
+
+FARTHEST_OUTLIER_SIGMAS = 3.5
+MOST_ROUNDS = 3
+LEAST_AGREEING = 0.5
+"""Where fewer of the encoders' places agree, none is left out: who is wrong can't be told."""
+LEAST_FACTOR = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """poses: (M,). covariance: (M, 6, 6) rotation then translation, reference axes. velocity_mps: (M, 3) or
+    None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
+    drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
+    without. encoder_off_m: (P, 3) of each place, encoder_used: (P,) those that agree.
+    """
+
+    poses: tuple[Pose, ...]
+    covariance: Float64
+    velocity_mps: Float64 | None
+    biases: tuple[ImuBias, ...]
+    pixel_sigma_px: float
+    drift: RigDrift | None
+    used: Bool
+    encoders: EncoderState | None
+    encoder_off_m: Float64
+    encoder_used: Bool
+
+
+def solve(problem: Problem) -> Estimate:
+    """After a first solution, drift of the rig included, sightings beyond 3.5 sigma leave and all sigmas
+    grow or shrink to what was seen; then the drift is sought on and weighed against its prior, and encoder
+    places beyond 5 sigma leave. (A cut before the drift is known would take the very sightings that show it
+    best.) Raises LinAlgError where the measurements leave an unknown undetermined.
+    """
+    used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
+    if problem.sightings is not None:
+        used = often(problem.sightings, used)
+    state = State(start_values(problem), start_points(problem), np.zeros(2))
+    state, system = _optimised(problem, state, used)
+    seeks_drift = problem.sightings is not None and problem.offset_prior_px > 0 and bool(used.any())
+    if problem.sightings is not None and used.any():
+        if problem.placed and seeks_drift:
+            state, system = _optimised(problem, state, used, drift_free=True)
+        problem, state, system, used = _with_seen_noise(problem, problem.sightings, state, used)
+    drift: RigDrift | None = None
+    everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)
+    for _ in range(MOST_ROUNDS):
+        if seeks_drift:
+            state, system = _optimised(problem, state, used, drift_free=True)
+            drift = rig_drift.weigh(state.drift, marginals(system).drift, problem)
+            state = replace(state, drift=np.array([drift.yaw_rad, drift.scale]))
+            state, system = _optimised(problem, state, used)
+        now = agreeing(state.values, everywhere)
+        if (now == agreed).all() or now.mean() < LEAST_AGREEING:
+            break
+        agreed = now
+        chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
+        problem = replace(everywhere, placed=chosen)
+        state, system = _optimised(problem, state, used)
+    poses, found = _poses(state, problem), marginals(system)
+    velocity, biases = _inertial(state, problem)
+    sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
+    return Estimate(
+        poses, covariances(found, poses, drift), velocity, biases, sigma, drift, used,
+        encoder_state(state.values, found.latency_sigma_s) if problem.placed else None,
+        disagreement(state.values, everywhere), agreeing(state.values, everywhere),
+    )  # fmt: skip
+
+
+def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None) -> Float64:
+    """(M, 6, 6) of the poses in the reference's axes, what the rig's drift leaves open included."""
+    shared = np.zeros((2, 2)) if drift is None else drift.covariance
+    result = np.zeros((len(poses), 6, 6))
+    for k, pose in enumerate(poses):
+        turned = np.zeros((6, 6))
+        turned[:3, :3] = turned[3:, 3:] = pose.rotation
+        own = found.poses[k] + found.swing[k] @ shared @ found.swing[k].T
+        result[k] = turned @ own @ turned.T
+    return result
+
+
+def _optimised(problem: Problem, state: State, used: Bool, drift_free: bool = False) -> tuple[State, System]:
+    return optimise(problem, factors(problem), state, used, drift_free)
+
+
+def _with_seen_noise(
+    problem: Problem, seen: StereoSightings, state: State, used: Bool
+) -> tuple[Problem, State, System, Bool]:
+    """The problem with the sightings' sigma as their residuals show it, and without the far ones, solved."""
+    residual = sighting_residuals(problem, state, used)
+    share = np.abs(residual) / seen.sigma_px[:, None]
+    factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])))
+    used = often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+    seen = replace(seen, sigma_px=factor * seen.sigma_px)
+    problem = replace(problem, sightings=seen)
+    state, system = _optimised(problem, state, used)
+    wider = persistence(sighting_residuals(problem, state, used), seen, used)
+    if wider > 1:
+        problem = replace(problem, sightings=replace(seen, sigma_px=wider * seen.sigma_px))
+        state, system = _optimised(problem, state, used)
+    return problem, state, system, used
+
+
+def _inertial(state: State, problem: Problem) -> tuple[Float64 | None, tuple[ImuBias, ...]]:
+    """(M, 3) velocities and the biases, where there is an IMU."""
+    if not problem.has_imu:
+        return None, ()
+    nodes = range(len(problem.start))
+    found = [state.values.atConstantBias(B(k)) for k in nodes]
+    biases = tuple(ImuBias(np.array(b.gyroscope()), np.array(b.accelerometer())) for b in found)
+    return np.array([state.values.atVector(V(k)) for k in nodes]), biases
+
+
+def _poses(state: State, problem: Problem) -> tuple[Pose, ...]:
+    target = problem.start[0].target
+    return tuple(_pose(state.values.atPose3(X(k)), target) for k in range(len(problem.start)))
+
+
+def _pose(pose: Any, target: str) -> Pose:
+    return Pose(target, "body", pose.rotation().matrix(), np.asarray(pose.translation()))

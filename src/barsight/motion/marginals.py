@@ -1,0 +1,45 @@
+"""Covariances out of a solved system: each node's own block, and what hangs on the border."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.motion.band import inverse_blocks
+from barsight.motion.solver import System
+
+
+@dataclass(frozen=True, eq=False)
+class Marginals:
+    """poses: (M, 6, 6) in GTSAM's order and body axes, the rig's drift taken as known. latency_sigma_s: nan
+    without encoders. swing: (M, 6, 2) how the poses move with the drift. drift: (2, 2) as the sightings show
+    it, everything else free.
+    """
+
+    poses: Float64
+    latency_sigma_s: float
+    swing: Float64
+    drift: Float64
+
+
+def marginals(system: System) -> Marginals:
+    """Of a system at its best state."""
+    factor, size = system.factor(), system.size
+    solved = system.solved(factor)
+    own, _ = system.schur(solved)
+    count = len(factor) // size
+    poses = np.empty((count, size, size))
+    inverse_blocks(factor, size, poses)
+    poses = poses[:, :6, :6]
+    by_border = -solved[1:].T.reshape(count, size, -1)[:, :6]
+    swing, latency = by_border[:, :, -2:], float("nan")
+    if len(own) == 3:
+        variance = 1 / own[0, 0]
+        latency = float(variance**0.5)
+        to_latency = by_border[:, :, :1]
+        poses = poses + variance * to_latency @ to_latency.transpose(0, 2, 1)
+        swing = swing - to_latency @ (own[:1, 1:] * variance)
+    drift: Float64 = np.linalg.inv(own)[-2:, -2:].astype(np.float64)
+    return Marginals(poses, latency, swing, drift)

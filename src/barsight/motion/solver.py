@@ -1,0 +1,238 @@
+"""Gauss-Newton over all unknowns: points taken out by kernels, the rest linearised by GTSAM.
+
+Unknowns are ordered node by node (pose, with an IMU velocity and biases), so the matrix is a band as wide as
+the longest track; the encoders' latency and the rig's drift touch all nodes and stand at its border.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, E, V, X
+from scipy.sparse import csc_matrix
+
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.motion import band
+from barsight.motion.point_kernels import Guess, Reduced, Rig, Sights, eliminate, residuals, substitute
+from barsight.motion.problem import Problem, StereoSightings
+from barsight.motion.rig_drift import HUBER_SIGMAS, LOOSE, columns
+
+MOST_ITERATIONS = 25
+RELATIVE_GAIN = 1e-5
+WIDTHS = {"x": 6, "v": 3, "b": 6, "e": 1}
+OFFSETS = {"x": 0, "v": 6, "b": 9}
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """values: GTSAM's, of all but the points (T, 3) and the rig's drift (2,)."""
+
+    values: Any
+    points: Float64
+    drift: Float64
+
+    def guess(self, nodes: int) -> Guess:
+        """As the kernels take it."""
+        poses = [self.values.atPose3(X(k)) for k in range(nodes)]
+        turn = np.array([pose.rotation().matrix() for pose in poses])
+        place = np.array([pose.translation() for pose in poses])
+        return Guess(turn, place, self.points, self.drift)
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Normal equations at a state. rows: (n, w), a band as `band` has it; gradient (n,). side: (b, n) with
+    the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one, then the
+    rig's drift. size: unknowns a node.
+    """
+
+    rows: Float64
+    gradient: Float64
+    side: Float64
+    corner: Float64
+    corner_gradient: Float64
+    size: int
+
+    def factor(self, damping: float = 0.0) -> Float64:
+        """The band's factor. Raises LinAlgError where the measurements leave it undetermined."""
+        factor = self.rows.copy()
+        factor[:, -1] *= 1 + damping
+        if not band.factorise(factor):
+            raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
+        return factor
+
+    def solved(self, factor: Float64) -> Float64:
+        """(1 + b, n) the band's inverse times gradient and side."""
+        result = np.vstack([self.gradient, self.side])
+        band.solve(factor, result)
+        return result
+
+    def schur(self, solved: Float64) -> tuple[Float64, Float64]:
+        """The border's own matrix (b, b) and gradient (b,)."""
+        loose = np.zeros(len(self.corner))
+        loose[-2:] = 1 / np.array(LOOSE) ** 2
+        left = self.corner - self.side @ solved[1:].T + np.diag(loose)
+        return left, self.corner_gradient - self.side @ solved[0]
+
+    def step(self, free: Bool, damping: float) -> tuple[Float64, Float64]:
+        """(n,) and (b,): the border's `free` (b,) unknowns step too, the others stay."""
+        solved = self.solved(self.factor(damping))
+        border = np.zeros(len(free))
+        if free.any():
+            left, right = self.schur(solved)
+            left = left + damping * np.diag(np.diag(left))
+            border[free] = -np.linalg.solve(left[np.ix_(free, free)], right[free])
+        return -(solved[0] + border @ solved[1:]), border
+
+
+def rig_of(seen: StereoSightings) -> Rig:
+    """The cameras as the kernels take them."""
+    c = seen.camera
+    lens = np.array([c.focal_px, c.cx_px, c.cy_px, c.focal_px * c.baseline_m, c.doffs_px])
+    mount = seen.body_from_rect0
+    turn, place = np.ascontiguousarray(mount.rotation), np.ascontiguousarray(mount.translation)
+    return Rig(lens, turn, place, HUBER_SIGMAS)
+
+
+def sights_of(problem: Problem, used: Bool) -> Sights:
+    """The sightings as the kernels take them."""
+    seen = problem.sightings
+    assert seen is not None
+    by_drift = columns(seen) * ([1.0, 1.0] if problem.sees_scale else [1.0, 0.0])
+    return Sights(seen.first, seen.node, used, seen.stereo, 1 / seen.sigma_px, by_drift)
+
+
+def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
+    """(N, 3) px seen minus predicted, 0 where unused."""
+    assert problem.sightings is not None
+    result = np.zeros((len(used), 3))
+    guess = state.guess(len(problem.start))
+    residuals(rig_of(problem.sightings), sights_of(problem, used), guess, result)
+    return result
+
+
+def optimise(
+    problem: Problem, graph: Any, state: State, used: Bool, drift_free: bool = False,
+    most: int = MOST_ITERATIONS,
+) -> tuple[State, System]:  # fmt: skip
+    """The state that fits best and its system. [Levenberg 1944, Marquardt 1963]
+
+    graph: GTSAM's factors of all but the sightings. drift_free: whether the rig's drift is sought too.
+    Raises LinAlgError where the measurements leave an unknown undetermined.
+    """
+    free = np.array([True] * bool(problem.placed) + [drift_free, drift_free])
+    cost, damping = _cost(problem, graph, state, used), 0.0
+    system = linearise(problem, graph, state, used)
+    for _ in range(most):
+        try:
+            moved = _moved(problem, state, used, *system.step(free, damping))
+            lower = _cost(problem, graph, moved, used)
+        except np.linalg.LinAlgError:
+            if damping > 1:
+                raise
+            lower = np.inf
+        if not lower <= cost:
+            if cost - lower > -RELATIVE_GAIN * cost or damping > 1e6:
+                break
+            damping = max(1e-5, 10 * damping)
+            continue
+        gain, cost, state, damping = cost - lower, lower, moved, damping / 10 if damping > 1e-5 else 0.0
+        system = linearise(problem, graph, state, used)
+        if gain < RELATIVE_GAIN * max(cost, 1e-9):
+            break
+    return state, system
+
+
+def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
+    """The system at a state."""
+    nodes, width = len(problem.start), 15 if problem.has_imu else 6
+    border = int(bool(problem.placed)) + 2
+    span = 2 if problem.has_imu else 1
+    seen = problem.sightings
+    if seen is not None and len(seen.node):
+        span = max(span, 1 + int(seen.reach.max()))
+    span = min(span, nodes)
+    size = nodes * width
+    rows = np.zeros((size, span * width))
+    gradient, side = np.zeros(size), np.zeros((border, size))
+    corner, corner_gradient = np.zeros((border, border)), np.zeros(border)
+    if seen is not None and used.any():
+        reduced = Reduced(
+            np.zeros((nodes, span, 6, 6)), np.zeros((nodes, 6)), np.zeros((nodes, 6, 2)), np.zeros((2, 2)),
+            np.zeros(2),
+        )  # fmt: skip
+        eliminate(rig_of(seen), sights_of(problem, used), state.guess(nodes), reduced)
+        _into_rows(rows, reduced.band, width)
+        at = (np.arange(nodes)[:, None] * width + np.arange(6)).ravel()
+        gradient[at] = reduced.gradient.ravel()
+        side[-2:, at] = reduced.side.reshape(-1, 2).T
+        corner[-2:, -2:], corner_gradient[-2:] = reduced.corner, reduced.corner_gradient
+    matrix, right = _others(graph, state.values, width, size)
+    low, last = matrix[:size, :size].tocoo(), matrix[size:].toarray()[0]
+    below = low.row >= low.col
+    at_row, at_column = low.row[below], low.col[below]
+    rows[at_row, at_column - at_row + rows.shape[1] - 1] += low.data[below]
+    gradient += right[:size]
+    if problem.placed:
+        side[0] += last[:size]
+        corner[0, 0] += last[size]
+        corner_gradient[0] += right[size]
+    return System(rows, gradient, side, corner, corner_gradient, width)
+
+
+def _into_rows(rows: Float64, blocks: Float64, width: int) -> None:
+    """Adds (M, S, 6, 6) blocks of node k (their rows) with node k + s (their columns) to a band."""
+    for s in range(blocks.shape[1]):
+        nodes = (np.arange(len(blocks) - s) * width)[:, None]
+        i, j = np.nonzero(np.tri(6).T if s == 0 else np.ones((6, 6)))
+        rows[nodes + s * width + j, i - j - s * width + rows.shape[1] - 1] += blocks[: len(nodes), s, i, j]
+
+
+def _others(graph: Any, values: Any, width: int, size: int) -> tuple[csc_matrix, Float64]:
+    """Normal matrix and gradient of GTSAM's factors in our order, the latency last."""
+    linear = graph.linearize(values)
+    row, column, value = linear.sparseJacobian_()
+    where: list[Int64] = []
+    for key in linear.keyVector():
+        kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
+        begin = size if kind == "e" else node * width + OFFSETS[kind]
+        where.append(begin + np.arange(WIDTHS[kind]))
+    at = np.concatenate(where)
+    column, row = column.astype(np.int64) - 1, row.astype(np.int64) - 1
+    rows, last = int(row.max(initial=0)) + 1, len(at)
+    right = np.zeros(rows)
+    of_right = column == last
+    right[row[of_right]] = value[of_right]
+    design = csc_matrix((value[~of_right], (row[~of_right], at[column[~of_right]])), (rows, size + 1))
+    return (design.T @ design).tocsc(), -(design.T @ right)
+
+
+def _moved(problem: Problem, state: State, used: Bool, step: Float64, border: Float64) -> State:
+    nodes = len(problem.start)
+    by_node = step.reshape(nodes, -1)
+    vectors = gtsam.VectorValues()
+    for k, part in enumerate(by_node):
+        vectors.insert(X(k), part[:6])
+        if problem.has_imu:
+            vectors.insert(V(k), part[6:9])
+            vectors.insert(B(k), part[9:])
+    if problem.placed:
+        vectors.insert(E(0), border[:1])
+    points, drift = state.points, border[-2:]
+    if problem.sightings is not None:
+        points = points.copy()
+        poses = np.ascontiguousarray(by_node[:, :6])
+        rig, sights = rig_of(problem.sightings), sights_of(problem, used)
+        substitute(rig, sights, state.guess(nodes), poses, np.ascontiguousarray(drift), points)
+    return replace(state, values=state.values.retract(vectors), points=points, drift=state.drift + drift)
+
+
+def _cost(problem: Problem, graph: Any, state: State, used: Bool) -> float:
+    cost = float(graph.error(state.values))
+    if problem.sightings is None:
+        return cost
+    seen, guess = problem.sightings, state.guess(len(problem.start))
+    return cost + residuals(rig_of(seen), sights_of(problem, used), guess, np.zeros((len(used), 3)))
