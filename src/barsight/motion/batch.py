@@ -60,7 +60,7 @@ def solve(problem: Problem) -> Estimate:
     state, system = _optimised(problem, state, used)
     seeks_drift = problem.sightings is not None and problem.offset_prior_px > 0 and bool(used.any())
     if problem.sightings is not None and used.any():
-        if problem.placed and seeks_drift:
+        if problem.has_latency and seeks_drift:
             state, system = _optimised(problem, state, used, drift_free=True)
         problem, state, system, used = _with_seen_noise(problem, problem.sightings, state, used)
     drift: RigDrift | None = None
@@ -83,7 +83,7 @@ def solve(problem: Problem) -> Estimate:
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
     return Estimate(
         poses, covariances(found, poses, drift), velocity, biases, sigma, drift, used,
-        encoder_state(state.values, found.latency_sigma_s) if problem.placed else None,
+        encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
         disagreement(state.values, everywhere), agreeing(state.values, everywhere),
     )  # fmt: skip
 

@@ -38,10 +38,9 @@ class EncoderState:
 
 def add_encoders(graph: Any, problem: Problem) -> None:
     """Factors for the problem's places, Huber, and the prior of the latency."""
-    if not problem.placed:
-        return
-    prior = gtsam.noiseModel.Isotropic.Sigma(1, problem.encoder_latency_sigma_s)
-    graph.add(gtsam.PriorFactorVector(E(0), np.zeros(1), prior))
+    if problem.prior is None and problem.has_latency:
+        prior = gtsam.noiseModel.Isotropic.Sigma(1, problem.encoder_latency_sigma_s)
+        graph.add(gtsam.PriorFactorVector(E(0), np.zeros(1), prior))
     huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS)
     for place in problem.placed:
         sigma = max(place.sigma_m, LEAST_SIGMA_M)

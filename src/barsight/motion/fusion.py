@@ -205,6 +205,7 @@ class FusedTrajectory:
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, tuple(placed),
             tuple(attitudes), ties.still, ties.bias,
             offset_prior_px=self.settings.calibration_sigma_px, scale_prior=self.settings.scale_sigma,
+            has_latency=bool(placed), has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
         estimate = solve(problem)
         warnings = encoder_warnings(

@@ -37,13 +37,13 @@ def start_values(problem: Problem) -> Any:
         if problem.has_imu:
             values.insert(V(k), velocity[k])
             values.insert(B(k), bias)
-    if problem.placed:
+    if problem.has_latency:
         values.insert(E(0), np.zeros(1))
     return values
 
 
 def _add_priors(graph: Any, problem: Problem) -> None:
-    if problem.first_fixed:
+    if problem.first_fixed and problem.prior is None:
         sigmas = _sigmas(1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6)
         if problem.has_imu:
             # Gravity turns the first attitude about level axes; its heading stays where it is.
@@ -61,7 +61,8 @@ def _add_priors(graph: Any, problem: Problem) -> None:
 def _add_imu(graph: Any, problem: Problem) -> None:
     bias = gtsam.imuBias.ConstantBias(problem.bias.accel_mps2, problem.bias.gyro_radps)
     model = _sigmas(*[problem.accel_bias_sigma_mps2] * 3, *[problem.gyro_bias_sigma_radps] * 3)
-    graph.add(gtsam.PriorFactorConstantBias(B(0), bias, model))
+    if problem.prior is None:
+        graph.add(gtsam.PriorFactorConstantBias(B(0), bias, model))
     for k in range(len(problem.start)):
         sigma = 1e-3 if k in problem.still else 10.0
         model = gtsam.noiseModel.Isotropic.Sigma(3, sigma)

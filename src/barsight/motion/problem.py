@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -87,6 +88,20 @@ class Attitude:
 
 
 @dataclass(frozen=True, eq=False)
+class Prior:
+    """What nodes that have left say of the first P ones that stay, to second order about `at`.
+
+    at: GTSAM's values of these nodes, and of the latency where there is one; drift (2,) of the rig. matrix
+    (n, n) and gradient (n,) of their unknowns, node by node, then the latency and the drift.
+    """
+
+    at: Any
+    drift: Float64
+    matrix: Float64
+    gradient: Float64
+
+
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Everything the estimate knows. start: (M,) poses to begin from, one per node.
 
@@ -110,13 +125,14 @@ class Problem:
     """How far a yaw between the cameras may move the disparity (1 sigma); 0 takes it as exact."""
     scale_prior: float = 5e-4
     """By which share baseline and encoders may disagree (1 sigma)."""
+    prior: Prior | None = None
+    """Takes the place of what fixes the first node, the biases and the latency."""
+    has_latency: bool = False
+    """Whether the encoders' latency is an unknown."""
+    has_imu: bool = False
+    """Whether velocities and biases are unknowns."""
 
     @property
     def sees_scale(self) -> bool:
         """Whether encoders say how long the way is."""
-        return bool(self.placed)
-
-    @property
-    def has_imu(self) -> bool:
-        """Whether any neighbours are tied by the IMU."""
-        return any(part is not None for part in self.preintegrated)
+        return self.has_latency

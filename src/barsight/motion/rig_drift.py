@@ -42,17 +42,17 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     assert seen is not None
     focal, baseline = seen.camera.focal_px, seen.camera.baseline_m
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
-    yaw_prior = SERVICE_RAD if problem.placed else problem.offset_prior_px / focal
+    yaw_prior = SERVICE_RAD if problem.has_latency else problem.offset_prior_px / focal
     prior = np.array([yaw_prior, problem.scale_prior]) ** 2
     floor = _floor(disparity, focal)
-    if not problem.placed:
+    if not problem.has_latency:
         floor[0, 0] += prior[0]
     information = np.linalg.inv(covariance + floor)
     combined = np.linalg.inv(information + np.diag(1 / prior))
     yaw, scale = combined @ information @ theta
     range_m = focal * baseline / float(np.median(disparity))
     return RigDrift(
-        float(yaw), float(scale), combined, np.sqrt(prior), baseline, range_m, bool(problem.placed)
+        float(yaw), float(scale), combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency)
     )
 
 

@@ -17,7 +17,7 @@ from scipy.sparse import csc_matrix
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
 from barsight.motion.point_kernels import Guess, Reduced, Rig, Sights, eliminate, residuals, substitute
-from barsight.motion.problem import Problem, StereoSightings
+from barsight.motion.problem import Prior, Problem, StereoSightings
 from barsight.motion.rig_drift import HUBER_SIGMAS, LOOSE, columns
 
 MOST_ITERATIONS = 25
@@ -77,13 +77,14 @@ class System:
         left = self.corner - self.side @ solved[1:].T + np.diag(loose)
         return left, self.corner_gradient - self.side @ solved[0]
 
-    def step(self, free: Bool, damping: float) -> tuple[Float64, Float64]:
-        """(n,) and (b,): the border's `free` (b,) unknowns step too, the others stay."""
+    def step(self, free: Bool, damping: float = 0.0, fixed: Float64 | None = None) -> tuple[Float64, Float64]:
+        """(n,) and (b,): the border's `free` (b,) unknowns step too, the others as `fixed` (b,) says."""
         solved = self.solved(self.factor(damping))
-        border = np.zeros(len(free))
+        border = np.zeros(len(free)) if fixed is None else np.where(free, 0.0, fixed)
         if free.any():
             left, right = self.schur(solved)
             left = left + damping * np.diag(np.diag(left))
+            right = right + left @ border
             border[free] = -np.linalg.solve(left[np.ix_(free, free)], right[free])
         return -(solved[0] + border @ solved[1:]), border
 
@@ -123,13 +124,13 @@ def optimise(
     graph: GTSAM's factors of all but the sightings. drift_free: whether the rig's drift is sought too.
     Raises LinAlgError where the measurements leave an unknown undetermined.
     """
-    free = np.array([True] * bool(problem.placed) + [drift_free, drift_free])
+    free = np.array([True] * problem.has_latency + [drift_free, drift_free])
     cost, damping = _cost(problem, graph, state, used), 0.0
     system = linearise(problem, graph, state, used)
     for _ in range(most):
         try:
-            moved = _moved(problem, state, used, *system.step(free, damping))
-            lower = _cost(problem, graph, moved, used)
+            trial = moved(problem, state, used, *system.step(free, damping))
+            lower = _cost(problem, graph, trial, used)
         except np.linalg.LinAlgError:
             if damping > 1:
                 raise
@@ -139,7 +140,7 @@ def optimise(
                 break
             damping = max(1e-5, 10 * damping)
             continue
-        gain, cost, state, damping = cost - lower, lower, moved, damping / 10 if damping > 1e-5 else 0.0
+        gain, cost, state, damping = cost - lower, lower, trial, damping / 10 if damping > 1e-5 else 0.0
         system = linearise(problem, graph, state, used)
         if gain < RELATIVE_GAIN * max(cost, 1e-9):
             break
@@ -149,11 +150,13 @@ def optimise(
 def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
     """The system at a state."""
     nodes, width = len(problem.start), 15 if problem.has_imu else 6
-    border = int(bool(problem.placed)) + 2
+    border = int(problem.has_latency) + 2
     span = 2 if problem.has_imu else 1
     seen = problem.sightings
     if seen is not None and len(seen.node):
         span = max(span, 1 + int(seen.reach.max()))
+    if problem.prior is not None:
+        span = nodes
     span = min(span, nodes)
     size = nodes * width
     rows = np.zeros((size, span * width))
@@ -176,11 +179,45 @@ def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
     at_row, at_column = low.row[below], low.col[below]
     rows[at_row, at_column - at_row + rows.shape[1] - 1] += low.data[below]
     gradient += right[:size]
-    if problem.placed:
+    if problem.has_latency:
         side[0] += last[:size]
         corner[0, 0] += last[size]
         corner_gradient[0] += right[size]
+    if problem.prior is not None:
+        _add_prior(problem.prior, state, rows, gradient, side, corner, corner_gradient)
     return System(rows, gradient, side, corner, corner_gradient, width)
+
+
+def _add_prior(
+    prior: Prior, state: State, rows: Float64, gradient: Float64, side: Float64, corner: Float64,
+    corner_gradient: Float64,
+) -> None:  # fmt: skip
+    border = len(corner)
+    count, last = len(prior.matrix) - border, rows.shape[1] - 1
+    slope = prior.gradient + prior.matrix @ _since(prior, state)
+    row, column = np.nonzero(np.tri(count))
+    rows[row, column - row + last] += prior.matrix[row, column]
+    gradient[:count] += slope[:count]
+    side[:, :count] += prior.matrix[count:, :count]
+    corner += prior.matrix[count:, count:]
+    corner_gradient += slope[count:]
+
+
+def _since(prior: Prior, state: State) -> Float64:
+    """(n,) how far the state has moved from where the prior stands."""
+    moves = []
+    for key in prior.at.keys():  # noqa: SIM118
+        kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
+        place = 1_000_000_000 if kind == "e" else node
+        if kind == "x":
+            move = prior.at.atPose3(key).localCoordinates(state.values.atPose3(key))
+        elif kind == "b":
+            move = state.values.atConstantBias(key).vector() - prior.at.atConstantBias(key).vector()
+        else:
+            move = state.values.atVector(key) - prior.at.atVector(key)
+        moves.append((place, OFFSETS.get(kind, 0), np.asarray(move)))
+    moves.sort(key=lambda move: move[:2])
+    return np.concatenate([*(move for _, _, move in moves), state.drift - prior.drift])
 
 
 def _into_rows(rows: Float64, blocks: Float64, width: int) -> None:
@@ -194,6 +231,8 @@ def _into_rows(rows: Float64, blocks: Float64, width: int) -> None:
 def _others(graph: Any, values: Any, width: int, size: int) -> tuple[csc_matrix, Float64]:
     """Normal matrix and gradient of GTSAM's factors in our order, the latency last."""
     linear = graph.linearize(values)
+    if linear.size() == 0:
+        return csc_matrix((size + 1, size + 1)), np.zeros(size + 1)
     row, column, value = linear.sparseJacobian_()
     where: list[Int64] = []
     for key in linear.keyVector():
@@ -210,7 +249,8 @@ def _others(graph: Any, values: Any, width: int, size: int) -> tuple[csc_matrix,
     return (design.T @ design).tocsc(), -(design.T @ right)
 
 
-def _moved(problem: Problem, state: State, used: Bool, step: Float64, border: Float64) -> State:
+def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Float64) -> State:
+    """The state after a step of the band's and the border's unknowns; the points follow."""
     nodes = len(problem.start)
     by_node = step.reshape(nodes, -1)
     vectors = gtsam.VectorValues()
@@ -219,7 +259,7 @@ def _moved(problem: Problem, state: State, used: Bool, step: Float64, border: Fl
         if problem.has_imu:
             vectors.insert(V(k), part[6:9])
             vectors.insert(B(k), part[9:])
-    if problem.placed:
+    if problem.has_latency:
         vectors.insert(E(0), border[:1])
     points, drift = state.points, border[-2:]
     if problem.sightings is not None:
@@ -232,6 +272,9 @@ def _moved(problem: Problem, state: State, used: Bool, step: Float64, border: Fl
 
 def _cost(problem: Problem, graph: Any, state: State, used: Bool) -> float:
     cost = float(graph.error(state.values))
+    if problem.prior is not None:
+        since = _since(problem.prior, state)
+        cost += float(since @ (problem.prior.gradient + problem.prior.matrix @ since / 2))
     if problem.sightings is None:
         return cost
     seen, guess = problem.sightings, state.guess(len(problem.start))

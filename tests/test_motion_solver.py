@@ -1,0 +1,156 @@
+"""The solver: band matrices against dense ones, points taken out against GTSAM's own factor per sighting."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+from scipy.spatial.transform import Rotation
+
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedCamera
+from barsight.features.guided import project_stereo
+from barsight.inertial.model import ImuBias
+from barsight.motion import band
+from barsight.motion.graph import factors, start_values
+from barsight.motion.marginals import marginals
+from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
+from barsight.motion.rig_drift import HUBER_SIGMAS
+from barsight.motion.sightings import Sighting
+from barsight.motion.solver import State, optimise
+from barsight.motion.stereo_factors import often, start_points
+
+CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.3, 4.0, 640, 480)
+MOUNT = Pose("body", "rect0", Rotation.from_rotvec([0.1, -0.3, 1.5]).as_matrix(), np.array([0.1, -0.2, 0.3]))
+
+
+def banded(rng: np.random.Generator, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    lower = np.tril(rng.normal(size=(n, n))) * (np.subtract.outer(np.arange(n), np.arange(n)) < width)
+    matrix = lower @ lower.T + np.eye(n)
+    matrix *= np.abs(np.subtract.outer(np.arange(n), np.arange(n))) < width
+    matrix += np.diag(np.abs(matrix).sum(axis=1))
+    rows = np.zeros((n, width))
+    for i in range(n):
+        for j in range(max(0, i - width + 1), i + 1):
+            rows[i, width - 1 - (i - j)] = matrix[i, j]
+    return matrix, rows
+
+
+@pytest.mark.parametrize(("n", "width"), [(12, 3), (30, 12), (6, 6), (12, 12)])
+def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
+    rng = np.random.default_rng(n)
+    matrix, rows = banded(rng, n, width)
+    right = rng.normal(size=(2, n))
+    expected = np.linalg.solve(matrix, right.T).T
+    assert band.factorise(rows)
+    band.solve(rows, right)
+    np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
+    blocks = np.empty((n // 3, 3, 3))
+    band.inverse_blocks(rows, 3, blocks)
+    inverse = np.linalg.inv(matrix)
+    for k, block in enumerate(blocks):
+        np.testing.assert_allclose(
+            block, inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-8, atol=1e-12
+        )
+
+
+def test_an_undetermined_band_is_told() -> None:
+    rows = np.array([[0.0, 1.0], [1.0, 1.0]])
+    assert not band.factorise(rows)
+
+
+def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple[Problem, np.ndarray]:
+    """A camera that moves past points, some of them wrong, started a little off."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-3, 6, 120), rng.uniform(-2, 2, 120), rng.uniform(4, 7, 120)])
+    sightings, poses = [], []
+    for k in range(count):
+        turn = Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
+        rect0 = Pose("yard", "rect0", turn, np.array([0.4 * k, 0, 0]) + rng.normal(0, 0.05, 3))
+        stereo = project_stereo(rect0.inverse().apply(points), CAMERA)
+        shown = (stereo[:, [0, 2]] > 0).all(1) & (stereo[:, [0, 2]] < 640).all(1)
+        shown &= (stereo[:, 1] > 0) & (stereo[:, 1] < 480)
+        noisy = stereo[shown] + rng.normal(0, 0.2, (shown.sum(), 3))
+        noisy[::15] += rng.normal(0, wrong_px, (len(noisy[::15]), 3))
+        sigma = rng.uniform(0.1, 0.3, len(noisy))
+        sightings.append(Sighting(k, np.flatnonzero(shown), noisy, sigma, None, 0))
+        off = Pose(
+            "body", "body", Rotation.from_rotvec(rng.normal(0, 2e-3, 3)).as_matrix(), rng.normal(0, 0.01, 3)
+        )
+        poses.append(rect0 @ MOUNT.inverse() @ off)
+    seen = StereoSightings.of(sightings, range(count), CAMERA, MOUNT)
+    stamps = np.arange(count) * 500_000_000
+    placed, attitudes = (), ()
+    if with_crane:
+        at = [pose.translation + rng.normal(0, 0.0005, 3) for pose in poses]
+        v, a = np.array([0.8, 0, 0]), np.array([0.3, 0.1, 0])
+        placed = tuple(Placed(k, place, v * (k % 3), a, 0.002) for k, place in enumerate(at))
+        attitudes = tuple(Attitude(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
+    problem = Problem(
+        tuple(poses), stamps, not with_crane, seen, (None,) * (count - 1), placed, attitudes, (),
+        ImuBias.none(), has_latency=with_crane,
+    )  # fmt: skip
+    return problem, often(seen, np.ones(len(seen.node), np.bool_))
+
+
+def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Marginals]:
+    """The slow way: a factor and its objects for every sighting."""
+    seen, graph, values = problem.sightings, factors(problem), start_values(problem)
+    assert seen is not None
+    lens = gtsam.Cal3_S2Stereo(
+        CAMERA.focal_px, CAMERA.focal_px, 0.0, CAMERA.cx_px, CAMERA.cy_px, CAMERA.baseline_m
+    )
+    mounted = gtsam.Pose3(gtsam.Rot3(MOUNT.rotation), MOUNT.translation)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS)
+    points = start_points(problem)
+    for k in np.flatnonzero(used):
+        model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, seen.sigma_px[k]))
+        u, v, right = seen.stereo[k]
+        place = gtsam.StereoPoint2(u, right - CAMERA.doffs_px, v)
+        node, track = X(int(seen.node[k])), L(int(seen.track[k]))
+        graph.add(gtsam.GenericStereoFactor3D(place, model, node, track, lens, mounted))
+        if not values.exists(track):
+            values.insert(track, points[seen.track[k]])
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-10)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    return values, gtsam.Marginals(graph, values)
+
+
+@pytest.mark.parametrize("with_crane", [False, True])
+def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
+    problem, used = seen_from(8, 1, with_crane, 2.0)
+    expected, covariance = by_gtsam(problem, used)
+    graph = factors(problem)
+    state = State(start_values(problem), start_points(problem), np.zeros(2))
+    for _ in range(10):
+        state, system = optimise(problem, graph, state, used)
+    found = marginals(system)
+    for k in range(8):
+        off = expected.atPose3(X(k)).localCoordinates(state.values.atPose3(X(k)))
+        sigma = np.sqrt(np.diag(covariance.marginalCovariance(X(k))))
+        assert (np.abs(off) < 0.01 * sigma + 1e-9).all()
+        np.testing.assert_allclose(np.sqrt(np.diag(found.poses[k])), sigma, rtol=0.01)
+
+
+def test_the_drifts_share_is_right() -> None:
+    """How yaw and scale swing the poses, against small changes of them."""
+    problem, used = seen_from(6, 2, True, 0.0)
+    assert problem.sightings is not None
+    wide = replace(problem.sightings, sigma_px=6 * problem.sightings.sigma_px)  # none beyond Huber's length
+    problem = replace(problem, sightings=wide)
+    graph = factors(problem)
+    state = State(start_values(problem), start_points(problem), np.zeros(2))
+    for _ in range(6):
+        state, system = optimise(problem, graph, state, used)
+    swing = marginals(system).swing
+    for axis, small in enumerate((1e-3, 1e-2)):
+        drift = np.eye(2)[axis] * small
+        other = replace(state, drift=drift)
+        for _ in range(6):
+            other, _ = optimise(problem, graph, other, used)
+        moved = [state.values.atPose3(X(k)).localCoordinates(other.values.atPose3(X(k))) for k in range(6)]
+        np.testing.assert_allclose(
+            np.array(moved) / small, swing[:, :, axis], rtol=0.1, atol=0.02 * np.abs(swing[:, :, axis]).max()
+        )
