@@ -2,88 +2,131 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-from numba import prange
+from numba import prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from barsight.core.arrays import UInt8, kernel
+from barsight.stereo.vectors import LANES, SHORTS, Vectors
 
 Int16 = NDArray[np.int16]
-UInt32 = NDArray[np.uint32]
 
 _UNKNOWN_COST = 60
+BESIDE_COST = 61
+"""Of the places that fill up the last vector: dearer than any candidate, so that no path goes there."""
+_MOST_APART = 20
+_CODE_BYTES = 3
 
 
-def census_codes(image: UInt8) -> UInt32:
-    codes = np.zeros(image.shape, dtype=np.uint32)
+@dataclass(frozen=True, eq=False)
+class Described:
+    """What is compared of each pixel. codes: (H, 3, W) the census' 24 bits. slope: (H, W) difference of the
+    neighbours in the row. grey: (H, W).
+    """
+
+    codes: UInt8
+    slope: Int16
+    grey: UInt8
+
+
+def described(image: UInt8) -> Described:
+    """See `Described`."""
+    height, width = image.shape
+    codes = np.empty((height, _CODE_BYTES, width), dtype=np.uint8)
     _write_census(cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_REPLICATE), codes)
-    return codes
+    slope: Int16 = cv2.filter2D(image, cv2.CV_16S, np.array([[-1, 0, 1]], dtype=np.float32))
+    return Described(codes, slope, image)
 
 
-def row_gradient(image: UInt8) -> Int16:
-    gradient: Int16 = cv2.filter2D(image, cv2.CV_16S, np.array([[-1, 0, 1]], dtype=np.float32))
-    return gradient
+def candidates_in_order(right: Described, lowest: int, places: int) -> Described:
+    """The right image with its rows reversed, so that a left pixel's candidates lie in memory's order: column
+    W - 1 - x + k holds candidate k of left column x. Filled up so that each of the `places` can be read.
+    """
+    before, after = max(0, -lowest), max(0, lowest + places)
 
+    def turned(array: NDArray[Any]) -> NDArray[Any]:
+        margins = [(0, 0)] * (array.ndim - 1) + [(before, after)]
+        return np.pad(array[..., ::-1], margins)[..., before + lowest :]
 
-def reversed_rows(image: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(image[:, ::-1])
+    return Described(*(np.ascontiguousarray(turned(a)) for a in (right.codes, right.slope, right.grey)))
 
 
 @kernel(parallel=True)
-def _write_census(framed: UInt8, codes: UInt32) -> None:
-    """Bit k is set where neighbour k is brighter than the centre. framed: (H + 4, W + 4)."""
-    height, width = codes.shape
-    one = np.uint32(1)
+def _write_census(framed: UInt8, codes: UInt8) -> None:
+    """A bit is set where a neighbour is brighter than the centre. framed: (H + 4, W + 4)."""
+    height, _, width = codes.shape
+    one = np.uint8(1)
     for y in prange(height):
-        row = codes[y]
         centre = framed[y + 2, 2 : 2 + width]
-        for dy in range(5):
-            for dx in range(5):
-                if dy == 2 and dx == 2:
-                    continue
-                there = framed[y + dy, dx : dx + width]
+        for part in range(_CODE_BYTES):
+            row = codes[y, part]
+            row[:] = 0
+            for bit in range(8):
+                neighbour = part * 8 + bit
+                place = neighbour + 1 if neighbour >= 12 else neighbour
+                there = framed[y + place // 5, place % 5 : place % 5 + width]
                 for x in range(width):
-                    row[x] = (row[x] << one) | np.uint32(there[x] > centre[x])
+                    row[x] = np.uint8(np.uint8(row[x] << one) | np.uint8(there[x] > centre[x]))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _write_costs(
+    _: Any, code: Any, slope: Any, grey: Any, codes: Any, slopes: Any, greys: Any, at: Any, cost: Any,
+    start: Any, places: Any,
+) -> Any:  # fmt: skip
+    """Costs of one left pixel (code: tuple of bytes, slope, grey) with the right ones from column `at` on,
+    written into the flat cost volume from `start` on."""
+    signature = types.void(code, slope, grey, codes, slopes, greys, at, cost, start, places)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        own = [v.all(byte) for byte in v.members(0)]
+        own_slope, own_grey = v.all(arguments[1], SHORTS), v.all(arguments[2])
+        width = context.make_array(signature.args[4])(context, builder, arguments[4]).nitems
+        chunks = builder.udiv(arguments[9], arguments[9].type(LANES))
+        with cgutils.for_range(builder, chunks) as loop:
+            offset = builder.mul(loop.index, loop.index.type(LANES))
+            there = builder.add(arguments[6], offset)
+            hamming = v.all(0)
+            for part, byte in enumerate(own):
+                place = builder.add(there, builder.mul(width, width.type(part)))
+                hamming = builder.add(hamming, v.ones(builder.xor(byte, v.load(v.data(3), place))))
+            steep = v.apart(own_slope, v.load(v.data(4), there, SHORTS), signed=True)
+            steep = builder.trunc(v.least(steep, v.all(_MOST_APART, SHORTS)), hamming.type)
+            bright = v.least(v.apart(own_grey, v.load(v.data(5), there)), v.all(_MOST_APART))
+            apart = builder.lshr(builder.add(steep, bright), v.all(1))
+            v.store(builder.add(hamming, apart), v.data(7), builder.add(arguments[8], offset))
+        return context.get_dummy_value()
+
+    return signature, generate
 
 
 @kernel()
 def row_costs(
-    left_code: UInt32,
-    right_code: UInt32,
-    left_slope: Int16,
-    right_slope: Int16,
-    left_grey: Int16,
-    right_grey: Int16,
-    lowest: int,
-    cost: UInt8,
-) -> None:
-    """(W, count) costs of one row. The right row is reversed, so that candidates lie in memory's order."""
-    width, count = cost.shape
+    code: UInt8, slope: Int16, grey: UInt8, codes: UInt8, slopes: Int16, greys: UInt8, lowest: int,
+    count: int, cost: UInt8,
+) -> None:  # fmt: skip
+    """(W, places) costs of one row, of which `count` are candidates. codes, slopes, greys: the right row, see
+    `candidates_in_order`."""
+    width, places = cost.shape
+    flat, flat_codes = cost.reshape(-1), codes.reshape(-1)
     for x in range(width):
         base = width - 1 - x + lowest
         first, end = max(0, -base), min(count, width - base)
         here = cost[x]
+        here_code = (code[0, x], code[1, x], code[2, x])
+        _write_costs(
+            here_code, slope[x], grey[x], flat_codes, slopes, greys, width - 1 - x, flat, x * places, places
+        )
         if end <= first:
-            here[:] = _UNKNOWN_COST
-            continue
-        code, slope, grey = left_code[x], left_slope[x], left_grey[x]
-        codes = right_code[base + first : base + end]
-        slopes = right_slope[base + first : base + end]
-        greys = right_grey[base + first : base + end]
-        inside = here[first:end]
-        for k in range(end - first):
-            bits = np.uint32(code ^ codes[k])
-            bits = np.uint32(bits - ((bits >> np.uint32(1)) & np.uint32(0x55555555)))
-            bits = np.uint32(
-                (bits & np.uint32(0x33333333)) + ((bits >> np.uint32(2)) & np.uint32(0x33333333))
-            )
-            bits = np.uint32((bits + (bits >> np.uint32(4))) & np.uint32(0x0F0F0F0F))
-            hamming = np.uint32(np.uint32(bits * np.uint32(0x01010101)) >> np.uint32(24))
-            steep = min(np.int16(abs(np.int16(slope - slopes[k]))), np.int16(20))
-            bright = min(np.int16(abs(np.int16(grey - greys[k]))), np.int16(20))
-            inside[k] = np.uint8(np.uint8(hamming) + np.uint8(np.int16(steep + bright) >> np.int16(1)))
-        here[:first] = here[first]
-        here[end:] = here[end - 1]
+            here[:count] = _UNKNOWN_COST
+        else:
+            here[:first] = here[first]
+            here[end:count] = here[end - 1]
+        here[count:] = BESIDE_COST

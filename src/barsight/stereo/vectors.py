@@ -1,0 +1,81 @@
+"""Vectors of 32 bytes in compiled kernels, for the loops that the compiler won't make vectors of by itself.
+
+Inside one pixel of semi-global matching a loop runs over a few dozen candidates only: the checks for
+overlapping arrays and the rest beyond whole vectors, which an automatic vectorizer adds, cost more than the
+work. What is built here is the compiler's portable vector code, which it fits to each processor.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils
+
+LANES = 32
+BYTE, SHORT = ir.IntType(8), ir.IntType(16)
+BYTES, SHORTS = ir.VectorType(BYTE, LANES), ir.VectorType(SHORT, LANES)
+
+
+class Vectors:
+    """Writes vector instructions into one kernel: arguments are the kernel's values as Numba hands them."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
+        self._context, self.builder, self._kinds, self._arguments = (
+            context,
+            builder,
+            signature.args,
+            arguments,
+        )
+
+    def data(self, place: int) -> Any:
+        """Pointer to the first element of the array that is argument number `place`."""
+        array = self._context.make_array(self._kinds[place])
+        return array(self._context, self.builder, self._arguments[place]).data
+
+    def members(self, place: int) -> list[Any]:
+        """The members of the tuple that is argument number `place`."""
+        return list(cgutils.unpack_tuple(self.builder, self._arguments[place]))
+
+    def load(self, data: Any, at: Any, kind: Any = BYTES) -> Any:
+        """A vector that begins with element `at`."""
+        return self.builder.load(self._pointer(data, at, kind), align=1)
+
+    def store(self, vector: Any, data: Any, at: Any) -> None:
+        """Writes a vector from element `at` on."""
+        self.builder.store(vector, self._pointer(data, at, vector.type), align=1)
+
+    def _pointer(self, data: Any, at: Any, kind: Any) -> Any:
+        return self.builder.bitcast(self.builder.gep(data, [at]), ir.PointerType(kind))
+
+    def all(self, value: Any, kind: Any = BYTES) -> Any:
+        """A vector of one value, or of one number."""
+        if isinstance(value, int):
+            return ir.Constant(kind, [value] * LANES)
+        first = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
+        return self.builder.shuffle_vector(
+            first, first, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        )
+
+    def least(self, one: Any, other: Any) -> Any:
+        """The lesser of both, unsigned."""
+        return self.builder.select(self.builder.icmp_unsigned("<", one, other), one, other)
+
+    def apart(self, one: Any, other: Any, *, signed: bool = False) -> Any:
+        """The absolute difference."""
+        compare = self.builder.icmp_signed if signed else self.builder.icmp_unsigned
+        forth, back = self.builder.sub(one, other), self.builder.sub(other, one)
+        return self.builder.select(compare("<", one, other), back, forth)
+
+    def ones(self, vector: Any) -> Any:
+        """The number of bits set in each byte."""
+        return self._call("llvm.ctpop.v32i8", BYTES, vector)
+
+    def least_of(self, vector: Any) -> Any:
+        """The least byte of a vector."""
+        return self._call("llvm.vector.reduce.umin.v32i8", BYTE, vector)
+
+    def _call(self, name: str, result: Any, vector: Any) -> Any:
+        kind = ir.FunctionType(result, [vector.type])
+        function = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        return self.builder.call(function, [vector])
