@@ -64,7 +64,7 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
     """A camera that moves past points, some of them wrong, started a little off."""
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(-3, 6, 120), rng.uniform(-2, 2, 120), rng.uniform(4, 7, 120)])
-    sightings, poses = [], []
+    sightings, poses, places = [], [], []
     for k in range(count):
         turn = Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
         rect0 = Pose("yard", "rect0", turn, np.array([0.4 * k, 0, 0]) + rng.normal(0, 0.05, 3))
@@ -79,13 +79,13 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
             "body", "body", Rotation.from_rotvec(rng.normal(0, 2e-3, 3)).as_matrix(), rng.normal(0, 0.01, 3)
         )
         poses.append(rect0 @ MOUNT.inverse() @ off)
+        places.append((rect0 @ MOUNT.inverse()).translation + rng.normal(0, 0.0005, 3))
     seen = StereoSightings.of(sightings, range(count), CAMERA, MOUNT)
     stamps = np.arange(count) * 500_000_000
     placed, attitudes = (), ()
     if with_crane:
-        at = [pose.translation + rng.normal(0, 0.0005, 3) for pose in poses]
         v, a = np.array([0.8, 0, 0]), np.array([0.3, 0.1, 0])
-        placed = tuple(Placed(k, place, v * (k % 3), a, 0.002) for k, place in enumerate(at))
+        placed = tuple(Placed(k, place, v * (k % 3 - 1), a, 0.002) for k, place in enumerate(places))
         attitudes = tuple(Attitude(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
     problem = Problem(
         tuple(poses), stamps, not with_crane, seen, (None,) * (count - 1), placed, attitudes, (),
