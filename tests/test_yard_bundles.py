@@ -121,3 +121,30 @@ def test_the_bars_of_a_bundle_are_found_one_by_one() -> None:
 def test_impossible_settings_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         BundleSettings(**change)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("yaw_deg", "length_m"), [(88.0, 1.6), (12.0, 2.4)])
+def test_a_slim_bundle_over_others_is_found_and_covers_them(yaw_deg: float, length_m: float) -> None:
+    lower = [Laid(0.25 * k, 0.0, 0.2, 0.0, 0.04, 19, roll_deg=1) for k in range(5)]
+    over = Laid(0.5, 0.2, 0.375, yaw_deg, 0.02, 61, length_m, roll_deg=2)
+    bundles = find_bundles(draw([*lower, over]), SETTINGS)
+    found = nearest(bundles, over)
+    expect(found, over)
+    assert found.on_top is True
+    # Where it hides a bundle over more than 0.8 m, that bundle shows as two pieces.
+    under = [b for b in bundles if b is not found and 0.2 < b.centre_m[0] < 0.8]
+    assert len(under) >= 3 and not any(b.on_top for b in under)
+
+
+def test_a_beam_over_bundles_is_no_bundle() -> None:
+    lower = [Laid(0.3 * k, 0.0, 0.2, 0.0) for k in range(4)]
+    heights = draw(lower)
+    rows, columns = heights.z_m.shape
+    x = heights.x0_m + heights.cell_m * np.arange(columns)
+    y = heights.y0_m + heights.cell_m * np.arange(rows)
+    beam = (np.abs(y - 0.5) < 0.05)[:, None] & ((x > -0.2) & (x < 1.2))[None]
+    noise = np.random.default_rng(3).normal(0, 0.003, beam.shape)
+    heights.z_m[beam] = (lower[0].top_z_m + 0.1 + noise[beam]).astype(np.float32)
+    bundles = find_bundles(heights, SETTINGS)
+    assert len(bundles) == 4 and all(b.on_top for b in bundles)
+    assert all(any("something narrow crosses" in reason for reason in b.reasons) for b in bundles)

@@ -237,11 +237,12 @@ def _crossed(carriers: list[Bundle], base: float, rng: np.random.Generator) -> B
 
 
 def _overlap(one: Bundle, other: Bundle) -> bool:
-    """Whether the outlines meet, seen from above: no axis of either separates them."""
+    """Whether their middle halves, which touch, meet seen from above: no axis of either separates them."""
     away = one.centre_m - other.centre_m
     for axis in (*one.axes[:2], *other.axes[:2]):
         reach = sum(
-            abs(axis @ b.axes[0]) * b.radius_m + abs(axis @ b.axes[1]) * b.length_m / 2 for b in (one, other)
+            abs(axis @ b.axes[0]) * b.radius_m / 2 + abs(axis @ b.axes[1]) * b.length_m / 2
+            for b in (one, other)
         )
         if abs(away @ axis) >= reach:
             return False

@@ -13,12 +13,13 @@ from barsight.yard.bundle_fit import AGREES, Fit, U, Z, refine
 from barsight.yard.bundle_growth import grow
 from barsight.yard.bundle_record import Found, Reading, describe
 from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.crossings import OVER_M, crossing_pieces, is_beam, rise_over
 from barsight.yard.floor import find_floor
 from barsight.yard.headings import find_headings
 from barsight.yard.kinds import common_diameter, other_packings, with_company
 from barsight.yard.matching import Guess, Templates, guess, make_templates
 from barsight.yard.outline import bundle_width
-from barsight.yard.selection import choose, overlaps, strongest_rivals
+from barsight.yard.selection import choose, overlaps, strongest_rivals, without_slivers
 from barsight.yard.sheet import Sheet, turn
 from barsight.yard.types import Bundle, HeightMap
 
@@ -30,6 +31,9 @@ _SUNKEN_M, _SUNKEN_SHARE = 0.04, 0.2
 """How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
 _RESOLVED_CELLS = 4.0
 _THREADS = 2
+_SLIVER_SHARE = 0.03
+_CROSSING_STEP_M = 0.25
+"""What lies across may be short: cross-sections this far apart meet it."""
 
 
 def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundle, ...]:
@@ -44,13 +48,32 @@ def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundl
     floor = find_floor(height_map)
     found: list[Found] = []
     templates = make_templates(settings, height_map.cell_m)
-    for heading in find_headings(height_map, settings.max_skew_deg):
-        sheet = turn(height_map, heading, -np.inf if floor is None else floor + settings.least_rise_m)
-        found += [Found(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
-    weights = np.array([_weight(one.fit) for one in found])
-    claims = [_claims(one) for one in found]
+    headings = find_headings(height_map, settings.max_skew_deg)
+    for heading in headings:
+        found += _found(height_map, heading, floor, templates, settings)
+    weights, claims = _weighed(found, settings)
+    kept = [(found[k].sheet, found[k].fit) for k in choose(weights, claims)]
+    close = replace(settings, slice_step_m=_CROSSING_STEP_M)
+    for heading, part in crossing_pieces(height_map, kept, headings, settings):
+        across = _found(part, heading, floor, templates, close)
+        found += [one for one in across if not is_beam(one.sheet, one.fit, settings)]
+    weights, claims = _weighed(found, settings)
     readings = _settled(found, weights, claims, settings)
     return describe(readings, floor, settings)
+
+
+def _found(
+    height_map: HeightMap, heading: float, floor: float | None, templates: Templates, settings: BundleSettings
+) -> list[Found]:
+    """Every outline that runs about as `heading` does."""
+    sheet = turn(height_map, heading, -np.inf if floor is None else floor + settings.least_rise_m)
+    return [Found(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
+
+
+def _weighed(found: list[Found], settings: BundleSettings) -> tuple[Float64, list[Int64]]:
+    """What each explains, and the places that it claims."""
+    claims = without_slivers([_claims(one, settings) for one in found], _SLIVER_SHARE)
+    return np.array([_weight(one.fit) for one in found]), claims
 
 
 def _settled(
@@ -176,15 +199,16 @@ def _weight(fit: Fit) -> float:
     return float((fit.gain[fit.first : fit.last + 1] - _EDGE_CELLS)[agreeing].sum())
 
 
-def _claims(reading: Found) -> Int64:
-    """Numbers of the map's patches of 20 mm that lie well inside the outline."""
+def _claims(reading: Found, settings: BundleSettings) -> Int64:
+    """Numbers of the map's patches of 20 mm that lie well inside the outline and near it in height."""
     sheet, fit = reading.sheet, reading.fit
     rows = np.arange(fit.first, fit.last + 1)
     rows = rows[fit.state[rows] == AGREES]
     v = sheet.v0_m + sheet.cell_m * rows
     middle = fit.values[U] + fit.values[1] * (v - fit.v_m)
     across = np.linspace(-0.35, 0.35, max(int(fit.width_m / 0.02), 3)) * fit.width_m
-    uv = np.stack(np.broadcast_arrays(middle[:, None] + across, v[:, None]), axis=-1).reshape(-1, 2)
-    xy = sheet.to_map(uv)
+    u = middle[:, None] + across
+    own = np.abs(rise_over(sheet, fit, rows, u, settings)) < OVER_M
+    xy = sheet.to_map(np.stack([u[own], np.broadcast_to(v[:, None], u.shape)[own]], axis=1))
     patch = np.floor(xy / _CLAIM_M).astype(np.int64) + (1 << 20)
     return np.unique(patch[:, 0] << 32 | patch[:, 1])

@@ -11,19 +11,20 @@ _OVERLAP_M = 0.05
 _TOUCH_M = 0.03
 _DUNNAGE_M = 0.1
 _HIGHER_SHARE = 0.4
+_PARALLEL = 0.08
 
 
 def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
     """Each bundle's layer by its height over the floor (the lowest bundle's underside where none was seen).
 
-    The distance of the layers is the smallest step between the undersides of bundles of its width that one
-    bundle and its dunnage can make, else the bundle's own height and 0.1 m.
+    The distance of the layers is the smallest step between the undersides of bundles of its width and heading
+    that one bundle and its dunnage can make, else the bundle's own height and 0.1 m.
     """
     bottoms = np.array([_bottom(b) for b in bundles])
     layers = []
     for bundle, bottom in zip(bundles, bottoms, strict=True):
         height = bundle.top_z_m - bottom
-        alike = np.array([abs(b.width_m - bundle.width_m) < 0.15 * bundle.width_m for b in bundles])
+        alike = np.array([_is_alike(bundle, b) for b in bundles])
         steps = np.abs(np.subtract.outer(bottoms[alike], bottoms[alike])).ravel()
         steps = steps[(steps > 0.8 * height) & (steps < height + 0.35)]
         pitch = float(np.percentile(steps, 25)) if steps.size else height + _DUNNAGE_M
@@ -31,6 +32,12 @@ def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
         under = max(pitch - height, 0.0) if floor_m is not None else 0.0
         layers.append(max(round((bottom - ground - under) / pitch), 0))
     return layers
+
+
+def _is_alike(one: Bundle, other: Bundle) -> bool:
+    """As wide, and no crossed one: these lie without dunnage."""
+    parallel = abs(np.sin(one.yaw_rad - other.yaw_rad)) < _PARALLEL
+    return bool(parallel and abs(other.width_m - one.width_m) < 0.15 * one.width_m)
 
 
 def _bottom(bundle: Bundle) -> float:

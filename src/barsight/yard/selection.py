@@ -30,6 +30,23 @@ def choose(weights: Float64, claims: list[Int64]) -> Int64:
     return np.array(useful, np.int64)[np.flatnonzero(solved.x > 0.5)]
 
 
+def without_slivers(claims: list[Int64], least_share: float) -> list[Int64]:
+    """The claims, less what two have in common where that is under least_share of the smaller: there only
+    their edges meet. The larger gives way.
+    """
+    if not claims:
+        return []
+    owner, place = _owners(claims)
+    takes = csr_matrix((np.ones(owner.size), (owner, place)), shape=(len(claims), int(place.max()) + 1))
+    common = (takes @ takes.T).tocoo()
+    sizes = np.array([claim.size for claim in claims])
+    out = list(claims)
+    for i, j, cells in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):
+        if cells < least_share * min(sizes[i], sizes[j]) and (sizes[i], i) > (sizes[j], j):
+            out[i] = np.setdiff1d(out[i], claims[j], assume_unique=True)
+    return out
+
+
 def _rivals(owner: Int64, place: Int64, readings: int) -> csc_matrix:
     """A row for each set of two or more readings that want the same places, 1 for those in it.
 

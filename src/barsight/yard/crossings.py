@@ -1,0 +1,156 @@
+"""Where something long lies across the bundles, and which way: bundles there have a heading of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float64, Int32, Int64, UInt8
+from barsight.core.types import Source
+from barsight.yard.bundle_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
+from barsight.yard.bundle_settings import BundleSettings
+from barsight.yard.outline import STEP_M, make_outline
+from barsight.yard.sheet import Sheet
+from barsight.yard.types import HeightMap
+
+OVER_M = 0.05
+"""What lies this much over a bundle's outline lies on it: more than the map's errors."""
+_FURTHER_M = 1.5
+"""So far beyond where a bundle was followed to it may go on under what lies there."""
+_STEP_M = 0.06
+"""Heights of neighbouring cells that differ more belong to different things."""
+_LEAST_CELLS = 30
+_FLANK = (0.3, 0.45)
+"""Of the width to either side: where a bundle falls off as round bars do."""
+_FOLLOWS_M = 0.03
+_MARGIN_M = 0.6
+_SLENDER = 1.8
+
+
+def crossing_pieces(
+    height_map: HeightMap,
+    kept: list[tuple[Sheet, Fit]],
+    headings: tuple[float, ...],
+    settings: BundleSettings,
+) -> Iterator[tuple[float, HeightMap]]:
+    """For each long thing over the kept outlines its heading (rad) and the map around it.
+
+    Things that run as the bundles do are found with these and left out.
+    """
+    over = np.zeros(height_map.z_m.shape, np.uint8)
+    for sheet, fit in kept:
+        row, column = _cells_over(sheet, fit, settings, height_map)
+        over[row, column] = 1
+    for piece in _pieces(_patches(height_map), over):
+        row, column = np.nonzero(piece)
+        heading = _heading(row, column, settings.least_length_m / height_map.cell_m)
+        if heading is None or _is_near(heading, headings, settings.max_skew_deg):
+            continue
+        yield heading, _around(height_map, row, column)
+
+
+def _cells_over(
+    sheet: Sheet, fit: Fit, settings: BundleSettings, height_map: HeightMap
+) -> tuple[Int64, Int64]:
+    """Rows and columns of the map's cells that lie over the outline, or over where it may go on."""
+    further = round(_FURTHER_M / sheet.cell_m)
+    rows = np.arange(max(fit.first - further, 0), min(fit.last + further + 1, sheet.z_m.shape[0]))
+    v = sheet.v0_m + sheet.cell_m * rows
+    across = np.arange(-0.5 * fit.width_m, 0.5 * fit.width_m, sheet.cell_m)
+    u = fit.values[U] + fit.values[SLOPE_U] * (v - fit.v_m)[:, None] + across
+    found = rise_over(sheet, fit, rows, u, settings) > OVER_M
+    places = sheet.to_map(np.stack([u[found], np.broadcast_to(v[:, None], u.shape)[found]], axis=1))
+    cell = height_map.cell_m
+    column = np.rint((places[:, 0] - height_map.x0_m) / cell).astype(np.int64)
+    row = np.rint((places[:, 1] - height_map.y0_m) / cell).astype(np.int64)
+    return row.clip(0, height_map.z_m.shape[0] - 1), column.clip(0, height_map.z_m.shape[1] - 1)
+
+
+def rise_over(sheet: Sheet, fit: Fit, rows: Int64, u: Float64, settings: BundleSettings) -> Float64:
+    """(R, N) measured heights over the outline at rows (R,) and places across u (R, N); NaN where unknown."""
+    outline = make_outline(
+        fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
+    )
+    along = (sheet.v0_m + sheet.cell_m * rows - fit.v_m)[:, None]
+    beside = u - fit.values[U] - fit.values[SLOPE_U] * along
+    place = np.rint((beside + outline.reach_m) / STEP_M).astype(int)
+    column = np.rint((u - sheet.u0_m) / sheet.cell_m).astype(int)
+    inside = (column >= 0) & (column < sheet.z_m.shape[1]) & (place >= 0) & (place < outline.seen_m.size)
+    z = sheet.z_m[rows[:, None], np.where(inside, column, 0)]
+    height = outline.seen_m[np.where(inside, place, 0)]
+    rise: Float64 = np.where(inside, z - fit.values[Z] - fit.values[SLOPE_Z] * along - height, np.nan)
+    return rise
+
+
+def is_beam(sheet: Sheet, fit: Fit, settings: BundleSettings) -> bool:
+    """Whether the mean section is level to where it ends, not round: a flank leaves the outline, or the
+    middle is nearer to level than to the outline.
+    """
+    rows = np.flatnonzero(fit.state == AGREES)
+    rows = rows[(rows >= fit.first) & (rows <= fit.last)]
+    across = np.arange(-_FLANK[1] * fit.width_m, _FLANK[1] * fit.width_m, sheet.cell_m / 2)
+    along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+    u = fit.values[U] + fit.values[SLOPE_U] * along[:, None] + across
+    rise = rise_over(sheet, fit, rows, u, settings)
+    known = np.isfinite(rise).any(axis=0)
+    section = np.full(across.size, np.nan)
+    section[known] = np.nanmedian(rise[:, known], axis=0)
+    flanks = [section[known & (side * across > _FLANK[0] * fit.width_m)] for side in (-1, 1)]
+    seen = [float(np.median(flank)) for flank in flanks if flank.size]
+    if max((abs(one) for one in seen), default=0.0) > _FOLLOWS_M:
+        return True
+    outline = make_outline(
+        fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
+    )
+    middle = known & (np.abs(across) < _FLANK[0] * fit.width_m)
+    height = outline.seen_m[np.rint((across[middle] + outline.reach_m) / STEP_M).astype(int)]
+    return bool(middle.sum() >= 3 and np.var(section[middle] + height) < np.var(section[middle]))
+
+
+def _patches(height_map: HeightMap) -> Int32:
+    """(rows, columns) numbers from 1 of the surfaces that steps bound, 0 where nothing was measured."""
+    measured = height_map.source == Source.VISION
+    z = height_map.z_m
+    around = np.ones((3, 3), np.uint8)
+    far = np.float32(1e6)
+    highest = cv2.dilate(np.where(measured, z, -far), around)
+    lowest = cv2.erode(np.where(measured, z, far), around)
+    level = measured & (highest - lowest < _STEP_M)
+    return np.asarray(cv2.connectedComponents(level.astype(np.uint8), connectivity=4)[1])
+
+
+def _pieces(patches: Int32, over: UInt8) -> Iterator[Bool]:
+    """The patches of which at least a part lies over an outline."""
+    numbers, cells = np.unique(patches[over > 0], return_counts=True)
+    for number in numbers[(numbers > 0) & (cells >= _LEAST_CELLS)]:
+        yield np.asarray(patches == number)
+
+
+def _heading(row: Int64, column: Int64, least_cells: float) -> float | None:
+    """The long axis's angle from +y, in (-pi/2, pi/2]; None for what is short or about as wide as long."""
+    if row.size < least_cells:
+        return None
+    places: Float64 = np.stack([column, row]).astype(np.float64)
+    spread, axes = np.linalg.eigh(np.cov(places))
+    if 12 * spread[1] < least_cells**2 or spread[1] < _SLENDER**2 * spread[0]:
+        return None
+    x, y = axes[:, 1]
+    heading = float(np.arctan2(-x, y))
+    return (heading + np.pi / 2) % -np.pi + np.pi / 2
+
+
+def _is_near(heading: float, headings: tuple[float, ...], apart_deg: float) -> bool:
+    apart = [abs((np.degrees(heading - other) + 90) % 180 - 90) for other in headings]
+    return min(apart, default=np.inf) < apart_deg
+
+
+def _around(height_map: HeightMap, row: Int64, column: Int64) -> HeightMap:
+    margin = round(_MARGIN_M / height_map.cell_m)
+    j, i = max(int(row.min()) - margin, 0), max(int(column.min()) - margin, 0)
+    part = np.s_[j : int(row.max()) + margin + 1, i : int(column.max()) + margin + 1]
+    return HeightMap(
+        height_map.x0_m + i * height_map.cell_m, height_map.y0_m + j * height_map.cell_m, height_map.cell_m,
+        height_map.z_m[part], height_map.sigma_m[part], height_map.views[part], height_map.source[part],
+    )  # fmt: skip
