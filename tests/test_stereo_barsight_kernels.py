@@ -66,14 +66,15 @@ def test_axis_follows_stripes_and_is_the_column_on_noise() -> None:
 
 @pytest.mark.parametrize("direction", [(0.0, 1.0), (0.6, 0.8), (1.0, 0.0)])
 def test_axis_means_are_weighted_means_along_the_axis(direction: tuple[float, float]) -> None:
-    first, second, weight = _noise(3), _noise(4), np.abs(_noise(5))
-    found = axis_means(first, second, weight, _axes(*direction), 3.0)
+    first, second, weight, alike = _noise(3), _noise(4), np.abs(_noise(5)), _noise(15, 0.5)
+    found = axis_means(first, second, weight, alike, _axes(*direction), 3.0)
     for y, x in ((0, 0), (13, 31), (39, 69), (20, 40)):
         total = sums = 0.0
         for step in range(-7, 8):
             row, column = y + round(step * direction[1]), x + round(step * direction[0])
             if 0 <= row < HEIGHT and 0 <= column < WIDTH:
-                share = np.exp(-0.5 * (step / 3.0) ** 2) * weight[row, column]
+                same = max(1 - (alike[row, column] - alike[y, x]) ** 2, 0) ** 2
+                share = np.exp(-0.5 * (step / 3.0) ** 2) * same * weight[row, column]
                 total += share
                 sums += share * np.array([first[row, column], second[row, column]])
         np.testing.assert_allclose([found[0][y, x], found[1][y, x]], sums / total, rtol=2e-4, atol=1e-5)

@@ -10,7 +10,8 @@ pixel locking.
 Gloss: a highlight is constant along a bar but lies behind its surface, so what is constant along the axis
 bends the match. Residual and gradient are therefore split into their mean along the axis and the detail; the
 mean counts only as far as it agrees with the detail: in the ratio of the residual that noise explains to the
-residual that is there.
+residual that is there. The mean is taken over places alike in grey: a strap or a shadow across the bars would
+turn the highlights beside it into detail.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ _BLEND_WINDOW_PX = 9
 _LONG_STEP_PX = 5
 _SHORT_STEP_PX = 3
 _BLOCK_PX = 3
+_ALIKE_BLUR_PX = 1.5
 _HOLD = np.float32(0.1)
 _HOLD_UNMATCHED = np.float32(0.02)
 _SUPPORT = np.float32(0.5 * 1.87)
@@ -65,8 +67,10 @@ class RefinementSettings:
     """The short support along the axis, for surfaces that the long one can't follow; 0 does without."""
     short_across_px: float = 2.0
     """The short support across the axis."""
-    gloss_px: float = 8.0
+    gloss_px: float = 10.0
     """Length along the axis over which what is constant counts as gloss, one sigma; 0 trusts everything."""
+    alike_grey: float = 20.0
+    """Places along the axis whose grey values differ by this are not one highlight: a strap, a shadow."""
     gloss_trust: float = 0.05
     """Weight of the evidence that is constant along the axis, where noise explains its residual."""
     outlier_grey: float = 8.0
@@ -79,8 +83,10 @@ class RefinementSettings:
     def __post_init__(self) -> None:
         if self.steps < 0:
             raise ConfigError(f"refinement steps can't be negative, {self.steps} is")
-        if min(self.along_px, self.across_px, self.outlier_grey, self.same_surface_px) <= 0:
-            raise ConfigError("the long support, outlier_grey and same_surface_px must be positive")
+        if min(self.along_px, self.across_px, self.outlier_grey, self.same_surface_px, self.alike_grey) <= 0:
+            raise ConfigError(
+                "the long support, outlier_grey, same_surface_px and alike_grey must be positive"
+            )
         if min(self.short_px, self.gloss_px, self.gloss_trust) < 0 or self.short_across_px <= 0:
             raise ConfigError("the short support and the gloss settings can't be negative")
         if self.window_px < 3 or self.window_px % 2 == 0:
@@ -111,7 +117,7 @@ def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: R
             slope, slope_noise = (slope + right_slope) * np.float32(0.5), 0.5 * slope_noise
         residual = _residual(left_grey, warped, usable, settings.window_px)
         trust = usable / (1 + np.square(residual / np.float32(settings.outlier_grey)))
-        weight, pull = _evidence(residual, slope, trust, axes, settings)
+        weight, pull = _evidence(residual, slope, trust, left_grey, axes, settings)
         short_of = _undamped(weight, trust, slope_noise, settings.window_px)
         if remaining > 0:
             pull *= short_of
@@ -189,12 +195,18 @@ def _residual(left: Float32, warped: Float32, usable: Float32, side: int) -> Flo
 
 
 def _evidence(
-    residual: Float32, slope: Float32, trust: Float32, axes: Float32, settings: RefinementSettings
+    residual: Float32,
+    slope: Float32,
+    trust: Float32,
+    grey: Float32,
+    axes: Float32,
+    settings: RefinementSettings,
 ) -> tuple[Float32, Float32]:
     """Each pixel's weight and pull, with what is constant along the axis weighed by how well it agrees."""
     if settings.gloss_px == 0:
         return trust * slope * slope, -trust * slope * residual
-    residual_mean, slope_mean = axis_means(residual, slope, trust, axes, settings.gloss_px)
+    alike = cv2.GaussianBlur(grey, (0, 0), _ALIKE_BLUR_PX) / np.float32(settings.alike_grey)
+    residual_mean, slope_mean = axis_means(residual, slope, trust, alike, axes, settings.gloss_px)
     residual_detail, slope_detail = residual - residual_mean, slope - slope_mean
     detail_power = _mean(trust * residual_detail * residual_detail, settings.window_px)
     mean_power = _mean(trust * residual_mean * residual_mean, settings.window_px)

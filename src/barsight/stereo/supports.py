@@ -56,15 +56,20 @@ def with_margin(array: Float32) -> Float32:
 
 
 def axis_means(
-    first: Float32, second: Float32, weight: Float32, axes: Float32, sigma_px: float
+    first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, sigma_px: float
 ) -> tuple[Float32, Float32]:
-    """Weighted Gaussian means of two images along each tile's axis, (H, W) each. Inputs: (H, W), no NaN."""
+    """Weighted Gaussian means of two images along each tile's axis, (H, W) each. Inputs: (H, W), no NaN.
+
+    alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at 1), so that
+    a strap or a shadow across the bars has a mean of its own.
+    """
     reach = min(int(2.5 * sigma_px), MARGIN - 1)
     means = np.empty_like(first), np.empty_like(second)
     _axis_means(
         with_margin(first),
         with_margin(second),
         with_margin(weight),
+        with_margin(alike),
         axes,
         reach,
         sigma_px,
@@ -79,6 +84,7 @@ def _axis_means(
     first: Float32,
     second: Float32,
     weight: Float32,
+    alike: Float32,
     axes: Float32,
     reach: int,
     sigma_px: float,
@@ -88,6 +94,7 @@ def _axis_means(
     height, width = first_mean.shape
     framed_width = first.shape[1]
     firsts, seconds, weights = first.reshape(-1), second.reshape(-1), weight.reshape(-1)
+    theres, one, zero = alike.reshape(-1), np.float32(1), np.float32(0)
     shares = np.empty(2 * reach + 1, dtype=np.float32)
     for step in range(-reach, reach + 1):
         shares[step + reach] = math.exp(-0.5 * (step / sigma_px) ** 2)
@@ -106,11 +113,14 @@ def _axis_means(
                 total_first[:] = 0
                 total_second[:] = 0
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
+                centre = alike[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
                 for step in range(2 * reach + 1):
                     at, share = np.uint64(middle + offsets[step]), shares[step]
                     for index in range(count):
                         u = np.uint64(index)
-                        w = share * weights[at + u]
+                        gap = theres[at + u] - centre[u]
+                        same = max(one - gap * gap, zero)
+                        w = share * same * same * weights[at + u]
                         total[u] += w
                         total_first[u] += w * firsts[at + u]
                         total_second[u] += w * seconds[at + u]
