@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numba import prange
+from numba import prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
-from barsight.core.arrays import Float32, kernel
+from barsight.core.arrays import Float32, Int64, kernel
 from barsight.stereo.supports import MARGIN, TILE_COLUMNS, TILE_ROWS, with_margin
+from barsight.stereo.vectors import FLOAT_LANES, FLOATS, Vectors
 
 _REACH = 2.0
 
@@ -39,160 +42,146 @@ def fit_planes(
     """
     step = shape.step
     framed = with_margin(disparity)
-    if step > 1:
-        weight, pull = (
-            array
-            for array in _summed_along(
-                framed,
-                with_margin(weight),
-                with_margin(pull),
-                axes,
-                step // 2,
-                same_surface_px,
-                disparity.shape,
-            )
-        )
     fitted, information = np.empty_like(disparity), np.empty_like(disparity)
-    _fit_planes(
-        framed, with_margin(weight), with_margin(pull), axes, shape.along_px, shape.across_px, step,
-        min(int(_REACH * shape.along_px), MARGIN - 8) // step, int(_REACH * shape.across_px + 0.5),
-        same_surface_px, fitted, information,
+    if step > 1:
+        # Summed over a step along the axis first, the support can go in steps and still hear every pixel.
+        alone = np.ones(1, dtype=np.float32), np.zeros(1, dtype=np.int64)
+        near = np.ones(step, dtype=np.float32), np.arange(step) - step // 2
+        weight_sum, pull_sum = np.empty_like(disparity), np.empty_like(disparity)
+        _gather(
+            framed, with_margin(weight), with_margin(pull), axes, *near, *alone, same_surface_px, False,
+            weight_sum, pull_sum,
+        )  # fmt: skip
+        weight, pull = weight_sum, pull_sum
+    along = _gaussian(shape.along_px, min(int(_REACH * shape.along_px), MARGIN - 8) // step, step)
+    across = _gaussian(shape.across_px, int(_REACH * shape.across_px + 0.5), 1)
+    _gather(
+        framed, with_margin(weight), with_margin(pull), axes, *along, *across, same_surface_px, True,
+        fitted, information,
     )  # fmt: skip
     return fitted, information
 
 
-def _summed_along(
-    disparity: Float32,
-    weight: Float32,
-    pull: Float32,
-    axes: Float32,
-    reach: int,
-    same_surface_px: float,
-    shape: tuple[int, ...],
-) -> tuple[Float32, Float32]:
-    """Weight and pull summed over 2 * reach + 1 pixels along the axis, the pulls now from the middle one's
-    disparity: so a support can go in steps and still hear every pixel. Arrays with margins in, without out.
+def _gaussian(sigma_px: float, reach: int, step: int) -> tuple[Float32, Int64]:
+    """Weights and places (px) of 2 * reach + 1 points a step apart."""
+    places = step * np.arange(-reach, reach + 1)
+    return np.exp(-0.5 * (places / sigma_px) ** 2).astype(np.float32), places
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _add_up(
+    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, shares: Any, alongs: Any,
+    across_shares: Any, acrosses: Any, nearness: Any, sums: Any, at: Any, stride: Any,
+) -> Any:  # fmt: skip
+    """The nine sums of a plane's normal equations for 16 pixels from `middle` on: the weights times 1, a, c,
+    a a, a c, c c and the pulls times 1, a, c; a along, c across the axis. They lie `stride` apart.
+
+    offsets: (across, along), flat, from a pixel to its support's points. All arrays are flat.
     """
-    sums = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    _sum_along(disparity, weight, pull, axes, reach, same_surface_px, sums[0], sums[1])
-    return sums
+    signature = types.void(
+        theres, weights, pulls, middle, offsets, shares, alongs, across_shares, acrosses, nearness, sums, at,
+        stride,
+    )  # fmt: skip
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        index = arguments[3].type
+        zero = v.all(0.0, FLOATS)
+
+        def add(place: Any, term: Any) -> None:
+            builder.store(v.sum(builder.load(place), term), place)
+
+        def number(place: int, at: Any) -> Any:
+            return v.all(builder.load(builder.gep(v.data(place), [at])), FLOATS)
+
+        def length(place: int) -> Any:
+            return context.make_array(signature.args[place])(context, builder, arguments[place]).nitems
+
+        centre = v.load(v.data(0), arguments[3], FLOATS)
+        nearness = v.all(arguments[9], FLOATS)
+        totals = [cgutils.alloca_once_value(builder, zero) for _ in range(9)]
+        with cgutils.for_range(builder, length(7)) as outer:
+            line = [cgutils.alloca_once(builder, FLOATS) for _ in range(5)]
+            for place in line:
+                builder.store(zero, place)
+            with cgutils.for_range(builder, length(5)) as inner:
+                point = builder.add(builder.mul(outer.index, length(5)), inner.index)
+                there = builder.add(arguments[3], builder.load(builder.gep(v.data(4), [point])))
+                gap = v.difference(v.load(v.data(0), there, FLOATS), centre)
+                scaled = v.product(gap, nearness)
+                same = v.not_negative(v.difference(v.all(1.0, FLOATS), v.product(scaled, scaled)))
+                kept = v.product(number(5, inner.index), same, same)
+                weight = v.product(kept, v.load(v.data(1), there, FLOATS))
+                pull = v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, FLOATS)))
+                a = number(6, inner.index)
+                weight_a = v.product(weight, a)
+                terms = (weight, weight_a, v.product(weight_a, a), pull, v.product(pull, a))
+                for place, term in zip(line, terms, strict=True):
+                    add(place, term)
+            share, c = number(7, outer.index), number(8, outer.index)
+            n, na, naa, m, ma = (v.product(share, builder.load(place)) for place in line)
+            nc = v.product(n, c)
+            outer_terms = (n, na, nc, naa, v.product(na, c), v.product(nc, c), m, ma, v.product(m, c))
+            for place, term in zip(totals, outer_terms, strict=True):
+                add(place, term)
+        for one, place in enumerate(totals):
+            target = builder.add(arguments[11], builder.mul(arguments[12], index(one)))
+            v.store(builder.load(place), v.data(10), target)
+        return context.get_dummy_value()
+
+    return signature, generate
 
 
 @kernel(parallel=True, fastmath=True)
-def _sum_along(
+def _gather(
     disparity: Float32,
     weight: Float32,
     pull: Float32,
     axes: Float32,
-    reach: int,
+    along_shares: Float32,
+    alongs: Int64,
+    across_shares: Float32,
+    acrosses: Int64,
     same_surface_px: float,
-    weight_sum: Float32,
-    pull_sum: Float32,
+    as_planes: bool,
+    first: Float32,
+    second: Float32,
 ) -> None:
-    height, width = weight_sum.shape
-    nearness, one, zero = np.float32(1.0 / same_surface_px), np.float32(1), np.float32(0)
-    framed_width = disparity.shape[1]
+    """With as_planes each pixel's plane and information, else the sums of weights and of pulls from its own
+    disparity. Arrays with margins in, without out."""
+    height, width = first.shape
+    nearness, one = np.float32(1.0 / same_surface_px), np.float32(1)
+    framed_width, lines, points = disparity.shape[1], len(acrosses), len(alongs)
     theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
+    float_alongs, float_acrosses = alongs.astype(np.float32), acrosses.astype(np.float32)
     for tile_y in prange(axes.shape[0]):
-        for tile_x in range(axes.shape[1]):
-            axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
-            x0 = tile_x * TILE_COLUMNS
-            count = min(TILE_COLUMNS, width - x0)
-            for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
-                centre = disparity[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
-                total, total_pull = weight_sum[y, x0 : x0 + count], pull_sum[y, x0 : x0 + count]
-                total[:] = 0
-                total_pull[:] = 0
-                for step in range(-reach, reach + 1):
-                    row = y + MARGIN + round(step * axis_y)
-                    column = x0 + MARGIN + round(step * axis_x)
-                    at = np.uint64(row * framed_width + column)
-                    for index in range(count):
-                        i = np.uint64(index)
-                        gap = theres[at + i] - centre[i]
-                        scaled = gap * nearness
-                        same = max(one - scaled * scaled, zero)
-                        kept = same * same
-                        w = kept * weights[at + i]
-                        total[i] += w
-                        total_pull[i] += w * gap + kept * pulls[at + i]
-
-
-@kernel(parallel=True, fastmath=True)
-def _fit_planes(
-    disparity: Float32,
-    weight: Float32,
-    pull: Float32,
-    axes: Float32,
-    along_px: float,
-    across_px: float,
-    step_along: int,
-    reach_along: int,
-    reach_across: int,
-    same_surface_px: float,
-    fitted: Float32,
-    information: Float32,
-) -> None:
-    height, width = fitted.shape
-    nearness, one, zero = np.float32(1.0 / same_surface_px), np.float32(1), np.float32(0)
-    framed_width = disparity.shape[1]
-    theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
-    shares = np.empty(2 * reach_along + 1, dtype=np.float32)
-    for j in range(-reach_along, reach_along + 1):
-        shares[j + reach_along] = math.exp(-0.5 * (j * step_along / along_px) ** 2)
-    for tile_y in prange(axes.shape[0]):
-        sums, line = (
-            np.empty((9, TILE_COLUMNS), dtype=np.float32),
-            np.empty((5, TILE_COLUMNS), dtype=np.float32),
-        )
+        flat = np.empty(9 * TILE_COLUMNS, dtype=np.float32)
+        sums = flat.reshape(9, TILE_COLUMNS)
         s, sa, sc, saa, sac, scc, r, ra, rc = (
             sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8],
         )  # fmt: skip
-        n, na, naa, m, ma = line[0], line[1], line[2], line[3], line[4]
-        offsets = np.empty((2 * reach_across + 1, 2 * reach_along + 1), dtype=np.int64)
+        offsets = np.empty(lines * points, dtype=np.int64)
         for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
-            for k in range(-reach_across, reach_across + 1):
-                for j in range(-reach_along, reach_along + 1):
-                    along = j * step_along
-                    row, column = round(along * axis_y + k * axis_x), round(along * axis_x - k * axis_y)
-                    offsets[k + reach_across, j + reach_along] = row * framed_width + column
+            for k in range(lines):
+                for j in range(points):
+                    row = round(alongs[j] * axis_y + acrosses[k] * axis_x)
+                    column = round(alongs[j] * axis_x - acrosses[k] * axis_y)
+                    offsets[k * points + j] = row * framed_width + column
             x0 = tile_x * TILE_COLUMNS
             count = min(TILE_COLUMNS, width - x0)
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
-                sums[:, :] = 0
-                centre = disparity[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                for k in range(-reach_across, reach_across + 1):
-                    line[:, :] = 0
-                    for j in range(-reach_along, reach_along + 1):
-                        share, a = shares[j + reach_along], np.float32(j * step_along)
-                        at = np.uint64(middle + offsets[k + reach_across, j + reach_along])
-                        for index in range(count):
-                            u = np.uint64(index)
-                            gap = theres[at + u] - centre[u]
-                            scaled = gap * nearness
-                            same = max(one - scaled * scaled, zero)
-                            kept = share * same * same
-                            w = kept * weights[at + u]
-                            b = w * gap + kept * pulls[at + u]
-                            wa = w * a
-                            n[u] += w
-                            na[u] += wa
-                            naa[u] += wa * a
-                            m[u] += b
-                            ma[u] += b * a
-                    share, c = np.float32(math.exp(-0.5 * (k / across_px) ** 2)), np.float32(k)
-                    for i in range(count):
-                        s[i] += share * n[i]
-                        sa[i] += share * na[i]
-                        sc[i] += share * c * n[i]
-                        saa[i] += share * naa[i]
-                        sac[i] += share * c * na[i]
-                        scc[i] += share * c * c * n[i]
-                        r[i] += share * m[i]
-                        ra[i] += share * ma[i]
-                        rc[i] += share * c * m[i]
+                for part in range(0, count, FLOAT_LANES):
+                    _add_up(
+                        theres, weights, pulls, middle + part, offsets, along_shares, float_alongs,
+                        across_shares, float_acrosses, nearness, flat, part, TILE_COLUMNS,
+                    )  # fmt: skip
+                if not as_planes:
+                    first[y, x0 : x0 + count] = s[:count]
+                    second[y, x0 : x0 + count] = r[:count]
+                    continue
+                centre = disparity[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
                 for i in range(count):
                     # A slope of zero is held with a small weight, so that a line of pixels still has a plane.
                     held = np.float32(0.02) * (saa[i] + scc[i]) + np.float32(1e-3)
@@ -201,5 +190,5 @@ def _fit_planes(
                     from_a = (sa[i] * cc - sc[i] * ac) * scale
                     from_c = (sc[i] * aa - sa[i] * ac) * scale
                     left_over = max(s[i] - from_a * sa[i] - from_c * sc[i], np.float32(1e-6))
-                    fitted[y, x0 + i] = centre[i] + (r[i] - from_a * ra[i] - from_c * rc[i]) / left_over
-                    information[y, x0 + i] = left_over
+                    first[y, x0 + i] = centre[i] + (r[i] - from_a * ra[i] - from_c * rc[i]) / left_over
+                    second[y, x0 + i] = left_over

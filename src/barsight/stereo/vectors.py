@@ -1,8 +1,8 @@
-"""Vectors of 32 bytes in compiled kernels, for the loops that the compiler won't make vectors of by itself.
+"""Vectors in compiled kernels, for the loops that the compiler makes poor vectors of by itself.
 
-Inside one pixel of semi-global matching a loop runs over a few dozen candidates only: the checks for
-overlapping arrays and the rest beyond whole vectors, which an automatic vectorizer adds, cost more than the
-work. What is built here is the compiler's portable vector code, which it fits to each processor.
+A few dozen candidates, or a few columns whose sums should stay in registers: the checks for overlapping
+arrays and the rest beyond whole vectors, which an automatic vectorizer adds, cost more than the work. What is
+built here is the compiler's portable vector code, which it fits to each processor.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from numba.core import cgutils
 LANES = 32
 BYTE, SHORT = ir.IntType(8), ir.IntType(16)
 BYTES, SHORTS = ir.VectorType(BYTE, LANES), ir.VectorType(SHORT, LANES)
+FLOAT_LANES = 16
+FLOATS = ir.VectorType(ir.FloatType(), FLOAT_LANES)
+_FAST = ("fast",)
 
 
 class Vectors:
@@ -50,11 +53,11 @@ class Vectors:
 
     def all(self, value: Any, kind: Any = BYTES) -> Any:
         """A vector of one value, or of one number."""
-        if isinstance(value, int):
-            return ir.Constant(kind, [value] * LANES)
+        if isinstance(value, int | float):
+            return ir.Constant(kind, [value] * kind.count)
         first = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
         return self.builder.shuffle_vector(
-            first, first, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+            first, first, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
         )
 
     def least(self, one: Any, other: Any) -> Any:
@@ -66,6 +69,25 @@ class Vectors:
         compare = self.builder.icmp_signed if signed else self.builder.icmp_unsigned
         forth, back = self.builder.sub(one, other), self.builder.sub(other, one)
         return self.builder.select(compare("<", one, other), back, forth)
+
+    def product(self, one: Any, *others: Any) -> Any:
+        """Of floats."""
+        for other in others:
+            one = self.builder.fmul(one, other, flags=_FAST)
+        return one
+
+    def sum(self, one: Any, other: Any) -> Any:
+        """Of floats."""
+        return self.builder.fadd(one, other, flags=_FAST)
+
+    def difference(self, one: Any, other: Any) -> Any:
+        """Of floats."""
+        return self.builder.fsub(one, other, flags=_FAST)
+
+    def not_negative(self, vector: Any) -> Any:
+        """Floats, zero in place of what is less."""
+        zero = self.all(0.0, FLOATS)
+        return self.builder.select(self.builder.fcmp_ordered(">", vector, zero, flags=_FAST), vector, zero)
 
     def ones(self, vector: Any) -> Any:
         """The number of bits set in each byte."""
