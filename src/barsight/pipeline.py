@@ -8,10 +8,8 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 from __future__ import annotations
 
 import resource
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -129,9 +127,8 @@ def measure(
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
     method = make_method(settings.stereo.for_map())
-    turn = threading.Lock() if method.uses_all_cores else nullcontext()
     per_pixel = points_per_pixel(first, cell_m)
-    viewer = Viewer(stereo, method, turn, rectifier, cell_m, per_pixel, settings.map.max_sigma_m, watch)
+    viewer = Viewer(stereo, method, rectifier, cell_m, per_pixel, settings.map.max_sigma_m, watch)
 
     def look(placed: tuple[StereoFrame | RefusedFrame, PosedFrame]) -> View | Refusal:
         frame, posed = placed

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import os
+import threading
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -19,12 +22,18 @@ Bool = NDArray[np.bool_]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+_ALL_CORES = threading.Lock()
+# Else OpenMP's idle threads spin after each kernel, on the cores that another frame's work could have.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 
 def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[F], F]:
     """Compile a function with Numba, cached on disk so that a second run starts at once.
 
     Where no folder may be written (a read-only installation and home), every run compiles anew.
-    `fastmath` lets the compiler reorder sums; never set it where NaN marks the invalid.
+    `fastmath` lets the compiler reorder sums; never set it where NaN marks the invalid. A `parallel` kernel
+    takes all cores, and calls from several threads take turns (Numba's plainest threading layer aborts when
+    two enter it); other kernels can't call it.
     """
 
     def decorate(function: F) -> F:
@@ -33,9 +42,18 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[F], F
             compiled = numba.njit(cache=True, parallel=parallel, fastmath=fastmath, nogil=True)(function)
         except RuntimeError:
             compiled = numba.njit(parallel=parallel, fastmath=fastmath, nogil=True)(function)
-        return cast(F, compiled)
+        return cast(F, _in_turn(compiled) if parallel else compiled)
 
     return decorate
+
+
+def _in_turn(compiled: Any) -> Any:
+    @functools.wraps(compiled)
+    def call(*arguments: Any) -> Any:
+        with _ALL_CORES:
+            return compiled(*arguments)
+
+    return call
 
 
 def expect_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...]) -> None:

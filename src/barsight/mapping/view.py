@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from barsight.calibration.rectification import Rectifier
@@ -32,13 +31,11 @@ class View:
 class Viewer:
     """From a frame and its pose to a `View`: without state, so that frames run side by side.
 
-    turn: held while matching, where the method uses all cores itself. per_pixel, max_sigma_m: see
-    `triangulate`.
+    per_pixel, max_sigma_m: see `triangulate`.
     """
 
     stereo: StereoSettings
     method: StereoMethod
-    turn: AbstractContextManager[object]
     rectifier: Rectifier
     cell_m: float
     per_pixel: int
@@ -58,7 +55,7 @@ class Viewer:
         if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
-        with self.turn, self.watch("stereo", 1):
+        with self.watch("stereo", 1):
             matched = self.method(pair, candidates)
             sure = surer_than(matched, self.stereo.max_sigma_px)
             disparity = without_gaps(sure, pair.left, self.stereo.gap_darkness)

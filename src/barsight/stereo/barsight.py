@@ -6,7 +6,7 @@ What only one image sees stays NaN; with `fill_occlusions` it is guessed and giv
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,10 +16,9 @@ from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.confidence import bend_around, beside_edges, start_disagreement, vertical_error_px
 from barsight.stereo.consistency import agrees, without_islands
 from barsight.stereo.edges import sharpen_edges
-from barsight.stereo.filling import fill
+from barsight.stereo.filling import fill, with_row_holes_filled
 from barsight.stereo.refinement import Refined, RefinementSettings, refine
 from barsight.stereo.semiglobal import SemiGlobalSettings, match
-from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 _NAN = np.float32(np.nan)
 _FAST_STEPS = 2
@@ -33,7 +32,7 @@ class BarsightSettings:
     """Barsight's own stereo."""
 
     preset: Literal["best", "fast"] = "best"
-    """`fast` starts from OpenCV's 3-way SGBM, refines in two steps and leaves the edges as they are."""
+    """`fast` refines in two steps, with the long support alone, and leaves the edges as they are."""
     fill_occlusions: bool = True
     """Guess what only one image sees (sigma of 1 px or more, which no map takes) instead of leaving NaN."""
     consistency_px: float = 1.0
@@ -79,7 +78,6 @@ class BarsightStereo:
     """`StereoMethod` of our own."""
 
     settings: BarsightSettings
-    uses_all_cores: ClassVar[bool] = True
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`. Candidates beyond the image's width are left out.
@@ -96,7 +94,7 @@ class BarsightStereo:
         refinement = settings.refinement
         if settings.preset == "fast":
             refinement = replace(refinement, steps=min(refinement.steps, _FAST_STEPS), short_px=0.0)
-        refined = refine(pair.left, pair.right, _without_holes(start.left_px), matched, refinement)
+        refined = refine(pair.left, pair.right, with_row_holes_filled(start.left_px), matched, refinement)
         sigma = self._sigma(pair, refined, start.left_px)
         kept = matched & (np.abs(refined.disparity_px - start.left_px) < _FURTHEST_FROM_START_PX)
         if not settings.fill_occlusions:
@@ -128,11 +126,6 @@ class BarsightStereo:
 
     def _start(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         settings = self.settings
-        if settings.preset == "fast" and _fits_opencv(pair, candidates):
-            left_px = Sgbm(SgbmSettings(mode="3way", speckle_px=settings.island_px))(
-                pair, candidates
-            ).disparity_px
-            return _Start(left_px, np.full_like(left_px, np.inf))
         found = match(pair.left, pair.right, candidates.lowest_px, candidates.count, settings.semiglobal)
         believed = agrees(found.left_px, found.right_px, settings.consistency_px) & pair.left_valid
         believed &= _lands_on(pair.right_valid, found.left_px)
@@ -150,11 +143,6 @@ def _inside(candidates: DisparityRange, width: int) -> DisparityRange:
     return DisparityRange(lowest, max(min(candidates.highest_px, width), lowest + 1))
 
 
-def _fits_opencv(pair: RectifiedPair, candidates: DisparityRange) -> bool:
-    """OpenCV's matcher fails on images hardly wider than its candidates."""
-    return pair.camera.width >= 2 * candidates.count + abs(candidates.lowest_px) and pair.camera.height >= 16
-
-
 def _lands_on(valid: Bool, disparity: Float32) -> Bool:
     width = disparity.shape[1]
     column = np.rint(np.arange(width, dtype=np.float32)[None, :] - disparity).astype(np.int32)
@@ -166,19 +154,3 @@ def _with_sharp_edges(disparity: Float32, sigma: Float32, pair: RectifiedPair) -
     """Edges sharpened; half of what a pixel was moved by counts as one sigma more."""
     sharp = sharpen_edges(disparity, pair.left, _JUMP_PX)
     return sharp, np.hypot(sigma, np.float32(0.5) * (sharp - disparity))
-
-
-def _without_holes(disparity: Float32) -> Float32:
-    """Holes take the smaller, farther, neighbour in their row: what is hidden lies behind."""
-    height, width = disparity.shape
-    known = np.isfinite(disparity)
-    if not known.any():
-        return np.zeros_like(disparity)
-    column = np.arange(width)[None, :]
-    before = np.maximum.accumulate(np.where(known, column, -1), axis=1)
-    after = np.minimum.accumulate(np.where(known, column, width)[:, ::-1], axis=1)[:, ::-1]
-    rows = np.arange(height)[:, None]
-    left = np.where(before >= 0, disparity[rows, before.clip(0)], np.float32(np.inf))
-    right = np.where(after < width, disparity[rows, after.clip(max=width - 1)], np.float32(np.inf))
-    filled = np.minimum(left, right)
-    return np.where(np.isfinite(filled), filled, np.nanmedian(disparity)).astype(np.float32)

@@ -8,7 +8,6 @@ Memory: two blocks of 16 candidates, whatever their number.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
@@ -72,7 +71,6 @@ class Census:
     """`StereoMethod`: improved Census over cross-shaped regions."""
 
     settings: CensusSettings
-    uses_all_cores: ClassVar[bool] = True
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import cv2
 import numba
@@ -76,7 +76,6 @@ class Csca:
     """`StereoMethod`: cross-scale cost aggregation."""
 
     settings: CscaSettings
-    uses_all_cores: ClassVar[bool] = True
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`."""

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numba import prange
 
-from barsight.core.arrays import Float32, UInt8, kernel
+from barsight.core.arrays import Float32, Float64, Int32, UInt8, kernel
 
 _RAYS = 16
 _REACH_PX = 200
@@ -47,8 +47,43 @@ def fill(
     rays = np.column_stack([np.cos(angle), np.sin(angle)])
     rays /= np.abs(rays).max(axis=1, keepdims=True)
     sigma = np.full_like(disparity, np.nan)
-    _fill(disparity, smooth, slope_x, slope_y, right_px, rays, lowest_px, highest_px, filled, sigma)
+    holes = np.isnan(disparity).astype(np.uint8)
+    if holes.all():
+        return filled, sigma
+    # A ray may leap as far as no pixel in any direction is matched.
+    leaps = cv2.distanceTransform(holes, cv2.DIST_C, 3).astype(np.int32)
+    _fill(disparity, smooth, leaps, slope_x, slope_y, right_px, rays, lowest_px, highest_px, filled, sigma)
     return filled, sigma
+
+
+def with_row_holes_filled(disparity: Float32) -> Float32:
+    """NaN take the smaller, farther, neighbour in their row: what is hidden lies behind. Rows without any
+    disparity take the median of all; a map without any is zero."""
+    known = disparity[np.isfinite(disparity)]
+    filled = np.empty_like(disparity)
+    _fill_rows(disparity, np.float32(np.median(known) if known.size else 0), filled)
+    return filled
+
+
+@kernel(parallel=True)
+def _fill_rows(disparity: Float32, empty: np.float32, filled: Float32) -> None:
+    height, width = disparity.shape
+    for y in prange(height):
+        last = -1
+        for x in range(width + 1):
+            if x < width and np.isnan(disparity[y, x]):
+                continue
+            value = empty
+            if last >= 0 and x < width:
+                value = min(disparity[y, last], disparity[y, x])
+            elif last >= 0:
+                value = disparity[y, last]
+            elif x < width:
+                value = disparity[y, x]
+            filled[y, last + 1 : x] = value
+            if x < width:
+                filled[y, x] = disparity[y, x]
+            last = x
 
 
 @kernel(parallel=True)
@@ -103,10 +138,22 @@ def _slopes_beside_holes(
             slope_x[y, x], slope_y[y, x] = p, q
 
 
+@kernel()
+def _sort_by_value(values: Float64, weights: Float64, count: int) -> None:
+    for i in range(1, count):
+        value, weight = values[i], weights[i]
+        j = i - 1
+        while j >= 0 and values[j] > value:
+            values[j + 1], weights[j + 1] = values[j], weights[j]
+            j -= 1
+        values[j + 1], weights[j + 1] = value, weight
+
+
 @kernel(parallel=True)
 def _fill(
     disparity: Float32,
     grey: Float32,
+    leaps: Int32,
     slope_x: Float32,
     slope_y: Float32,
     right_px: Float32,
@@ -127,12 +174,14 @@ def _fill(
             for ray in range(_RAYS):
                 way_x, way_y = rays[ray, 0], rays[ray, 1]
                 pixel = math.hypot(way_x, way_y)
-                for j in range(1, _REACH_PX):
+                j = leaps[y, x]
+                while j < _REACH_PX:
                     xx, yy = round(x + j * way_x), round(y + j * way_y)
                     if xx < 0 or xx >= width or yy < 0 or yy >= height:
                         break
                     there = disparity[yy, xx]
                     if np.isnan(there):
+                        j += leaps[yy, xx]
                         continue
                     distance = j * pixel
                     # The plane's slope fades out with the distance: far off it says nothing.
@@ -152,7 +201,8 @@ def _fill(
                 continue
             wanted = weights[:found].sum() * (0.5 if beyond_border else _HIDDEN_QUANTILE)
             passed = 0.0
-            for i in np.argsort(values[:found]):
+            _sort_by_value(values, weights, found)
+            for i in range(found):
                 passed += weights[i]
                 if passed >= wanted:
                     filled[y, x] = values[i]

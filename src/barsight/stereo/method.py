@@ -8,14 +8,9 @@ from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 
 
 class StereoMethod(Protocol):
-    """From a rectified pair to the left image's disparity. A method keeps no state between calls.
-
-    uses_all_cores: the method spreads one pair over all cores itself, so that two pairs must not be matched
-    side by side (Numba's plainest threading layer aborts when two threads enter it).
+    """From a rectified pair to the left image's disparity. A method keeps no state between calls, so that two
+    pairs can be matched side by side.
     """
-
-    @property
-    def uses_all_cores(self) -> bool: ...
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """Match within `candidates`; NaN where there is no match or either image is invalid."""

@@ -9,7 +9,6 @@ refinement). Memory: two blocks of 16 candidates, whatever their number.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import cv2
 import numba
@@ -53,7 +52,6 @@ class Nonlocal:
     """`StereoMethod`: non-local aggregation and refinement."""
 
     settings: NonlocalSettings
-    uses_all_cores: ClassVar[bool] = True
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`."""

@@ -9,7 +9,7 @@ from the images after the start, so that the loop smooths D and can't undo its b
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -64,7 +64,6 @@ class Paper:
     """`StereoMethod`: the paper's loop from an initial disparity."""
 
     settings: PaperSettings
-    uses_all_cores: ClassVar[bool] = True
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`. Without `output.fill`, NaN where the initial disparity has none."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -55,7 +55,6 @@ class Sgbm:
     """
 
     settings: SgbmSettings
-    uses_all_cores: ClassVar[bool] = False
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """See `StereoMethod`."""
