@@ -85,9 +85,11 @@ def rise_over(sheet: Sheet, fit: Fit, rows: Int64, u: Float64, settings: BundleS
 
 
 def is_beam(sheet: Sheet, fit: Fit, settings: BundleSettings) -> bool:
-    """Whether the mean section is level to where it ends, not round: a flank leaves the outline, or the
-    middle is nearer to level than to the outline.
+    """Whether the mean section is level to where it ends, not round: a flank leaves the outline, the middle
+    is nearer to level than to the outline, or only bars thinner than any would make it so level.
     """
+    if fit.rings > 0 and fit.values[DIAMETER] < settings.least_bar_m:
+        return True
     rows = np.flatnonzero(fit.state == AGREES)
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
     across = np.arange(-_FLANK[1] * fit.width_m, _FLANK[1] * fit.width_m, sheet.cell_m / 2)

@@ -11,6 +11,7 @@ from barsight.yard.assess import Lift, Yard, assess
 from barsight.yard.footprint import BundleTable, Placement
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet
+from barsight.yard.pile_sides import PileSide, pile_sides
 from barsight.yard.set_down import FreePlace, free_places
 from barsight.yard.stability import Footing, footings
 from barsight.yard.travel import Travel
@@ -39,7 +40,8 @@ class LiftPlan:
     """offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
 
     vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
-    stands. free: places to set down the longest and widest bundle, in `set_down.RULE`'s order.
+    stands. sides: of the piles. free: places to set down the longest and widest bundle, in the order of
+    `set_down.RULE`.
     """
 
     magnet: Magnet
@@ -48,6 +50,7 @@ class LiftPlan:
     refused: tuple[Lift, ...]
     vetoes: tuple[Veto, ...]
     footings: tuple[Footing, ...]
+    sides: tuple[PileSide, ...]
     free: tuple[FreePlace, ...]
 
 
@@ -89,7 +92,16 @@ def plan_lifts(
     wide = max((b.width_m for b in bundles), default=settings.set_down_width_m)
     long = max((b.length_m for b in bundles), default=settings.set_down_length_m)
     free = free_places(heights, wide, long)
-    return LiftPlan(magnet, settings, tuple(offered), tuple(refused), vetoes, standing, free)
+    return LiftPlan(
+        magnet,
+        settings,
+        tuple(offered),
+        tuple(refused),
+        vetoes,
+        standing,
+        pile_sides(bundles, standing),
+        free,
+    )
 
 
 def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:

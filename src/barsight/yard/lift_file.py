@@ -16,7 +16,7 @@ from barsight.yard.lift import RULE, LiftPlan
 from barsight.yard.stability import Footing
 from barsight.yard.vetoes import Veto
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 def schema() -> dict[str, Any]:
@@ -62,6 +62,7 @@ def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
             "lifts": [_lift(lift, rank) for rank, lift in enumerate(plan.offered, start=1)],
             "refused": [_lift(lift, None) for lift in plan.refused],
             "footings": [_footing(footing) for footing in plan.footings],
+            "sides": [asdict(side) for side in plan.sides],
             "free_places": [asdict(place) for place in plan.free],
         }
     )

@@ -1,0 +1,58 @@
+"""The pile's sides: slope, lean and overhang per layer, with sigmas that hold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.yard.pile_sides import pile_sides
+from barsight.yard.stability import footings
+from barsight.yard.types import Bundle
+from lift_yards import SETTINGS, SIGMA, laid, map_of, record
+
+RISE, STEP = 0.36, 0.05
+STOCK = [laid(0.3 + STEP * layer + 0.3 * k, z=0.2 + RISE * layer) for layer in range(3) for k in range(3)]
+APART = laid(3.0)
+BUNDLES = (*(record(one, k, layer=k // 3) for k, one in enumerate(STOCK)), record(APART, 9))
+STANDING = footings(map_of([*STOCK, APART]), BUNDLES, SETTINGS)
+
+
+def test_a_pile_that_leans_says_how_far_and_how_surely() -> None:
+    low, high, *others = pile_sides(BUNDLES, STANDING)
+    assert (low.side, high.side) == (-1, 1)
+    assert (low.bundles, high.bundles) == ((0, 3, 6), (2, 5, 8))
+    lean = math.degrees(math.atan2(2 * STEP, 2 * RISE))
+    assert high.lean_deg == pytest.approx(lean) and low.lean_deg == pytest.approx(-lean)
+    assert [o.overhang_m for o in high.overhangs] == pytest.approx([STEP, STEP])
+    assert [o.overhang_m for o in low.overhangs] == pytest.approx([-STEP, -STEP])
+    assert high.drop_m == pytest.approx(STOCK[8].top_z_m, abs=0.02)
+    assert low.slope_deg < 85 < high.slope_deg
+    assert [side.bundles for side in others] == [(9,), (9,)]
+    assert all(math.isnan(side.lean_deg) and side.overhangs == () for side in others)
+
+
+def test_the_stated_sigmas_hold() -> None:
+    rng = np.random.default_rng(5)
+
+    def seen(bundle: Bundle) -> Bundle:
+        moved = bundle.centre_m + np.array([rng.normal(0, SIGMA.lateral_m), 0, 0])
+        return replace(bundle, centre_m=moved, width_m=bundle.width_m + rng.normal(0, SIGMA.width_m))
+
+    scores = []
+    for _ in range(300):
+        high = pile_sides(tuple(seen(b) for b in BUNDLES), STANDING)[1]
+        lean = math.degrees(math.atan2(2 * STEP, 2 * RISE))
+        scores.append([(high.lean_deg - lean) / high.lean_sigma_deg])
+        scores[-1] += [(o.overhang_m - STEP) / o.sigma_m for o in high.overhangs]
+    assert np.std(scores, axis=0) == pytest.approx(np.ones(3), abs=0.15)
+
+
+def test_bundles_across_are_a_pile_of_their_own() -> None:
+    across = record(laid(0.6, z=1.3, yaw_deg=88.0, length_m=1.5), 10, layer=3)
+    bundles = (*BUNDLES, across)
+    sides = pile_sides(bundles, footings(map_of(STOCK), bundles, SETTINGS))
+    assert sum(side.bundles == (10,) for side in sides) == 2 and len(sides) == 6
+    assert pile_sides((), ()) == ()
