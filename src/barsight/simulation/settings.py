@@ -220,6 +220,27 @@ class SensorSettings:
 
 
 @dataclass(frozen=True)
+class MagnetSettings:
+    """A magnet's plate that hangs from the crane into the pictures, for a part of the travel."""
+
+    size_m: tuple[float, float] = (0.0, 0.0)
+    """Along the travel and across; 0 0 leaves it out."""
+    below_body_m: float = 3.0
+    """How far it hangs under the body."""
+    offset_m: tuple[float, float] = (0.6, 0.3)
+    """Where its middle hangs from the body, along the travel and across."""
+    first_share: float = 0.3
+    """Share of the frames from which it hangs there."""
+    last_share: float = 0.6
+    """Share of the frames until which it hangs there."""
+
+    def __post_init__(self) -> None:
+        _expect(min(self.size_m) >= 0, "magnet size_m can't be negative")
+        _expect(self.below_body_m > 0.2, "magnet below_body_m must be over 0.2 m")
+        _expect(0 <= self.first_share <= self.last_share <= 1, "magnet shares must rise within 0 and 1")
+
+
+@dataclass(frozen=True)
 class SimulationSettings:
     """A simulated recording of a bar yard. The same settings give the same bytes."""
 
@@ -237,6 +258,7 @@ class SimulationSettings:
     yard: YardSettings = field(default_factory=YardSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
     sensors: SensorSettings = field(default_factory=SensorSettings)
+    magnet: MagnetSettings = field(default_factory=MagnetSettings)
 
     def __post_init__(self) -> None:
         expect_numbers(asdict(self))

@@ -14,6 +14,7 @@ from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.simulation import layout
+from barsight.simulation.carried import cover, plate_at
 from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
 from barsight.simulation.render import Look, render
@@ -139,15 +140,18 @@ def _write_pictures(
     deep = depth_views(settings)
     for number, stamp in enumerate(world.frame_stamp_ns.tolist()):
         yard_from_body = world.yard_from_body(stamp)
-        surface.count_frame(rig, yard_from_body)
+        plate = plate_at(settings.magnet, number / settings.frames, yard_from_body)
+        surface.count_frame(rig, yard_from_body, plate)
         for k, (name, camera, mounting, gain) in enumerate(cameras):
             yard_from_cam = yard_from_body @ mounting
             radiance = render(world.scene, look, rays[k], side, yard_from_cam)
+            if plate is not None:
+                cover(radiance, plate, rays[k], side, yard_from_cam, tile)
             noise = _stream(settings, 9, 2 * number + k)
             image = expose(radiance, shares[k], gain, settings.camera, noise)
             layout.write_png(folder / "mav0" / name / "data" / f"{stamp}.png", image)
             if number in deep:
-                depth = true_depth(world.scene, camera, yard_from_cam)
+                depth = true_depth(world.scene, camera, yard_from_cam, plate)
                 np.savez_compressed(folder / "truth" / f"depth_{name}_{stamp}.npz", z=depth)
         if progress is not None:
             progress(number + 1, settings.frames)

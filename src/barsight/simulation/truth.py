@@ -13,6 +13,7 @@ from barsight.calibration.camera import Camera
 from barsight.calibration.rig import StereoRig
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.pose import Pose
+from barsight.simulation.carried import Plate
 from barsight.simulation.optics import sample_rays
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
@@ -53,12 +54,17 @@ class SurfaceTruth:
         self.profile_z_m = self._points[gx.size :, 2].reshape(px.shape)
         self.profile_visible = self._seen[gx.size :].reshape(px.shape)
 
-    def count_frame(self, rig: StereoRig, yard_from_body: Pose) -> None:
+    def count_frame(self, rig: StereoRig, yard_from_body: Pose, plate: Plate | None = None) -> None:
         """Add one to every cell that both cameras see in this frame."""
         low, high = _floor_reach(rig.cam0, yard_from_body @ rig.body_from_cam0)
         rows = np.flatnonzero((self._points[:, 0] >= low) & (self._points[:, 0] <= high))
         for camera, mounting in ((rig.cam0, rig.body_from_cam0), (rig.cam1, rig.body_from_cam1)):
-            rows = rows[self._sees(camera, yard_from_body @ mounting, self._points[rows])]
+            yard_from_cam = yard_from_body @ mounting
+            rows = rows[self._sees(camera, yard_from_cam, self._points[rows])]
+            if plate is not None:
+                origin = yard_from_cam.translation
+                hit, share, _ = plate.covers(origin, self._points[rows] - origin)
+                rows = rows[~(hit & (share < 1))]
         self._seen[rows] += 1
 
     def _sees(self, camera: Camera, yard_from_cam: Pose, points: Float64) -> Bool:
@@ -99,11 +105,14 @@ def _floor_reach(camera: Camera, yard_from_cam: Pose) -> tuple[float, float]:
     return float(reached.min()), float(reached.max())
 
 
-def true_depth(scene: Scene, camera: Camera, yard_from_cam: Pose) -> Float32:
+def true_depth(scene: Scene, camera: Camera, yard_from_cam: Pose, plate: Plate | None = None) -> Float32:
     """(H, W) depth along the raw camera's optical axis at each pixel's centre, m; inf where nothing is."""
     plane = sample_rays(camera, 1).reshape(-1, 2).astype(np.float64)
     directions = np.column_stack([plane, np.ones(len(plane))]) @ yard_from_cam.rotation.T
     depth, _ = cast_rays(scene, yard_from_cam.translation[None], directions)
+    if plate is not None:
+        hit, share, _ = plate.covers(yard_from_cam.translation, directions)
+        depth = np.where(hit, np.minimum(depth, share), depth)
     return depth.reshape(camera.height, camera.width).astype(np.float32)
 
 
