@@ -11,6 +11,7 @@ import resource
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -35,7 +36,7 @@ from barsight.mapping.look import choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import finish
 from barsight.mapping.tiles import TileStore
-from barsight.mapping.view import View, Viewer
+from barsight.mapping.view import Placed, View, Viewer
 from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, digest, plain
 from barsight.motion.self_calibration import self_calibrated
 from barsight.motion.settings import MotionSettings, make_estimator
@@ -130,11 +131,11 @@ def measure(
     per_pixel = points_per_pixel(first, cell_m)
     viewer = Viewer(stereo, method, rectifier, cell_m, per_pixel, settings.map.max_sigma_m, watch)
 
-    def look(placed: tuple[StereoFrame | RefusedFrame, PosedFrame]) -> View | Refusal:
-        frame, posed = placed
+    def look(placed: tuple[StereoFrame | RefusedFrame, PosedFrame, list[Placed]]) -> View | Refusal:
+        frame, posed, beside = placed
         if isinstance(frame, RefusedFrame):
             return Refusal("recording", frame)
-        view = once(kept, f"view_{frame.stamp_ns}", lambda: viewer(frame, posed))
+        view = once(kept, f"view_{frame.stamp_ns}", lambda: viewer(frame, posed, beside))
         if isinstance(view, Failed):
             return Refusal("stereo", RefusedFrame(frame.stamp_ns, view.reason))
         return view
@@ -229,11 +230,15 @@ def measure(
 
 def _placed(
     source: Recording, poses: dict[int, PosedFrame]
-) -> Iterator[tuple[StereoFrame | RefusedFrame, PosedFrame]]:
-    """The frames that have a pose; those without one were refused by the trajectory already."""
-    for frame in source.frames():
-        if frame.stamp_ns in poses:
-            yield frame, poses[frame.stamp_ns]
+) -> Iterator[tuple[StereoFrame | RefusedFrame, PosedFrame, list[Placed]]]:
+    """The frames that have a pose, each with those before and after it."""
+    known = ((frame, poses[frame.stamp_ns]) for frame in source.frames() if frame.stamp_ns in poses)
+    before = None
+    for here, after in pairwise(chain(known, (None,))):
+        assert here is not None
+        beside = (other for other in (before, after) if other is not None)
+        yield *here, [(frame, pose) for frame, pose in beside if not isinstance(frame, RefusedFrame)]
+        before = here
 
 
 def _speed_along_x(trajectory: Trajectory) -> float:

@@ -79,10 +79,13 @@ class Rectifier:
                     f"the {name} image is {image.shape[1]}x{image.shape[0]}, "
                     f"the calibration is for {size[1]}x{size[0]}",
                 )
-        left, right = frame.left, frame.right
-        if self._warps is not None:
-            left, right = self._warps[0](left), self._warps[1](right)
+        right = frame.right if self._warps is None else self._warps[1](frame.right)
+        left = self.left(frame.left)
         return RectifiedPair(frame.stamp_ns, left, right, self._left_valid, self._right_valid, self.camera)
+
+    def left(self, image: UInt8) -> UInt8:
+        """The left image alone, of the calibration's size."""
+        return image if self._warps is None else self._warps[0](image)
 
 
 def _rectified_axes(rig: StereoRig) -> Float64:

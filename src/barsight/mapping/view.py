@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import Failed
 from barsight.core.timing import Stopwatch
-from barsight.core.types import DisparityRange, PosedFrame, RectifiedPair, StereoFrame
+from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair, StereoFrame
+from barsight.mapping.carried import carried_along
 from barsight.mapping.observation import CellObservations, observe
 from barsight.stereo.disparity_range import find_range
-from barsight.stereo.gaps import surer_than, without_gaps
+from barsight.stereo.gaps import keep, surer_than, without_gaps
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.points import triangulate
 from barsight.stereo.settings import StereoSettings
+
+Placed = tuple[StereoFrame, PosedFrame]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +46,11 @@ class Viewer:
     max_sigma_m: float
     watch: Stopwatch
 
-    def __call__(self, frame: StereoFrame, posed: PosedFrame) -> View | Failed:
-        """Failed where the images have the wrong size, are swapped, have no texture or show no depth."""
+    def __call__(self, frame: StereoFrame, posed: PosedFrame, beside: Sequence[Placed] = ()) -> View | Failed:
+        """beside: the frames before and after, against which the crane's own parts stand still.
+
+        Failed where the images have the wrong size, are swapped, have no texture or show no depth.
+        """
         with self.watch("rectify", 1):
             pair = self.rectifier(frame)
         if isinstance(pair, Failed):
@@ -59,6 +66,9 @@ class Viewer:
             matched = self.method(pair, candidates)
             sure = surer_than(matched, self.stereo.max_sigma_px)
             disparity = without_gaps(sure, pair.left, self.stereo.gap_darkness)
+        with self.watch("carried", 1):
+            for other in beside:
+                disparity = self._without_carried(pair, disparity, posed, other)
         with self.watch("points", 1):
             points = triangulate(
                 pair,
@@ -77,6 +87,19 @@ class Viewer:
         if cells.z_m.size == 0:
             return Failed("no-depth", "no pixel has a depth within max_depth_m and max_sigma_m")
         return View(pair.stamp_ns, cells, pair.left, disparity.disparity_px)
+
+    def _without_carried(
+        self, pair: RectifiedPair, disparity: Disparity, posed: PosedFrame, other: Placed
+    ) -> Disparity:
+        frame, pose = other
+        if frame.left.shape != pair.left.shape:
+            return disparity
+        here, there = (p.reference_from_body @ self.rectifier.body_from_rect0 for p in (posed, pose))
+        still = carried_along(
+            pair.left, disparity.disparity_px, pair.camera, self.rectifier.left(frame.left),
+            there.inverse() @ here,
+        )  # fmt: skip
+        return keep(disparity, ~still)
 
 
 def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:

@@ -29,15 +29,16 @@ def without_gaps(disparity: Disparity, image: UInt8, darkness: float) -> Dispari
     """The disparity with gaps made unknown; darkness 0 leaves it as it is."""
     if darkness <= 0:
         return disparity
-    return _kept(disparity, ~in_gap(image, darkness))
+    return keep(disparity, ~in_gap(image, darkness))
 
 
 def surer_than(disparity: Disparity, max_sigma_px: float) -> Disparity:
     """The disparity without what is less sure than this, guesses among it."""
-    return _kept(disparity, disparity.sigma_px <= max_sigma_px)
+    return keep(disparity, disparity.sigma_px <= max_sigma_px)
 
 
-def _kept(disparity: Disparity, kept: Bool) -> Disparity:
+def keep(disparity: Disparity, kept: Bool) -> Disparity:
+    """The disparity with all made unknown that is not `kept` (H, W)."""
     nan = np.float32(np.nan)
     return replace(
         disparity,

@@ -1,0 +1,76 @@
+"""What travels along with the crane, such as its magnet: it stands still in the picture while the yard moves.
+
+A view's depth and pose say where each pixel lies in the picture taken before or after it. Where the neighbour
+shows the same not there but where the pixel itself is, the thing was carried along, and no map takes it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedCamera
+
+_SHRINK = 4
+_SWING = 2
+"""Shrunk pixels by which a thing that hangs may swing from one picture to the next."""
+_LEAST_WAY_PX = 6.0 * _SHRINK
+_WINDOW, _SMOOTH, _LEAST_SIZE, _MARGIN = 9, 15, 5, 7
+_ALIKE = 0.6
+"""Standing still explains the picture if its difference is at most this share of the motion's."""
+_LEAST_DIFFERENCE = 2.0
+
+
+def carried_along(
+    left: UInt8, disparity_px: Float32, camera: RectifiedCamera, neighbour: UInt8, neighbour_from_here: Pose
+) -> Bool:
+    """(H, W) what stands still in the rectified left pictures `left` and `neighbour`, both (H, W).
+
+    neighbour_from_here: between the two views' rect0. Nothing is found where the yard itself moves by less
+    than `_LEAST_WAY_PX`, nor where the picture shows too little to tell.
+    """
+    here, there = _shrunk(left), _shrunk(neighbour)
+    first = _SHRINK // 2
+    shift = disparity_px[first::_SHRINK, first::_SHRINK][: here.shape[0], : here.shape[1]] + camera.doffs_px
+    matched = np.isfinite(shift) & (shift > 0)
+    depth = camera.focal_px * camera.baseline_m / np.where(matched, shift, np.inf).clip(1e-3, None)
+    rows, columns = np.indices(depth.shape)
+    u, v = ((_SHRINK * at + (_SHRINK - 1) / 2) for at in (columns, rows))
+    rays = np.dstack([(u - camera.cx_px) / camera.focal_px, (v - camera.cy_px) / camera.focal_px])
+    points = neighbour_from_here.apply(np.dstack([rays * depth[..., None], depth]))
+    ahead = matched & (points[..., 2] > 1e-3)
+    at = camera.focal_px * points[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None]
+    at += (camera.cx_px, camera.cy_px)
+    way = np.hypot(at[..., 0] - u, at[..., 1] - v)
+    place = ((at + 0.5) / _SHRINK - 0.5).astype(np.float32)
+    # Near the border the wide mean is another picture's.
+    known = np.full(here.shape, np.nan, np.float32)
+    known[_SMOOTH // 2 : -(_SMOOTH // 2), _SMOOTH // 2 : -(_SMOOTH // 2)] = 0.0
+    moved = cv2.remap(there + known, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=float("nan"))
+    by_motion = _difference(here + known, np.asarray(moved, np.float32))
+    still = np.full(here.shape, np.inf, np.float32)
+    edge = cv2.copyMakeBorder(there, _SWING, _SWING, _SWING, _SWING, cv2.BORDER_REPLICATE)
+    for i in range(2 * _SWING + 1):
+        for j in range(2 * _SWING + 1):
+            other = edge[i : i + here.shape[0], j : j + here.shape[1]]
+            np.minimum(still, _difference(here, other), out=still)
+    found = ahead & (way > _LEAST_WAY_PX) & (by_motion > _LEAST_DIFFERENCE) & (still < _ALIKE * by_motion)
+    least, margin = np.ones((_LEAST_SIZE, _LEAST_SIZE), np.uint8), np.ones((_MARGIN, _MARGIN), np.uint8)
+    grown = cv2.dilate(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, least), margin)
+    whole: Bool = cv2.resize(grown, left.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    return whole
+
+
+def _shrunk(image: UInt8) -> Float32:
+    """A quarter of the size, without what is brighter or darker over a wide area."""
+    size = (image.shape[1] // _SHRINK, image.shape[0] // _SHRINK)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return np.asarray(small - cv2.blur(small, (_SMOOTH, _SMOOTH)), np.float32)
+
+
+def _difference(here: Float32, there: Float32) -> Float32:
+    """Mean absolute difference over a window; what one of them doesn't show differs by nothing."""
+    off = np.abs(here - there)
+    return np.asarray(cv2.blur(np.nan_to_num(off), (_WINDOW, _WINDOW)), np.float32)
