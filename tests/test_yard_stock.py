@@ -13,7 +13,7 @@ from barsight.core.errors import InputError
 from barsight.yard.bundle_file import read_bundles, schema, write_bundles
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
-from barsight.yard.stock_list import Expected, match_stock, read_stock
+from barsight.yard.stock_list import Expected, match_stock, read_stock, stock_warnings
 from barsight.yard.types import Bundle
 from yard_maps import Laid, draw
 
@@ -54,6 +54,13 @@ def test_a_list_that_contradicts_the_map_is_told_so(bundles: tuple[Bundle, ...])
     assert len(by_name["thinner"].disagrees) == 2
     assert match.hidden == ("under",)
     assert match.extra == (2,)
+    said = stock_warnings(listed, match)
+    assert said[0] == "stock list: 1 of 4 listed bundles weren't found: gone"
+    assert said[1] == "stock list: 1 of 4 lie elsewhere than listed: shifted"
+    assert said[2].startswith("stock list: 1 of 4 aren't as listed: thinner (bars' diameter 9")
+    assert said[3] == "stock list: 1 of 4 lie under others, so the map can't tell: under"
+    assert said[4:] == ("stock list: 1 of 3 found ones aren't listed, bundle: 2",)
+    assert "yard's frame" in stock_warnings(listed, None)[0]
 
 
 def test_an_empty_yard_lacks_everything_and_an_empty_list_makes_all_extra(

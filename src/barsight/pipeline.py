@@ -49,7 +49,7 @@ from barsight.yard.bundles import find_bundles
 from barsight.yard.lift import map_vetoes, plan_lifts
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet, load_magnet
-from barsight.yard.stock_list import match_stock, read_stock
+from barsight.yard.stock_list import match_stock, read_stock, stock_warnings
 from barsight.yard.travel import Travel
 from barsight.yard.types import HeightMap
 
@@ -175,13 +175,19 @@ def measure(
     with watch("bundles"):
         heights = HeightMap.of(surface)
         bundles = find_bundles(heights, settings.bundles)
-        stock = match_stock(expected, bundles) if expected and trajectory.reference == "yard" else None
+        stock = (
+            match_stock(expected, bundles)
+            if expected is not None and trajectory.reference == "yard"
+            else None
+        )
 
     warnings = [Notice("assumed", text) for text in source.notes]
     warnings += [Notice("imu", text) for text in hints]
     warnings += [Notice("calibration", text) for text in first.warnings]
     warnings += [Notice("calibration-drift", text) for text in calibrated.warnings]
     warnings += [Notice("trajectory", text) for text in trajectory.warnings]
+    if expected is not None:
+        warnings += [Notice("stock-list", text) for text in stock_warnings(expected, stock)]
     warnings += [Notice(a.code, a.reason) for a in agreed if isinstance(a, Failed)]
     if len(laser) < len(whole_laser):
         warnings.append(

@@ -152,6 +152,24 @@ def match_stock(listed: tuple[Expected, ...], bundles: tuple[Bundle, ...]) -> St
     )
 
 
+def stock_warnings(listed: tuple[Expected, ...], match: StockMatch | None) -> tuple[str, ...]:
+    """Sentences on where list and map differ. match: None where the map isn't in the yard's frame."""
+    if match is None:
+        return ("the map isn't in the yard's frame: the stock list can't be held against it",)
+    differs = [f"{one.name} ({'; '.join(one.disagrees)})" for one in match.matched if one.disagrees]
+    return tuple(
+        f"stock list: {len(names)} of {total} {what}: {', '.join(map(str, names))}"
+        for names, total, what in (
+            (match.missing, len(listed), "listed bundles weren't found"),
+            (match.moved, len(listed), "lie elsewhere than listed"),
+            (differs, len(listed), "aren't as listed"),
+            (match.hidden, len(listed), "lie under others, so the map can't tell"),
+            (match.extra, len(match.extra) + len(match.matched), "found ones aren't listed, bundle"),
+        )
+        if names
+    )
+
+
 def _shift(one: Expected, bundle: Bundle) -> tuple[float, float, float]:
     rise = 0.0 if one.top_z_m is None else bundle.top_z_m - one.top_z_m
     return float(bundle.centre_m[0] - one.x_m), float(bundle.centre_m[1] - one.y_m), float(rise)
