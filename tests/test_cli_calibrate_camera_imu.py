@@ -157,6 +157,20 @@ def test_pictures_of_a_recording_with_its_own_noise(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_bag_is_calibrated_from_pictures_to_mounting(tmp_path: Path) -> None:
+    truth, waved, bag = draw_recording(tmp_path / "waved"), tmp_path / "waved", str(tmp_path / "bag")
+    assert run(["convert", str(waved), "-o", bag, "--to", "ros2-mcap"]) == 0
+    stereo = tmp_path / "stereo.yaml"
+    assert run(["calibrate", "stereo", bag, "--board", TEXT, "-o", str(stereo)]) == 0
+    noise = waved / "mav0" / "imu0" / "sensor.yaml"
+    assert run(arguments(tmp_path / "bag", tmp_path / "rig.yaml", rig=stereo, imu=noise)) == 0
+    found = read_rig_file(tmp_path / "rig.yaml")
+    assert np.degrees(found.body_from_cam0.angle_to(truth.body_from_cam0)) < 0.1
+    assert found.body_from_cam0.distance_to(truth.body_from_cam0) < 6e-3
+    assert abs(found.baseline_m - truth.baseline_m) < 4e-4
+
+
+@pytest.mark.slow
 def test_eurocs_calibration_recording(data: Path, tmp_path: Path) -> None:
     """Published are Kalibr's values of the whole recording; ours must lie within three of our sigmas."""
     mav0, out = data / "euroc_v101_still" / "mav0", tmp_path / "rig.yaml"
