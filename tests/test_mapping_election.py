@@ -132,3 +132,24 @@ def test_views_with_few_points_a_cell_owe_few_votes(tmp_path: Path) -> None:
     surface = finish(store, tmp_path, 0.01, 2, MapSettings(fill_m=0.0), Sights.of(poses, far))
     known = surface.window(0, 0, 60, 60).source == Source.VISION
     np.testing.assert_array_equal(known.ravel(), votes >= 2)
+
+
+@pytest.mark.parametrize(("wall_ends", "known_beneath"), [(60, False), (30, True)])
+def test_beneath_a_surface_that_the_border_cuts_off_nothing_is_known(
+    tmp_path: Path, wall_ends: int, known_beneath: bool
+) -> None:
+    """Pictures so low that the floor is seen up to y = 0.43 m and the wall's top to 0.38 m: what is seen of
+    the floor between, in the wall's columns, may lie beneath the wall, unless the wall was seen to end."""
+    camera = replace(CAMERA, height=100, cy_px=50.0)
+    x, y = (a.ravel() for a in block(60, 43, -30))
+    top_m = np.where((x >= 0) & (y < wall_ends) & (y < 38), 1.0, 0.0)
+    store = TileStore(tmp_path, 64)
+    for _ in EYES_X_M:
+        fuse(store, view(x, y, top_m), MapSettings())
+    sights = Sights.of([pose_at(eye) for eye in EYES_X_M], camera)
+    known = np.isfinite(
+        finish(store, tmp_path, CELL_M, 2, MapSettings(fill_m=0.0), sights).window(-30, 0, 60, 43).z_m
+    )
+    assert known[38:42, 30:].any() == known_beneath
+    assert known[10:25, 30:].all()
+    assert known[38:42, :15].all()

@@ -4,6 +4,9 @@ A wrong height hangs in the air, most often beside an edge, where matching stret
 few pixels. Every view that looks through it to what lies behind speaks against it. So a height's votes are
 held against the number of views whose two cameras have a free line of sight to it, over the surface as the
 votes alone would have it. A height that fewer than `min_views` views can see at all is an error of matching.
+
+Where the pictures' border cuts off a high surface, cameras still see beneath its overhang from the side. What
+they see there is no surface to lift from, since the high one may go on above it.
 """
 
 from __future__ import annotations
@@ -18,10 +21,10 @@ from numba import prange
 from barsight.core.arrays import Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
+from barsight.mapping.lines_of_sight import density, free, inside, may_be_covered
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
 
-_BORDER_PX = 3.0
 _RIM_CELLS = 2
 _RIM_SLOPE = 2.5
 _ALONG = 5
@@ -127,7 +130,7 @@ def _supported(
     one_point_m: float,
 ) -> tuple[Float32, Float32]:
     """Two arrays (rows, columns, SLOTS): the share of the votes that a height can expect which it has, -1
-    where fewer than min_views see or can see it; and how many it can expect.
+    where fewer than min_views see or can see it or something may lie above; and how many it can expect.
 
     A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
     further apart than cells: at ranges over one_point_m, and where it looks along the ground.
@@ -144,12 +147,15 @@ def _supported(
                 point = np.array([(corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z])
                 able, votes = 0, 0.0
                 for k in range(rotation.shape[0]):
-                    if _inside(point, lens, size, rotation[k], translation[k]):
-                        free = _free(point, i, j, eyes[k, 0], around, ceiling, cell_m)
-                        if free and _free(point, i, j, eyes[k, 1], around, ceiling, cell_m):
+                    if inside(point, lens, size, rotation[k], translation[k]):
+                        seen = free(point, i, j, eyes[k, 0], around, ceiling, cell_m)
+                        if seen and free(point, i, j, eyes[k, 1], around, ceiling, cell_m):
                             able += 1
-                            votes += _density(point, eyes[k, 0], one_point_m)
-                if able >= min_views:
+                            votes += density(point, eyes[k, 0], one_point_m)
+                covered = able >= min_views and may_be_covered(
+                    point, i, j, around, ceiling, lens, size, rotation, translation, cell_m, min_views
+                )
+                if able >= min_views and not covered:
                     share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
                     expected[i, j, s] = votes
     return share, expected
@@ -207,53 +213,6 @@ def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float,
         if alike > most:
             most, result = alike, total / inside
     return result
-
-
-@kernel()
-def _density(point: Float64, eye: Float64, one_point_m: float) -> float:
-    """Points that a view has in a level cell, at most 1."""
-    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
-    squared = x * x + y * y + z * z
-    return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
-
-
-@kernel()
-def _inside(point: Float64, lens: Float64, size: Float64, rotation: Float64, translation: Float64) -> bool:
-    """Whether both cameras of a view have the point in their pictures."""
-    x, y, depth = translation[0], translation[1], translation[2]
-    for a in range(3):
-        x += rotation[0, a] * point[a]
-        y += rotation[1, a] * point[a]
-        depth += rotation[2, a] * point[a]
-    if depth <= 0:
-        return False
-    u, v = lens[0] * x / depth + lens[1], lens[0] * y / depth + lens[2]
-    right = u - (lens[0] * lens[3] / depth - lens[4])
-    across = min(u, right) >= _BORDER_PX and max(u, right) <= size[0] - 1 - _BORDER_PX
-    return bool(across and _BORDER_PX <= v <= size[1] - 1 - _BORDER_PX)
-
-
-@kernel()
-def _free(
-    point: Float64, row: int, column: int, eye: Float64, around: Float32, ceiling: float, cell_m: float
-) -> bool:
-    """Whether no cell between rises over the line from the point (in the middle tile) to the eye."""
-    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
-    length = max(abs(x), abs(y)) / cell_m
-    if length < 2:
-        return True
-    step_x, step_y, step_z = x / cell_m / length, y / cell_m / length, z / length
-    for n in range(2, int(length)):
-        height = point[2] + n * step_z
-        if height > ceiling:
-            return True
-        i = int(np.rint(row + TILE_CELLS + n * step_y))
-        j = int(np.rint(column + TILE_CELLS + n * step_x))
-        if i < 0 or j < 0 or i >= around.shape[0] or j >= around.shape[1]:
-            return True
-        if around[i, j] > height + cell_m:
-            return False
-    return True
 
 
 @kernel()

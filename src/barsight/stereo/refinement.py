@@ -71,7 +71,7 @@ class RefinementSettings:
     """Length along the axis over which what is constant counts as gloss, one sigma; 0 trusts everything."""
     alike_grey: float = 20.0
     """Places along the axis whose grey values differ by this are not one highlight: a strap, a shadow."""
-    gloss_trust: float = 0.05
+    gloss_trust: float = 0.02
     """Weight of the evidence that is constant along the axis, where noise explains its residual."""
     outlier_grey: float = 8.0
     """Residual at which a pixel's weight is halved, grey levels."""

@@ -1,0 +1,103 @@
+"""Lines of sight: whether a view has a point in its pictures, free before it, and nothing above it unseen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, kernel
+from barsight.mapping.tiles import TILE_CELLS
+
+_BORDER_PX = 3.0
+_CUT_CELLS = 30
+_CUT_MARGIN_CELLS = 3
+_OVERHANG_CELLS = 10.0
+
+
+@kernel()
+def density(point: Float64, eye: Float64, one_point_m: float) -> float:
+    """Points that a view has in a level cell, at most 1."""
+    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
+    squared = x * x + y * y + z * z
+    return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
+
+
+@kernel()
+def inside(point: Float64, lens: Float64, size: Float64, rotation: Float64, translation: Float64) -> bool:
+    """Whether both cameras of a view have the point in their pictures."""
+    x, y, depth = translation[0], translation[1], translation[2]
+    for a in range(3):
+        x += rotation[0, a] * point[a]
+        y += rotation[1, a] * point[a]
+        depth += rotation[2, a] * point[a]
+    if depth <= 0:
+        return False
+    u, v = lens[0] * x / depth + lens[1], lens[0] * y / depth + lens[2]
+    right = u - (lens[0] * lens[3] / depth - lens[4])
+    across = min(u, right) >= _BORDER_PX and max(u, right) <= size[0] - 1 - _BORDER_PX
+    return bool(across and _BORDER_PX <= v <= size[1] - 1 - _BORDER_PX)
+
+
+@kernel()
+def may_be_covered(
+    point: Float64,
+    row: int,
+    column: int,
+    around: Float32,
+    ceiling: float,
+    lens: Float64,
+    size: Float64,
+    rotation: Float64,
+    translation: Float64,
+    cell_m: float,
+    min_views: float,
+) -> bool:
+    """Whether, within `_CUT_CELLS` along x or y, a much higher surface ends where fewer than min_views views
+    could see it go on towards the point: their pictures end there.
+    """
+    above = point.copy()
+    above[2] = ceiling
+    if views_of(above, lens, size, rotation, translation) >= min_views:
+        return False
+    for direction in range(4):
+        di, dj = (0, 0, 1, -1)[direction], (1, -1, 0, 0)[direction]
+        for n in range(1, _CUT_CELLS + 1):
+            height = around[row + TILE_CELLS + n * di, column + TILE_CELLS + n * dj]
+            if height > point[2] + _OVERHANG_CELLS * cell_m:
+                outward = max(n - _CUT_MARGIN_CELLS, 0) * cell_m
+                above[0], above[1], above[2] = point[0] + dj * outward, point[1] + di * outward, height
+                if views_of(above, lens, size, rotation, translation) < min_views:
+                    return True
+                break
+    return False
+
+
+@kernel()
+def views_of(point: Float64, lens: Float64, size: Float64, rotation: Float64, translation: Float64) -> int:
+    """How many views have the point in both pictures."""
+    count = 0
+    for k in range(rotation.shape[0]):
+        count += inside(point, lens, size, rotation[k], translation[k])
+    return count
+
+
+@kernel()
+def free(
+    point: Float64, row: int, column: int, eye: Float64, around: Float32, ceiling: float, cell_m: float
+) -> bool:
+    """Whether no cell between rises over the line from the point (in the middle tile) to the eye."""
+    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
+    length = max(abs(x), abs(y)) / cell_m
+    if length < 2:
+        return True
+    step_x, step_y, step_z = x / cell_m / length, y / cell_m / length, z / length
+    for n in range(2, int(length)):
+        height = point[2] + n * step_z
+        if height > ceiling:
+            return True
+        i = int(np.rint(row + TILE_CELLS + n * step_y))
+        j = int(np.rint(column + TILE_CELLS + n * step_x))
+        if i < 0 or j < 0 or i >= around.shape[0] or j >= around.shape[1]:
+            return True
+        if around[i, j] > height + cell_m:
+            return False
+    return True
