@@ -1,12 +1,11 @@
-"""Simulated views of a board by a rig whose numbers are known, and pictures of boards drawn exactly."""
+"""Simulated views of a board by a rig whose numbers are known."""
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.boards import Board, BoardKind, parse_board
+from barsight.calibration.boards import parse_board
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.views import BoardView, Corners
 
@@ -59,25 +58,3 @@ def simulated(
         if min(corners.ids.size for corners in view.cameras if corners) >= 20:
             views.append(view)
     return views
-
-
-def drawn(board: Board, px_per_m: float, margin_m: float) -> np.ndarray:
-    """The board seen straight on; its point (x, y) lies at (margin + x, margin + y) (AprilGrid: y up)."""
-    if board.kind is BoardKind.CHARUCO:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-        pattern = cv2.aruco.CharucoBoard(
-            (board.columns, board.rows), board.size_m, board.marker_m, dictionary
-        )
-        size = round(board.columns * board.size_m * px_per_m), round(board.rows * board.size_m * px_per_m)
-        inner = pattern.generateImage(size)
-    else:
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-        side, step = round(board.size_m * px_per_m), round(board.size_m * (1 + board.spacing) * px_per_m)
-        inner = np.full((step * (board.rows - 1) + side, step * (board.columns - 1) + side), 255, np.uint8)
-        for tag in range(board.rows * board.columns):
-            row, column = divmod(tag, board.columns)
-            y = (board.rows - 1 - row) * step
-            marker = cv2.aruco.generateImageMarker(dictionary, tag, side, borderBits=2)
-            inner[y : y + side, column * step : column * step + side] = marker
-    margin = round(margin_m * px_per_m)
-    return cv2.copyMakeBorder(inner, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=255)

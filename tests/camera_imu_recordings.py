@@ -15,7 +15,7 @@ from barsight.calibration.rig import StereoRig
 from barsight.calibration.views import BoardView, Corners
 from barsight.core.pose import Pose
 from barsight.core.types import ImuSamples
-from calibration_views import drawn
+from barsight.simulation.board import draw_board
 
 SIZE = (752, 480)
 BOARD = parse_board("aprilgrid:6x6:0.088:0.3")
@@ -127,7 +127,7 @@ def draw_recording(folder: Path, seconds: float = 4.0) -> StereoRig:
     _, imu, _ = simulated(2, seconds, shift_s=(0.0, 0.0))
     way = Way(np.random.default_rng(2), rig.body_from_cam0)
     px_per_m, margin_m = 1250.0, 0.1
-    picture = cv2.GaussianBlur(drawn(BOARD, px_per_m, margin_m), (0, 0), 1.2)
+    picture = cv2.GaussianBlur(draw_board(BOARD, px_per_m, margin_m), (0, 0), 1.2)
     low = margin_m * px_per_m - 0.5
     high = picture.shape[0] - 1 - low
     board_from_drawn = np.linalg.inv([[px_per_m, 0, low], [0, -px_per_m, high], [0, 0, 1]])

@@ -8,7 +8,7 @@ from barsight.calibration.board_detection import detect
 from barsight.calibration.boards import parse_board
 from barsight.calibration.views import Corners
 from barsight.core.errors import ConfigError, Failed
-from calibration_views import drawn
+from barsight.simulation.board import draw_board
 
 SCALE, MARGIN_M = 2000.0, 0.05
 TILT = np.array([[0.9, 0.12, 40.0], [-0.08, 0.85, 60.0], [1e-4, 5e-5, 1.0]])
@@ -17,7 +17,7 @@ TILT = np.array([[0.9, 0.12, 40.0], [-0.08, 0.85, 60.0], [1e-4, 5e-5, 1.0]])
 def picture(text: str) -> tuple[np.ndarray, np.ndarray]:
     """A tilted view of the board and its points' true pixels."""
     board = parse_board(text)
-    flat = drawn(board, SCALE, MARGIN_M)
+    flat = draw_board(board, SCALE, MARGIN_M)
     small = cv2.warpPerspective(flat, TILT, (900, 900), flags=cv2.INTER_AREA, borderValue=(255,))
     points = board.points_m[:, :2] * SCALE
     if text.startswith("charuco"):

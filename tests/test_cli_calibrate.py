@@ -7,8 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
+from barsight.calibration.board_detection import detect
+from barsight.calibration.boards import parse_board
 from barsight.calibration.rig_file import read_covariance
+from barsight.calibration.views import Corners
 from barsight.cli.main import run
 
 
@@ -79,3 +83,20 @@ def test_swapped_folders_and_wrong_sizes_are_said(
     assert "holds no pairs" in refused(capsys, ["calibrate", "stereo", str(tmp_path), *board, *out])
     assert "known are" in refused(capsys, ["calibrate", "lidar"])
     assert not list(tmp_path.glob("rig*"))
+
+
+def test_a_board_is_printed_in_its_true_size(tmp_path: Path) -> None:
+    board, out = "checkerboard:9x6:0.025", tmp_path / "board.png"
+    assert run(["calibrate", "board", "--board", board, "-o", str(out)]) == 0
+    with Image.open(out) as picture:
+        dpi, image = picture.info["dpi"][0], np.array(picture)
+    assert dpi == pytest.approx(300, abs=0.1)
+    found = detect(parse_board(board), image)
+    assert isinstance(found, Corners)
+    across = np.linalg.norm(found.pixels[8] - found.pixels[0]) * 0.0254 / dpi
+    assert across == pytest.approx(8 * 0.025, rel=2e-3)
+    views = tmp_path / "views.pdf"
+    assert run(["calibrate", "board", "--board", "aprilgrid:6x6:0.088:0.3", "--views", "-o", str(views)]) == 0
+    assert views.read_bytes().startswith(b"%PDF")
+    assert run(["calibrate", "board", "--board", board, "--dpi", "5", "-o", str(out)]) == 2
+    assert run(["calibrate", "board", "--board", board, "-o", str(tmp_path / "board.jpg")]) == 4

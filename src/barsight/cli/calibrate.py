@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from barsight.core.errors import ConfigError
 
 KINDS = {
+    "board": "Draw a board to print in its true size, or how to hold it before the cameras",
     "stereo": "Calibrate two cameras from pictures of a board: rig.yaml and a report that judges it",
     "camera-imu": "Where the cameras sit on the IMU and the clocks' offset, from a recording with a board",
     "check": "Has the rig drifted? Ordinary crane travel shows it, with sigma and cost in mm",
