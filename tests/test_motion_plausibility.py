@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.evaluation.drift import compare
 from barsight.inertial.model import without_saturation
@@ -109,13 +108,3 @@ def test_frozen_encoders_dont_pull(data: Path) -> None:
     assert mm < 0.95
     assert deg < 0.02
     assert any("frozen from 8" in warning for warning in warnings)
-
-
-def test_wrong_stamps_and_units_are_refused(data: Path) -> None:
-    with pytest.raises(InputError, match=r"1 frame\(s\) late"):
-        estimated(data / "yard_dev", stamps=lambda stamps: [*stamps[1:], 2 * stamps[-1] - stamps[-2]])
-    with pytest.raises(InputError, match="degrees/s"):
-        estimated(
-            data / "yard_dev",
-            spoil_imu=lambda imu: replace(imu, gyro_radps=np.degrees(imu.gyro_radps)),
-        )

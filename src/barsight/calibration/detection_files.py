@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -32,7 +33,8 @@ def read_detections(folder: Path, board: Board) -> list[BoardView]:
     return [BoardView(str(stamp), cameras[0].get(stamp), cameras[1].get(stamp)) for stamp in stamps]
 
 
-def _read(path: Path, board: Board) -> dict[int, Corners]:
+def read_rows(path: Path, fields: tuple[str, ...] = FIELDS) -> Any:
+    """The structured array of one camera. Raises CalibrationError where a field is missing or not finite."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             rows = archive["detections"]
@@ -40,11 +42,22 @@ def _read(path: Path, board: Board) -> dict[int, Corners]:
         raise CalibrationError(
             path, f"is no file of detections ({error})", "take the original file"
         ) from None
-    missing = [field for field in FIELDS if field not in (rows.dtype.names or ())]
+    missing = [field for field in fields if field not in (rows.dtype.names or ())]
     if missing:
         raise CalibrationError(
             path, f"lacks {', '.join(missing)}", "write every field of docs/calibration.md"
         )
+    finite = np.isfinite(rows["u"]) & np.isfinite(rows["v"])
+    if not finite.all():
+        count = int((~finite).sum())
+        raise CalibrationError(
+            path, f"{count} corners' pixels are NaN or infinite", "leave those corners out"
+        )
+    return rows
+
+
+def _read(path: Path, board: Board) -> dict[int, Corners]:
+    rows = read_rows(path)
     points = board.points_m
     place = np.column_stack([rows["x"], rows["y"]]).astype(np.float64)
     ids = np.asarray(KDTree(points[:, :2]).query(place)[1], dtype=np.int64)
@@ -56,11 +69,6 @@ def _read(path: Path, board: Board) -> dict[int, Corners]:
             "give the board these corners were detected on",
         )
     pixels = np.column_stack([rows["u"], rows["v"]]).astype(np.float64)
-    if not np.isfinite(pixels).all():
-        count = int((~np.isfinite(pixels).all(axis=1)).sum())
-        raise CalibrationError(
-            path, f"{count} corners' pixels are NaN or infinite", "leave those corners out"
-        )
     views = {}
     for stamp in np.unique(rows["stamp_ns"]):
         chosen = np.flatnonzero(rows["stamp_ns"] == stamp)

@@ -46,6 +46,7 @@ class Rectifier:
         rotation = _rectified_axes(rig)
         self.body_from_rect0 = rig.body_from_cam0 @ Pose("cam0", "rect0", rotation, np.zeros(3))
         right_rotation = right_from_rectified(rig)
+        self._lenses, self._rotations = (rig.cam0, rig.cam1), (rotation, right_rotation)
         self._warps: tuple[_Warp, _Warp] | None = None
         if _is_rectified(rig):
             self.camera = RectifiedCamera(
@@ -86,6 +87,18 @@ class Rectifier:
     def left(self, image: UInt8) -> UInt8:
         """The left image alone, of the calibration's size."""
         return image if self._warps is None else self._warps[0](image)
+
+    def places(self, left: Float64, right: Float64) -> tuple[Float64, Float64]:
+        """Where raw pixels (N, 2) of cam0 and cam1 come to lie in the rectified pair, (N, 2) each."""
+        camera = self.camera
+        placed = []
+        for lens, rotation, pixels, cx in zip(
+            self._lenses, self._rotations, (left, right), (camera.cx_px, camera.cx_px + camera.doffs_px),
+            strict=True,
+        ):  # fmt: skip
+            ray = lens.rays(pixels) @ rotation
+            placed.append(camera.focal_px * ray[:, :2] / ray[:, 2:] + (cx, camera.cy_px))
+        return placed[0], placed[1]
 
 
 def _rectified_axes(rig: StereoRig) -> Float64:

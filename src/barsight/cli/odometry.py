@@ -15,13 +15,16 @@ from rich.markup import escape
 from barsight.calibration.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.core.errors import MeasurementError
+from barsight.core.files import atomic_directory
 from barsight.core.types import Trajectory
-from barsight.evaluation.drift import Drift, compare
+from barsight.evaluation.drift import Drift, compare, frame_errors
+from barsight.motion.example import matching_example
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.open import open_recording
-from barsight.recording.truth import find_ground_truth, read_ground_truth
+from barsight.recording.truth import GroundTruth, find_ground_truth, read_ground_truth
 from barsight.report.files import write_trajectory
+from barsight.report.odometry_page import OdometryResult, write_odometry_page
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -37,20 +40,32 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             recording: The recording.
-            out: Folder for trajectory.tum; nothing is written where it is not given.
+            out: Folder for trajectory.tum, report.html and odometry.json; nothing is written without it.
             reading: How to read the recording.
             settings: The estimate's settings; --fusion.use names the sensors.
         """
         console = Console()
         source = open_recording(recording, reading)
-        trajectory = make_estimator(settings)(source, Rectifier(source.rig), lambda: None)
+        rectifier = Rectifier(source.rig)
+        trajectory = make_estimator(settings)(source, rectifier, lambda: None)
         if not trajectory.frames:
             why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"
             raise MeasurementError(f"{recording}: no frame could be placed: {why}")
+        truth = _truth(source)
+        drift = None if truth is None else compare(trajectory, truth, source.rig.timeshift_cam_imu_ns)
         if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            write_trajectory(trajectory, out / "trajectory.tum")
-        for line in _summary(trajectory) + _against_truth(source, trajectory):
+            front_end, with_crane = settings.fusion.front_end, "crane" in trajectory.sensors
+            example = matching_example(source, rectifier, trajectory.stamp_ns, front_end, with_crane)
+            errors = None
+            if truth is not None:
+                errors = frame_errors(trajectory, truth, source.rig.timeshift_cam_imu_ns)
+            frames = len(source.index.stamps_ns)
+            result = OdometryResult(recording.resolve().name, frames, trajectory, example, drift, errors)
+            with atomic_directory(out, replace=True) as folder:
+                write_trajectory(trajectory, folder / "trajectory.tum")
+                write_odometry_page(result, folder / "report.html", folder / "odometry.json")
+        lines = [] if truth is None else _drift_lines(drift)
+        for line in _summary(trajectory) + lines:
             console.print(escape(line), soft_wrap=True, highlight=False)
 
     call(command, "odometry", arguments)
@@ -69,16 +84,15 @@ def _summary(trajectory: Trajectory) -> list[str]:
     return lines
 
 
-def _against_truth(source: Recording, trajectory: Trajectory) -> list[str]:
+def _truth(source: Recording) -> GroundTruth | None:
     if find_ground_truth(source.path) is None:
-        return []
-    stamps = np.array(source.index.stamps_ns, np.int64)
-    truth = read_ground_truth(source.path, stamps)
-    drift = compare(trajectory, truth, source.rig.timeshift_cam_imu_ns)
-    return ["truth overlaps fewer than 3 frames"] if drift is None else _drift_lines(drift)
+        return None
+    return read_ground_truth(source.path, np.array(source.index.stamps_ns, np.int64))
 
 
-def _drift_lines(drift: Drift) -> list[str]:
+def _drift_lines(drift: Drift | None) -> list[str]:
+    if drift is None:
+        return ["truth overlaps fewer than 3 frames"]
     lines = [f"aligned to truth: {drift.aligned_rmse_mm:.2f} mm, {drift.aligned_rmse_deg:.4f} deg RMSE"]
     if not math.isnan(drift.reference_rmse_mm):
         lines.append(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, expect_shape
+from barsight.core.motion_detail import MotionDetail
 from barsight.core.pose import Pose
 
 
@@ -25,6 +26,23 @@ class StereoFrame:
     def __post_init__(self) -> None:
         expect_shape("left", self.left, (None, None))
         expect_shape("right", self.right, (None, None))
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPoints:
+    """What a pair shows of points that are known one from another. stamp_ns: cam0's clock.
+
+    names: (N,) int64, each once. left, right: (N, 2) raw px in cam0 and cam1.
+    """
+
+    stamp_ns: int
+    names: Int64
+    left: Float64
+    right: Float64
+
+    def __post_init__(self) -> None:
+        expect_shape("left", self.left, (self.names.size, 2))
+        expect_shape("right", self.right, (self.names.size, 2))
 
 
 @dataclass(frozen=True)
@@ -214,7 +232,7 @@ class Trajectory:
     """Poses of the frames that could be placed, in time's order, and the refused ones.
 
     reference: `yard` or `world`. sensors: which were used. warnings: sentences for the result.
-    drift: of the rig, where the estimate sees it.
+    drift: of the rig, where the estimate sees it. detail: what else it knows, where it is one of all sensors.
     """
 
     reference: str
@@ -223,6 +241,7 @@ class Trajectory:
     sensors: tuple[str, ...]
     warnings: tuple[str, ...] = ()
     drift: RigDrift | None = None
+    detail: MotionDetail | None = None
 
     @property
     def stamp_ns(self) -> Int64:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, Int64
 from barsight.core.stamps import NS_PER_S, interpolate_at
-from barsight.core.types import Trajectory
+from barsight.core.types import PosedFrame, Trajectory
 from barsight.recording.truth import GroundTruth
 
 
@@ -33,10 +33,42 @@ class Drift:
     nees_attitude: float
 
 
-def compare(
-    trajectory: Trajectory, truth: GroundTruth, shift_ns: int, least_way_m: float = 10.0
-) -> Drift | None:
-    """shift_ns: truth's clock minus the frames' (`timeshift_cam_imu`). None where fewer than 3 overlap."""
+@dataclass(frozen=True, eq=False)
+class FrameErrors:
+    """Estimate minus truth of the frames that truth covers. stamp_ns: (N,). place_m, turn_rad: (N, 3),
+    reference axes; in `world` after the best rigid motion.
+    """
+
+    stamp_ns: Int64
+    place_m: Float64
+    turn_rad: Float64
+
+
+def frame_errors(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> FrameErrors | None:
+    """shift_ns: truth's clock minus the frames'. None where fewer than 3 overlap."""
+    met = _met(trajectory, truth, shift_ns)
+    if met is None:
+        return None
+    place, true_place = met.place, met.true_place
+    off = met.turn * met.true_turn.inv()
+    if trajectory.reference != "yard":
+        place, off = align(place, true_place), off.mean().inv() * off
+    stamps = np.array([frame.stamp_ns for frame in met.frames], np.int64)
+    return FrameErrors(stamps, place - true_place, off.as_rotvec())
+
+
+@dataclass(frozen=True, eq=False)
+class _Met:
+    """The frames that truth covers, and truth at their stamps."""
+
+    frames: list[PosedFrame]
+    place: Float64
+    turn: Rotation
+    true_place: Float64
+    true_turn: Rotation
+
+
+def _met(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> _Met | None:
     stamps = trajectory.stamp_ns + shift_ns
     inside = (stamps >= truth.stamp_ns[0]) & (stamps <= truth.stamp_ns[-1])
     if inside.sum() < 3:
@@ -49,6 +81,18 @@ def compare(
     seconds = (truth.stamp_ns - truth.stamp_ns[0]) / NS_PER_S
     turns = Rotation.from_matrix(np.array([pose.rotation for pose in truth.poses]))
     true_turn = Slerp(seconds, turns)((stamps[inside] - truth.stamp_ns[0]) / NS_PER_S)
+    return _Met(frames, place, turn, true_place, true_turn)
+
+
+def compare(
+    trajectory: Trajectory, truth: GroundTruth, shift_ns: int, least_way_m: float = 10.0
+) -> Drift | None:
+    """shift_ns: truth's clock minus the frames' (`timeshift_cam_imu`). None where fewer than 3 overlap."""
+    met = _met(trajectory, truth, shift_ns)
+    if met is None:
+        return None
+    frames, place, turn = met.frames, met.place, met.turn
+    true_place, true_turn = met.true_place, met.true_turn
     aligned = align(place, true_place)
     off = turn * true_turn.inv()
     spread = (off.mean().inv() * off).magnitude()

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.motion_detail import Inertial, InSigmas
 from barsight.core.pose import Pose
 from barsight.core.types import RigDrift
 from barsight.inertial.model import ImuBias
 from barsight.motion import rig_drift
+from barsight.motion.detail import imu_in_sigmas, inertial, pictures_in_sigmas
 from barsight.motion.encoders import EncoderState, agreeing, disagreement, encoder_state
 from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import Marginals, marginals
@@ -32,7 +34,8 @@ class Estimate:
     """poses: (M,). covariance: (M, 6, 6) rotation then translation, reference axes. velocity_mps: (M, 3) or
     None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
     drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
-    without. encoder_off_m: (P, 3) of each place, encoder_used: (P,) those that agree.
+    without. encoder_off_m: (P, 3) of each place, encoder_used: (P,) those that agree. inertial, pictures,
+    imu: of the nodes, their stamps by the nodes' clock; points: (M,) sightings used at each.
     """
 
     poses: tuple[Pose, ...]
@@ -45,6 +48,10 @@ class Estimate:
     encoders: EncoderState | None
     encoder_off_m: Float64
     encoder_used: Bool
+    inertial: Inertial | None
+    pictures: InSigmas | None
+    imu: InSigmas | None
+    points: Int64
 
 
 def solve(problem: Problem) -> Estimate:
@@ -81,10 +88,12 @@ def solve(problem: Problem) -> Estimate:
     poses, found = _poses(state, problem), marginals(system)
     velocity, biases = _inertial(state, problem)
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
+    pictures, points = pictures_in_sigmas(problem, state, used)
     return Estimate(
         poses, covariances(found, poses, drift), velocity, biases, sigma, drift, used,
         encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
         disagreement(state.values, everywhere), agreeing(state.values, everywhere),
+        inertial(problem, state, system), pictures, imu_in_sigmas(problem, state), points,
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +11,11 @@ import numpy as np
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
+from barsight.core.motion_detail import Inertial, InSigmas, MotionDetail
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
+from barsight.motion.corners import follow_corners
 from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position, with_seen_noise
 from barsight.motion.gravity import Level, level_attitude
 from barsight.motion.nodes import Nodes, make_nodes, start_poses, tied_by_imu
@@ -22,6 +24,7 @@ from barsight.motion.plausibility import check_crane, frames_off, gyro_in_degree
 from barsight.motion.prediction import CranePredictor
 from barsight.motion.sightings import FrontEndSettings, Sighting, follow
 from barsight.recording.base import Recording
+from barsight.recording.corners import CornerRecording
 
 if TYPE_CHECKING:
     from barsight.motion.batch import Estimate
@@ -92,7 +95,7 @@ class FusedTrajectory:
             return self._simple(recording, rectifier, inputs)
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
-            estimate, seen = self._solve(recording, rectifier, inputs, nodes, shift)
+            estimate, seen, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
         except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
             simple = self._simple(recording, rectifier, inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
@@ -104,8 +107,9 @@ class FusedTrajectory:
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
         return Trajectory(
-            self._reference(inputs), placed, tuple(refused), sensors, inputs.warnings + seen, estimate.drift
-        )
+            self._reference(inputs), placed, tuple(refused), sensors, inputs.warnings + seen, estimate.drift,
+            _detail(estimate, inputs.sightings, nodes, encoders, shift),
+        )  # fmt: skip
 
     def _simple(self, recording: Recording, rectifier: Rectifier, inputs: _Inputs) -> Trajectory:
         """Without a graph: the encoders' trajectory, or frame to frame."""
@@ -132,7 +136,11 @@ class FusedTrajectory:
             shift = recording.rig.timeshift_cam_imu_ns
             bias = np.zeros(3) if imu is None else imu.gyro_radps.mean(axis=0)
             predictor = CranePredictor(crane, imu, bias, rectifier, shift) if crane else lambda a, b: None
-            sightings, refused = follow(recording, rectifier, predictor, self.settings.front_end, advance)
+            if isinstance(recording, CornerRecording):
+                rough = self.settings.front_end.rough
+                sightings, refused = follow_corners(recording, rectifier, rough, advance)
+            else:
+                sightings, refused = follow(recording, rectifier, predictor, self.settings.front_end, advance)
         else:
             for _ in recording.index.stamps_ns:
                 advance()
@@ -165,9 +173,10 @@ class FusedTrajectory:
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
-    ) -> tuple[Estimate, tuple[str, ...]]:
+    ) -> tuple[Estimate, tuple[str, ...], InSigmas | None]:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
         from barsight.motion.batch import solve
+        from barsight.motion.detail import encoders_in_sigmas
         from barsight.motion.encoders import encoder_warnings
         from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
 
@@ -211,7 +220,27 @@ class FusedTrajectory:
         warnings = encoder_warnings(
             estimate.encoders, nodes.stamp_ns, problem.placed, estimate.encoder_off_m, estimate.encoder_used
         )
-        return estimate, warnings
+        encoders = encoders_in_sigmas(nodes.stamp_ns, problem.placed, estimate.encoder_off_m)
+        return estimate, warnings, encoders
+
+
+def _detail(
+    estimate: Estimate, sightings: tuple[Sighting, ...], nodes: Nodes, encoders: InSigmas | None, shift: int
+) -> MotionDetail:
+    """By cam0's clock; of the frames alone where it is of the nodes."""
+    inertial = estimate.inertial
+    if inertial is not None:
+        values = {f.name: getattr(inertial, f.name)[nodes.frame] for f in fields(inertial)}
+        inertial = Inertial(**{**values, "stamp_ns": values["stamp_ns"] - shift})
+    seen = {sighting.stamp_ns: sighting.ambiguous for sighting in sightings}
+    shown = np.flatnonzero(estimate.points)
+    ambiguous = [seen.get(int(stamp) - shift, 0) for stamp in nodes.stamp_ns[shown]]
+    points = np.column_stack([estimate.points[shown], np.array(ambiguous, np.int64)])
+    by_frames = [
+        None if part is None else replace(part, stamp_ns=part.stamp_ns - shift)
+        for part in (estimate.pictures, estimate.imu, encoders)
+    ]
+    return MotionDetail(inertial, by_frames[0], by_frames[1], by_frames[2], points)
 
 
 def _silent() -> None:

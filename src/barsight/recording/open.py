@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from barsight.calibration.detection_files import has_detections
 from barsight.core.errors import InputError
 from barsight.recording.bag import BagRecording
 from barsight.recording.base import RecordingSettings
+from barsight.recording.corners import CornerRecording
 from barsight.recording.euroc import EurocRecording
 from barsight.recording.kitti import KittiRecording, is_kitti
 from barsight.recording.stored import Source
@@ -14,7 +16,7 @@ from barsight.recording.stored import Source
 BAG_KINDS = {".bag": "ros1", ".mcap": "ros2-mcap", ".db3": "ros2-sqlite3"}
 KNOWN = (
     "an EuRoC folder (holding mav0), a KITTI odometry sequence (calib.txt, image_0, image_1), a ROS 1 .bag, "
-    "a ROS 2 bag folder (metadata.yaml), a .mcap or a .db3"
+    "a ROS 2 bag folder (metadata.yaml), a .mcap, a .db3 or a board's corners (camN_detections.npz)"
 )
 
 
@@ -42,6 +44,8 @@ def _open(path: Path, settings: RecordingSettings) -> Source:
     bags = sorted(file for file in path.iterdir() if file.suffix in BAG_KINDS and file.is_file())
     if (path / "metadata.yaml").is_file() or bags:
         return _open_bag_folder(path, bags, settings)
+    if has_detections(path):
+        return CornerRecording(path, settings)
     if is_kitti(path):
         return KittiRecording(path, settings)
     raise InputError(path, "is no recording that Barsight knows", f"give {_hint(path) or KNOWN}")

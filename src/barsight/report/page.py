@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -14,6 +14,7 @@ import jinja2
 from plotly.offline import get_plotlyjs
 
 from barsight.core.files import atomic_path
+from barsight.report.match_pictures import Picture
 from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_path import path_plots
 from barsight.report.page_yard import yard_part
@@ -52,16 +53,17 @@ def write_report(out_dir: Path, target: Path) -> None:
 
 
 def write_summary_page(
-    template: str, summary: dict[str, Any], figures: list[Figure], plots: list[Plot], html: Path, data: Path
-) -> None:
+    template: str, summary: dict[str, Any], figures: list[Figure], plots: list[Plot], html: Path, data: Path,
+    pictures: Sequence[Picture] = (),
+) -> None:  # fmt: skip
     """Write a page of key figures and plots to `html`, and its summary as JSON to `data`, each whole or not
-    at all. The template finds the plots in `plots`, by name."""
+    at all. The template finds the plots in `plots`, by name, and the pictures in `pictures`."""
     with atomic_path(data) as path:
         path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     page = environment().get_template(template).render(
         summary=summary, figures=figures, plots={plot.name: plot for plot in plots},
         plot_data=plot_json(plots), plotly_js=get_plotlyjs(), css=resource("page.css"),
-        script=resource("page_script.js.jinja"),
+        script=resource("page_script.js.jinja"), pictures=pictures,
     )  # fmt: skip
     with atomic_path(html) as path:
         path.write_text(page, encoding="utf-8")

@@ -1,0 +1,47 @@
+"""What an estimate of the motion knows besides the poses, for reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from barsight.core.arrays import Float64, Int64
+
+
+@dataclass(frozen=True, eq=False)
+class InSigmas:
+    """What a sensor measured minus what the whole estimate says, over its stated sigma.
+
+    stamp_ns: (K,) cam0's clock. values: (K, C), one column for each of `names`. One value should scatter
+    by 1; a root mean square of many stands for them where there are many at a stamp.
+    """
+
+    names: tuple[str, ...]
+    stamp_ns: Int64
+    values: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """Velocity (reference axes) and the IMU's biases (body axes), (F, 3) each, with one sigma of each."""
+
+    stamp_ns: Int64
+    velocity_mps: Float64
+    velocity_sigma_mps: Float64
+    gyro_bias_radps: Float64
+    gyro_bias_sigma_radps: Float64
+    accel_bias_mps2: Float64
+    accel_bias_sigma_mps2: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class MotionDetail:
+    """inertial: None without IMU. pictures: u, v and right u of each frame, RMS over its points; imu: turn,
+    way and speed between neighbours, RMS over the axes; encoders: x, y, z of each place, those left out
+    included. points: (F, 2) of each frame of `pictures`: used, and refused as ambiguous.
+    """
+
+    inertial: Inertial | None
+    pictures: InSigmas | None
+    imu: InSigmas | None
+    encoders: InSigmas | None
+    points: Int64

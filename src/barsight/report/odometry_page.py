@@ -1,0 +1,251 @@
+"""The page of `barsight odometry`: path, velocity, biases, residuals, drift, matches; and its JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import barsight
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import Failed
+from barsight.core.motion_detail import InSigmas
+from barsight.core.stamps import NS_PER_S
+from barsight.core.types import Trajectory
+from barsight.evaluation.drift import Drift, FrameErrors
+from barsight.motion.example import MatchingExample
+from barsight.report.match_pictures import match_pictures
+from barsight.report.page import Figure, number, write_summary_page
+from barsight.report.page_path import path_plots
+from barsight.report.plots import SERIES, Plot, Trace, keep_extremes, numbers
+from barsight.result_folder import CameraPath
+
+MOST_POINTS = 6000
+AXES = "xyz"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OdometryResult:
+    """What the page is made of. frames: of the recording. example: a pair's matches, or why there are none.
+    drift, errors: None without truth.
+    """
+
+    source: str
+    frames: int
+    trajectory: Trajectory
+    example: MatchingExample | Failed
+    drift: Drift | None
+    errors: FrameErrors | None
+
+
+def write_odometry_page(result: OdometryResult, html: Path, data: Path) -> None:
+    """Write the page to `html` and its numbers to `data`, each whole or not at all."""
+    pictures = () if isinstance(result.example, Failed) else match_pictures(result.example)
+    summary = odometry_summary(result)
+    plots = [*_path(result.trajectory), *_states(result), *_in_sigmas(result), *_sigma(result)]
+    write_summary_page(
+        "odometry_page.html.jinja", summary, _figures(result), plots, html, data, pictures=pictures
+    )
+
+
+def odometry_summary(result: OdometryResult) -> dict[str, Any]:
+    """Everything of the page as JSON values; NaN is null."""
+    trajectory, detail = result.trajectory, result.trajectory.detail
+    frames: list[dict[str, Any]] = [
+        {
+            "stamp_ns": frame.stamp_ns,
+            "position_m": frame.reference_from_body.translation.tolist(),
+            "quaternion_xyzw": frame.reference_from_body.quaternion_xyzw.tolist(),
+            "covariance": frame.covariance.tolist(),
+        } for frame in trajectory.frames
+    ]  # fmt: skip
+    if detail is not None and detail.inertial is not None:
+        columns = {
+            f.name: getattr(detail.inertial, f.name).tolist()
+            for f in dataclasses.fields(detail.inertial) if f.name != "stamp_ns"
+        }  # fmt: skip
+        for k, frame in enumerate(frames):
+            frame |= {name: rows[k] for name, rows in columns.items()}
+    parts = {} if detail is None else {
+        "pictures": detail.pictures, "imu": detail.imu, "encoders": detail.encoders
+    }  # fmt: skip
+    example = result.example
+    return {
+        "schema": 1,
+        "software": {"name": "barsight", "version": barsight.__version__},
+        "source": result.source,
+        "reference": trajectory.reference,
+        "sensors": list(trajectory.sensors),
+        "frames_total": result.frames,
+        "refused": [dataclasses.asdict(frame) for frame in trajectory.refused],
+        "warnings": list(trajectory.warnings),
+        "length_m": trajectory.length_m,
+        "seconds": _seconds(trajectory.stamp_ns[-1:], trajectory)[0],
+        "drift": None if result.drift is None else _without_nan(dataclasses.asdict(result.drift)),
+        "rig_drift": _rig_drift(trajectory),
+        "residuals_in_sigma": {
+            name: {
+                "names": list(part.names), "stamp_ns": part.stamp_ns.tolist(),
+                "values": part.values.tolist(), "rms": np.sqrt((part.values**2).mean(axis=0)).tolist(),
+            }
+            for name, part in parts.items() if part is not None and part.stamp_ns.size
+        },
+        "matches": {"failed": example.reason} if isinstance(example, Failed) else {
+            "stamps_ns": list(example.stamps_ns), "raw": len(example.raw),
+            "filtered": int(example.filtered.sum()), "followed": len(example.followed),
+            "agreed": int(example.agreed.sum()), "ambiguous": int(example.ambiguous.sum()),
+        },
+        "frames": frames,
+    }  # fmt: skip
+
+
+def _figures(result: OdometryResult) -> list[Figure]:
+    trajectory, drift = result.trajectory, result.drift
+    sigma = _sigmas(trajectory)
+    turn, place = (
+        float(np.sqrt((sigma[:, part] ** 2).sum(axis=1).mean())) for part in (slice(3), slice(3, 6))
+    )
+    figures = [
+        Figure(
+            "Frames", f"{len(trajectory.frames)} of {result.frames}", f"{len(trajectory.refused)} refused"
+        ),
+        Figure("Way", number(trajectory.length_m, 2, "m"), f"in {trajectory.reference}"),
+        Figure(
+            "Stated sigma",
+            number(place * 1e3, 2, "mm"),
+            number(math.degrees(turn), 4, "°"),
+        ),
+    ]
+    if drift is not None:
+        figures.append(Figure(
+            "Against truth, aligned", number(drift.aligned_rmse_mm, 2, "mm"),
+            f"{number(drift.aligned_rmse_deg, 3, '°')} RMSE"))  # fmt: skip
+        if not math.isnan(drift.reference_rmse_mm):
+            nees = f"{number(drift.nees_position, 2)} and {number(drift.nees_attitude, 2)}"
+            figures.append(Figure(
+                "In the yard", number(drift.reference_rmse_mm, 2, "mm"),
+                f"{number(drift.reference_rmse_deg, 3, '°')} RMSE; NEES {nees}"))  # fmt: skip
+        if not math.isnan(drift.drift_percent):
+            note = f"over {drift.least_way_m:.0f} m and more"
+            figures.append(Figure("Drift", number(drift.drift_percent, 3, "%"), note))
+    return figures
+
+
+def _path(trajectory: Trajectory) -> tuple[Plot, ...]:
+    quaternions = np.array([frame.reference_from_body.quaternion_xyzw for frame in trajectory.frames])
+    path = CameraPath(trajectory.stamp_ns, trajectory.positions_m, quaternions)
+    return path_plots(path, trajectory.reference)
+
+
+def _states(result: OdometryResult) -> list[Plot]:
+    """Velocity and biases with two sigma to either side."""
+    detail = result.trajectory.detail
+    if detail is None or detail.inertial is None:
+        return []
+    known, plots = detail.inertial, []
+    time = _seconds(known.stamp_ns, result.trajectory)
+    for name, title, scale, values, sigma in (
+        ("velocity", "velocity / mm/s", 1e3, known.velocity_mps, known.velocity_sigma_mps),
+        ("gyro-bias", "gyro bias / °/s", 180 / np.pi, known.gyro_bias_radps, known.gyro_bias_sigma_radps),
+        ("accel-bias", "accelerometer bias / mm/s²", 1e3, known.accel_bias_mps2, known.accel_bias_sigma_mps2),
+    ):
+        traces: list[Trace] = []
+        for axis in range(3):
+            middle, half = values[:, axis] * scale, 2 * sigma[:, axis] * scale
+            traces.append(_line(AXES[axis], time, middle, axis))
+            for side in (-1, 1):
+                edge = _line(AXES[axis], time, middle + side * half, axis)
+                edge |= {"mode": "lines", "line": {**edge["line"], "dash": "dot", "width": 0.8}}
+                traces.append({**edge, "showlegend": False, "hoverinfo": "skip"})
+        where = "reference axes" if name == "velocity" else "the IMU's axes"
+        plots.append(_over_time(name, title, traces, f"In {where}; dotted: ± 2 sigma."))
+    return plots
+
+
+def _in_sigmas(result: OdometryResult) -> list[Plot]:
+    detail = result.trajectory.detail
+    if detail is None:
+        return []
+    plots = []
+    for name, part, caption in (
+        ("pictures", detail.pictures, "Pictures: each frame's points, root mean square of u, v and right u."),
+        ("imu", detail.imu, "IMU: between neighbours, root mean square over the axes."),
+        ("encoders", detail.encoders, "Encoders: each place, those left out included."),
+    ):
+        if part is not None and part.stamp_ns.size:
+            plots.append(_sensor(name, part, caption, result.trajectory))
+    return plots
+
+
+def _sensor(name: str, part: InSigmas, caption: str, trajectory: Trajectory) -> Plot:
+    time = _seconds(part.stamp_ns, trajectory)
+    traces = [_line(label, time, part.values[:, k], k) for k, label in enumerate(part.names)]
+    return _over_time(
+        f"in-sigma-{name}", "sigma", traces, f"{caption} Measured minus estimated, over the stated sigma."
+    )
+
+
+def _sigma(result: OdometryResult) -> list[Plot]:
+    """Stated sigma of every frame, and where there is truth the errors."""
+    trajectory = result.trajectory
+    time, sigma = _seconds(trajectory.stamp_ns, trajectory), _sigmas(trajectory)
+    plots = []
+    for name, title, part, scale in (
+        ("place", "mm", slice(3, 6), 1e3), ("attitude", "°", slice(0, 3), 180 / np.pi),
+    ):  # fmt: skip
+        traces = [_line(AXES[k], time, sigma[:, part][:, k] * scale, k) for k in range(3)]
+        plots.append(
+            _over_time(f"sigma-{name}", f"sigma / {title}", traces, f"One sigma of each frame's {name}.")
+        )
+    errors = result.errors
+    if errors is not None:
+        over = "in the yard" if trajectory.reference == "yard" else "after the best rigid motion"
+        at = _seconds(errors.stamp_ns, trajectory)
+        for name, title, values, scale in (
+            ("place", "mm", errors.place_m, 1e3), ("attitude", "°", errors.turn_rad, 180 / np.pi),
+        ):  # fmt: skip
+            traces = [_line(AXES[k], at, values[:, k] * scale, k) for k in range(3)]
+            caption = f"Estimate minus truth {over}: {name}."
+            plots.append(_over_time(f"error-{name}", f"error / {title}", traces, caption))
+    return plots
+
+
+def _rig_drift(trajectory: Trajectory) -> dict[str, float] | None:
+    drift = trajectory.drift
+    return None if drift is None else {
+        "yaw_rad": drift.yaw_rad, "yaw_sigma_rad": drift.yaw_sigma_rad, "scale": drift.scale,
+        "scale_sigma": drift.scale_sigma,
+    }  # fmt: skip
+
+
+def _sigmas(trajectory: Trajectory) -> Float64:
+    """(F, 6) of attitude (rad) and place (m)."""
+    variances = np.array([np.diag(frame.covariance) for frame in trajectory.frames])
+    return np.asarray(np.sqrt(variances), np.float64)
+
+
+def _seconds(stamp_ns: Int64, trajectory: Trajectory) -> Float64:
+    """Since the first placed frame."""
+    result: Float64 = (stamp_ns - trajectory.stamp_ns[0]) / NS_PER_S
+    return result
+
+
+def _over_time(name: str, title: str, traces: list[Trace], caption: str) -> Plot:
+    layout = {"xaxis": {"title": {"text": "time / s"}}, "yaxis": {"title": {"text": title}}}
+    return Plot(name, traces, layout, 300, caption)
+
+
+def _line(name: str, x: Float64, y: Float64, colour: int) -> Trace:
+    kept = keep_extremes(y, MOST_POINTS)
+    return {
+        "type": "scatter", "mode": "lines+markers" if x.size <= 60 else "lines", "name": name,
+        "x": numbers(x[kept], 3), "y": numbers(y[kept], 5), "line": {"color": SERIES[colour], "width": 1.4},
+        "marker": {"color": SERIES[colour], "size": 4},
+    }  # fmt: skip
+
+
+def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
+    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}

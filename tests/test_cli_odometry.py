@@ -1,0 +1,124 @@
+"""`barsight odometry`: what it writes, and sensors that mislead it."""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.cli.main import run
+
+PITCH_M = 0.09
+"""A bar of the development yard."""
+
+
+def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a [b] c"
+    assert run(["odometry", str(whole), "-o", str(out)]) == 0
+    assert "placed in yard" in capsys.readouterr().out
+    assert sorted(path.name for path in out.iterdir()) == ["odometry.json", "report.html", "trajectory.tum"]
+    page = (out / "report.html").read_text()
+    body = page.partition("<script>")[0]
+    assert 'src="http' not in body and 'href="http' not in body
+    for section in ("path", "truth", "sigma", "states", "innovations", "matches", "refused"):
+        assert f'<section id="{section}">' in page
+    for picture in ("features", "raw", "filtered", "guided", "enlarged"):
+        assert f'<figure id="{picture}">' in page
+    data = json.loads((out / "odometry.json").read_text())
+    assert len(data["frames"]) + len(data["refused"]) == data["frames_total"] == 4
+    assert data["sensors"] == ["crane", "imu", "stereo"]
+    frame = data["frames"][0]
+    assert np.array(frame["covariance"]).shape == (6, 6)
+    assert (np.array(frame["velocity_sigma_mps"]) > 0).all()
+    assert set(data["residuals_in_sigma"]) == {"pictures", "imu", "encoders"}
+    assert all(max(part["rms"]) < 3 for part in data["residuals_in_sigma"].values())
+    assert data["drift"]["reference_rmse_mm"] < 20
+    assert run(["odometry", str(whole), "-o", str(out), "--fusion.use", "stereo"]) == 0
+    data = json.loads((out / "odometry.json").read_text())
+    assert data["reference"] == "world" and "velocity_mps" not in data["frames"][0]
+
+
+@pytest.fixture
+def yard(data: Path, tmp_path: Path) -> Path:
+    """The development yard, its pictures linked and its tables open to change."""
+    source, copy = data / "yard_dev", tmp_path / "yard"
+    for folder, _, names in os.walk(source / "mav0"):
+        to = copy / Path(folder).relative_to(source)
+        to.mkdir(parents=True)
+        for name in names:
+            if name.endswith(".png"):
+                (to / name).symlink_to(Path(folder) / name)
+            else:
+                shutil.copyfile(Path(folder) / name, to / name)
+    return copy
+
+
+def change(yard: Path, sensor: str, edit: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+    """edit: stamps (N,) in s since the first and values (N, C) to new values, NaN first to drop a row."""
+    path = yard / "mav0" / sensor / "data.csv"
+    header, *rows = path.read_text().splitlines()
+    stamps = np.array([int(row.split(",")[0]) for row in rows])
+    values = edit((stamps - stamps[0]) / 1e9, np.array([row.split(",")[1:] for row in rows], float))
+    lines = [
+        ",".join([str(stamp), *map(repr, row)])
+        for stamp, row in zip(stamps.tolist(), values.tolist(), strict=True) if row[0] == row[0]
+    ]  # fmt: skip
+    path.write_text("\n".join([header, *lines]) + "\n")
+
+
+def figures(text: str) -> tuple[float, float]:
+    """mm and degrees in the yard."""
+    line = next(line for line in text.splitlines() if line.startswith("in the yard"))
+    return float(line.split()[3]), float(line.split()[5])
+
+
+def test_encoders_off_by_a_bar_and_a_torn_imu(yard: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From 10 s on the encoders, and with them all predictions, are one bar further; the IMU stands at the
+    end of its scale for 0.1 s and is silent for 0.3 s.
+    """
+
+    def jump(time: np.ndarray, place: np.ndarray) -> np.ndarray:
+        return place + np.where(time >= 10, PITCH_M, 0)[:, None] * [1, 0, 0]
+
+    def tear(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+        values[(time > 5) & (time < 5.1), 3] = 39.2
+        values[(time > 7) & (time < 7.3)] = np.nan
+        return values
+
+    change(yard, "crane0", jump)
+    change(yard, "imu0", tear)
+    assert run(["odometry", str(yard)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"the encoders jump by (8[5-9]|9[0-5]) mm at (9\.9|10\.\d) s", text)
+    assert "19 IMU samples are at the end of their scale" in text
+    mm, deg = figures(text)
+    assert mm < 4 and deg < 0.05
+
+
+@pytest.mark.parametrize(
+    ("sensor", "scale", "words"),
+    [("imu0", [180 / np.pi] * 3 + [1] * 3, "degrees/s"), ("imu0", [1] * 3 + [1 / 9.80665] * 3, "in g")],
+)
+def test_wrong_units_are_refused(
+    yard: Path, capsys: pytest.CaptureFixture[str], sensor: str, scale: list[float], words: str
+) -> None:
+    change(yard, sensor, lambda time, values: values * scale)
+    assert run(["odometry", str(yard), "-o", str(yard / "out")]) == 3
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert not (yard / "out").exists()
+
+
+def test_stamps_off_by_a_frame_are_found(yard: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for camera in ("cam0", "cam1"):
+        path = yard / "mav0" / camera / "data.csv"
+        header, *rows = path.read_text().splitlines()
+        stamps, names = zip(*(row.split(",") for row in rows), strict=True)
+        moved = [f"{stamp},{name}" for stamp, name in zip(stamps[1:], names[:-1], strict=True)]
+        path.write_text("\n".join([header, *moved]) + "\n")
+    assert run(["odometry", str(yard)]) == 3
+    assert "1 frame(s) late against gyro and encoders" in capsys.readouterr().err
