@@ -17,6 +17,7 @@ from barsight.stereo.plane_fits import SupportShape, fit_planes
 from barsight.stereo.semiglobal import SemiGlobalSettings, match
 from barsight.stereo.spline import row_coefficients, value_and_slope
 from barsight.stereo.supports import TILE_COLUMNS, TILE_ROWS, axis_means, tile_axes
+from barsight.stereo.windows import equalised_difference, window_means
 
 HEIGHT, WIDTH = 40, 70
 
@@ -303,3 +304,21 @@ def test_only_jumps_between_known_neighbours_are_edges() -> None:
     beside = beside_edges(disparity, 1.0)
     assert (beside[:, 39:41] == 1).all() and (beside[:, 18:23] < 0.01).all()
     np.testing.assert_allclose(beside[20, 43], np.exp(-1.0), rtol=0.05)
+
+
+def test_windows_are_what_box_filters_say() -> None:
+    left, right = _noise(21, 20) + 100, _noise(22, 30) + 90
+    usable = (_noise(23) > -0.8).astype(np.float32)
+
+    def mean(image: np.ndarray) -> np.ndarray:
+        return cv2.boxFilter(image, -1, (21, 21))
+
+    share = mean(usable) + 1e-6
+    means = [mean(usable * image) / share for image in (left, right)]
+    powers = [mean(usable * i * i) / share - m * m + 4 for i, m in zip((left, right), means, strict=True)]
+    wanted = left - means[0] - np.sqrt(powers[0] / powers[1]) * (right - means[1])
+    found = equalised_difference(left, right, usable, 21, np.float32(4))
+    np.testing.assert_allclose(found, wanted, atol=5e-3)
+    sums = window_means(np.stack([left, right]), usable, 21, 10)
+    for image, summed in zip((left, right), sums, strict=True):
+        np.testing.assert_allclose(summed, mean(usable * image)[::10, ::10], rtol=1e-4)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Literal
@@ -32,7 +32,7 @@ from barsight.kept import keeping_folder, once
 from barsight.mapping.contours import cut_contours
 from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
-from barsight.mapping.look import choose_cell, first_look, points_per_pixel
+from barsight.mapping.look import apart, choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import finish
 from barsight.mapping.tiles import TileStore
@@ -57,12 +57,15 @@ Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
 WORKERS = 2
+_FAST_SHIFT = 0.1
 
 
 @dataclass(frozen=True)
 class MeasureSettings:
     """Everything that `barsight measure` can be told; each stage gets its own part only."""
 
+    preset: Literal["best", "fast"] = "best"
+    """fast: the stereo preset `fast`, and no more pictures matched than lie a tenth apart."""
     use: tuple[Literal["stereo", "imu", "crane"], ...] = ("stereo", "imu", "crane")
     """Sensors that may be used, where the recording has them."""
     self_calibrate: Literal["none", "yaw"] = "none"
@@ -78,6 +81,14 @@ class MeasureSettings:
         if "stereo" not in self.use:
             raise ConfigError("stereo can't be left out of --use: it is what measures")
         expect_numbers(asdict(self))
+
+    def chosen(self) -> MeasureSettings:
+        """The same with what the preset says written out."""
+        if self.preset == "best":
+            return self
+        stereo = replace(self.stereo, barsight=replace(self.stereo.barsight, preset="fast"))
+        shift = max(self.map.least_shift, _FAST_SHIFT)
+        return replace(self, stereo=stereo, map=replace(self.map, least_shift=shift))
 
 
 def measure(
@@ -97,6 +108,7 @@ def measure(
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
     """
+    settings = settings.chosen()
     expected = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
     source = SelectedSensors(recording, settings.use)
     watch = Stopwatch()
@@ -124,7 +136,8 @@ def measure(
         )
         rectifier = calibrated.rectifier
 
-    poses = {frame.stamp_ns: frame for frame in trajectory.frames}
+    taken = apart(trajectory.frames, rectifier, first.range_m, settings.map.least_shift)
+    poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
     method = make_method(settings.stereo.for_map())
@@ -150,7 +163,7 @@ def measure(
             with watch("fuse", 1):
                 fuse(store, view.cells, settings.map)
             placed.append(poses[view.stamp_ns].reference_from_body @ rectifier.body_from_rect0)
-            if preview is None or abs(done - total / 2) < 1:
+            if preview is None or abs(done - len(poses) / 2) < 1:
                 preview = Preview(view.left, view.disparity_px)
         advance("map", done, len(poses))
     used = len(placed)
@@ -237,7 +250,7 @@ def measure(
 def _placed(
     source: Recording, poses: dict[int, PosedFrame]
 ) -> Iterator[tuple[StereoFrame | RefusedFrame, PosedFrame, list[Placed]]]:
-    """The frames that have a pose, each with those before and after it."""
+    """The frames that are taken, each with those before and after it."""
     known = ((frame, poses[frame.stamp_ns]) for frame in source.frames() if frame.stamp_ns in poses)
     before = None
     for here, after in pairwise(chain(known, (None,))):

@@ -18,7 +18,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "paper": ("--stereo.method", "paper", "--motion.estimator", "paper", "--map.contours", "paper"),
     "sgbm": ("--stereo.method", "sgbm"),
     "ours": (),
-    "ours fast": ("--stereo.barsight.preset", "fast"),
+    "ours fast": ("--preset", "fast"),
     "ours crane-only": ("--motion.estimator", "crane"),
     "ours paper-contours": ("--map.contours", "paper"),
 }

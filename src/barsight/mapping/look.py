@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
-from barsight.core.types import DisparityRange, RectifiedPair, RefusedFrame
+from barsight.core.types import DisparityRange, PosedFrame, RectifiedPair, RefusedFrame
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import find_range
 from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
@@ -82,6 +86,23 @@ def choose_cell(first: FirstLook, *, has_crane: bool) -> float:
         return CELL_SIDES_M[0]
     wanted = 1.5 * first.pixel_on_surface_m
     return next((side for side in CELL_SIDES_M if side >= wanted), CELL_SIDES_M[-1])
+
+
+def apart(frames: Sequence[PosedFrame], rectifier: Rectifier, range_m: float, least_shift: float) -> set[int]:
+    """The stamps of the frames whose picture has moved, since the last one taken, by least_shift of its
+    shorter side on a surface range_m away; the first and the last always.
+    """
+    camera = rectifier.camera
+    least_m = least_shift * min(camera.width, camera.height) * range_m / camera.focal_px
+    ahead = np.array([0.0, 0.0, range_m])
+    taken: set[int] = set()
+    last: Float64 | None = None
+    for frame in frames:
+        seen = (frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead)
+        if last is None or np.linalg.norm(seen - last) >= least_m or frame is frames[-1]:
+            taken.add(frame.stamp_ns)
+            last = seen
+    return taken
 
 
 def points_per_pixel(first: FirstLook, cell_m: float) -> int:

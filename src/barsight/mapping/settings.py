@@ -16,6 +16,8 @@ class MapSettings:
     """Side of a cell; 0.01 in the yard, else fitted to the pictures' resolution."""
     min_views: int = 2
     """A cell seen in fewer frames is unknown (one is enough where the recording has only one)."""
+    least_shift: float = 0.0
+    """A frame is matched once its picture has moved by this share of its shorter side; 0 matches them all."""
     top_share: float = 0.35
     """What may hide a cell: its highest height that has this share of the best-seen one's views."""
     inner_share: float = 0.3
@@ -43,6 +45,8 @@ class MapSettings:
             raise ConfigError(f"cell_m must lie in 0.001...10, not {self.cell_m}")
         if self.min_views < 1 or self.resident_tiles < 16:
             raise ConfigError("min_views must be at least 1 and resident_tiles at least 16")
+        if not 0 <= self.least_shift <= 0.5:
+            raise ConfigError(f"least_shift must lie in 0...0.5, not {self.least_shift}")
         for name in ("top_share", "inner_share", "rim_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must lie in 0...1, not {getattr(self, name)}")

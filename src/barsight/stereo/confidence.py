@@ -12,6 +12,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.stereo.spline import row_coefficients, value_and_slope
+from barsight.stereo.windows import window_means
 
 _BLUR_PX = 0.7
 _WINDOW_PX = 21
@@ -96,11 +97,9 @@ def _vertical_shifts(
     share = _mean(usable) + np.float32(1e-6)
     residual = (left_grey - _mean(usable * left_grey) / share) - (warped - _mean(usable * warped) / share)
     trust = usable / (1 + np.square(residual / _OUTLIER_GREY))
+    products = np.stack([x * x, x * y, y * y, x * residual, y * residual, trust * np.square(y * residual)])
+    xx, xy, yy, xr, yr, power = window_means(products, trust, _WINDOW_PX, _EVERY_PX)
     chosen = (slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX))
-    xx, xy, yy, xr, yr, power = (
-        _mean(trust * product)[chosen]
-        for product in (x * x, x * y, y * y, x * residual, y * residual, trust * np.square(y * residual))
-    )
     determinant = xx * yy - xy * xy
     told = (usable[chosen] > 0) & (determinant > _LEAST_INDEPENDENCE * xx * yy) & (yy > _LEAST_SLOPE_POWER)
     xx, xy, yy, xr, yr, power, determinant = (a[told] for a in (xx, xy, yy, xr, yr, power, determinant))

@@ -30,6 +30,7 @@ from barsight.stereo.plane_fits import SupportShape, fit_planes
 from barsight.stereo.sgbm import image_noise
 from barsight.stereo.spline import row_coefficients, value_and_slope
 from barsight.stereo.supports import axis_means, tile_axes
+from barsight.stereo.windows import equalised_difference
 
 _BLUR_PX = 0.5
 _FIRST_BLUR_PX = 0.7
@@ -115,7 +116,7 @@ def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: R
         slope, slope_noise = _own_slope(row_coefficients(left_grey)), noise * _slope_gain(blur_px)
         if remaining > 0:
             slope, slope_noise = (slope + right_slope) * np.float32(0.5), 0.5 * slope_noise
-        residual = _residual(left_grey, warped, usable, settings.window_px)
+        residual = equalised_difference(left_grey, warped, usable, settings.window_px, _CONTRAST_FLOOR)
         trust = usable / (1 + np.square(residual / np.float32(settings.outlier_grey)))
         weight, pull = _evidence(residual, slope, trust, left_grey, axes, settings)
         short_of = _undamped(weight, trust, slope_noise, settings.window_px)
@@ -179,19 +180,6 @@ def _mean(image: Float32, side: int) -> Float32:
 
 def _weighted_mean(image: Float32, weight: Float32, side: int) -> Float32:
     return _mean(weight * image, side) / (_mean(weight, side) + np.float32(1e-6))
-
-
-def _residual(left: Float32, warped: Float32, usable: Float32, side: int) -> Float32:
-    """Left minus right after their means and contrasts in a window are made equal."""
-    share = _mean(usable, side) + np.float32(1e-6)
-    left_mean, right_mean = _mean(usable * left, side) / share, _mean(usable * warped, side) / share
-    left_power = _mean(usable * left * left, side) / share - left_mean * left_mean
-    right_power = _mean(usable * warped * warped, side) / share - right_mean * right_mean
-    gain = np.sqrt(
-        (np.maximum(left_power, 0) + _CONTRAST_FLOOR) / (np.maximum(right_power, 0) + _CONTRAST_FLOOR)
-    )
-    residual: Float32 = (left - left_mean) - gain * (warped - right_mean)
-    return residual
 
 
 def _evidence(
