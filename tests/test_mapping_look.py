@@ -1,0 +1,52 @@
+"""Which frames of a recording are matched."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barsight.core.errors import ConfigError
+from barsight.core.pose import Pose
+from barsight.core.types import PosedFrame, RectifiedCamera
+from barsight.mapping.look import apart
+from barsight.mapping.settings import MapSettings
+from barsight.pipeline import MeasureSettings
+
+CAMERA = RectifiedCamera(1000.0, 499.5, 399.5, 0.5, 0.0, 1000, 800)
+RANGE_M = 8.0
+
+
+def _frames(places_m: list[float], turns_rad: list[float]) -> list[PosedFrame]:
+    frames = []
+    for stamp, (x, turn) in enumerate(zip(places_m, turns_rad, strict=True)):
+        sine, cosine = np.sin(turn), np.cos(turn)
+        about_y = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+        pose = Pose("yard", "body", about_y, np.array([x, 0.0, 0.0]))
+        frames.append(PosedFrame(stamp, pose, np.eye(6)))
+    return frames
+
+
+def _rectifier() -> Any:
+    return SimpleNamespace(camera=CAMERA, body_from_rect0=Pose("body", "rect0", np.eye(3), np.zeros(3)))
+
+
+def test_frames_are_taken_once_the_picture_has_moved_far_enough() -> None:
+    # A tenth of 800 px at 8 m and 1000 px is 0.64 m.
+    frames = _frames([0.0, 0.3, 0.65, 0.9, 1.2, 1.3, 1.4], [0.0] * 7)
+    assert apart(frames, _rectifier(), RANGE_M, 0.1) == {0, 2, 5, 6}
+    assert apart(frames, _rectifier(), RANGE_M, 0.0) == set(range(7))
+    turned = _frames([0.0] * 4, [0.0, 0.05, 0.1, 0.1])
+    assert apart(turned, _rectifier(), RANGE_M, 0.1) == {0, 2, 3}
+
+
+def test_preset_fast_says_what_it_changes() -> None:
+    best, fast = MeasureSettings().chosen(), MeasureSettings(preset="fast").chosen()
+    assert (best.stereo.barsight.preset, best.map.least_shift) == ("best", 0.0)
+    assert (fast.stereo.barsight.preset, fast.map.least_shift) == ("fast", 0.1)
+    wider = MeasureSettings(preset="fast", map=MapSettings(least_shift=0.2)).chosen()
+    assert wider.map.least_shift == 0.2
+    with pytest.raises(ConfigError, match="least_shift"):
+        MapSettings(least_shift=0.9)
