@@ -301,8 +301,9 @@ def test_only_jumps_between_known_neighbours_are_edges() -> None:
     disparity = np.full((HEIGHT, WIDTH), 5, dtype=np.float32)
     disparity[:, 40:] = 9
     disparity[:, 20] = np.nan
-    beside = beside_edges(disparity, 1.0)
+    beside, other_side = beside_edges(disparity, 1.0)
     assert (beside[:, 39:41] == 1).all() and (beside[:, 18:23] < 0.01).all()
+    assert (other_side[:, 38:42] == 4).all() and not other_side[:, :37].any() and not other_side[:, 43:].any()
     np.testing.assert_allclose(beside[20, 43], np.exp(-1.0), rtol=0.05)
 
 

@@ -33,7 +33,9 @@ def steps_picture(seed: int = 3) -> UInt8:
     def matched(settings: BarsightSettings) -> Disparity:
         return BarsightStereo(settings)(rendered.pair, posed.candidates)
 
-    no_guess = replace(whole, fill_occlusions=False, max_sigma_px=math.inf, wrong_side_px=0.0)
+    no_guess = replace(
+        whole, fill_occlusions=False, max_sigma_px=math.inf, wrong_side_px=0.0, other_side_share=0.0
+    )
     start = matched(replace(no_guess, refinement=replace(whole.refinement, steps=0)))
     refined, final = matched(no_guess), matched(whole)
     truth = rendered.truth_px.astype(np.float32)

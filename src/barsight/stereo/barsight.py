@@ -51,6 +51,9 @@ class BarsightSettings:
     """Error per pixel by which the start and its refinement disagree over a window."""
     wrong_side_px: float = 0.4
     """Error on a depth edge, where a pixel may belong to either side; it falls to 1 / e within 3 px."""
+    other_side_share: float = 0.5
+    """Error within 2.5 px of a depth edge per pixel that its other side lies away: with a half, 2 sigma
+    reach across. None for a map, which outvotes wrong sides."""
     max_sigma_px: float = 1.0
     """A match less sure than this is none."""
     semiglobal: SemiGlobalSettings = field(default_factory=SemiGlobalSettings)
@@ -59,7 +62,7 @@ class BarsightSettings:
     def __post_init__(self) -> None:
         if min(self.consistency_px, self.max_sigma_px) <= 0:
             raise ConfigError("consistency_px and max_sigma_px must be positive")
-        shares = (self.vertical_share, self.edge_share, self.start_share)
+        shares = (self.vertical_share, self.edge_share, self.start_share, self.other_side_share)
         lengths = (self.widest_edge_px, self.wrong_side_px)
         if min(self.model_sigma_px, self.island_px, *shares, *lengths) < 0:
             raise ConfigError("model_sigma_px, island_px and the shares of sigma can't be negative")
@@ -106,7 +109,9 @@ class BarsightStereo:
             sigma = np.where(np.isfinite(guessed), guessed, sigma)
         if settings.preset == "best":
             disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
-        sigma = np.hypot(sigma, np.float32(settings.wrong_side_px) * beside_edges(disparity, _JUMP_PX))
+        beside, other_side = beside_edges(disparity, _JUMP_PX)
+        sigma = np.hypot(sigma, np.float32(settings.wrong_side_px) * beside)
+        sigma = np.hypot(sigma, np.float32(settings.other_side_share) * other_side)
         disparity, sigma = np.where(pair.left_valid, disparity, _NAN), np.where(pair.left_valid, sigma, _NAN)
         return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
 

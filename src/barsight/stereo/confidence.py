@@ -27,6 +27,8 @@ _BEND_PX = 3
 _START_WINDOW_PX = 9
 _EDGE_REACH_PX = 3.0
 _FAR_PX = 1e4
+_OTHER_SIDE_PX = 4
+_UNSURE_SIDE_PX = 2.5
 
 
 def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bool) -> float:
@@ -69,18 +71,22 @@ def start_disagreement(start: Float32, refined: Float32) -> Float32:
     return disagreement
 
 
-def beside_edges(disparity: Float32, jump_px: float) -> Float32:
-    """(H, W) 1 on jumps of more than jump_px between neighbours, falling to 1 / e within 3 px: where a pixel
-    may have been given to the wrong side. NaN in `disparity` is no jump.
+def beside_edges(disparity: Float32, jump_px: float) -> tuple[Float32, Float32]:
+    """Two arrays (H, W) for pixels that may have been given to the wrong side of a jump of more than jump_px
+    between neighbours: 1 on the jump, falling to 1 / e within 3 px; and how far away (px) the other side lies
+    within 4 px, zero further than 2.5 px from the jump. NaN in `disparity` is no jump.
     """
-    three = np.ones((3, 3), dtype=np.uint8)
     known = np.isfinite(disparity)
-    highest = cv2.dilate(np.where(known, disparity, np.float32(-_FAR_PX)), three)
-    lowest = cv2.erode(np.where(known, disparity, np.float32(_FAR_PX)), three)
-    level = (highest - lowest <= jump_px).astype(np.uint8)
+    for_highest = np.where(known, disparity, np.float32(-_FAR_PX))
+    for_lowest = np.where(known, disparity, np.float32(_FAR_PX))
+    three = np.ones((3, 3), dtype=np.uint8)
+    level = (cv2.dilate(for_highest, three) - cv2.erode(for_lowest, three) <= jump_px).astype(np.uint8)
     distance = cv2.distanceTransform(level, cv2.DIST_L2, 5)
     beside: Float32 = np.exp(-distance / np.float32(_EDGE_REACH_PX))
-    return beside
+    window = np.ones((2 * _OTHER_SIDE_PX + 1,) * 2, dtype=np.uint8)
+    away = np.maximum(cv2.dilate(for_highest, window) - disparity, disparity - cv2.erode(for_lowest, window))
+    other: Float32 = np.where(known & (distance < _UNSURE_SIDE_PX) & (away > jump_px), away, np.float32(0))
+    return beside, other
 
 
 def _vertical_shifts(

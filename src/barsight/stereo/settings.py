@@ -61,8 +61,10 @@ class StereoSettings:
         return self if sigma_px is None else replace(self, calibration_sigma_px=sigma_px)
 
     def for_map(self) -> StereoSettings:
-        """The same without the time that guesses take, since no map takes them."""
-        return replace(self, barsight=replace(self.barsight, fill_occlusions=False))
+        """The same without guesses, which no map takes, and as sure of a pixel's side as if there were no
+        edge: a map holds the views' sides against each other.
+        """
+        return replace(self, barsight=replace(self.barsight, fill_occlusions=False, other_side_share=0.0))
 
 
 def make_method(settings: StereoSettings) -> StereoMethod:
