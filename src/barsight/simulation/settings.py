@@ -282,7 +282,9 @@ class SimulationSettings:
     def demo(cls) -> SimulationSettings:
         """A small yard for `barsight demo`: 3 m of stack, 10 pairs of 640x512."""
         camera = CameraSettings(width_px=640, height_px=512, focal_px=625.0)
-        return cls(length_m=3.0, frames=10, seed=1, camera=camera, yard=YardSettings(max_layers=3))
+        return cls(
+            length_m=3.0, frames=10, seed=1, camera=camera, yard=YardSettings(max_layers=3, bar_length_m=5.0)
+        )
 
 
 def _expect(holds: bool, sentence: str) -> None:
