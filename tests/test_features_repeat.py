@@ -8,7 +8,8 @@ import pytest
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.evaluation.matching_bench import TrueStep, _stereo, true_steps
+from barsight.evaluation.matching_bench import _stereo
+from barsight.evaluation.matching_truth import TrueStep, true_steps
 from barsight.features.guided import PredictedMotion, triangulate
 from barsight.features.repeat import repeat_px
 from barsight.features.tracks import Tracks, TrackSettings, detect_corners

@@ -16,6 +16,8 @@ from barsight.features.patches import Located, PatchImage, PatchPair, locate
 
 GATE_SIGMAS = 4.0
 MOST_OFF_ROW_PX = 1.0
+MARGIN_PX = 12.0
+"""Nearer to its border a picture doesn't show a patch whole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,11 @@ def stereo_jacobian(points: Float64, camera: RectifiedCamera) -> Float64:
 
 
 def predict_places(
-    points: Float64, sigma_px: float, motion: PredictedMotion, camera: RectifiedCamera, margin_px: float = 12
+    points: Float64,
+    sigma_px: float,
+    motion: PredictedMotion,
+    camera: RectifiedCamera,
+    margin_px: float = MARGIN_PX,
 ) -> Predicted:
     """points: (N, 3) in the old `rect0`, seen there with `sigma_px` in u, v and right u."""
     moved = points @ motion.rotation.T + motion.translation
@@ -140,6 +146,31 @@ def match_guided(
     distance2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
     found[tried] = left.found & right.found & (distance2 < GATE_SIGMAS**2)
     return GuidedMatches(stereo, sigma, found, ambiguous)
+
+
+def match_left(
+    source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: Predicted,
+    sigma_px: float,
+) -> tuple[Float64, Bool]:  # fmt: skip
+    """(N, 2) and (N,): the patches that the left picture of `pair` shows and the right one doesn't.
+
+    As `match_guided`, but for a prediction that consensus has checked already: one picture alone doesn't
+    check the depth.
+    """
+    camera, guess = pair.pair.camera, predicted.stereo
+    with np.errstate(invalid="ignore"):
+        shown = ~predicted.inside & (guess[:, :2] > MARGIN_PX).all(axis=1)
+        shown &= (guess[:, :2] < np.array([camera.width, camera.height]) - MARGIN_PX).all(axis=1)
+    pixels, found = np.full((len(places), 2), np.nan), np.zeros(len(places), np.bool_)
+    tried = np.flatnonzero(shown)
+    disparity = guess[tried, 0] - guess[tried, 2]
+    now = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
+    left = locate(source, pair.left, places[tried], guess[tried, :2], grown=depth[tried] / now)
+    off = left.pixels - guess[tried, :2]
+    spread = predicted.covariance[tried, :2, :2] + sigma_px**2 * np.eye(2)
+    distance2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
+    pixels[tried], found[tried] = left.pixels, left.found & (distance2 < GATE_SIGMAS**2)
+    return pixels, found
 
 
 def match_across(pair: PatchPair, left: Float64, disparity: Float64, sure: bool = False) -> Located:
