@@ -13,25 +13,41 @@ from barsight.yard.stability import footings
 from barsight.yard.types import Bundle
 from lift_yards import SETTINGS, SIGMA, laid, map_of, record
 
-RISE, STEP = 0.36, 0.05
+RISE, STEP = 0.36, 0.08
+LEAN = math.degrees(math.atan2(2 * STEP, 2 * RISE))
 STOCK = [laid(0.3 + STEP * layer + 0.3 * k, z=0.2 + RISE * layer) for layer in range(3) for k in range(3)]
 APART = laid(3.0)
 BUNDLES = (*(record(one, k, layer=k // 3) for k, one in enumerate(STOCK)), record(APART, 9))
 STANDING = footings(map_of([*STOCK, APART]), BUNDLES, SETTINGS)
 
 
-def test_a_pile_that_leans_says_how_far_and_how_surely() -> None:
+def test_a_side_that_steps_back_says_how_far_and_one_that_is_hidden_says_nothing() -> None:
     low, high, *others = pile_sides(BUNDLES, STANDING)
     assert (low.side, high.side) == (-1, 1)
-    assert (low.bundles, high.bundles) == ((0, 3, 6), (2, 5, 8))
-    lean = math.degrees(math.atan2(2 * STEP, 2 * RISE))
-    assert high.lean_deg == pytest.approx(lean) and low.lean_deg == pytest.approx(-lean)
-    assert [o.overhang_m for o in high.overhangs] == pytest.approx([STEP, STEP])
-    assert [o.overhang_m for o in low.overhangs] == pytest.approx([-STEP, -STEP])
+    # On the high side every layer stands over the one below: from above only the highest shows.
+    assert (low.bundles, high.bundles) == ((0, 3, 6), (8,))
+    assert low.lean_deg == pytest.approx(-LEAN) and math.isnan(high.lean_deg)
+    assert [o.overhang_m for o in low.overhangs][1:] == pytest.approx([-STEP, -STEP])
+    assert math.isnan(low.overhangs[0].overhang_m) and math.isnan(high.overhangs[0].overhang_m)
     assert high.drop_m == pytest.approx(STOCK[8].top_z_m, abs=0.02)
     assert low.slope_deg < 85 < high.slope_deg
     assert [side.bundles for side in others] == [(9,), (9,)]
-    assert all(math.isnan(side.lean_deg) and side.overhangs == () for side in others)
+
+
+def test_a_gully_within_the_pile_is_none_of_its_sides() -> None:
+    stock = [laid(0.0, z=0.56), laid(0.4), laid(0.8, z=0.56)]
+    bundles = tuple(record(one, k, layer=int(one.z_m > 0.5)) for k, one in enumerate(stock))
+    low, high = pile_sides(bundles, footings(map_of(stock), bundles, SETTINGS))
+    assert (low.bundles, high.bundles) == ((0,), (2,))
+
+
+def test_a_bundle_over_the_edge_stands_over_and_leans() -> None:
+    stock = [laid(0.0), laid(0.1, z=0.56)]
+    bundles = tuple(record(one, k, layer=k) for k, one in enumerate(stock))
+    low, high = pile_sides(bundles, footings(map_of(stock), bundles, SETTINGS))
+    assert high.bundles == (1,) and low.bundles == (0, 1)
+    assert high.overhangs[0].overhang_m == pytest.approx(0.1, abs=0.02) and high.lean_deg > 5
+    assert low.overhangs[1].overhang_m == pytest.approx(-0.1, abs=0.001) and low.lean_deg < -5
 
 
 def test_the_stated_sigmas_hold() -> None:
@@ -43,10 +59,9 @@ def test_the_stated_sigmas_hold() -> None:
 
     scores = []
     for _ in range(300):
-        high = pile_sides(tuple(seen(b) for b in BUNDLES), STANDING)[1]
-        lean = math.degrees(math.atan2(2 * STEP, 2 * RISE))
-        scores.append([(high.lean_deg - lean) / high.lean_sigma_deg])
-        scores[-1] += [(o.overhang_m - STEP) / o.sigma_m for o in high.overhangs]
+        low = pile_sides(tuple(seen(b) for b in BUNDLES), STANDING)[0]
+        scores.append([(low.lean_deg + LEAN) / low.lean_sigma_deg])
+        scores[-1] += [(o.overhang_m + STEP) / o.sigma_m for o in low.overhangs[1:]]
     assert np.std(scores, axis=0) == pytest.approx(np.ones(3), abs=0.15)
 
 

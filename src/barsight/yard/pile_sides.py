@@ -1,12 +1,11 @@
 """The pile's sides: how steep they are, which way they lean, and what stands over at each layer.
 
-A pile is all parallel bundles that lie near each other. What its lower layers do is known only where they
-show beside the upper ones: a layer that doesn't show is left out.
+A pile is all parallel bundles that lie near each other. From above a lower layer's side shows only where it
+stands out beyond the upper ones; what stands over is inferred from the other side (`stability.Footing`).
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from barsight.core.arrays import Float64
-from barsight.yard.stability import STEP_M, Footing
+from barsight.yard.stability import LEAST_LEDGE_M, STEP_M, Footing
 from barsight.yard.types import Bundle
 
 NEAR_M = 0.3
@@ -24,13 +23,11 @@ PARALLEL_RAD = np.radians(5.0)
 
 @dataclass(frozen=True)
 class LayerOverhang:
-    """By how much the outermost bundle of a layer stands out over that of the next lower layer that shows.
-
-    Negative: it stands back. sigma_m: one standard deviation.
+    """By how much a side's bundle stands over the edge of what carries it; negative: so far the next lower
+    layer stands out beyond it. NaN where it can't be told. sigma_m: one standard deviation.
     """
 
-    upper: int
-    lower: int
+    bundle: int
     overhang_m: float
     sigma_m: float
 
@@ -39,9 +36,9 @@ class LayerOverhang:
 class PileSide:
     """One side of a pile: -1 towards low x, 1 towards high x (y, where the bars lie along X).
 
-    bundles: the outermost of each layer that shows, from below. drop_m: from the highest's top to the lowest
-    place beside it. slope_deg: of the line between (90 is sheer). lean_deg: of the outermost edges, positive
-    outwards, NaN where one layer shows only. Sigmas are one standard deviation, NaN where the figure is.
+    bundles: the outermost of each layer that shows there, from below. drop_m: from the highest's top to the
+    lowest place beside it. slope_deg: of the line between (90 is sheer). lean_deg: from the lowest edge to
+    the highest, positive outwards, NaN where it can't be told. Sigmas are one standard deviation.
     """
 
     side: int
@@ -90,22 +87,28 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
     def edge(bundle: Bundle) -> float:
         return float(side * (bundle.centre_m[:2] @ across)) + bundle.width_m / 2
 
-    layers = sorted({b.layer for b in pile})
-    outer = [max((b for b in pile if b.layer == layer), key=edge) for layer in layers]
-    overhangs = tuple(
-        LayerOverhang(
-            upper.id, lower.id, edge(upper) - edge(lower), math.hypot(_edge_sigma(upper), _edge_sigma(lower))
-        )
-        for lower, upper in itertools.pairwise(outer)
-    )
-    lean = sigma = math.nan
+    outer: list[Bundle] = []
+    for layer in sorted({b.layer for b in pile}, reverse=True):
+        widest = max((b for b in pile if b.layer == layer), key=edge)
+        # Behind an upper layer's edge it isn't this side that shows.
+        if not outer or edge(widest) > edge(outer[0]) + LEAST_LEDGE_M:
+            outer.insert(0, widest)
     lowest, highest = outer[0], outer[-1]
-    rise = float(highest.centre_m[2] - lowest.centre_m[2])
-    if rise > 0:
-        out = edge(highest) - edge(lowest)
-        lean = math.degrees(math.atan2(out, rise))
-        spread = math.hypot(_edge_sigma(highest), _edge_sigma(lowest))
-        sigma = math.degrees(spread * rise / (rise**2 + out**2))
+    overhangs = []
+    for place, bundle in enumerate(outer):
+        footing, own = footings[bundle.id], _edge_sigma(bundle)
+        if footing.overhang_side == side:
+            overhangs.append(LayerOverhang(bundle.id, footing.overhang_m, math.hypot(own, STEP_M)))
+        elif place:
+            lower = outer[place - 1]
+            spread = math.hypot(own, _edge_sigma(lower))
+            overhangs.append(LayerOverhang(bundle.id, edge(bundle) - edge(lower), spread))
+        else:
+            overhangs.append(LayerOverhang(bundle.id, math.nan, math.nan))
+    lean, sigma = _lean(lowest, highest, edge(highest) - edge(lowest))
+    if footings[highest.id].overhang_side == side:
+        lean = footings[highest.id].lean_deg
+        sigma = math.degrees(overhangs[-1].sigma_m / highest.width_m)
     beside = footings[highest.id].sides[0 if side < 0 else 1]
     run, drop = beside.run_m, beside.drop_m
     reach = run**2 + drop**2
@@ -116,8 +119,25 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
         if reach > 0 else math.nan
     )  # fmt: skip
     return PileSide(
-        side, tuple(b.id for b in outer), drop, beside.slope_deg, slope_sigma, lean, sigma, overhangs
+        side,
+        tuple(b.id for b in outer),
+        drop,
+        beside.slope_deg,
+        slope_sigma,
+        lean,
+        sigma,
+        tuple(overhangs),
     )
+
+
+def _lean(lowest: Bundle, highest: Bundle, out_m: float) -> tuple[float, float]:
+    """Of the line between two edges and its sigma, degrees; NaN where one layer shows only."""
+    rise = float(highest.centre_m[2] - lowest.centre_m[2])
+    if not rise > 0:
+        return math.nan, math.nan
+    spread = math.hypot(_edge_sigma(highest), _edge_sigma(lowest))
+    sigma = math.degrees(spread * rise / (rise**2 + out_m**2))
+    return math.degrees(math.atan2(out_m, rise)), sigma
 
 
 def _edge_sigma(bundle: Bundle) -> float:
