@@ -32,7 +32,7 @@ _SUNKEN_M, _SUNKEN_SHARE = 0.04, 0.2
 _RESOLVED_CELLS = 4.0
 _THREADS = 2
 _SLIVER_SHARE = 0.03
-_CROSSING_STEP_M = 0.25
+_CROSSING_STEP_M = 0.4
 """What lies across may be short: cross-sections this far apart meet it."""
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, Int32, Int64, UInt8
+from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
 from barsight.core.types import Source
 from barsight.yard.bundle_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
 from barsight.yard.bundle_settings import BundleSettings
@@ -25,6 +25,7 @@ _LEAST_CELLS = 30
 _FLANK = (0.3, 0.45)
 """Of the width to either side: where a bundle falls off as round bars do."""
 _FOLLOWS_M = 0.03
+_LEVEL_M = 0.008
 _MARGIN_M = 0.6
 _SLENDER = 1.8
 
@@ -47,6 +48,8 @@ def crossing_pieces(
         row, column = np.nonzero(piece)
         heading = _heading(row, column, settings.least_length_m / height_map.cell_m)
         if heading is None or _is_near(heading, headings, settings.max_skew_deg):
+            continue
+        if _is_level(height_map.z_m[row, column], row, column, heading):
             continue
         yield heading, _around(height_map, row, column)
 
@@ -141,6 +144,14 @@ def _heading(row: Int64, column: Int64, least_cells: float) -> float | None:
     x, y = axes[:, 1]
     heading = float(np.arctan2(-x, y))
     return (heading + np.pi / 2) % -np.pi + np.pi / 2
+
+
+def _is_level(z: Float32, row: Int64, column: Int64, heading: float) -> bool:
+    """Whether the middle of the section is level, as a beam's: reading it would be in vain."""
+    across = np.rint(np.cos(heading) * column + np.sin(heading) * row).astype(np.int64)
+    low, high = np.quantile(across, [0.15, 0.85])
+    heights = [float(np.median(z[across == u])) for u in range(int(np.ceil(low)), int(high) + 1)]
+    return bool(np.ptp(heights) < _LEVEL_M) if heights else True
 
 
 def _is_near(heading: float, headings: tuple[float, ...], apart_deg: float) -> bool:
