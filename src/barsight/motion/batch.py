@@ -13,8 +13,8 @@ from barsight.core.motion_detail import Inertial, InSigmas
 from barsight.core.pose import Pose
 from barsight.core.types import RigDrift
 from barsight.inertial.model import ImuBias
-from barsight.motion import rig_drift
 from barsight.motion.detail import imu_in_sigmas, inertial, pictures_in_sigmas
+from barsight.motion.drift_search import sought
 from barsight.motion.encoders import EncoderState, agreeing, disagreement, encoder_state
 from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import Marginals, marginals
@@ -68,16 +68,13 @@ def solve(problem: Problem) -> Estimate:
     seeks_drift = problem.sightings is not None and problem.offset_prior_px > 0 and bool(used.any())
     if problem.sightings is not None and used.any():
         if problem.has_latency and seeks_drift:
-            state, system = _optimised(problem, state, used, drift_free=True)
+            state, system, _ = sought(problem, state, system, used)
         problem, state, system, used = _with_seen_noise(problem, problem.sightings, state, used)
     drift: RigDrift | None = None
     everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)
     for _ in range(MOST_ROUNDS):
         if seeks_drift:
-            state, system = _optimised(problem, state, used, drift_free=True)
-            drift = rig_drift.weigh(state.drift, marginals(system).drift, problem)
-            state = replace(state, drift=np.array([drift.yaw_rad, drift.scale]))
-            state, system = _optimised(problem, state, used)
+            state, system, drift = sought(problem, state, system, used)
         now = agreeing(state.values, everywhere)
         if (now == agreed).all() or now.mean() < LEAST_AGREEING:
             break
@@ -109,8 +106,8 @@ def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | Non
     return result
 
 
-def _optimised(problem: Problem, state: State, used: Bool, drift_free: bool = False) -> tuple[State, System]:
-    return optimise(problem, factors(problem), state, used, drift_free)
+def _optimised(problem: Problem, state: State, used: Bool) -> tuple[State, System]:
+    return optimise(problem, factors(problem), state, used)
 
 
 def _with_seen_noise(

@@ -15,13 +15,13 @@ from barsight.motion.encoders import add_encoders
 from barsight.motion.problem import Problem
 
 
-def factors(problem: Problem) -> Any:
-    """The graph of a problem without its sightings."""
+def factors(problem: Problem, before: int | None = None) -> Any:
+    """The graph of a problem without its sightings; of the IMU only what touches nodes `before` the given."""
     graph = gtsam.NonlinearFactorGraph()
     _add_priors(graph, problem)
     add_encoders(graph, problem)
     if problem.has_imu:
-        _add_imu(graph, problem)
+        _add_imu(graph, problem, len(problem.start) if before is None else before)
     return graph
 
 
@@ -58,17 +58,17 @@ def _add_priors(graph: Any, problem: Problem) -> None:
         graph.add(gtsam.PoseRotationPrior3D(X(attitude.node), rotation, _sigmas(*attitude.sigma_rad)))
 
 
-def _add_imu(graph: Any, problem: Problem) -> None:
+def _add_imu(graph: Any, problem: Problem, before: int) -> None:
     bias = gtsam.imuBias.ConstantBias(problem.bias.accel_mps2, problem.bias.gyro_radps)
     model = _sigmas(*[problem.accel_bias_sigma_mps2] * 3, *[problem.gyro_bias_sigma_radps] * 3)
     if problem.prior is None:
         graph.add(gtsam.PriorFactorConstantBias(B(0), bias, model))
-    for k in range(len(problem.start)):
+    for k in range(before):
         sigma = 1e-3 if k in problem.still else 10.0
         model = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
         graph.add(gtsam.PriorFactorVector(V(k), np.zeros(3), model))
     gap = _sigmas(*[0.01] * 3, *[1e-3] * 3)
-    for k, part in enumerate(problem.preintegrated):
+    for k, part in enumerate(problem.preintegrated[:before]):
         if part is None:
             none = gtsam.imuBias.ConstantBias()
             graph.add(gtsam.BetweenFactorConstantBias(B(k), B(k + 1), none, gap))

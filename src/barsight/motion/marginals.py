@@ -14,14 +14,12 @@ from barsight.motion.solver import System
 @dataclass(frozen=True, eq=False)
 class Marginals:
     """poses: (M, 6, 6) in GTSAM's order and body axes, the rig's drift taken as known. latency_sigma_s: nan
-    without encoders. swing: (M, 6, 2) how the poses move with the drift. drift: (2, 2) as the sightings show
-    it, everything else free.
+    without encoders. swing: (M, 6, 2) how the poses move with the drift.
     """
 
     poses: Float64
     latency_sigma_s: float
     swing: Float64
-    drift: Float64
 
 
 def marginals(system: System) -> Marginals:
@@ -41,5 +39,34 @@ def marginals(system: System) -> Marginals:
         to_latency = by_border[:, :, :1]
         poses = poses + variance * to_latency @ to_latency.transpose(0, 2, 1)
         swing = swing - to_latency @ (own[:1, 1:] * variance)
-    drift: Float64 = np.linalg.inv(own)[-2:, -2:].astype(np.float64)
-    return Marginals(poses, latency, swing, drift)
+    return Marginals(poses, latency, swing)
+
+
+@dataclass(frozen=True, eq=False)
+class Newest:
+    """The last node's covariance (n, n), of pose (body axes), velocity (reference) and biases (accelerometer,
+    gyro), the rig's drift taken as known; swing (n, 2) by which it goes with the drift.
+    """
+
+    covariance: Float64
+    swing: Float64
+
+
+def newest(system: System) -> Newest:
+    """Of a system at its best state, without the work for all the other nodes."""
+    factor, size = system.factor(), system.size
+    solved = system.solved(factor)
+    own, _ = system.schur(solved)
+    last = len(factor) - size
+    row, column = np.nonzero(np.tri(size))
+    lower = np.zeros((size, size))
+    lower[row, column] = factor[last + row, column - row + factor.shape[1] - 1]
+    inverse = np.linalg.inv(lower)
+    covariance = inverse.T @ inverse
+    by_border = -solved[1:, last:].T
+    swing = by_border[:, -2:]
+    if len(own) == 3:
+        to_latency = by_border[:, :1]
+        covariance = covariance + to_latency @ to_latency.T / own[0, 0]
+        swing = swing - to_latency @ (own[:1, 1:] / own[0, 0])
+    return Newest(covariance, swing)

@@ -58,10 +58,15 @@ def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
         edges.insert(0, lead)
     stamps = [edges[0]]
     for first, last in pairwise(edges):
-        parts = max(1, int(np.ceil((last - first) / seconds_to_ns(MOST_SPACING_S) - 0.05)))
-        stamps += [first + (last - first) * part // parts for part in range(1, parts + 1)]
+        stamps += divided(first, last)
     stamp_ns = np.array(stamps, np.int64)
     return Nodes(stamp_ns, np.searchsorted(stamp_ns, frames_ns))
+
+
+def divided(first_ns: int, last_ns: int) -> list[int]:
+    """Stamps after the first up to the last, at most `MOST_SPACING_S` apart."""
+    parts = max(1, int(np.ceil((last_ns - first_ns) / seconds_to_ns(MOST_SPACING_S) - 0.05)))
+    return [first_ns + (last_ns - first_ns) * part // parts for part in range(1, parts + 1)]
 
 
 def start_poses(
@@ -102,31 +107,40 @@ def _between(
 
 
 def tied_by_imu(nodes: Nodes, start: tuple[Pose, ...], imu: ImuSamples | None, noise: ImuNoise) -> ImuTies:
-    """Preintegrated motions between neighbours, and the nodes at which the body rests.
-
-    Rest needs both: an IMU that shows nothing but noise, as it does at constant speed, and a place that
-    doesn't change over the neighbours.
-    """
+    """Preintegrated motions between neighbours, and the nodes at which the body rests."""
     count = len(nodes.stamp_ns)
     if imu is None:
         return ImuTies((None,) * (count - 1), (), ImuBias.none())
+    still = resting(nodes.stamp_ns, start, imu, noise)
+    bias = _bias_at_rest(nodes, still, imu, noise)
+    return ImuTies(preintegrated(nodes.stamp_ns, imu, noise, bias), tuple(still), bias)
+
+
+def preintegrated(
+    stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise, bias: ImuBias
+) -> tuple[Preintegrated | None, ...]:
+    """Between neighbouring stamps (M,); None where the IMU has a gap."""
     from barsight.inertial.preintegration import Preintegrator
 
+    integrator = Preintegrator(imu, noise)
+    parts = [integrator.between(int(a), int(b), bias) for a, b in pairwise(stamp_ns.tolist())]
+    return tuple(None if isinstance(part, Failed) else part for part in parts)
+
+
+def resting(stamp_ns: Int64, start: tuple[Pose, ...], imu: ImuSamples, noise: ImuNoise) -> list[int]:
+    """Which of the nodes (M,) the body rests at. That needs both: an IMU that shows nothing but noise, as it
+    does at constant speed, and a place that doesn't change over the neighbours.
+    """
+    count = len(stamp_ns)
     quiet = stands_still(imu, noise)
-    nearest = np.clip(np.searchsorted(imu.stamp_ns, nodes.stamp_ns), 0, imu.stamp_ns.size - 1)
+    nearest = np.clip(np.searchsorted(imu.stamp_ns, stamp_ns), 0, imu.stamp_ns.size - 1)
     place = np.array([pose.translation for pose in start])
     still = []
     for k in range(count):
         first, last = max(0, k - 1), min(count - 1, k + 1)
         if quiet[nearest[k]] and np.linalg.norm(place[last] - place[first]) < MOST_STILL_M:
             still.append(k)
-    bias = _bias_at_rest(nodes, still, imu, noise)
-    integrator = Preintegrator(imu, noise)
-    parts = []
-    for first_ns, last_ns in zip(nodes.stamp_ns[:-1], nodes.stamp_ns[1:], strict=True):
-        part = integrator.between(int(first_ns), int(last_ns), bias)
-        parts.append(None if isinstance(part, Failed) else part)
-    return ImuTies(tuple(parts), tuple(still), bias)
+    return still
 
 
 def _bias_at_rest(nodes: Nodes, still: list[int], imu: ImuSamples, noise: ImuNoise) -> ImuBias:

@@ -31,7 +31,7 @@ class Rig(NamedTuple):
 
 class Sights(NamedTuple):
     """N sightings of T points, in the points' order. first: (T + 1,) each point's begin; node, used (N,);
-    stereo (N, 3) u, v, right u; weight (N,) 1 / sigma; by_drift (N, 2) px of the right column.
+    stereo (N, 3) u, v, right u; weight (N,) 1 / sigma. scale: 1 where the rig's scale is seen, else 0.
     """
 
     first: Int64
@@ -39,7 +39,7 @@ class Sights(NamedTuple):
     used: Bool
     stereo: Float64
     weight: Float64
-    by_drift: Float64
+    scale: float
 
 
 class Guess(NamedTuple):
@@ -65,10 +65,11 @@ class Reduced(NamedTuple):
 
 @kernel(fastmath=True)
 def _error(
-    rig: Rig, sights: Sights, guess: Guess, k: int, t: int, error: Float64, body: Float64, q: Float64
-) -> bool:
-    """error (3,) px predicted minus seen; the point in the body (3,) and q (3,) in the left camera; false
-    behind it.
+    rig: Rig, sights: Sights, guess: Guess, k: int, t: int, error: Float64, body: Float64, q: Float64,
+    by_drift: Float64,
+) -> bool:  # fmt: skip
+    """error (3,) px predicted minus seen; the point in the body (3,) and q (3,) in the left camera; by_drift
+    (2,) px of the right column. False behind the camera.
     """
     node = sights.node[k]
     turn, place, point = guess.turn[node], guess.place[node], guess.points[t]
@@ -85,7 +86,11 @@ def _error(
     u = rig.lens[0] * q[0] / q[2] + rig.lens[1]
     error[0] = u - sights.stereo[k, 0]
     error[1] = rig.lens[0] * q[1] / q[2] + rig.lens[2] - sights.stereo[k, 1]
-    shift = sights.by_drift[k, 0] * guess.drift[0] + sights.by_drift[k, 1] * guess.drift[1]
+    # By the predicted place: by the seen one, a scale would shrink the right picture's noise and be liked.
+    x = (q[0] - rig.lens[3] / rig.lens[0]) / q[2]
+    by_drift[0] = -rig.lens[0] * (1 + x**2)
+    by_drift[1] = -sights.scale * rig.lens[3] / q[2]
+    shift = by_drift[0] * guess.drift[0] + by_drift[1] * guess.drift[1]
     error[2] = u - rig.lens[3] / q[2] + rig.lens[4] + shift - sights.stereo[k, 2]
     return True
 
@@ -93,12 +98,12 @@ def _error(
 @kernel(fastmath=True)
 def residuals(rig: Rig, sights: Sights, guess: Guess, result: Float64) -> float:
     """Seen minus predicted (N, 3) px of the used sightings; returns their robust cost."""
-    error, body, q, cost = np.empty(3), np.empty(3), np.empty(3), 0.0
+    error, body, q, by_drift, cost = np.empty(3), np.empty(3), np.empty(3), np.empty(2), 0.0
     for t in range(len(sights.first) - 1):
         for k in range(sights.first[t], sights.first[t + 1]):
             if not sights.used[k]:
                 continue
-            if not _error(rig, sights, guess, k, t, error, body, q):
+            if not _error(rig, sights, guess, k, t, error, body, q, by_drift):
                 error[:] = BEHIND_SIGMAS / sights.weight[k]
             total = 0.0
             for i in range(3):
@@ -118,7 +123,7 @@ def _rows(
     (2,) of its third row. room: (3, 3) scratch.
     """
     body, q = room[0], room[1]
-    if not _error(rig, sights, guess, k, t, error, body, q):
+    if not _error(rig, sights, guess, k, t, error, body, q, by_drift):
         error[:] = 0
         by_pose[:] = 0
         by_point[:] = 0
@@ -144,7 +149,8 @@ def _rows(
         by_pose[i, 2] = a * body[1] - b * body[0]
         by_pose[i, 3], by_pose[i, 4], by_pose[i, 5] = -a, -b, -c
         error[i] *= weight
-    by_drift[0], by_drift[1] = weight * sights.by_drift[k, 0], weight * sights.by_drift[k, 1]
+    by_drift[0] *= weight
+    by_drift[1] *= weight
 
 
 @kernel(fastmath=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -12,14 +14,21 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import interpolate_at, seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.features.guided import PredictedMotion
+from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 from barsight.motion.crane import fit_position
+from barsight.motion.step import cross
 from barsight.motion.sway import turned_angle
+
+if TYPE_CHECKING:
+    from barsight.inertial.preintegration import Preintegrated
 
 WINDOW_S = 0.3
 SWAY_RAD = float(np.deg2rad(0.15))
 GYRO_BIAS_SIGMA_RADPS = 5e-4
 SLEW_SIGMA_S = 0.03
 """What isn't known of the encoders' latency, s: it matters while the speed changes only."""
+SPARE_SIGMAS = 1.5
+"""By how much a predicted ellipse is wider than the estimate's own covariance says."""
 
 
 class CranePredictor:
@@ -68,3 +77,29 @@ class CranePredictor:
                 sigma = GYRO_BIAS_SIGMA_RADPS * seconds + 2e-4
                 return angle[1] - angle[0] - self._bias * seconds, sigma
         return np.zeros(3), SWAY_RAD * 2**0.5
+
+
+def moved_by_imu(
+    old: Pose, state: BodyState, part: Preintegrated, bias: ImuBias, covariance: Float64,
+    body_from_rect0: Pose,
+) -> PredictedMotion:  # fmt: skip
+    """The motion of `rect0` from an old body to the one that the IMU takes `state` to.
+
+    covariance: (15, 15) of the state in GTSAM's order: pose in body axes, velocity, biases. It counts
+    `SPARE_SIGMAS` times.
+    """
+    end, dt = part.predict(state, bias), part.seconds
+    new = Pose(old.target, "body", end.rotation, end.position_m)
+    motion = (new @ body_from_rect0).inverse() @ (old @ body_from_rect0)
+    # What the attitude turns is all but what the IMU itself measured.
+    way = state.velocity_mps * dt + np.array([0.0, 0.0, -GRAVITY_MPS2]) * dt**2 / 2
+    by_state = np.zeros((6, 15))
+    by_state[3:, :3] = cross((state.rotation.T @ way)[None])[0]
+    by_state[3:, 6:9] = state.rotation.T * dt
+    by_state[3:, 9:12] = -np.eye(3) * dt**2 / 2
+    by_state[:3, 12:] = -np.eye(3) * dt
+    own = by_state @ covariance @ by_state.T + part.covariance[:6, :6]
+    to_rect0 = np.kron(np.eye(2), body_from_rect0.rotation.T)
+    to_rect0[3:, :3] = -body_from_rect0.rotation.T @ cross(body_from_rect0.translation[None])[0]
+    spread = SPARE_SIGMAS**2 * (to_rect0 @ own @ to_rect0.T)
+    return PredictedMotion(motion.rotation, motion.translation, spread)

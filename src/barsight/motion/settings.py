@@ -8,6 +8,7 @@ from typing import Literal
 from barsight.motion.crane import CraneSettings, CraneTrajectory
 from barsight.motion.estimator import TrajectoryEstimator
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.live import LiveSettings, LiveTrajectory
 from barsight.motion.odometry import StereoOdometry
 from barsight.motion.stitching import PaperStitching, StitchingSettings
 from barsight.motion.views import OdometrySettings
@@ -17,10 +18,12 @@ from barsight.motion.views import OdometrySettings
 class MotionSettings:
     """The trajectory."""
 
-    estimator: Literal["fused", "crane", "odometry", "paper"] = "fused"
-    """fused: all sensors in one estimate. crane: encoders, nominal attitude and the gyro's sway, no picture.
-    odometry: frame to frame from the pictures alone, for comparison. paper: the paper's stitching by SVD."""
+    estimator: Literal["fused", "live", "crane", "odometry", "paper"] = "fused"
+    """fused: all sensors in one estimate. live: the same frame by frame, without looking ahead. crane:
+    encoders, nominal attitude and the gyro's sway, no picture. odometry: frame to frame from the pictures
+    alone, for comparison. paper: the paper's stitching by SVD."""
     fusion: FusionSettings = field(default_factory=FusionSettings)
+    live: LiveSettings = field(default_factory=LiveSettings)
     crane: CraneSettings = field(default_factory=CraneSettings)
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     stitching: StitchingSettings = field(default_factory=StitchingSettings)
@@ -31,6 +34,8 @@ def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
     match settings.estimator:
         case "fused":
             return FusedTrajectory(settings.fusion, settings.crane)
+        case "live":
+            return LiveTrajectory(settings.fusion, settings.live, settings.crane)
         case "crane":
             return CraneTrajectory(settings.crane)
         case "odometry":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -74,8 +74,20 @@ def follow(
     advance: Callable[[], None],
 ) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:  # fmt: skip
     """Sightings of all frames that show enough; the others are refused with a reason."""
-    sightings: list[Sighting] = []
-    refused: list[RefusedFrame] = []
+    seen = list(follow_live(recording, rectifier, predictor, settings, advance))
+    return (
+        tuple(s for s in seen if isinstance(s, Sighting)),
+        tuple(s for s in seen if isinstance(s, RefusedFrame)),
+    )
+
+
+def follow_live(
+    recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
+    advance: Callable[[], None],
+) -> Iterator[Sighting | RefusedFrame]:  # fmt: skip
+    """One frame after the other; only the last few views are held. `predictor` is asked when a frame's turn
+    comes, so it may know what was made of the frames before.
+    """
     state: _State | None = None
 
     def prepare(frame: StereoFrame | RefusedFrame) -> PatchPair | RefusedFrame:
@@ -89,7 +101,7 @@ def follow(
     for pair in ordered_map(prepare, recording.frames(), PREPARED):
         advance()
         if isinstance(pair, RefusedFrame):
-            refused.append(pair)
+            yield pair
             continue
         stamp_ns = pair.pair.stamp_ns
         prediction = predictor(state.stamp_ns, stamp_ns) if state else None
@@ -98,11 +110,10 @@ def follow(
             # The other sensors tie the frame to the ones before; pictures begin anew.
             result = _see(replace(state, tracks=None), pair, prediction, settings)
         if isinstance(result, Failed):
-            refused.append(RefusedFrame(stamp_ns, result.reason))
+            yield RefusedFrame(stamp_ns, result.reason)
             continue
         state, sighting = result
-        sightings.append(sighting)
-    return tuple(sightings), tuple(refused)
+        yield sighting
 
 
 def _see(

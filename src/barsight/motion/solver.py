@@ -18,7 +18,7 @@ from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
 from barsight.motion.point_kernels import Guess, Reduced, Rig, Sights, eliminate, residuals, substitute
 from barsight.motion.problem import Prior, Problem, StereoSightings
-from barsight.motion.rig_drift import HUBER_SIGMAS, LOOSE, columns
+from barsight.motion.rig_drift import HUBER_SIGMAS, LOOSE
 
 MOST_ITERATIONS = 25
 RELATIVE_GAIN = 1e-5
@@ -102,8 +102,8 @@ def sights_of(problem: Problem, used: Bool) -> Sights:
     """The sightings as the kernels take them."""
     seen = problem.sightings
     assert seen is not None
-    by_drift = columns(seen) * ([1.0, 1.0] if problem.sees_scale else [1.0, 0.0])
-    return Sights(seen.first, seen.node, used, seen.stereo, 1 / seen.sigma_px, by_drift)
+    scale = 1.0 if problem.sees_scale else 0.0
+    return Sights(seen.first, seen.node, used, seen.stereo, 1 / seen.sigma_px, scale)
 
 
 def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
@@ -116,15 +116,14 @@ def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
 
 
 def optimise(
-    problem: Problem, graph: Any, state: State, used: Bool, drift_free: bool = False,
-    most: int = MOST_ITERATIONS,
-) -> tuple[State, System]:  # fmt: skip
+    problem: Problem, graph: Any, state: State, used: Bool, most: int = MOST_ITERATIONS
+) -> tuple[State, System]:
     """The state that fits best and its system. [Levenberg 1944, Marquardt 1963]
 
-    graph: GTSAM's factors of all but the sightings. drift_free: whether the rig's drift is sought too.
-    Raises LinAlgError where the measurements leave an unknown undetermined.
+    graph: GTSAM's factors of all but the sightings. The rig's drift stays. Raises LinAlgError where the
+    measurements leave an unknown undetermined.
     """
-    free = np.array([True] * problem.has_latency + [drift_free, drift_free])
+    free = np.array([True] * problem.has_latency + [False, False])
     cost, damping = _cost(problem, graph, state, used), 0.0
     system = linearise(problem, graph, state, used)
     for _ in range(most):

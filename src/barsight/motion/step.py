@@ -123,7 +123,7 @@ def refine(
             ],
             axis=1,
         )
-        by_turn = -by_point @ _cross(moved)
+        by_turn = -by_point @ cross(moved)
         jacobian = np.concatenate([by_turn, by_point], axis=2)
         spread = by_point @ rotation @ by_old_places
         covariance = variance * (spread @ spread.transpose(0, 2, 1) + np.eye(3))
@@ -147,8 +147,8 @@ def refine(
     return Step(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
 
 
-def _cross(vectors: Float64) -> Float64:
-    """(N, 3) to (N, 3, 3) with `_cross(v) @ w = v x w`."""
+def cross(vectors: Float64) -> Float64:
+    """(N, 3) to (N, 3, 3) with `cross(v)[k] @ w = v[k] x w`."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     rows = [np.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
@@ -160,7 +160,7 @@ def carried(covariance: Float64, way: Float64) -> Float64:
     that is fixed to it: what the attitude is off by swings the point.
     """
     further = np.eye(6)
-    further[3:, :3] = -_cross(way[None])[0]
+    further[3:, :3] = -cross(way[None])[0]
     result: Float64 = further @ covariance @ further.T
     return result
 

@@ -1,0 +1,214 @@
+"""Takes frames as they come: new nodes, what binds them, the window's solution, and what leaves it.
+
+Sensors are read no further than they would have come; the encoders' place of a node joins as soon as the
+readings after it do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.core.pose import Pose
+from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import PosedFrame, RefusedFrame
+from barsight.features.guided import PredictedMotion
+from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.crane import CraneSettings, fit_position, with_seen_noise
+from barsight.motion.fusion import PLACE_SPACING_S, FusionSettings
+from barsight.motion.graph import start_values
+from barsight.motion.gravity import Level
+from barsight.motion.nodes import divided, make_nodes, preintegrated, resting, start_poses, tied_by_imu
+from barsight.motion.prediction import CranePredictor, moved_by_imu
+from barsight.motion.problem import Attitude, Placed, Problem
+from barsight.motion.readings import Readings
+from barsight.motion.sightings import Sighting
+from barsight.motion.solver import State
+from barsight.motion.window import Window, grown, solved, with_frame, without_first
+
+SENSOR_DELAY_S = 0.06
+"""A frame is computed once readings this much later are there."""
+LOOK_BACK_S = 6.0
+"""What is held of IMU and encoders before the first node held."""
+FIT_S = PLACE_SPACING_S / 2 + 0.01
+
+
+class LiveEstimator:
+    """Takes frame after frame and holds `held` of them; `window` is all that it knows."""
+
+    def __init__(
+        self, settings: FusionSettings, crane: CraneSettings, held: int, rectifier: Rectifier, shift_ns: int,
+        readings: Readings, level: Level | None,
+    ) -> None:  # fmt: skip
+        self._settings, self._crane, self._held = settings, crane, held
+        self._rectifier, self._shift_ns = rectifier, shift_ns
+        self._readings, self._level = readings, level
+        self.window: Window | None = None
+        self._last_placed_ns = self._last_seen_ns = -(10**18)
+        self._stood = False
+
+    def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
+        """A `Predictor`: by the IMU from the last estimate, else by encoders; None without either."""
+        window, now = self.window, self._now(new_ns)
+        if window is None or window.newest is None:
+            return None
+        at = np.flatnonzero(window.problem.stamp_ns == old_ns + self._shift_ns)
+        if now.imu is not None and at.size:
+            stamps = np.array([window.problem.stamp_ns[-1], new_ns + self._shift_ns])
+            part = preintegrated(stamps, now.imu, now.noise, window.bias)[0]
+            if part is not None:
+                return moved_by_imu(
+                    window.pose(int(at[0])), window.body, part, window.bias, window.newest.covariance,
+                    self._rectifier.body_from_rect0,
+                )  # fmt: skip
+        if now.crane is None:
+            return None
+        bias = window.bias.gyro_radps
+        return CranePredictor(now.crane, now.imu, bias, self._rectifier, self._shift_ns)(old_ns, new_ns)
+
+    def take(self, seen: Sighting | RefusedFrame) -> PosedFrame | RefusedFrame:
+        """The frame's pose, or why it has none."""
+        stamp = seen.stamp_ns + self._shift_ns
+        sighting = seen if isinstance(seen, Sighting) else None
+        now = self._now(seen.stamp_ns)
+        covered = now.crane is not None and not isinstance(
+            fit_position(now.crane, stamp, seconds_to_ns(self._crane.window_s)), Failed
+        )
+        if sighting is None and not covered:
+            assert isinstance(seen, RefusedFrame)
+            return seen
+        window = (
+            self._begun(stamp, sighting, now) if self.window is None else self._grown(stamp, sighting, now)
+        )
+        if isinstance(window, Failed):
+            return RefusedFrame(seen.stamp_ns, window.reason)
+        window = with_frame(window, sighting, self._held)
+        window = self._bound(window, now, stamp)
+        rectifier = self._rectifier
+        try:
+            window, problem, used = solved(window, rectifier.camera, rectifier.body_from_rect0)
+        except np.linalg.LinAlgError:
+            return RefusedFrame(seen.stamp_ns, "the sensors together have no solution here")
+        if sighting is not None:
+            self._last_seen_ns = stamp
+        pose = window.pose(len(window.problem.start) - 1)
+        covariance = window.covariance
+        leaving = window.leaving(self._held)
+        self.window = without_first(window, problem, used, leaving) if leaving else window
+        return PosedFrame(seen.stamp_ns, pose, covariance)
+
+    def _now(self, stamp_ns: int) -> Readings:
+        """What has come when the frame of a stamp is computed, back to before the nodes held."""
+        last = stamp_ns + self._shift_ns + seconds_to_ns(SENSOR_DELAY_S)
+        begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
+        return self._readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
+
+    def _begun(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
+        nodes = make_nodes(np.array([stamp]), now.imu)
+        if now.crane is None:
+            assert sighting is not None
+        elif isinstance(fit_position(now.crane, stamp, seconds_to_ns(0.35)), Failed):
+            return Failed("no-encoder", "the encoders don't cover the first frame")
+        sightings = () if sighting is None else (sighting,)
+        start = start_poses(nodes, now.crane, sightings, self._shift_ns, self._rectifier, self._level)
+        ties = tied_by_imu(nodes, start, now.imu, now.noise)
+        settings = self._settings
+        problem = Problem(
+            start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
+            offset_prior_px=settings.calibration_sigma_px, scale_prior=settings.scale_sigma,
+            has_latency=now.crane is not None, has_imu=now.imu is not None,
+        )  # fmt: skip
+        state = State(start_values(problem), np.empty((0, 3)), np.zeros(2))
+        window = Window(problem, (), state, np.empty(0, np.int64))
+        return self._with_attitudes(window, 0, now)
+
+    def _grown(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
+        window = self.window
+        assert window is not None
+        first = len(window.problem.start)
+        last_ns = int(window.problem.stamp_ns[-1])
+        stamps = divided(last_ns, stamp) if now.imu is not None else [stamp]
+        parts: tuple[Preintegrated | None, ...] = (None,) * len(stamps)
+        if now.imu is not None:
+            parts = preintegrated(np.array([last_ns, *stamps]), now.imu, now.noise, window.bias)
+        poses, speeds = self._started(window, stamps, parts, sighting, now)
+        grew = grown(window, stamps, poses, speeds, parts)
+        if now.imu is not None:
+            tail = slice(max(0, first - 2), None)
+            rest = resting(grew.problem.stamp_ns[tail], self._places(grew)[tail], now.imu, now.noise)
+            still = tuple(k + tail.start for k in rest if k + tail.start >= first)
+            grew = replace(grew, problem=replace(grew.problem, still=grew.problem.still + still))
+        return self._with_attitudes(grew, first, now)
+
+    def _started(
+        self, window: Window, stamps: list[int], parts: tuple[Preintegrated | None, ...],
+        sighting: Sighting | None, now: Readings,
+    ) -> tuple[list[Pose], list[Float64]]:  # fmt: skip
+        """Where new nodes begin: by the IMU, else on the line to where pictures or encoders see the last."""
+        old = window.pose(len(window.problem.start) - 1)
+        if all(part is not None for part in parts):
+            poses, speeds, state = [], [], window.body
+            for part in parts:
+                assert part is not None
+                state = part.predict(state, window.bias)
+                poses.append(Pose(old.target, "body", state.rotation, state.position_m))
+                speeds.append(state.velocity_mps)
+            return poses, speeds
+        end = old
+        at = np.flatnonzero(window.problem.stamp_ns == self._last_seen_ns)
+        if sighting is not None and sighting.motion is not None and at.size:
+            mount, motion = self._rectifier.body_from_rect0, sighting.motion
+            moved = Pose("rect0", "rect0", motion.rotation, motion.translation).inverse()
+            end = window.pose(int(at[0])) @ mount @ moved @ mount.inverse()
+        elif now.crane is not None:
+            fit = fit_position(now.crane, stamps[-1], seconds_to_ns(0.35))
+            if not isinstance(fit, Failed):
+                place = fit.position_m + now.crane.crane_to_body_m
+                end = Pose(old.target, "body", old.rotation, place)
+        seconds = (stamps[-1] - int(window.problem.stamp_ns[-1])) / 1e9
+        way = end.translation - old.translation
+        share = [(k + 1) / len(stamps) for k in range(len(stamps))]
+        poses = [Pose(old.target, "body", end.rotation, old.translation + s * way) for s in share]
+        return poses, [way / seconds] * len(stamps)
+
+    def _places(self, window: Window) -> tuple[Pose, ...]:
+        return tuple(window.pose(k) for k in range(len(window.problem.start)))
+
+    def _with_attitudes(self, window: Window, first: int, now: Readings) -> Window:
+        """The nominal attitude at the nodes from `first` on: loose under way; standing still it is told once,
+        since its error is the same each time.
+        """
+        if now.crane is None:
+            return window
+        crane, problem, added = self._crane, window.problem, []
+        for k in range(first, len(problem.start)):
+            sigma = crane.attitude_std_deg * 1.6
+            if k in problem.still:
+                if self._stood:
+                    continue
+                sigma, self._stood = crane.sway_std_deg, True
+            added.append(Attitude(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
+        return replace(window, problem=replace(problem, attitudes=problem.attitudes + tuple(added)))
+
+    def _bound(self, window: Window, now: Readings, stamp: int) -> Window:
+        """With the encoders' places of nodes whose fit has come to be complete, 0.4 s apart."""
+        if now.crane is None:
+            return window
+        crane, placed = with_seen_noise(now.crane), list(window.problem.placed)
+        complete = stamp + seconds_to_ns(SENSOR_DELAY_S - FIT_S)
+        for k, node_ns in enumerate(window.problem.stamp_ns.tolist()):
+            near = node_ns - self._last_placed_ns < 0.97 * seconds_to_ns(PLACE_SPACING_S)
+            if near or node_ns > complete:
+                continue
+            fit = fit_position(crane, node_ns, seconds_to_ns(FIT_S))
+            if isinstance(fit, Failed):
+                continue
+            place = fit.position_m + crane.crane_to_body_m
+            sigma = float(np.sqrt(fit.covariance[0, 0]))
+            placed.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
+            self._last_placed_ns = node_ns
+        return replace(window, problem=replace(window.problem, placed=tuple(placed)))
