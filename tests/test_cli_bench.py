@@ -56,3 +56,13 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run(["bench", "stereo", str(tmp_path)]) == 3
     text = capsys.readouterr().err
     assert text.count("\n") == 1 and str(tmp_path) in text
+
+
+def test_the_live_estimate_is_timed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(["bench", "live", "--keyframes", "30", "--json", str(tmp_path / "live.json")])
+    assert "30 keyframes" in capsys.readouterr().out
+    bench = json.loads((tmp_path / "live.json").read_text())
+    assert bench["rmse_mm"] < 3
+    assert 0.2 < bench["nees"] < 3
+    assert len(bench["wall_ms"]) == len(bench["grown_mib"]) == 10
+    assert bench["grown_mib"][-1] - bench["grown_mib"][2] < 20

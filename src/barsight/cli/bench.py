@@ -13,6 +13,7 @@ from barsight.cli import bench_matching
 from barsight.cli.arguments import call
 from barsight.cli.bench_bundles import bench_found_bundles
 from barsight.cli.bench_lifts import bench_lift_targets
+from barsight.cli.bench_live import bench_live_estimate
 from barsight.cli.bench_yard import bench_yard
 from barsight.core.errors import ConfigError
 from barsight.evaluation.stereo_ablation import without_one_part
@@ -46,6 +47,7 @@ def run(arguments: Sequence[str]) -> None:
         "lifts": bench_lift_targets,
         "features": bench_matching.features,
         "matching": bench_matching.matching,
+        "live": bench_live_estimate,
     }
     names = " | ".join(benches)
     if not arguments or arguments[0] in ("-h", "--help"):

@@ -182,7 +182,11 @@ class FusedTrajectory:
 
         start = start_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
         noise = recording.imu_noise() or ORDINARY_NOISE
-        ties = tied_by_imu(nodes, start, inputs.imu, noise)
+        if inputs.crane is not None:
+            known = int(inputs.crane.stamp_ns[0]), int(inputs.crane.stamp_ns[-1])
+        else:
+            known = inputs.sightings[0].stamp_ns + shift, inputs.sightings[-1].stamp_ns + shift
+        ties = tied_by_imu(nodes, start, known, inputs.imu, noise)
         placed: list[Placed] = []
         attitudes: list[Attitude] = []
         if inputs.crane is not None:

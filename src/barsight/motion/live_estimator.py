@@ -22,7 +22,15 @@ from barsight.motion.crane import CraneSettings, fit_position, with_seen_noise
 from barsight.motion.fusion import PLACE_SPACING_S, FusionSettings
 from barsight.motion.graph import start_values
 from barsight.motion.gravity import Level
-from barsight.motion.nodes import divided, make_nodes, preintegrated, resting, start_poses, tied_by_imu
+from barsight.motion.nodes import (
+    MOST_STILL_M,
+    divided,
+    make_nodes,
+    preintegrated,
+    quiet_at,
+    start_poses,
+    tied_by_imu,
+)
 from barsight.motion.prediction import CranePredictor, moved_by_imu
 from barsight.motion.problem import Attitude, Placed, Problem
 from barsight.motion.readings import Readings
@@ -108,14 +116,16 @@ class LiveEstimator:
         return self._readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
 
     def _begun(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
-        nodes = make_nodes(np.array([stamp]), now.imu)
+        # Without encoders the first frame is the origin: a node before it would be, and move against it.
+        nodes = make_nodes(np.array([stamp]), None if now.crane is None else now.imu)
         if now.crane is None:
             assert sighting is not None
         elif isinstance(fit_position(now.crane, stamp, seconds_to_ns(0.35)), Failed):
             return Failed("no-encoder", "the encoders don't cover the first frame")
         sightings = () if sighting is None else (sighting,)
         start = start_poses(nodes, now.crane, sightings, self._shift_ns, self._rectifier, self._level)
-        ties = tied_by_imu(nodes, start, now.imu, now.noise)
+        known = (stamp, stamp) if now.crane is None else (int(now.crane.stamp_ns[0]), stamp)
+        ties = tied_by_imu(nodes, start, known, now.imu, now.noise)
         settings = self._settings
         problem = Problem(
             start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
@@ -137,11 +147,10 @@ class LiveEstimator:
             parts = preintegrated(np.array([last_ns, *stamps]), now.imu, now.noise, window.bias)
         poses, speeds = self._started(window, stamps, parts, sighting, now)
         grew = grown(window, stamps, poses, speeds, parts)
-        if now.imu is not None:
-            tail = slice(max(0, first - 2), None)
-            rest = resting(grew.problem.stamp_ns[tail], self._places(grew)[tail], now.imu, now.noise)
-            still = tuple(k + tail.start for k in rest if k + tail.start >= first)
-            grew = replace(grew, problem=replace(grew.problem, still=grew.problem.still + still))
+        if now.imu is not None and self._stays(stamp, last_ns, sighting, now):
+            quiet = quiet_at(grew.problem.stamp_ns[first:], now.imu, now.noise)
+            still = (*grew.problem.still, *(first + int(k) for k in np.flatnonzero(quiet)))
+            grew = replace(grew, problem=replace(grew.problem, still=still))
         return self._with_attitudes(grew, first, now)
 
     def _started(
@@ -175,8 +184,18 @@ class LiveEstimator:
         poses = [Pose(old.target, "body", end.rotation, old.translation + s * way) for s in share]
         return poses, [way / seconds] * len(stamps)
 
-    def _places(self, window: Window) -> tuple[Pose, ...]:
-        return tuple(window.pose(k) for k in range(len(window.problem.start)))
+    def _stays(self, stamp: int, last_ns: int, sighting: Sighting | None, now: Readings) -> bool:
+        """Whether encoders, else pictures, see no way since the last node. (An IMU sees none at any constant
+        speed.)
+        """
+        if now.crane is not None:
+            window_ns = seconds_to_ns(FIT_S)
+            fits = [fit_position(now.crane, ns, window_ns) for ns in (last_ns, stamp)]
+            places = [fit.position_m for fit in fits if not isinstance(fit, Failed)]
+            return len(places) == 2 and float(np.linalg.norm(places[1] - places[0])) < MOST_STILL_M
+        if sighting is None or sighting.motion is None or self._last_seen_ns != last_ns:
+            return False
+        return float(np.linalg.norm(sighting.motion.translation)) < MOST_STILL_M
 
     def _with_attitudes(self, window: Window, first: int, now: Readings) -> Window:
         """The nominal attitude at the nodes from `first` on: loose under way; standing still it is told once,

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from barsight.calibration.documents import ImuNoise
 from barsight.calibration.rectification import Rectifier
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
@@ -102,16 +102,23 @@ def _between(
     time = (np.clip(stamp_ns, known_ns[0], known_ns[-1]) - known_ns[0]) / NS_PER_S
     known = (known_ns - known_ns[0]) / NS_PER_S
     place = np.column_stack([np.interp(time, known, places[:, axis]) for axis in range(3)])
-    rotation = Slerp(known, turns)(time).as_matrix() if len(known) > 1 else turns.as_matrix()
+    if len(known) > 1:
+        turns = Slerp(known, turns)(time)
+    rotation = np.broadcast_to(turns.as_matrix(), (len(time), 3, 3))
     return tuple(Pose(target, "body", r, p) for r, p in zip(rotation, place, strict=True))
 
 
-def tied_by_imu(nodes: Nodes, start: tuple[Pose, ...], imu: ImuSamples | None, noise: ImuNoise) -> ImuTies:
-    """Preintegrated motions between neighbours, and the nodes at which the body rests."""
+def tied_by_imu(
+    nodes: Nodes, start: tuple[Pose, ...], placed_ns: tuple[int, int], imu: ImuSamples | None, noise: ImuNoise
+) -> ImuTies:
+    """Preintegrated motions between neighbours, and the nodes at which the body rests. placed_ns: from when
+    to when the starting poses are known (IMU's clock).
+    """
     count = len(nodes.stamp_ns)
     if imu is None:
         return ImuTies((None,) * (count - 1), (), ImuBias.none())
-    still = resting(nodes.stamp_ns, start, imu, noise)
+    known = (nodes.stamp_ns >= placed_ns[0]) & (nodes.stamp_ns <= placed_ns[1])
+    still = _resting(nodes.stamp_ns, start, known, imu, noise)
     bias = _bias_at_rest(nodes, still, imu, noise)
     return ImuTies(preintegrated(nodes.stamp_ns, imu, noise, bias), tuple(still), bias)
 
@@ -127,20 +134,34 @@ def preintegrated(
     return tuple(None if isinstance(part, Failed) else part for part in parts)
 
 
-def resting(stamp_ns: Int64, start: tuple[Pose, ...], imu: ImuSamples, noise: ImuNoise) -> list[int]:
+def _resting(
+    stamp_ns: Int64, start: tuple[Pose, ...], known: Bool, imu: ImuSamples, noise: ImuNoise
+) -> list[int]:
     """Which of the nodes (M,) the body rests at. That needs both: an IMU that shows nothing but noise, as it
-    does at constant speed, and a place that doesn't change over the neighbours.
+    does at constant speed, and a place that doesn't change over the neighbours. Where no place is `known`
+    (M,), the rest next to it goes on as long as the IMU shows nothing.
     """
-    count = len(stamp_ns)
-    quiet = stands_still(imu, noise)
-    nearest = np.clip(np.searchsorted(imu.stamp_ns, stamp_ns), 0, imu.stamp_ns.size - 1)
+    quiet = quiet_at(stamp_ns, imu, noise)
     place = np.array([pose.translation for pose in start])
-    still = []
-    for k in range(count):
-        first, last = max(0, k - 1), min(count - 1, k + 1)
-        if quiet[nearest[k]] and np.linalg.norm(place[last] - place[first]) < MOST_STILL_M:
-            still.append(k)
-    return still
+    index = np.flatnonzero(known)
+    rests = np.zeros(len(stamp_ns), np.bool_)
+    for k, node in enumerate(index):
+        first, last = index[max(0, k - 1)], index[min(len(index) - 1, k + 1)]
+        near = np.linalg.norm(place[last] - place[first]) < MOST_STILL_M
+        rests[node] = quiet[node] and near and last > first
+    if len(index):
+        for k in range(index[0] - 1, -1, -1):
+            rests[k] = quiet[k] and rests[k + 1]
+        for k in range(index[-1] + 1, len(rests)):
+            rests[k] = quiet[k] and rests[k - 1]
+    return [int(k) for k in np.flatnonzero(rests)]
+
+
+def quiet_at(stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise) -> Bool:
+    """(M,) whether the IMU shows nothing but noise around the stamps."""
+    nearest = np.clip(np.searchsorted(imu.stamp_ns, stamp_ns), 0, imu.stamp_ns.size - 1)
+    quiet: Bool = stands_still(imu, noise)[nearest]
+    return quiet
 
 
 def _bias_at_rest(nodes: Nodes, still: list[int], imu: ImuSamples, noise: ImuNoise) -> ImuBias:

@@ -194,8 +194,8 @@ def _add_prior(
     border = len(corner)
     count, last = len(prior.matrix) - border, rows.shape[1] - 1
     slope = prior.gradient + prior.matrix @ _since(prior, state)
-    row, column = np.nonzero(np.tri(count))
-    rows[row, column - row + last] += prior.matrix[row, column]
+    for i in range(count):
+        rows[i, last - i :] += prior.matrix[i, : i + 1]
     gradient[:count] += slope[:count]
     side[:, :count] += prior.matrix[count:, :count]
     corner += prior.matrix[count:, count:]

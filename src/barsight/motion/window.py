@@ -24,10 +24,11 @@ from barsight.motion.graph import factors
 from barsight.motion.marginals import Newest, newest
 from barsight.motion.problem import Prior, Problem, StereoSightings
 from barsight.motion.sightings import Sighting
-from barsight.motion.solver import State, System, linearise, optimise, sighting_residuals
+from barsight.motion.solver import State, System, linearise, moved, optimise, sighting_residuals
 from barsight.motion.stereo_factors import often, persistence, start_points
 
-STEPS = 3
+STEPS = 1
+"""Before outliers leave; one more follows. The frame before was solved, so little is left to do."""
 NOISE_SHARE = 0.2
 """By how much one window's noise moves the running one."""
 
@@ -134,7 +135,8 @@ def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window
         points = _points(window, problem, names)
         used = often(seen, np.ones(len(seen.node), np.bool_))
     state = replace(window.state, points=points)
-    state, system = optimise(problem, factors(problem), state, used, most=STEPS)
+    graph = factors(problem)
+    state, system = optimise(problem, graph, state, used, most=STEPS)
     noise = window.noise
     if seen is not None and used.any():
         residual = sighting_residuals(problem, state, used)
@@ -144,11 +146,14 @@ def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window
         now = factor * persistence(residual, seen, used)
         noise = now if noise is None else (1 - NOISE_SHARE) * noise + NOISE_SHARE * now
         problem = replace(problem, sightings=replace(seen, sigma_px=noise * stated))
-        state, system = optimise(problem, factors(problem), state, used, most=1)
+        system = linearise(problem, graph, state, used)
     covariance = None
     if problem.offset_prior_px > 0 and used.any():
         state, drift = drifted(problem, state, system, used)
         covariance = drift.covariance
+    elif used.any():
+        free = np.array([True] * problem.has_latency + [False, False])
+        state = moved(problem, state, used, *system.step(free))
     kept = tuple(
         place for place, fits in zip(problem.placed, agreeing(state.values, problem), strict=True) if fits
     )
@@ -211,8 +216,10 @@ def _without(system: System, count: int) -> tuple[Float64, Float64]:
     n, width = system.rows.shape
     border = len(system.corner)
     whole = np.zeros((n + border, n + border))
-    row, column = np.nonzero(np.tri(n) * (np.subtract.outer(np.arange(n), np.arange(n)) < width))
-    whole[row, column] = whole[column, row] = system.rows[row, column - row + width - 1]
+    for i in range(n):
+        first = max(0, i - width + 1)
+        whole[i, first : i + 1] = system.rows[i, first - i + width - 1 :]
+    whole[:n, :n] += np.tril(whole[:n, :n], -1).T
     whole[n:, :n], whole[:n, n:] = system.side, system.side.T
     whole[n:, n:] = system.corner
     slope = np.concatenate([system.gradient, system.corner_gradient])

@@ -1,0 +1,180 @@
+"""The live estimate against batch and truth, in bounded memory; and what holds nothing to go by."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.errors import ConfigError
+from barsight.core.pose import Pose
+from barsight.core.types import RefusedFrame, StereoFrame, Trajectory
+from barsight.evaluation.drift import compare
+from barsight.inertial.model import ORDINARY_NOISE
+from barsight.motion import fusion, live
+from barsight.motion.crane import CraneSettings
+from barsight.motion.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.live import LiveSettings, LiveTrajectory
+from barsight.motion.live_estimator import LiveEstimator
+from barsight.motion.readings import Readings
+from barsight.recording.base import Recording
+from barsight.recording.open import open_recording
+from barsight.recording.truth import read_ground_truth
+from motion_recordings import MemoryRecording, ideal_rig
+from simulated_ways import steady
+from test_motion_fusion import simulated
+
+ESTIMATORS = {
+    "fused": lambda use: FusedTrajectory(FusionSettings(use=use), CraneSettings()),
+    "live": lambda use: LiveTrajectory(FusionSettings(use=use), LiveSettings(), CraneSettings()),
+}
+
+
+def off_in_sigmas(found: Trajectory, batch: Trajectory) -> float:
+    """RMS of how far the places are apart, in the found ones' sigmas."""
+    off = []
+    for a, b in zip(found.frames, batch.frames, strict=True):
+        way = a.reference_from_body.translation - b.reference_from_body.translation
+        off.append(np.linalg.solve(np.linalg.cholesky(a.covariance[3:, 3:]), way))
+    return float(np.sqrt(np.mean(np.square(off))))
+
+
+def estimated(
+    name: str, use: str, recording: Recording, seen: tuple, patch: pytest.MonkeyPatch
+) -> Trajectory:
+    patch.setattr(
+        fusion, "follow", lambda *_: (tuple(s for s in seen if not isinstance(s, RefusedFrame)), ())
+    )
+    patch.setattr(live, "follow_live", lambda *_: iter(seen))
+    return ESTIMATORS[name](use)(recording, Rectifier(recording.rig), lambda: None)
+
+
+def test_live_agrees_with_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within its own covariance, and that is right against truth."""
+    nees = []
+    for seed in (0, 1, 2):
+        recording, seen, truth = simulated(seed)
+        batch, found = (estimated(n, "stereo,imu,crane", recording, seen, monkeypatch) for n in ESTIMATORS)
+        assert off_in_sigmas(found, batch) < 1.3
+        drift = compare(found, truth, 0)
+        assert drift is not None
+        assert drift.reference_rmse_mm < 2.0
+        nees.append([drift.nees_position, drift.nees_attitude])
+    assert (np.mean(nees, axis=0) < 1.6).all()
+    assert (np.mean(nees, axis=0) > 0.4).all()
+
+
+def test_a_crane_over_bars(data: Path) -> None:
+    recording = open_recording(data / "yard_dev")
+    batch, found = (
+        make("stereo,imu,crane")(recording, Rectifier(recording.rig), lambda: None)
+        for make in ESTIMATORS.values()
+    )
+    assert off_in_sigmas(found, batch) < 1.3
+    truth = read_ground_truth(data / "yard_dev", np.array(recording.index.stamps_ns))
+    drift = compare(found, truth, recording.rig.timeshift_cam_imu_ns)
+    assert drift is not None
+    assert drift.reference_rmse_mm < 1.5
+    assert drift.reference_rmse_deg < 0.05
+    assert drift.nees_position < 2
+
+
+def estimator_of(recording: Recording, use: str, held: int) -> LiveEstimator:
+    crane = recording.crane() if "crane" in use else None
+    readings = Readings(crane, recording.imu(), recording.imu_noise() or ORDINARY_NOISE)
+    level = None if crane else live.level_attitude(recording)
+    settings = FusionSettings(use=use)
+    return LiveEstimator(settings, CraneSettings(), held, Rectifier(recording.rig), 0, readings, level)
+
+
+def test_what_is_held_doesnt_grow() -> None:
+    recording, seen, _ = steady(0.4, 0, frames=30)
+    estimator = estimator_of(recording, "stereo,imu,crane", 4)
+    held = []
+    for sighting in seen:
+        estimator.take(sighting)
+        window = estimator.window
+        assert window is not None
+        held.append((len(window.problem.start), sum(len(s.track) for _, s in window.sightings)))
+    assert max(nodes for nodes, _ in held[10:]) <= max(nodes for nodes, _ in held[:10]) <= 12
+    most = max(len(s.track) for s in seen)
+    assert max(count for _, count in held) <= 4 * most
+
+
+def test_the_imu_alone_predicts_the_next_frame() -> None:
+    """Without encoders: as near the true motion as it says, and near enough to guide the matching."""
+    off = []
+    for seed in range(6):
+        recording, seen, truth = steady(0.4, seed)
+        estimator = estimator_of(recording, "stereo,imu", 8)
+        mount = Rectifier(recording.rig).body_from_rect0
+        for k, sighting in enumerate(seen):
+            if k > 2:
+                predicted = estimator.predict(seen[k - 1].stamp_ns, sighting.stamp_ns)
+                assert predicted is not None
+                old, new = (truth.poses[j] @ mount for j in (k - 1, k))
+                found = Pose("rect0", "rect0", predicted.rotation, predicted.translation)
+                step = (new.inverse() @ old) @ found.inverse()
+                error = np.r_[Rotation.from_matrix(step.rotation).as_rotvec(), step.translation]
+                off.append(error @ np.linalg.solve(predicted.covariance, error) / 6)
+                assert np.linalg.norm(step.translation) < 0.01
+            estimator.take(sighting)
+    assert np.mean(off) < 1.2
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("speed_mps", [0.0, 0.4])
+@pytest.mark.parametrize("use", ["stereo", "stereo,imu", "stereo,imu,crane", "crane,imu"])
+def test_no_motion_and_even_motion(
+    name: str, speed_mps: float, use: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where an IMU sees nothing of the velocity, pictures and encoders must say it."""
+    recording, seen, truth = steady(speed_mps, 3)
+    drift = compare(estimated(name, use, recording, seen, monkeypatch), truth, 0)
+    assert drift is not None
+    assert drift.frames == len(seen)
+    # Live, `world` is upright only as far as the first seconds tell.
+    assert drift.aligned_rmse_mm < {"fused": 2, "live": 20 if use == "stereo,imu" else 6}[name]
+    if "crane" in use:
+        assert drift.reference_rmse_mm < 10  # an unknown latency of 20 ms at 0.4 m/s
+        assert drift.nees_position < 2
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_no_texture(name: str) -> None:
+    """Encoders and IMU place frames that show nothing; without encoders each is refused, with a reason."""
+    recording, _, truth = steady(0.4, 5)
+    gray = np.full((1024, 1280), 90, np.uint8)
+    blank = replace(recording, pictures=tuple(StereoFrame(s, gray, gray) for s in recording.stamps_ns))
+    rectifier = Rectifier(blank.rig)
+    drift = compare(ESTIMATORS[name]("stereo,imu,crane")(blank, rectifier, lambda: None), truth, 0)
+    assert drift is not None
+    assert drift.frames == len(truth.poses)
+    assert drift.reference_rmse_mm < 10
+    alone = ESTIMATORS[name]("stereo,imu")(blank, rectifier, lambda: None)
+    assert alone.frames == ()
+    assert all("have a depth" in frame.reason for frame in alone.refused)
+
+
+def test_frames_that_show_nothing_are_bridged(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, seen, truth = simulated(4)
+    gone = tuple(RefusedFrame(s.stamp_ns, "dark") if 8 <= k < 11 else s for k, s in enumerate(seen))
+    found = estimated("live", "stereo,imu,crane", recording, gone, monkeypatch)
+    drift = compare(found, truth, 0)
+    assert drift is not None
+    assert drift.frames == len(seen)
+    assert drift.reference_rmse_mm < 3
+
+
+def test_settings() -> None:
+    with pytest.raises(ConfigError, match="frames"):
+        LiveSettings(frames=2)
+    recording = MemoryRecording(ideal_rig())
+    assert (
+        LiveTrajectory(FusionSettings(), LiveSettings(), CraneSettings())(
+            recording, Rectifier(recording.rig), lambda: None
+        ).frames
+        == ()
+    )
