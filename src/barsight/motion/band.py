@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.arrays import Float64, kernel
+from barsight.core.arrays import Float64, Int64, kernel
 
 
 @kernel(fastmath=True)
@@ -83,3 +83,50 @@ def inverse_blocks(factor: Float64, size: int, blocks: Float64) -> None:
         for i in range(size):
             for j in range(size):
                 blocks[b, i, j] = inverse[b * size + i, j - i + width - 1]
+
+
+@kernel(fastmath=True)
+def add_products(
+    first: Int64, at: Int64, values: Float64, right: Float64, rows: Float64, gradient: Float64,
+    side: Float64, corner: Float64, corner_gradient: Float64,
+) -> None:  # fmt: skip
+    """Adds the normal equations of sparse rows: row r has values[k] at unknown at[k], first[r] <= k <
+    first[r + 1], and `right`. Unknown n, one after the band's, is the border's first.
+    """
+    n, width = rows.shape
+    for r in range(len(right)):
+        for a in range(first[r], first[r + 1]):
+            i = at[a]
+            if i == n:
+                corner_gradient[0] -= values[a] * right[r]
+            else:
+                gradient[i] -= values[a] * right[r]
+            for b in range(first[r], first[r + 1]):
+                j, product = at[b], values[a] * values[b]
+                if i == n and j == n:
+                    corner[0, 0] += product
+                elif i == n:
+                    side[0, j] += product
+                elif j <= i:
+                    rows[i, j - i + width - 1] += product
+
+
+@kernel(fastmath=True)
+def add_blocks(blocks: Float64, size: int, rows: Float64) -> None:
+    """Adds blocks (M, S, b, b) of unknowns from k size on (rows) with those from (k + s) size on."""
+    width = rows.shape[1]
+    for k in range(blocks.shape[0]):
+        for s in range(min(blocks.shape[1], blocks.shape[0] - k)):
+            for i in range(blocks.shape[2]):
+                for j in range(i if s == 0 else 0, blocks.shape[3]):
+                    row, column = (k + s) * size + j, k * size + i
+                    rows[row, column - row + width - 1] += blocks[k, s, i, j]
+
+
+@kernel(fastmath=True)
+def add_dense(matrix: Float64, count: int, rows: Float64) -> None:
+    """Adds a symmetric matrix's first `count` unknowns to the band's first ones."""
+    width = rows.shape[1]
+    for i in range(count):
+        for j in range(i + 1):
+            rows[i, j - i + width - 1] += matrix[i, j]

@@ -12,7 +12,6 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, E, V, X
-from scipy.sparse import csc_matrix
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
@@ -167,21 +166,13 @@ def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
             np.zeros(2),
         )  # fmt: skip
         eliminate(rig_of(seen), sights_of(problem, used), state.guess(nodes), reduced)
-        _into_rows(rows, reduced.band, width)
+        band.add_blocks(reduced.band, width, rows)
         at = (np.arange(nodes)[:, None] * width + np.arange(6)).ravel()
         gradient[at] = reduced.gradient.ravel()
         side[-2:, at] = reduced.side.reshape(-1, 2).T
         corner[-2:, -2:], corner_gradient[-2:] = reduced.corner, reduced.corner_gradient
-    matrix, right = _others(graph, state.values, width, size)
-    low, last = matrix[:size, :size].tocoo(), matrix[size:].toarray()[0]
-    below = low.row >= low.col
-    at_row, at_column = low.row[below], low.col[below]
-    rows[at_row, at_column - at_row + rows.shape[1] - 1] += low.data[below]
-    gradient += right[:size]
-    if problem.has_latency:
-        side[0] += last[:size]
-        corner[0, 0] += last[size]
-        corner_gradient[0] += right[size]
+    first, at, values, right = _sparse_rows(graph, state.values, width, size)
+    band.add_products(first, at, values, right, rows, gradient, side, corner, corner_gradient)
     if problem.prior is not None:
         _add_prior(problem.prior, state, rows, gradient, side, corner, corner_gradient)
     return System(rows, gradient, side, corner, corner_gradient, width)
@@ -192,10 +183,9 @@ def _add_prior(
     corner_gradient: Float64,
 ) -> None:  # fmt: skip
     border = len(corner)
-    count, last = len(prior.matrix) - border, rows.shape[1] - 1
+    count = len(prior.matrix) - border
     slope = prior.gradient + prior.matrix @ _since(prior, state)
-    for i in range(count):
-        rows[i, last - i :] += prior.matrix[i, : i + 1]
+    band.add_dense(prior.matrix, count, rows)
     gradient[:count] += slope[:count]
     side[:, :count] += prior.matrix[count:, :count]
     corner += prior.matrix[count:, count:]
@@ -219,33 +209,26 @@ def _since(prior: Prior, state: State) -> Float64:
     return np.concatenate([*(move for _, _, move in moves), state.drift - prior.drift])
 
 
-def _into_rows(rows: Float64, blocks: Float64, width: int) -> None:
-    """Adds (M, S, 6, 6) blocks of node k (their rows) with node k + s (their columns) to a band."""
-    for s in range(blocks.shape[1]):
-        nodes = (np.arange(len(blocks) - s) * width)[:, None]
-        i, j = np.nonzero(np.tri(6).T if s == 0 else np.ones((6, 6)))
-        rows[nodes + s * width + j, i - j - s * width + rows.shape[1] - 1] += blocks[: len(nodes), s, i, j]
-
-
-def _others(graph: Any, values: Any, width: int, size: int) -> tuple[csc_matrix, Float64]:
-    """Normal matrix and gradient of GTSAM's factors in our order, the latency last."""
+def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64, Int64, Float64, Float64]:
+    """GTSAM's whitened rows as `band.add_products` takes them; the latency is unknown `size`."""
     linear = graph.linearize(values)
     if linear.size() == 0:
-        return csc_matrix((size + 1, size + 1)), np.zeros(size + 1)
+        return np.zeros(1, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)
     row, column, value = linear.sparseJacobian_()
     where: list[Int64] = []
     for key in linear.keyVector():
         kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
         begin = size if kind == "e" else node * width + OFFSETS[kind]
         where.append(begin + np.arange(WIDTHS[kind]))
-    at = np.concatenate(where)
-    column, row = column.astype(np.int64) - 1, row.astype(np.int64) - 1
-    rows, last = int(row.max(initial=0)) + 1, len(at)
-    right = np.zeros(rows)
-    of_right = column == last
+    unknown = np.concatenate(where)
+    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
+    right = np.zeros(int(row.max()) + 1)
+    of_right = column == len(unknown)
     right[row[of_right]] = value[of_right]
-    design = csc_matrix((value[~of_right], (row[~of_right], at[column[~of_right]])), (rows, size + 1))
-    return (design.T @ design).tocsc(), -(design.T @ right)
+    row, column, value = row[~of_right], column[~of_right], value[~of_right]
+    order = np.argsort(row, kind="stable")
+    first = np.searchsorted(row[order], np.arange(len(right) + 1)).astype(np.int64)
+    return first, unknown[column[order]], np.ascontiguousarray(value[order]), right
 
 
 def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Float64) -> State:
