@@ -18,7 +18,10 @@ IMU_PARTS = 9
 
 
 def inertial(problem: Problem, state: State, system: System) -> Inertial | None:
-    """Of all nodes (their own clock); the rig's drift and the encoders' latency are taken as known."""
+    """Of all nodes (their own clock); the rig's drift and the encoders' latency are taken as known.
+
+    The velocity is NaN where the IMU ties the node to neither neighbour.
+    """
     if not problem.has_imu:
         return None
     count = len(problem.start)
@@ -27,6 +30,9 @@ def inertial(problem: Problem, state: State, system: System) -> Inertial | None:
     sigma = np.sqrt(np.einsum("nii->ni", blocks)[:, 6:])
     biases = [state.values.atConstantBias(B(k)) for k in range(count)]
     velocity = np.array([state.values.atVector(V(k)) for k in range(count)])
+    tied = np.array([part is not None for part in problem.preintegrated])
+    alone = ~(np.append(tied, False) | np.append(False, tied))
+    velocity[alone] = sigma[alone, :3] = np.nan
     return Inertial(
         problem.stamp_ns, velocity, sigma[:, :3],
         np.array([bias.gyroscope() for bias in biases]), sigma[:, 6:],

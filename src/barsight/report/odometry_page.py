@@ -64,7 +64,7 @@ def odometry_summary(result: OdometryResult) -> dict[str, Any]:
     ]  # fmt: skip
     if detail is not None and detail.inertial is not None:
         columns = {
-            f.name: getattr(detail.inertial, f.name).tolist()
+            f.name: [_or_null(row) for row in getattr(detail.inertial, f.name)]
             for f in dataclasses.fields(detail.inertial) if f.name != "stamp_ns"
         }  # fmt: skip
         for k, frame in enumerate(frames):
@@ -245,6 +245,10 @@ def _line(name: str, x: Float64, y: Float64, colour: int) -> Trace:
         "x": numbers(x[kept], 3), "y": numbers(y[kept], 5), "line": {"color": SERIES[colour], "width": 1.4},
         "marker": {"color": SERIES[colour], "size": 4},
     }  # fmt: skip
+
+
+def _or_null(row: Float64) -> list[float] | None:
+    return row.tolist() if np.isfinite(row).all() else None
 
 
 def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
