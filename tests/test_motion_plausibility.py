@@ -88,7 +88,8 @@ def estimated(path: Path, **spoiling: Callable) -> tuple[float, float, tuple[str
 
 
 def test_lost_frames_wild_and_late_encoders(data: Path) -> None:
-    """A tenth of the frames and 2 s lost, 5 % of the readings 50 mm off, all 40 ms late."""
+    """A tenth of the frames and 2 s lost, 5 % of the readings 50 mm off, all 40 ms late: at most 1.5 times the
+    0.61 mm of the whole recording, and 1.7 times its 0.0102 degrees."""
     stamps = open_recording(data / "yard_dev").index.stamps_ns
 
     def kept(k: int) -> bool:
@@ -97,8 +98,8 @@ def test_lost_frames_wild_and_late_encoders(data: Path) -> None:
     mm, deg, warnings = estimated(
         data / "yard_dev", kept=kept, spoil_crane=lambda crane: late(with_outliers(crane, 0.05, 0.05), 0.04)
     )
-    assert mm < 0.95
-    assert deg < 0.02
+    assert mm < 0.91
+    assert deg < 0.0175
     assert len(warnings) == 1
     assert "the encoders are 40 ms late" in warnings[0] or "the encoders are 41 ms late" in warnings[0]
 
