@@ -18,7 +18,7 @@ PITCH_M = 0.09
 
 def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a [b] c"
-    assert run(["odometry", str(whole), "-o", str(out)]) == 0
+    assert run(["odometry", str(whole), "-o", str(out), "--use", "stereo,imu,crane"]) == 0
     assert "placed in yard" in capsys.readouterr().out
     assert sorted(path.name for path in out.iterdir()) == ["odometry.json", "report.html", "trajectory.tum"]
     page = (out / "report.html").read_text()
@@ -37,7 +37,7 @@ def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert set(data["residuals_in_sigma"]) == {"pictures", "imu", "encoders"}
     assert all(max(part["rms"]) < 3 for part in data["residuals_in_sigma"].values())
     assert data["drift"]["reference_rmse_mm"] < 20
-    assert run(["odometry", str(whole), "-o", str(out), "--fusion.use", "stereo"]) == 0
+    assert run(["odometry", str(whole), "-o", str(out), "--use=stereo"]) == 0
     data = json.loads((out / "odometry.json").read_text())
     assert data["reference"] == "world" and "velocity_mps" not in data["frames"][0]
 

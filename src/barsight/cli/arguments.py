@@ -15,7 +15,21 @@ Settings = TypeVar("Settings")
 
 def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> None:
     """Parse `arguments` by the function's signature and call it; wrong usage exits with 2."""
-    tyro.cli(command, prog=f"barsight {name}", args=list(arguments), compact_help=False)
+    tyro.cli(command, prog=f"barsight {name}", args=_listed(arguments), compact_help=False)
+
+
+def _listed(arguments: Sequence[str]) -> list[str]:
+    """`--use stereo,imu` as `--use stereo imu`."""
+    listed: list[str] = []
+    for argument in arguments:
+        flag, equals, value = argument.partition("=")
+        if flag == "--use" and equals:
+            listed += [flag, *value.split(",")]
+        elif listed and listed[-1] == "--use":
+            listed += argument.split(",")
+        else:
+            listed.append(argument)
+    return listed
 
 
 def config_path(arguments: Sequence[str]) -> Path | None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -33,6 +34,7 @@ def run(arguments: Sequence[str]) -> None:
     def command(
         recording: tyro.conf.Positional[Path],
         out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
+        use: tuple[Literal["stereo", "imu", "crane"], ...] | None = None,
         reading: RecordingSettings = RecordingSettings(),  # noqa: B008
         settings: Annotated[MotionSettings, tyro.conf.arg(name="")] = MotionSettings(),  # noqa: B008
     ) -> None:
@@ -41,12 +43,15 @@ def run(arguments: Sequence[str]) -> None:
         Args:
             recording: The recording.
             out: Folder for trajectory.tum, report.html and odometry.json; nothing is written without it.
+            use: Sensors that may be used, where the recording has them: stereo,imu,crane if not given.
             reading: How to read the recording.
-            settings: The estimate's settings; --fusion.use names the sensors.
+            settings: The estimate's settings.
         """
         console = Console()
         source = open_recording(recording, reading)
         rectifier = Rectifier(source.rig)
+        if use is not None:
+            settings = replace(settings, fusion=replace(settings.fusion, use=",".join(use)))
         trajectory = make_estimator(settings)(source, rectifier, lambda: None)
         if not trajectory.frames:
             why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"
