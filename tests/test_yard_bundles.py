@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
+from barsight.core.types import Source
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
-from barsight.yard.types import Bundle
+from barsight.yard.headings import find_headings
+from barsight.yard.types import Bundle, HeightMap
 from yard_maps import Laid, draw
 
 SETTINGS = BundleSettings()
@@ -148,3 +150,16 @@ def test_a_beam_over_bundles_is_no_bundle() -> None:
     bundles = find_bundles(heights, SETTINGS)
     assert len(bundles) == 4 and all(b.on_top for b in bundles)
     assert all(any("something narrow crosses" in reason for reason in b.reasons) for b in bundles)
+
+
+def test_ripples_of_the_floor_are_no_heading() -> None:
+    """Matching ripples a flat floor along the pictures' columns; the bars alone say how bundles lie."""
+    x, y = np.meshgrid(0.01 * np.arange(900), 0.01 * np.arange(400))
+    turned = np.cos(np.radians(4.2)) * x + np.sin(np.radians(4.2)) * y
+    z = 0.004 * np.sin(2 * np.pi * turned / 0.15)
+    stack = x < 2.0
+    z[stack] = 0.3 + np.sqrt(0.045**2 - (np.mod(x[stack], 0.09) - 0.045) ** 2)
+    flat = np.full(z.shape, 0.005, np.float32)
+    seen = np.full(z.shape, Source.VISION, np.uint8)
+    height_map = HeightMap(0.0, 0.0, 0.01, z.astype(np.float32), flat, flat + 3, seen)
+    assert find_headings(height_map, 3.0) == (0.0,)

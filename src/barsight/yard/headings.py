@@ -42,8 +42,9 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
         return (0.0,)
     across = 0.5 * np.arctan2(odd[clear], even[clear])  # direction of the slope from +x: the heading itself
     degrees = np.degrees(across)
-    counts, _ = np.histogram(degrees, bins=180, range=(-90, 90))
-    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), 2.0, mode="wrap")
+    # A block counts by its relief: the ripples of a flat floor run as the pictures do, not as the bars.
+    relief, _ = np.histogram(degrees, bins=180, range=(-90, 90), weights=energy[clear])
+    smooth = ndimage.gaussian_filter1d(relief, 2.0, mode="wrap")
     found: list[float] = []
     for index in np.argsort(-smooth, kind="stable"):
         if smooth[index] < _LEAST_SHARE * smooth.sum() or len(found) == 4:
