@@ -88,8 +88,8 @@ def estimated(path: Path, **spoiling: Callable) -> tuple[float, float, tuple[str
 
 
 def test_lost_frames_wild_and_late_encoders(data: Path) -> None:
-    """A tenth of the frames and 2 s lost, 5 % of the readings 50 mm off, all 40 ms late: at most 1.5 times the
-    0.61 mm of the whole recording, and 1.7 times its 0.0102 degrees."""
+    """A tenth of the frames and 2 s lost, 5 % of the readings 50 mm off, all 40 ms late: at most 1.5 times
+    the 0.61 mm of the whole recording, and 1.7 times its 0.0102 degrees."""
     stamps = open_recording(data / "yard_dev").index.stamps_ns
 
     def kept(k: int) -> bool:

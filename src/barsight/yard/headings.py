@@ -13,6 +13,8 @@ _BLOCK_M = 0.3
 _COHERENT = 0.5
 _STEEPEST = 1.5
 _LEAST_SHARE = 0.02
+_LEAST_RELIEF = 0.15
+"""Of the mean squared slope where most of the relief is: what a block needs to count."""
 
 
 def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
@@ -37,17 +39,20 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
         return summed
 
     even, odd, energy = blocks(gx * gx - gy * gy), blocks(2 * gx * gy), blocks(gx * gx + gy * gy)
+    # The ripples of a flat floor run as the pictures do, not as the bars: they have little relief.
+    usual = float((energy**2).sum() / max(energy.sum(), 1e-12))
     clear = np.hypot(even, odd) > _COHERENT * np.maximum(energy, 1e-12)
+    clear &= energy > _LEAST_RELIEF * usual
     if not clear.any():
         return (0.0,)
     across = 0.5 * np.arctan2(odd[clear], even[clear])  # direction of the slope from +x: the heading itself
     degrees = np.degrees(across)
-    # A block counts by its relief: the ripples of a flat floor run as the pictures do, not as the bars.
-    relief, _ = np.histogram(degrees, bins=180, range=(-90, 90), weights=energy[clear])
-    smooth = ndimage.gaussian_filter1d(relief, 2.0, mode="wrap")
+    counts, _ = np.histogram(degrees, bins=180, range=(-90, 90))
+    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), 2.0, mode="wrap")
     found: list[float] = []
-    for index in np.argsort(-smooth, kind="stable"):
-        if smooth[index] < _LEAST_SHARE * smooth.sum() or len(found) == 4:
+    peak = (smooth >= np.roll(smooth, 1)) & (smooth >= np.roll(smooth, -1))
+    for index in np.argsort(np.where(peak, -smooth, 0.0), kind="stable"):
+        if not peak[index] or smooth[index] < _LEAST_SHARE * smooth.sum() or len(found) == 4:
             break
         near = np.abs((degrees - (index - 89.5) + 90) % 180 - 90) < apart_deg
         offset = np.median((degrees[near] - (index - 89.5) + 90) % 180 - 90) if near.any() else 0.0
