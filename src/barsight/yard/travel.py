@@ -10,6 +10,7 @@ from scipy.interpolate import interp1d
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed
+from barsight.core.pose import skew
 from barsight.core.types import CraneSamples, RectifiedCamera, Trajectory
 from barsight.motion.crane import fit_position
 from barsight.yard.contact import UPPER
@@ -51,8 +52,7 @@ class Travel:
         """
         stamps, places = trajectory.stamp_ns, trajectory.positions_m
         lever = np.array([0.0, 0.0, -range_m])
-        turn = np.array([[0, lever[2], -lever[1]], [-lever[2], 0, lever[0]], [lever[1], -lever[0], 0]])
-        carry = np.hstack([turn, np.eye(3)])
+        carry = np.hstack([-skew(lever), np.eye(3)])
         ground = [np.diag(carry @ frame.covariance @ carry.T) for frame in trajectory.frames]
         refused = np.array([frame.stamp_ns for frame in trajectory.refused], np.int64)
         return cls(
