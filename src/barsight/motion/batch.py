@@ -90,7 +90,7 @@ def solve(problem: Problem) -> Estimate:
         poses, covariances(found, poses, drift), velocity, biases, sigma, drift, used,
         encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
         disagreement(state.values, everywhere), agreeing(state.values, everywhere),
-        inertial(problem, state, system), pictures, imu_in_sigmas(problem, state), points,
+        inertial(problem, state, found.nodes), pictures, imu_in_sigmas(problem, state), points,
     )  # fmt: skip
 
 

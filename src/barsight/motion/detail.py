@@ -8,26 +8,23 @@ from gtsam.symbol_shorthand import B, V
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.motion_detail import Inertial, InSigmas
-from barsight.motion.band import inverse_blocks
 from barsight.motion.graph import factors
 from barsight.motion.problem import Placed, Problem
-from barsight.motion.solver import State, System, sighting_residuals
+from barsight.motion.solver import State, sighting_residuals
 
 IMU_PARTS = 9
 """Of GTSAM's residual: three of turn, of way and of speed; the biases' walk follows."""
 
 
-def inertial(problem: Problem, state: State, system: System) -> Inertial | None:
-    """Of all nodes (their own clock); the rig's drift and the encoders' latency are taken as known.
+def inertial(problem: Problem, state: State, covariance: Float64) -> Inertial | None:
+    """Of all nodes (their own clock). covariance: (M, n, n) as `Marginals.nodes` has it.
 
     The velocity is NaN where the IMU ties the node to neither neighbour.
     """
     if not problem.has_imu:
         return None
     count = len(problem.start)
-    blocks = np.empty((count, system.size, system.size))
-    inverse_blocks(system.factor(), system.size, blocks)
-    sigma = np.sqrt(np.einsum("nii->ni", blocks)[:, 6:])
+    sigma = np.sqrt(np.einsum("nii->ni", covariance)[:, 6:])
     biases = [state.values.atConstantBias(B(k)) for k in range(count)]
     velocity = np.array([state.values.atVector(V(k)) for k in range(count)])
     tied = np.array([part is not None for part in problem.preintegrated])

@@ -14,12 +14,14 @@ from barsight.motion.solver import System
 @dataclass(frozen=True, eq=False)
 class Marginals:
     """poses: (M, 6, 6) in GTSAM's order and body axes, the rig's drift taken as known. latency_sigma_s: nan
-    without encoders. swing: (M, 6, 2) how the poses move with the drift.
+    without encoders. swing: (M, 6, 2) how the poses move with the drift. nodes: (M, n, n) of all that a node
+    has, the latency taken as known too.
     """
 
     poses: Float64
     latency_sigma_s: float
     swing: Float64
+    nodes: Float64
 
 
 def marginals(system: System) -> Marginals:
@@ -28,9 +30,9 @@ def marginals(system: System) -> Marginals:
     solved = system.solved(factor)
     own, _ = system.schur(solved)
     count = len(factor) // size
-    poses = np.empty((count, size, size))
-    inverse_blocks(factor, size, poses)
-    poses = poses[:, :6, :6]
+    nodes = np.empty((count, size, size))
+    inverse_blocks(factor, size, nodes)
+    poses = nodes[:, :6, :6]
     by_border = -solved[1:].T.reshape(count, size, -1)[:, :6]
     swing, latency = by_border[:, :, -2:], float("nan")
     if len(own) == 3:
@@ -39,7 +41,7 @@ def marginals(system: System) -> Marginals:
         to_latency = by_border[:, :, :1]
         poses = poses + variance * to_latency @ to_latency.transpose(0, 2, 1)
         swing = swing - to_latency @ (own[:1, 1:] * variance)
-    return Marginals(poses, latency, swing)
+    return Marginals(poses, latency, swing, nodes)
 
 
 @dataclass(frozen=True, eq=False)
