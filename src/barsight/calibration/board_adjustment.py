@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.lens_model import Lens, project
 from barsight.calibration.views import BoardView
 from barsight.core.arrays import Float64, Int64
+from barsight.core.pose import skew
 
 MOST_STEPS = 100
 COST_TOLERANCE = 1e-12
@@ -188,7 +189,7 @@ def _derivatives(
     turned = np.einsum("nij,nj->ni", rotation, observed.points_m + observed.by_shape @ state.shape)
     by_shape = rotation @ observed.by_shape
     point = turned + state.board_translation_m[observed.view]
-    by_board = np.concatenate([-_cross(turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
+    by_board = np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
     if camera == 1:
         rig_turned = point @ state.rotation.T
         point = rig_turned + state.translation_m
@@ -197,7 +198,7 @@ def _derivatives(
     projected = project(lens, state.lenses[camera], point)
     by_common = projected.by_lens
     if camera == 1:
-        by_rig = np.concatenate([-_cross(rig_turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
+        by_rig = np.concatenate([-skew(rig_turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
         by_common = np.concatenate([by_common, projected.by_point @ by_rig], axis=2)
     by_common = np.concatenate([by_common, projected.by_point @ by_shape], axis=2)
     return observed.pixels - projected.pixels, by_common, projected.by_point @ by_board
@@ -245,10 +246,3 @@ def move(state: State, common: Float64, boards: Float64 | None = None) -> State:
             board_translation_m=state.board_translation_m + boards[:, 3:],
         )
     return moved
-
-
-def _cross(v: Float64) -> Float64:
-    """(N, 3, 3) so that `_cross(v) @ w` is v x w."""
-    zero = np.zeros(len(v))
-    x, y, z = v.T
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

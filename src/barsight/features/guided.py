@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64
+from barsight.core.pose import skew
 from barsight.core.types import RectifiedCamera
 from barsight.features.patches import Located, PatchImage, PatchPair, locate
 
@@ -100,10 +101,7 @@ def predict_places(
     stereo = project_stereo(moved, camera)
     safe = np.where(np.isfinite(stereo[:, :1]), moved, [0.0, 0.0, 1.0])
     by_point = stereo_jacobian(safe, camera)
-    x, y, z = safe.T
-    zero = np.zeros(len(points))
-    cross = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    by_motion = np.concatenate([by_point @ -cross, by_point], axis=2)
+    by_motion = np.concatenate([by_point @ -skew(safe), by_point], axis=2)
     covariance = by_motion @ motion.covariance @ by_motion.transpose(0, 2, 1)
     old = by_point @ motion.rotation @ np.linalg.inv(stereo_jacobian(points, camera))
     covariance += sigma_px**2 * (old @ old.transpose(0, 2, 1))

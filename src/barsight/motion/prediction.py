@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.pose import Pose
+from barsight.core.pose import Pose, skew
 from barsight.core.stamps import interpolate_at, seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.features.guided import PredictedMotion
 from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 from barsight.motion.crane import fit_position
-from barsight.motion.step import cross
 from barsight.motion.sway import turned_angle
 
 if TYPE_CHECKING:
@@ -94,12 +93,12 @@ def moved_by_imu(
     # What the attitude turns is all but what the IMU itself measured.
     way = state.velocity_mps * dt + np.array([0.0, 0.0, -GRAVITY_MPS2]) * dt**2 / 2
     by_state = np.zeros((6, 15))
-    by_state[3:, :3] = cross((state.rotation.T @ way)[None])[0]
+    by_state[3:, :3] = skew(state.rotation.T @ way)
     by_state[3:, 6:9] = state.rotation.T * dt
     by_state[3:, 9:12] = -np.eye(3) * dt**2 / 2
     by_state[:3, 12:] = -np.eye(3) * dt
     own = by_state @ covariance @ by_state.T + part.covariance[:6, :6]
     to_rect0 = np.kron(np.eye(2), body_from_rect0.rotation.T)
-    to_rect0[3:, :3] = -body_from_rect0.rotation.T @ cross(body_from_rect0.translation[None])[0]
+    to_rect0[3:, :3] = -body_from_rect0.rotation.T @ skew(body_from_rect0.translation)
     spread = SPARE_SIGMAS**2 * (to_rect0 @ own @ to_rect0.T)
     return PredictedMotion(motion.rotation, motion.translation, spread)

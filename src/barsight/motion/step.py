@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
+from barsight.core.pose import skew
 from barsight.core.types import RectifiedCamera
 from barsight.features.guided import match_across
 from barsight.features.matching import match_mutual
@@ -123,7 +124,7 @@ def refine(
             ],
             axis=1,
         )
-        by_turn = -by_point @ cross(moved)
+        by_turn = -by_point @ skew(moved)
         jacobian = np.concatenate([by_turn, by_point], axis=2)
         spread = by_point @ rotation @ by_old_places
         covariance = variance * (spread @ spread.transpose(0, 2, 1) + np.eye(3))
@@ -147,20 +148,12 @@ def refine(
     return Step(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
 
 
-def cross(vectors: Float64) -> Float64:
-    """(N, 3) to (N, 3, 3) with `cross(v)[k] @ w = v[k] x w`."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    rows = [np.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    return np.stack(rows, axis=1)
-
-
 def carried(covariance: Float64, way: Float64) -> Float64:
     """(6, 6) of a pose, rotation then translation in the reference's axes, for a point `way` (m) further on
     that is fixed to it: what the attitude is off by swings the point.
     """
     further = np.eye(6)
-    further[3:, :3] = -cross(way[None])[0]
+    further[3:, :3] = -skew(way)
     result: Float64 = further @ covariance @ further.T
     return result
 
