@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.arrays import expect_shape, kernel
-from barsight.core.parallel import ordered_map
+from barsight.core.parallel import ordered_map, read_ahead
 from barsight.core.timing import Stopwatch
 
 
@@ -52,6 +52,32 @@ def test_leaving_early_ends_the_threads() -> None:
     results.close()
     assert threading.active_count() == before
     assert len(started) <= 4
+
+
+def test_items_are_made_while_others_are_used() -> None:
+    made: list[int] = []
+    there = threading.Event()
+
+    def items() -> Iterator[int]:
+        for k in range(5):
+            made.append(k)
+            there.set()
+            yield k
+        raise ZeroDivisionError
+
+    before = threading.active_count()
+    ahead = read_ahead(items())
+    assert next(ahead) == 0
+    there.clear()
+    assert made == [0, 1] or (there.wait(5) and made == [0, 1])
+    assert [next(ahead) for _ in range(4)] == [1, 2, 3, 4]
+    with pytest.raises(ZeroDivisionError):
+        next(ahead)
+    assert threading.active_count() == before
+    left = read_ahead(iter(range(1000)), count=3)
+    assert next(left) == 0
+    left.close()
+    assert threading.active_count() == before
 
 
 def test_a_stopwatch_adds_up_and_survives_exceptions() -> None:

@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed
-from barsight.core.pose import Pose
+from barsight.core.pose import Pose, skew
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame, Trajectory
-from barsight.features.guided import project_stereo, triangulate
+from barsight.features.guided import project_stereo, stereo_jacobian, triangulate
 from barsight.motion.odometry import StereoOdometry
 from barsight.motion.step import Step, _by_old_places, carried, in_world, refine
+from barsight.motion.step_kernel import step_equations
 from barsight.motion.views import OdometrySettings
 from barsight.recording.open import open_recording
 from barsight.recording.truth import read_ground_truth
@@ -91,6 +92,37 @@ def test_how_points_move_with_their_places() -> None:
         expected[:, :, k] = (triangulate(places + moved, HALL) - triangulate(places - moved, HALL)) / 2e-5
     np.testing.assert_allclose(
         _by_old_places(triangulate(places, HALL), HALL), expected, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_the_kernel_against_matrices() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform((-2, -2, 3), (2, 2, 9), (80, 3))
+    points[7, 2] = -1
+    turn, variance = Rotation.from_rotvec(TURN).as_matrix(), 0.09
+    target = project_stereo(points @ turn.T + MOVE, HALL) + rng.normal(0, 0.5, (80, 3))
+    target[:10] += rng.uniform(-20, 20, (10, 3))
+    by_old = _by_old_places(points, HALL)
+    base = HALL.focal_px * HALL.baseline_m
+    lens = np.array([HALL.focal_px, HALL.cx_px, HALL.cy_px, base, HALL.doffs_px])
+    distance, normal, gradient = np.empty(80), np.empty((6, 6)), np.empty(6)
+    step_equations(points, by_old, target, turn, MOVE, lens, variance, distance, normal, gradient)
+    moved = points @ turn.T + MOVE
+    by_point = stereo_jacobian(moved, HALL)
+    jacobian = np.concatenate([-by_point @ skew(moved), by_point], axis=2)
+    spread = by_point @ turn @ by_old
+    information = np.linalg.inv(variance * (spread @ spread.transpose(0, 2, 1) + np.eye(3)))
+    residual = np.nan_to_num(target - project_stereo(moved, HALL))
+    expected = np.sqrt(np.einsum("ni,nij,nj->n", residual, information, residual))
+    expected[7] = np.inf
+    weight = np.where(expected < 5, np.minimum(1, 1.5 / expected), 0)
+    assert 0 < np.count_nonzero(weight) < 79
+    np.testing.assert_allclose(distance, expected)
+    np.testing.assert_allclose(
+        normal, np.einsum("n,nki,nkl,nlj->ij", weight, jacobian, information, jacobian)
+    )
+    np.testing.assert_allclose(
+        gradient, np.einsum("n,nki,nkl,nl->i", weight, jacobian, information, residual)
     )
 
 

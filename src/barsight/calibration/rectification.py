@@ -6,32 +6,16 @@ Both cameras are turned about their centres so that their x axes run along the b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.rig import StereoRig
-from barsight.core.arrays import Bool, Float32, Float64, UInt8
+from barsight.calibration.warp import Warp
+from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera, RectifiedPair, StereoFrame
-
-
-@dataclass(frozen=True, eq=False)
-class _Warp:
-    """Where each rectified pixel comes from: map_x, map_y (H, W) float32 raw pixels; valid where inside."""
-
-    map_x: Float32
-    map_y: Float32
-    valid: Bool
-
-    def __call__(self, image: UInt8) -> UInt8:
-        warped: UInt8 = cv2.remap(
-            image, self.map_x, self.map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-        )
-        return warped
 
 
 class Rectifier:
@@ -47,7 +31,7 @@ class Rectifier:
         self.body_from_rect0 = rig.body_from_cam0 @ Pose("cam0", "rect0", rotation, np.zeros(3))
         right_rotation = right_from_rectified(rig)
         self._lenses, self._rotations = (rig.cam0, rig.cam1), (rotation, right_rotation)
-        self._warps: tuple[_Warp, _Warp] | None = None
+        self._warps: tuple[Warp, Warp] | None = None
         if _is_rectified(rig):
             self.camera = RectifiedCamera(
                 rig.cam0.fx_px, rig.cam0.cx_px, rig.cam0.cy_px, rig.baseline_m,
@@ -144,7 +128,7 @@ def _principal_point(camera: Camera, rotation: Float64, focal: float) -> tuple[f
 
 def _warp(
     camera: Camera, rotation: Float64, intrinsics: tuple[float, float, float], size: tuple[int, int]
-) -> _Warp:
+) -> Warp:
     focal, cx, cy = intrinsics
     new_matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
     coefficients = np.array(camera.coefficients or (0.0,) * 4, dtype=np.float64)
@@ -156,5 +140,4 @@ def _warp(
     map_x, map_y = make_maps(
         camera.matrix, coefficients, rotation.T, new_matrix, (size[1], size[0]), cv2.CV_32FC1
     )
-    valid = (map_x >= 0) & (map_x <= camera.width - 1) & (map_y >= 0) & (map_y <= camera.height - 1)
-    return _Warp(map_x, map_y, valid)
+    return Warp.of(map_x, map_y, (camera.height, camera.width))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import TypeVar, cast
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -26,5 +26,26 @@ def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], worke
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def read_ahead(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
+    """The items in order, the next `count` of them made in a thread of their own while one is used.
+
+    An exception of the items comes out at its turn; leaving early waits for the item under way.
+    """
+    end = object()
+    pool = ThreadPoolExecutor(1)
+    source = iter(items)
+
+    def following() -> Item | object:
+        return next(source, end)
+
+    waiting = deque(pool.submit(following) for _ in range(count))
+    try:
+        while (item := waiting.popleft().result()) is not end:
+            waiting.append(pool.submit(following))
+            yield cast(Item, item)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

@@ -7,7 +7,7 @@ errors don't add up from frame to frame; after that its last view takes over.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ from barsight.features.guided import (
 from barsight.features.patches import PatchImage, PatchPair
 
 MOST_VIEWS = 8
+TILES = 4
 
 
 @dataclass(frozen=True)
@@ -150,24 +151,26 @@ def detect_corners(image: UInt8, settings: TrackSettings, taken: Float64) -> Flo
 
     The picture is cut into 4 x 4 tiles that yield alike, so that a bright label doesn't take them all.
     """
-    mask = np.full(image.shape, 255, np.uint8)
-    for x, y in taken.round().astype(int):
-        cv2.circle(mask, (int(x), int(y)), settings.spacing_px, 0, -1)
-    wanted = max(0, settings.points - len(taken))
-    if wanted == 0:
-        return np.empty((0, 2), np.float32)
-    rows, columns = (np.linspace(14, size - 14, 5).astype(int) for size in image.shape)
-    found = []
-    for top, bottom in pairwise(rows):
-        for left, right in pairwise(columns):
-            tile = image[top:bottom, left:right]
-            places = cv2.goodFeaturesToTrack(
-                tile, max(1, wanted // 16), settings.quality, settings.spacing_px,
-                mask=mask[top:bottom, left:right], blockSize=7,
-            )  # fmt: skip
-            if places is not None:
-                found.append(places.reshape(-1, 2) + np.array([left, top], np.float32))
-    return np.concatenate(found).astype(np.float32) if found else np.empty((0, 2), np.float32)
+    small = cv2.pyrDown(image)
+    mask = np.full(small.shape, 255, np.uint8)
+    for x, y in (taken / 2).round().astype(int).tolist():
+        cv2.circle(mask, (x, y), settings.spacing_px // 2, 0, -1)
+    rows, columns = (np.linspace(7, size - 7, TILES + 1).astype(int) for size in small.shape)
+    there, _, _ = np.histogram2d(taken[:, 1] / 2, taken[:, 0] / 2, [rows, columns])
+    found = [np.empty((0, 2), np.float32)]
+    for (i, (top, bottom)), (j, (left, right)) in product(
+        enumerate(pairwise(rows)), enumerate(pairwise(columns))
+    ):
+        wanted = settings.points // TILES**2 - int(there[i, j])
+        if wanted <= 0:
+            continue
+        places = cv2.goodFeaturesToTrack(
+            small[top:bottom, left:right], wanted, settings.quality, settings.spacing_px / 2,
+            mask=mask[top:bottom, left:right], blockSize=5,
+        )  # fmt: skip
+        if places is not None:
+            found.append(2 * (places.reshape(-1, 2) + np.array([left, top], np.float32)))
+    return np.concatenate(found)
 
 
 def _across(

@@ -10,7 +10,7 @@ import numpy as np
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import Failed
-from barsight.core.parallel import ordered_map
+from barsight.core.parallel import ordered_map, read_ahead
 from barsight.core.types import RefusedFrame, StereoFrame
 from barsight.features.guided import GuidedMatches, PredictedMotion, predict_places, triangulate
 from barsight.features.patches import PatchPair, patch_pair
@@ -98,7 +98,7 @@ def follow_live(
             return RefusedFrame(frame.stamp_ns, rectified.reason)
         return patch_pair(rectified)
 
-    for pair in ordered_map(prepare, recording.frames(), PREPARED):
+    for pair in ordered_map(prepare, read_ahead(recording.frames()), PREPARED):
         advance()
         if isinstance(pair, RefusedFrame):
             yield pair

@@ -15,6 +15,7 @@ from barsight.core.types import RectifiedCamera
 from barsight.features.guided import match_across
 from barsight.features.matching import match_mutual
 from barsight.features.patches import locate
+from barsight.motion.step_kernel import MOST_SIGMAS, step_equations
 from barsight.motion.views import OdometrySettings, View
 
 
@@ -103,41 +104,19 @@ def refine(
     projected into the new pair and widens the residual's covariance. Huber's weights; outliers beyond 5
     sigma leave. The step's covariance is that of a small motion that follows it, in the new frame's axes.
     """
-    focal, base = camera.focal_px, camera.focal_px * camera.baseline_m
-    variance = settings.pixel_sigma_px**2
-    by_old_places = _by_old_places(points, camera)
+    base = camera.focal_px * camera.baseline_m
+    lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, base, camera.doffs_px])
+    by_old_places, target = _by_old_places(points, camera), np.ascontiguousarray(target)
     kept: Bool = np.ones(len(points), dtype=np.bool_)
-    normal = np.eye(6)
+    distance, normal, gradient = np.empty(len(points)), np.empty((6, 6)), np.empty(6)
     for _ in range(10):
-        moved = points @ rotation.T + translation
-        in_front = moved[:, 2] > 0.1
-        x, y, z = np.where(in_front[:, None], moved, 1.0).T
-        u, v = focal * x / z + camera.cx_px, focal * y / z + camera.cy_px
-        predicted = np.column_stack([u, v, u - base / z + camera.doffs_px])
-        residual = target - predicted
-        zero = np.zeros_like(z)
-        by_point = np.stack(
-            [
-                np.stack([focal / z, zero, -focal * x / z**2], axis=1),
-                np.stack([zero, focal / z, -focal * y / z**2], axis=1),
-                np.stack([focal / z, zero, -focal * x / z**2 + base / z**2], axis=1),
-            ],
-            axis=1,
-        )
-        by_turn = -by_point @ skew(moved)
-        jacobian = np.concatenate([by_turn, by_point], axis=2)
-        spread = by_point @ rotation @ by_old_places
-        covariance = variance * (spread @ spread.transpose(0, 2, 1) + np.eye(3))
-        information = np.linalg.inv(covariance)
-        distance = np.sqrt(((information @ residual[:, :, None])[:, :, 0] * residual).sum(axis=1))
-        kept = (distance < 5.0) & in_front
+        step_equations(
+            points, by_old_places, target, rotation, translation, lens, settings.pixel_sigma_px**2, distance,
+            normal, gradient,
+        )  # fmt: skip
+        kept = distance < MOST_SIGMAS
         if kept.sum() < settings.least_inliers:
             return Failed("no-consensus", f"only {int(kept.sum())} of {len(points)} points agree in 3D")
-        weight = np.where(kept, np.minimum(1.0, 1.5 / np.maximum(distance, 1e-9)), 0.0)
-        weighted = information * weight[:, None, None]
-        rows = jacobian.reshape(-1, 6)
-        normal = rows.T @ (weighted @ jacobian).reshape(-1, 6)
-        gradient = rows.T @ (weighted @ residual[:, :, None]).reshape(-1)
         update = np.linalg.solve(normal, gradient)
         rotation = Rotation.from_rotvec(update[:3]).as_matrix() @ rotation
         translation = Rotation.from_rotvec(update[:3]).as_matrix() @ translation + update[3:]
