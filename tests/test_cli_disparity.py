@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from barsight.calibration.rig_file import write_rig_file
 from barsight.cli.main import run
 from barsight.stereo.disparity_files import read_disparity
+from motion_recordings import ideal_rig
 
 SHIFT_PX = 12
 
@@ -52,6 +54,21 @@ def test_colour_and_16_bits_are_turned_to_grey(pair: tuple[Path, Path], tmp_path
     assert run(["disparity", *map(str, pair), "-o", str(plain)]) == 0
     assert run(["disparity", str(colour), str(deep), "-o", str(mixed)]) == 0
     assert plain.read_bytes() == mixed.read_bytes()
+
+
+def test_csca_looks_at_the_colours_of_raw_pictures_too(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    tinted = [tmp_path / "left tinted.png", tmp_path / "right tinted.png"]
+    for path, out in zip(pair, tinted, strict=True):
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(out), np.dstack([grey, grey, grey // 2]))
+    rig = tmp_path / "rig.yaml"
+    write_rig_file(rig, ideal_rig(260, 150))
+    plain, raw = tmp_path / "plain.pfm", tmp_path / "raw.pfm"
+    csca = ["--method", "csca", "--range", "4:20"]
+    assert run(["disparity", *map(str, tinted), "-o", str(plain), *csca]) == 0
+    assert run(["disparity", *map(str, tinted), "-o", str(raw), *csca, "--rig", str(rig)]) == 0
+    assert plain.read_bytes() == raw.read_bytes()
+    assert abs(np.nanmedian(read_disparity(raw).disparity_px) - SHIFT_PX) < 0.1
 
 
 def test_a_black_pair_has_no_match(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from barsight.stereo.census_transform import HEIGHT_PX, WIDTH_PX, WORST, census_
 from barsight.stereo.cross_regions import cross_filter, cross_regions
 from barsight.stereo.csca import _Scale, _tie, scale_weights
 from barsight.stereo.gradient_cost import GradientCostSettings, cost_images, gradient_cost
-from barsight.stereo.guided import guided_filter
+from barsight.stereo.guided import colour_guided_filter, guided_filter
 from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.nonlocal_tree import refined
 from barsight.stereo.outliers import region_vote
@@ -72,6 +72,16 @@ def test_guided_filter_is_the_mean_of_local_linear_models(rng: np.random.Generat
         slope = (windows(guide * one) - mean * mean_cost) / (windows(guide * guide) - mean**2 + epsilon)
         expected = windows(slope) * guide + windows(mean_cost - slope * mean)
         np.testing.assert_allclose(result, expected, atol=2e-4)
+
+
+def test_a_colour_guide_of_three_like_channels_is_a_gray_one(rng: np.random.Generator) -> None:
+    """Three channels alike share one slope, so that each is held by a third of the regulariser."""
+    guide = rng.uniform(0, 255, (40, 50)).astype(np.float32)
+    cost = rng.uniform(0, 3, (2, 40, 50)).astype(np.float32)
+    found = colour_guided_filter(np.dstack([guide] * 3), 3, 120.0)(cost.copy())
+    expected = guided_filter(guide, 3, 40.0)(cost.copy())
+    inner = (slice(None), slice(6, -6), slice(6, -6))  # beyond the border OpenCV mirrors, we cut windows off
+    np.testing.assert_allclose(found[inner], expected[inner], atol=1e-3)
 
 
 def test_spanning_tree_is_minimal_and_its_filter_sums_over_all_paths(rng: np.random.Generator) -> None:
@@ -269,7 +279,7 @@ def test_scales_are_tied_by_halving_place_and_candidate(rng: np.random.Generator
     images = cost_images(np.zeros((3, 4), np.float32), np.zeros((3, 4), np.float32), everywhere, everywhere)
     slices = rng.random((8, 5, 7)).astype(np.float32)
     tied = slices.copy()
-    _tie(tied, 0.6, 2, _Scale(images, coarse_candidates, coarse))
+    _tie(tied, 0.6, 2, _Scale(images, images.left, coarse_candidates, coarse))
     for index in range(8):
         for y in range(5):
             for x in range(7):

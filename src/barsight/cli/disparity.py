@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import numpy as np
 import tyro
@@ -20,12 +20,13 @@ from barsight.core.errors import CalibrationError, ConfigError, Failed, InputErr
 from barsight.core.types import Disparity, DisparityRange, RectifiedCamera, RectifiedPair, StereoFrame
 from barsight.mapping.view import disparity_range
 from barsight.measurement import Preview
-from barsight.recording.images import TornImageError, decode_gray
+from barsight.recording.images import TornImageError, decode_colour, decode_gray
 from barsight.report.files import write_preview
 from barsight.stereo.disparity_files import write_disparity
 from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
 from barsight.stereo.settings import StereoSettings, make_method
 
+_Picture = TypeVar("_Picture", UInt8, UInt8 | None)
 SUFFIXES = (".pfm", ".png", ".tif", ".tiff")
 
 
@@ -44,7 +45,8 @@ def run(arguments: Sequence[str]) -> None:
         """Match one pair: the left picture's disparity, in pixels, with a sigma per pixel in a .tif.
 
         Args:
-            left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to grey.
+            left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to grey,
+                but `csca` looks at the colours too.
             right: The right picture.
             out: The file to write: .pfm, .png (16 bits, disparity times 256) or .tif (disparity and sigma).
             rig: Rig file (ours, Kalibr's, OpenCV's) or EuRoC folder: the pictures are raw and get rectified.
@@ -89,11 +91,16 @@ def _summary(out: Path, disparity: Disparity) -> str:
 
 def _pair(left: Path, right: Path, rig: Path | None) -> RectifiedPair:
     """The rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
-    frame = StereoFrame(0, _read(left), _read(right))
+    frame = StereoFrame(0, _read(left, decode_gray), _read(right, decode_gray))
+    left_colour, right_colour = _read(left, decode_colour), _read(right, decode_colour)
+    colours = None if left_colour is None or right_colour is None else (left_colour, right_colour)
     if rig is not None:
-        pair = Rectifier(read_rig_file(rig))(frame)
+        rectifier = Rectifier(read_rig_file(rig))
+        pair = rectifier(frame)
         if isinstance(pair, Failed):
             raise CalibrationError(rig, pair.reason, "give the rig of these pictures")
+        if colours is not None:
+            pair = _with_colours(pair, rectifier, *colours)
     else:
         if frame.left.shape != frame.right.shape:
             sizes = " and ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (frame.left, frame.right))
@@ -101,7 +108,7 @@ def _pair(left: Path, right: Path, rig: Path | None) -> RectifiedPair:
         height, width = frame.left.shape
         whole = np.ones((height, width), np.bool_)
         camera = RectifiedCamera(float(width), (width - 1) / 2, (height - 1) / 2, 1.0, 0.0, width, height)
-        pair = RectifiedPair(0, frame.left, frame.right, whole, whole, camera)
+        pair = RectifiedPair(0, frame.left, frame.right, whole, whole, camera, *(colours or ()))
     offset = vertical_offset(pair.left, pair.right)
     if not isinstance(offset, Failed) and offset > MOST_OFFSET_PX:
         remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their --rig"
@@ -111,9 +118,16 @@ def _pair(left: Path, right: Path, rig: Path | None) -> RectifiedPair:
     return pair
 
 
-def _read(path: Path) -> UInt8:
+def _with_colours(pair: RectifiedPair, rectifier: Rectifier, left: UInt8, right: UInt8) -> RectifiedPair:
+    channels = [rectifier(StereoFrame(0, left[:, :, one], right[:, :, one])) for one in range(3)]
+    pairs = [one for one in channels if not isinstance(one, Failed)]
+    left, right = np.dstack([one.left for one in pairs]), np.dstack([one.right for one in pairs])
+    return replace(pair, left_colour=left, right_colour=right)
+
+
+def _read(path: Path, decode: Callable[[bytes], _Picture]) -> _Picture:
     try:
-        return decode_gray(path.read_bytes())
+        return decode(path.read_bytes())
     except OSError as error:
         raise InputError(path, f"can't be read ({error.strerror})", "check the name") from error
     except TornImageError as error:

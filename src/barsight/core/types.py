@@ -111,6 +111,7 @@ class RectifiedPair:
     """left, right: (H, W) uint8 with matches on the same row, x_right = x_left - disparity.
 
     left_valid, right_valid: (H, W) bool, False where the raw image has no such pixel.
+    left_colour, right_colour: (H, W, 3) uint8, the same in colour (BGR), or None; most methods look at grey.
     """
 
     stamp_ns: int
@@ -119,11 +120,16 @@ class RectifiedPair:
     left_valid: Bool
     right_valid: Bool
     camera: RectifiedCamera
+    left_colour: UInt8 | None = None
+    right_colour: UInt8 | None = None
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
         for name in ("left", "right", "left_valid", "right_valid"):
             expect_shape(name, getattr(self, name), shape)
+        for name in ("left_colour", "right_colour"):
+            if getattr(self, name) is not None:
+                expect_shape(name, getattr(self, name), (*shape, 3))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import InputError
 from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
+from barsight.recording.images import TornImageError, decode_colour
 from barsight.stereo.disparity_files import read_disparity
 
 _BRIGHTEST_16_BIT = 257
@@ -74,7 +75,9 @@ def load_scene(folder: Path) -> StereoScene:
     count = int(np.floor(np.nanmax(truth))) + 2 - lowest
     return StereoScene(
         name=folder.name,
-        pair=pair_from_images(left, right),
+        pair=pair_from_images(
+            left, right, *(_read_colour(folder / name) for name in ("left.png", "right.png"))
+        ),
         truth_px=truth,
         counted=counted,
         mask=mask_path.name if mask_path.is_file() else "known",
@@ -82,12 +85,21 @@ def load_scene(folder: Path) -> StereoScene:
     )
 
 
-def pair_from_images(left: UInt8, right: UInt8) -> RectifiedPair:
+def pair_from_images(
+    left: UInt8, right: UInt8, left_colour: UInt8 | None = None, right_colour: UInt8 | None = None
+) -> RectifiedPair:
     """A pair without a known rig: unit focal length and baseline, everything valid."""
     height, width = left.shape
     everywhere = np.ones((height, width), dtype=np.bool_)
     camera = RectifiedCamera(float(width), (width - 1) / 2, (height - 1) / 2, 1.0, 0.0, width, height)
-    return RectifiedPair(0, left, right, everywhere, everywhere, camera)
+    return RectifiedPair(0, left, right, everywhere, everywhere, camera, left_colour, right_colour)
+
+
+def _read_colour(path: Path) -> UInt8 | None:
+    try:
+        return decode_colour(path.read_bytes())
+    except TornImageError as error:
+        raise InputError(path, str(error), "fetch it again") from error
 
 
 def _read_gray(path: Path) -> UInt8:

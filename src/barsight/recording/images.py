@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +31,19 @@ def decode_gray(data: bytes) -> UInt8:
 
     Raises `TornImageError` for a picture that is cut short, damaged or of an unknown kind.
     """
+    return to_gray(_decoded(data))
+
+
+def decode_colour(data: bytes) -> UInt8 | None:
+    """(H, W, 3) uint8 BGR, or None where the picture holds gray values only. Raises as `decode_gray` does."""
+    image = _eight_bits(_decoded(data))
+    if image.ndim != 3 or image.shape[2] not in (3, 4):
+        return None
+    colour = np.ascontiguousarray(image[:, :, :3])
+    return colour if (colour != colour[:, :, :1]).any() else None
+
+
+def _decoded(data: bytes) -> NDArray[Any]:
     if not data:
         raise TornImageError("is empty")
     if data.startswith(PNG_SIGNATURE):
@@ -42,7 +56,7 @@ def decode_gray(data: bytes) -> UInt8:
         image = None
     if image is None:
         raise TornImageError("is no readable picture")
-    return to_gray(image)
+    return np.asarray(image)
 
 
 def to_gray(image: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8:
@@ -51,15 +65,7 @@ def to_gray(image: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8:
     Raises `TornImageError` for other kinds, and for 16-bit pictures that use the lowest 12 bits only: those
     would come out all but black.
     """
-    if image.dtype == np.uint16:
-        brightest = int(image.max(initial=0))
-        if 0 < brightest < 4096:
-            raise TornImageError(
-                f"is a 16-bit picture whose brightest value is {brightest}: scale it to the full 16 bits"
-            )
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    if image.dtype != np.uint8:
-        raise TornImageError(f"has {image.dtype} pixels; 8 or 16 bits are needed")
+    image = _eight_bits(image)
     if image.ndim == 3:
         if image.shape[2] == 1:
             image = image[:, :, 0]
@@ -69,6 +75,19 @@ def to_gray(image: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8:
         else:
             raise TornImageError(f"has {image.shape[2]} channels; 1, 3 or 4 are needed")
     return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def _eight_bits(image: NDArray[Any]) -> UInt8:
+    if image.dtype == np.uint16:
+        brightest = int(image.max(initial=0))
+        if 0 < brightest < 4096:
+            raise TornImageError(
+                f"is a 16-bit picture whose brightest value is {brightest}: scale it to the full 16 bits"
+            )
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise TornImageError(f"has {image.dtype} pixels; 8 or 16 bits are needed")
+    return np.asarray(image, dtype=np.uint8)
 
 
 def check_png(data: bytes) -> tuple[int, int]:

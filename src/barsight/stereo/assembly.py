@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Int32
+from barsight.core.arrays import Bool, Float32, Int32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.evidence import noise_sigma
@@ -78,13 +78,19 @@ def lands_on_valid(disparity_px: Int32, pair: RectifiedPair) -> Bool:
 
 def mirrored_pair(pair: RectifiedPair) -> RectifiedPair:
     """Right for left as in a mirror: its left disparities are the pair's right ones, mirrored."""
+
+    def mirrored(image: UInt8) -> UInt8:
+        return np.ascontiguousarray(image[:, ::-1])
+
     return RectifiedPair(
         stamp_ns=pair.stamp_ns,
-        left=np.ascontiguousarray(pair.right[:, ::-1]),
-        right=np.ascontiguousarray(pair.left[:, ::-1]),
+        left=mirrored(pair.right),
+        right=mirrored(pair.left),
         left_valid=np.ascontiguousarray(pair.right_valid[:, ::-1]),
         right_valid=np.ascontiguousarray(pair.left_valid[:, ::-1]),
         camera=pair.camera,
+        left_colour=None if pair.right_colour is None else mirrored(pair.right_colour),
+        right_colour=None if pair.left_colour is None else mirrored(pair.left_colour),
     )
 
 

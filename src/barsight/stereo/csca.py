@@ -4,7 +4,7 @@ Costs are aggregated at each scale of a pyramid on their own, then tied: the cos
 scales s minimise sum_s |z_s - a_s|^2 + lambda sum_s |z_s - z_(s-1)|^2, a tridiagonal system; the first row of
 its inverse gives the finest scale's cost as a weighted sum over the scales' aggregated costs a_s. Then winner
 takes all, left-right check, a weighted median where it fails, a parabola where it doesn't. Aggregation is by
-the guided filter, or over the spanning tree of `nonlocal`.
+the guided filter, in colour where the pair has it, or over the spanning tree of `nonlocal`.
 
 Memory: the scales above the finest are kept, a seventh of the volume together (float32); the finest passes
 in blocks of 16 candidates (the tree needs as much again).
@@ -13,7 +13,7 @@ in blocks of 16 candidates (the tree needs as much again).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
@@ -26,7 +26,7 @@ from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.assembly import OutputSettings, assemble, fits, mirrored_pair, nothing
 from barsight.stereo.evidence import has_texture
 from barsight.stereo.gradient_cost import CostImages, GradientCostSettings, cost_images, gradient_cost
-from barsight.stereo.guided import guided_filter
+from barsight.stereo.guided import colour_guided_filter, guided_filter
 from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
 from barsight.stereo.spanning_tree import spanning_tree, tree_filter
 from barsight.stereo.winner import Winners, sweep
@@ -114,11 +114,11 @@ def cross_scale_winners(pair: RectifiedPair, candidates: DisparityRange, setting
     for scale, weight in zip(reversed(pyramid[1:]), reversed(weights[1:]), strict=True):
         costs = np.empty((scale.candidates.count, *scale.images.left.shape), dtype=np.float32)
         gradient_cost(scale.images, scale.candidates.lowest_px, settings.cost, costs)
-        _aggregation(scale.images, settings)(costs)
+        _aggregation(scale, settings)(costs)
         _tie(costs, weight, scale.candidates.lowest_px, tied)
-        tied = _Scale(scale.images, scale.candidates, costs)
+        tied = replace(scale, costs=costs)
     finest = pyramid[0].images
-    aggregate = _aggregation(finest, settings)
+    aggregate = _aggregation(pyramid[0], settings)
 
     def fill(lowest_px: int, slices: Float32) -> None:
         gradient_cost(finest, lowest_px, settings.cost, slices)
@@ -130,7 +130,10 @@ def cross_scale_winners(pair: RectifiedPair, candidates: DisparityRange, setting
 
 @dataclass(frozen=True, eq=False)
 class _Scale:
+    """guide: (H, W) gray or (H, W, 3) colour. costs: (K, H, W)."""
+
     images: CostImages
+    guide: Float32
     candidates: DisparityRange
     costs: Float32
 
@@ -140,8 +143,9 @@ def _pyramid(pair: RectifiedPair, candidates: DisparityRange, scales: int) -> li
     images = cost_images(
         pair.left.astype(np.float32), pair.right.astype(np.float32), pair.left_valid, pair.right_valid
     )
+    guide = images.left if pair.left_colour is None else pair.left_colour.astype(np.float32)
     no_costs = np.empty((0, 0, 0), dtype=np.float32)
-    pyramid = [_Scale(images, candidates, no_costs)]
+    pyramid = [_Scale(images, guide, candidates, no_costs)]
     while len(pyramid) < scales:
         held = pyramid[-1].candidates
         coarser = DisparityRange(held.lowest_px // 2, held.highest_px // 2 + 1)
@@ -149,14 +153,16 @@ def _pyramid(pair: RectifiedPair, candidates: DisparityRange, scales: int) -> li
             break
         masks = [np.ascontiguousarray(mask[::2, ::2]) for mask in (images.left_valid, images.right_valid)]
         images = cost_images(cv2.pyrDown(images.left), cv2.pyrDown(images.right), *masks)
-        pyramid.append(_Scale(images, coarser, no_costs))
+        guide = cv2.pyrDown(guide)
+        pyramid.append(_Scale(images, guide, coarser, no_costs))
     return pyramid
 
 
-def _aggregation(images: CostImages, settings: CscaSettings) -> Callable[[Float32], Float32]:
+def _aggregation(scale: _Scale, settings: CscaSettings) -> Callable[[Float32], Float32]:
     if settings.aggregation == "guided":
-        return guided_filter(images.left, settings.radius_px, settings.epsilon)
-    guide: UInt8 = np.rint(images.left).clip(0, 255).astype(np.uint8)
+        by_guide = guided_filter if scale.guide.ndim == 2 else colour_guided_filter
+        return by_guide(scale.guide, settings.radius_px, settings.epsilon)
+    guide: UInt8 = np.rint(scale.images.left).clip(0, 255).astype(np.uint8)
     return tree_filter(spanning_tree(guide), settings.tree_sigma_gray)
 
 
