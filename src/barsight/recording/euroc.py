@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
@@ -11,12 +10,12 @@ from barsight.calibration.documents import ImuNoise, read_document
 from barsight.calibration.euroc import read_imu, read_rig
 from barsight.calibration.rig import StereoRig
 from barsight.core.errors import InputError
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
-from barsight.recording.base import FrameIndex, RecordingSettings
+from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
+from barsight.recording.base import RecordingSettings
 from barsight.recording.digest import file_digests
-from barsight.recording.pairing import PairedStamps, pair_cameras, read_pair
+from barsight.recording.pairing import pair_cameras
+from barsight.recording.picture_files import PictureFiles
 from barsight.recording.sensors import laser_std, make_crane, make_imu, make_laser
-from barsight.recording.stored import StoredImage, merged
 from barsight.recording.tables import Table, read_image_list, read_table
 
 IMU_COLUMNS = ("timestamp", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z")
@@ -24,7 +23,7 @@ CRANE_COLUMNS = ("timestamp", "bridge_x", "trolley_y", "hoist_z")
 LASER_COLUMNS = ("profile", "x", "y", "z")
 
 
-class EurocRecording:
+class EurocRecording(PictureFiles):
     """A `Recording` in a folder `mav0`. Opening checks the calibration and both lists of pictures.
 
     `state_groundtruth_estimate0` is never read here. Raises `InputError` and `CalibrationError`.
@@ -34,18 +33,18 @@ class EurocRecording:
 
     def __init__(self, path: Path, settings: RecordingSettings) -> None:
         self.path = path
-        self._mav0 = path / "mav0" if (path / "mav0").is_dir() else path
+        self._root = path / "mav0" if (path / "mav0").is_dir() else path
         for camera in ("cam0", "cam1"):
-            if not (self._mav0 / camera).is_dir():
+            if not (self._root / camera).is_dir():
                 raise InputError(
-                    self._mav0, f"has no folder {camera}", "a stereo recording needs both cam0 and cam1"
+                    self._root, f"has no folder {camera}", "a stereo recording needs both cam0 and cam1"
                 )
-        self.rig: StereoRig = chosen_rig(settings.rig, read_rig(self._mav0))
-        left_ns, left_names = read_image_list(self._mav0 / "cam0" / "data.csv")
-        right_ns, right_names = read_image_list(self._mav0 / "cam1" / "data.csv")
+        self.rig: StereoRig = chosen_rig(settings.rig, read_rig(self._root))
+        left_ns, left_names = read_image_list(self._root / "cam0" / "data.csv")
+        right_ns, right_names = read_image_list(self._root / "cam1" / "data.csv")
         self._left = self._image_paths("cam0", left_names)
         self._right = self._image_paths("cam1", right_names)
-        self._pairs: PairedStamps = pair_cameras(self._mav0, left_ns, right_ns, settings.pair_tolerance_s)
+        self._pairs = pair_cameras(self._root, left_ns, right_ns, settings.pair_tolerance_s)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -58,30 +57,8 @@ class EurocRecording:
     @cached_property
     def is_simulated(self) -> bool:
         """`is_simulated` of `body.yaml`; False where it isn't said."""
-        path = self._mav0 / "body.yaml"
+        path = self._root / "body.yaml"
         return path.is_file() and read_document(path).values.get("is_simulated") is True
-
-    @property
-    def index(self) -> FrameIndex:
-        """See `Recording.index`."""
-        return self._pairs.index
-
-    @property
-    def camera_stamps(self) -> PairedStamps:
-        """All pictures' stamps, paired or not."""
-        return self._pairs
-
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
-        """See `Recording.frames`."""
-        pairing = self._pairs.pairing
-        for stamp, left, right in zip(self.index.stamps_ns, pairing.left, pairing.right, strict=True):
-            yield read_pair(stamp, self._mav0, self._left[left], self._right[right], self.rig)
-
-    def stored_images(self) -> Iterator[StoredImage]:
-        """Every picture's bytes as stored, both cameras in time's order, missing files left out."""
-        for camera, stamp, path in merged(self._pairs, self._left, self._right):
-            if path.is_file():
-                yield StoredImage(camera, stamp, path.suffix.lstrip(".").lower(), path.read_bytes())
 
     @cached_property
     def _imu(self) -> ImuSamples | None:
@@ -89,7 +66,7 @@ class EurocRecording:
         if path is None:
             return None
         table = _stamped(path, IMU_COLUMNS)
-        mount = read_imu(self._mav0 / "imu0" / "sensor.yaml").body_from_imu
+        mount = read_imu(self._root / "imu0" / "sensor.yaml").body_from_imu
         return make_imu(path, table.first, table.rest[:, :3], table.rest[:, 3:], mount)
 
     def imu(self) -> ImuSamples | None:
@@ -103,7 +80,7 @@ class EurocRecording:
 
     def crane(self) -> CraneSamples | None:
         """See `Recording.crane`."""
-        folder = self._mav0 / "crane0"
+        folder = self._root / "crane0"
         if not folder.is_dir():
             return None
         table = _stamped(folder / "data.csv", CRANE_COLUMNS)
@@ -111,7 +88,7 @@ class EurocRecording:
 
     def laser(self) -> tuple[LaserProfile, ...]:
         """See `Recording.laser`."""
-        folder = self._mav0 / "laser0"
+        folder = self._root / "laser0"
         if not folder.is_dir():
             return ()
         table = read_table(folder / "data.csv", LASER_COLUMNS)
@@ -127,14 +104,14 @@ class EurocRecording:
             for sensor in ("cam0", "cam1", "imu0", "crane0", "laser0")
             for name in ("data.csv", "sensor.yaml")
         ]
-        return file_digests(self._mav0, [self._mav0 / name for name in ["body.yaml", *names]])
+        return file_digests(self._root, [self._root / name for name in ["body.yaml", *names]])
 
     def _imu_file(self, name: str) -> Path | None:
-        folder = self._mav0 / "imu0"
+        folder = self._root / "imu0"
         return folder / name if folder.is_dir() else None
 
     def _image_paths(self, camera: str, names: tuple[str, ...]) -> list[Path]:
-        folder = self._mav0 / camera / "data"
+        folder = self._root / camera / "data"
         paths = [folder / name for name in names]
         if not any(path.is_file() for path in paths):
             raise InputError(

@@ -7,7 +7,6 @@ and `times.txt`. A second layout has two bare lines of twelve numbers, `image_l`
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -21,12 +20,12 @@ from barsight.calibration.rig import StereoRig
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import CalibrationError, InputError
 from barsight.core.stamps import NS_PER_S, expect_increasing
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
-from barsight.recording.base import FrameIndex, RecordingSettings
+from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
+from barsight.recording.base import RecordingSettings
 from barsight.recording.digest import file_digests
 from barsight.recording.images import TornImageError, decode_gray
-from barsight.recording.pairing import PairedStamps, pair_cameras, read_pair
-from barsight.recording.stored import StoredImage, merged
+from barsight.recording.pairing import pair_cameras
+from barsight.recording.picture_files import PictureFiles
 
 FOLDERS = (
     ("image_0", "image_1", "P0", "P1"),
@@ -42,7 +41,7 @@ def is_kitti(path: Path) -> bool:
     return (path / "calib.txt").is_file() or any((path / names[0]).is_dir() for names in FOLDERS)
 
 
-class KittiRecording:
+class KittiRecording(PictureFiles):
     """A `Recording` in KITTI's layout. `poses.txt` is never read here."""
 
     format = "kitti"
@@ -66,33 +65,13 @@ class KittiRecording:
         if times is None:
             self.notes = (f"no times.txt: {ASSUMED_RATE_HZ} pictures per second are assumed",)
         self._left, self._right = list(left.values()), list(right.values())
+        self._root = path
         self._pairs = pair_cameras(
             path, _stamps(path, left, times), _stamps(path, right, times), settings.pair_tolerance_s
         )
         projections = _read_projections(path / "calib.txt", (keys[0], keys[1]))
         own = _rig(path / "calib.txt", projections, (_size(self._left), _size(self._right)))
         self.rig = chosen_rig(settings.rig, own)
-
-    @property
-    def index(self) -> FrameIndex:
-        """See `Recording.index`."""
-        return self._pairs.index
-
-    @property
-    def camera_stamps(self) -> PairedStamps:
-        """All pictures' stamps, paired or not."""
-        return self._pairs
-
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
-        """See `Recording.frames`."""
-        pairing = self._pairs.pairing
-        for stamp, left, right in zip(self.index.stamps_ns, pairing.left, pairing.right, strict=True):
-            yield read_pair(stamp, self.path, self._left[left], self._right[right], self.rig)
-
-    def stored_images(self) -> Iterator[StoredImage]:
-        """Every picture's bytes as stored, both cameras in time's order."""
-        for camera, stamp, path in merged(self._pairs, self._left, self._right):
-            yield StoredImage(camera, stamp, path.suffix.lstrip(".").lower(), path.read_bytes())
 
     def imu(self) -> ImuSamples | None:
         """None: KITTI's odometry recordings have no IMU."""

@@ -1,4 +1,4 @@
-"""Which left picture belongs to which right one, and the reading of such a pair from two files."""
+"""Which left picture belongs to which right one, and a stored picture's decoding for its camera."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from barsight.calibration.camera import Camera
-from barsight.calibration.rig import StereoRig
 from barsight.core.arrays import Int64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.stamps import Pairing, pair_stamps, seconds_to_ns
-from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.core.types import RefusedFrame
 from barsight.recording.base import FrameIndex
 from barsight.recording.images import TornImageError, decode_gray
 
@@ -44,23 +43,6 @@ def pair_cameras(path: Path, left_ns: Int64, right_ns: Int64, tolerance_s: float
     unpaired = tuple(RefusedFrame(stamp, reason) for stamp, reason in sorted(left_only + right_only))
     stamps = tuple(int(stamp) for stamp in left_ns[pairing.left])
     return PairedStamps(left_ns, right_ns, pairing, FrameIndex(stamps, unpaired))
-
-
-def read_pair(
-    stamp_ns: int, root: Path, left: Path, right: Path, rig: StereoRig
-) -> StereoFrame | RefusedFrame:
-    """One pair from two files; refused, with the file's name below `root`, where either can't be used."""
-    images = []
-    for path, camera in ((left, rig.cam0), (right, rig.cam1)):
-        try:
-            images.append(decode_for(camera, path.read_bytes()))
-        except FileNotFoundError:
-            return RefusedFrame(stamp_ns, f"{path.relative_to(root)} is missing")
-        except OSError as error:
-            return RefusedFrame(stamp_ns, f"{path.relative_to(root)} can't be read ({error.strerror})")
-        except TornImageError as error:
-            return RefusedFrame(stamp_ns, f"{path.relative_to(root)} {error}")
-    return StereoFrame(stamp_ns, images[0], images[1])
 
 
 def decode_for(camera: Camera, data: bytes) -> UInt8:
