@@ -31,17 +31,20 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[F], F
     """Compile a function with Numba, cached on disk so that a second run starts at once.
 
     Where no folder may be written (a read-only installation and home), every run compiles anew.
-    `fastmath` lets the compiler reorder sums; never set it where NaN marks the invalid. A `parallel` kernel
+    `fastmath` lets the compiler reorder sums; never set it where NaN marks the invalid. A division by zero
+    gives inf or NaN as in NumPy: the check for it would keep loops from being vectorised. A `parallel` kernel
     takes all cores, and calls from several threads take turns (Numba's plainest threading layer aborts when
-    two enter it); other kernels can't call it.
+    two enter it); other kernels can't call it. It compiles several times as long as a plain one, which
+    `core.parallel.in_bands` spreads over the cores as well.
     """
+    options = {"parallel": parallel, "fastmath": fastmath, "nogil": True, "error_model": "numpy"}
 
     def decorate(function: F) -> F:
         compiled: Any
         try:
-            compiled = numba.njit(cache=True, parallel=parallel, fastmath=fastmath, nogil=True)(function)
+            compiled = numba.njit(cache=True, **options)(function)
         except RuntimeError:
-            compiled = numba.njit(parallel=parallel, fastmath=fastmath, nogil=True)(function)
+            compiled = numba.njit(**options)(function)
         return cast(F, _in_turn(compiled) if parallel else compiled)
 
     return decorate

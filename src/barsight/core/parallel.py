@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
 from typing import TypeVar, cast
+
+import numba
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -49,3 +52,31 @@ def read_ahead(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
             yield cast(Item, item)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def in_bands(work: Callable[[int, int], None], rows: int, band_rows: int) -> None:
+    """Call `work(first, end)` for every band of `rows` rows, on all cores at once; bands may not depend on
+    each other.
+
+    For compiled kernels, which release the interpreter: plain ones compile in a fraction of the time of
+    parallel ones, and calls from several threads needn't take turns. The caller works along, so that it never
+    waits for a thread that is busy elsewhere.
+    """
+    firsts = iter(range(0, rows, band_rows))
+
+    def take() -> None:
+        for first in firsts:
+            work(first, min(rows, first + band_rows))
+
+    helpers = [_helpers().submit(take) for _ in range(numba.get_num_threads() - 1)]
+    try:
+        take()
+    finally:
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
+
+
+@cache
+def _helpers() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(numba.config.NUMBA_NUM_THREADS - 1, 1), thread_name_prefix="bands")

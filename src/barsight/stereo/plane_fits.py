@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import prange, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int64, kernel
-from barsight.stereo.supports import MARGIN, TILE_COLUMNS, TILE_ROWS, with_margin
+from barsight.core.parallel import in_bands
+from barsight.stereo.supports import BAND_TILES, MARGIN, TILE_COLUMNS, TILE_ROWS
 from barsight.stereo.vectors import FLOAT_LANES, FLOATS, Vectors
 
 _REACH = 2.0
@@ -33,33 +34,36 @@ def fit_planes(
     axes: Float32,
     shape: SupportShape,
     same_surface_px: float,
-) -> tuple[Float32, Float32]:
+    room: tuple[Float32, Float32],
+    fitted: Float32,
+    information: Float32,
+) -> None:
     """A plane through the evidence of each pixel's support: its disparity there, and its information.
 
     Pixel i says: disparity[i] + pull[i] / weight[i], with weight[i] (0 = nothing). Its share falls with the
     distance (Gaussian) and with the difference of disparity (Tukey's biweight that ends at same_surface_px),
-    so that a support doesn't cross a depth edge. Inputs: (H, W), no NaN.
+    so that a support doesn't cross a depth edge. Frames in, no NaN, and two more (`room`) for use inside;
+    (H, W) out.
     """
-    step = shape.step
-    framed = with_margin(disparity)
-    fitted, information = np.empty_like(disparity), np.empty_like(disparity)
+    step, nearness = shape.step, np.float32(1 / same_surface_px)
     if step > 1:
         # Summed over a step along the axis first, the support can go in steps and still hear every pixel.
-        alone = np.ones(1, dtype=np.float32), np.zeros(1, dtype=np.int64)
-        near = np.ones(step, dtype=np.float32), np.arange(step) - step // 2
-        weight_sum, pull_sum = np.empty_like(disparity), np.empty_like(disparity)
-        _gather(
-            framed, with_margin(weight), with_margin(pull), axes, *near, *alone, same_surface_px, False,
-            weight_sum, pull_sum,
-        )  # fmt: skip
-        weight, pull = weight_sum, pull_sum
+        near = np.arange(step) - step // 2
+
+        def sum_up(first: int, end: int) -> None:
+            _sum_near(disparity, weight, pull, axes, near, nearness, *fitted.shape, *room, first, end)
+
+        in_bands(sum_up, len(axes), BAND_TILES)
+        weight, pull = room
     along = _gaussian(shape.along_px, min(int(_REACH * shape.along_px), MARGIN - 8) // step, step)
     across = _gaussian(shape.across_px, int(_REACH * shape.across_px + 0.5), 1)
-    _gather(
-        framed, with_margin(weight), with_margin(pull), axes, *along, *across, same_surface_px, True,
-        fitted, information,
-    )  # fmt: skip
-    return fitted, information
+
+    def gather(first: int, end: int) -> None:
+        _gather(
+            disparity, weight, pull, axes, *along, *across, nearness, fitted, information, first, end
+        )
+
+    in_bands(gather, len(axes), BAND_TILES)
 
 
 def _gaussian(sigma_px: float, reach: int, step: int) -> tuple[Float32, Int64]:
@@ -86,44 +90,30 @@ def _add_up(
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
         index = arguments[3].type
-        zero = v.all(0.0, FLOATS)
-
-        def add(place: Any, term: Any) -> None:
-            builder.store(v.sum(builder.load(place), term), place)
-
-        def number(place: int, at: Any) -> Any:
-            return v.all(builder.load(builder.gep(v.data(place), [at])), FLOATS)
-
-        def length(place: int) -> Any:
-            return context.make_array(signature.args[place])(context, builder, arguments[place]).nitems
-
-        centre = v.load(v.data(0), arguments[3], FLOATS)
-        nearness = v.all(arguments[9], FLOATS)
-        totals = [cgutils.alloca_once_value(builder, zero) for _ in range(9)]
-        with cgutils.for_range(builder, length(7)) as outer:
+        centre, nearness = v.load(v.data(0), arguments[3], FLOATS), v.all(arguments[9], FLOATS)
+        totals = v.zeros(9)
+        with cgutils.for_range(builder, v.length(7)) as outer:
             line = [cgutils.alloca_once(builder, FLOATS) for _ in range(5)]
             for place in line:
-                builder.store(zero, place)
-            with cgutils.for_range(builder, length(5)) as inner:
-                point = builder.add(builder.mul(outer.index, length(5)), inner.index)
+                builder.store(v.all(0.0, FLOATS), place)
+            with cgutils.for_range(builder, v.length(5)) as inner:
+                point = builder.add(builder.mul(outer.index, v.length(5)), inner.index)
                 there = builder.add(arguments[3], builder.load(builder.gep(v.data(4), [point])))
                 gap = v.difference(v.load(v.data(0), there, FLOATS), centre)
-                scaled = v.product(gap, nearness)
-                same = v.not_negative(v.difference(v.all(1.0, FLOATS), v.product(scaled, scaled)))
-                kept = v.product(number(5, inner.index), same, same)
+                kept = v.product(v.number(5, inner.index, FLOATS), v.alike(gap, nearness))
                 weight = v.product(kept, v.load(v.data(1), there, FLOATS))
                 pull = v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, FLOATS)))
-                a = number(6, inner.index)
+                a = v.number(6, inner.index, FLOATS)
                 weight_a = v.product(weight, a)
                 terms = (weight, weight_a, v.product(weight_a, a), pull, v.product(pull, a))
                 for place, term in zip(line, terms, strict=True):
-                    add(place, term)
-            share, c = number(7, outer.index), number(8, outer.index)
+                    v.add_to(place, term)
+            share, c = v.number(7, outer.index, FLOATS), v.number(8, outer.index, FLOATS)
             n, na, naa, m, ma = (v.product(share, builder.load(place)) for place in line)
             nc = v.product(n, c)
             outer_terms = (n, na, nc, naa, v.product(na, c), v.product(nc, c), m, ma, v.product(m, c))
             for place, term in zip(totals, outer_terms, strict=True):
-                add(place, term)
+                v.add_to(place, term)
         for one, place in enumerate(totals):
             target = builder.add(arguments[11], builder.mul(arguments[12], index(one)))
             v.store(builder.load(place), v.data(10), target)
@@ -132,7 +122,66 @@ def _add_up(
     return signature, generate
 
 
-@kernel(parallel=True, fastmath=True)
+@intrinsic  # type: ignore[untyped-decorator]
+def _add_near(
+    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, nearness: Any, weight_sums: Any,
+    pull_sums: Any, at: Any,
+) -> Any:  # fmt: skip
+    """The sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written from
+    `at` on. All arrays are flat."""
+    signature = types.void(
+        theres, weights, pulls, middle, offsets, nearness, weight_sums, pull_sums, at
+    )
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        centre, nearness = v.load(v.data(0), arguments[3], FLOATS), v.all(arguments[5], FLOATS)
+        totals = v.zeros(2)
+        with cgutils.for_range(builder, v.length(4)) as loop:
+            there = builder.add(arguments[3], builder.load(builder.gep(v.data(4), [loop.index])))
+            gap = v.difference(v.load(v.data(0), there, FLOATS), centre)
+            kept = v.alike(gap, nearness)
+            weight = v.product(kept, v.load(v.data(1), there, FLOATS))
+            v.add_to(totals[0], weight)
+            v.add_to(totals[1], v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, FLOATS))))
+        for place, total in zip((6, 7), totals, strict=True):
+            v.store(builder.load(total), v.data(place), arguments[8])
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@kernel()
+def _sum_near(
+    disparity: Float32, weight: Float32, pull: Float32, axes: Float32, near: Int64, nearness: np.float32,
+    height: int, width: int, weight_sum: Float32, pull_sum: Float32, first_tile: int, end_tile: int,
+) -> None:  # fmt: skip
+    """Sums of weights and of pulls from each pixel's own disparity over the points `near` along the axis.
+    Frames in and out."""
+    framed_width = disparity.shape[1]
+    theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
+    offsets = np.empty(len(near), dtype=np.int64)
+    flat = np.empty((2, TILE_COLUMNS), dtype=np.float32)
+    weight_part, pull_part = flat[0], flat[1]
+    for tile_y in range(first_tile, end_tile):
+        for tile_x in range(axes.shape[1]):
+            axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
+            for j in range(len(near)):
+                offsets[j] = round(near[j] * axis_y) * framed_width + round(near[j] * axis_x)
+            x0 = tile_x * TILE_COLUMNS
+            count = min(TILE_COLUMNS, width - x0)
+            for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+                middle = (y + MARGIN) * framed_width + x0 + MARGIN
+                for part in range(0, count, FLOAT_LANES):
+                    _add_near(
+                        theres, weights, pulls, middle + part, offsets, nearness, weight_part, pull_part, part
+                    )
+                for i in range(count):
+                    weight_sum[y + MARGIN, x0 + MARGIN + i] = weight_part[i]
+                    pull_sum[y + MARGIN, x0 + MARGIN + i] = pull_part[i]
+
+
+@kernel(fastmath=True)
 def _gather(
     disparity: Float32,
     weight: Float32,
@@ -142,25 +191,21 @@ def _gather(
     alongs: Int64,
     across_shares: Float32,
     acrosses: Int64,
-    same_surface_px: float,
-    as_planes: bool,
-    first: Float32,
-    second: Float32,
+    nearness: np.float32,
+    fitted: Float32,
+    information: Float32,
+    first_tile: int,
+    end_tile: int,
 ) -> None:
-    """With as_planes each pixel's plane and information, else the sums of weights and of pulls from its own
-    disparity. Arrays with margins in, without out."""
-    height, width = first.shape
-    nearness, one = np.float32(1.0 / same_surface_px), np.float32(1)
+    height, width = fitted.shape
+    one = np.float32(1)
     framed_width, lines, points = disparity.shape[1], len(acrosses), len(alongs)
     theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
     float_alongs, float_acrosses = alongs.astype(np.float32), acrosses.astype(np.float32)
-    for tile_y in prange(axes.shape[0]):
-        flat = np.empty(9 * TILE_COLUMNS, dtype=np.float32)
-        sums = flat.reshape(9, TILE_COLUMNS)
-        s, sa, sc, saa, sac, scc, r, ra, rc = (
-            sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8],
-        )  # fmt: skip
-        offsets = np.empty(lines * points, dtype=np.int64)
+    flat = np.empty(9 * TILE_COLUMNS, dtype=np.float32)
+    sums = flat.reshape(9, TILE_COLUMNS)
+    offsets = np.empty(lines * points, dtype=np.int64)
+    for tile_y in range(first_tile, end_tile):
         for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
             for k in range(lines):
@@ -177,18 +222,15 @@ def _gather(
                         theres, weights, pulls, middle + part, offsets, along_shares, float_alongs,
                         across_shares, float_acrosses, nearness, flat, part, TILE_COLUMNS,
                     )  # fmt: skip
-                if not as_planes:
-                    first[y, x0 : x0 + count] = s[:count]
-                    second[y, x0 : x0 + count] = r[:count]
-                    continue
                 centre = disparity[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
+                planes, certain = fitted[y, x0 : x0 + count], information[y, x0 : x0 + count]
                 for i in range(count):
                     # A slope of zero is held with a small weight, so that a line of pixels still has a plane.
-                    held = np.float32(0.02) * (saa[i] + scc[i]) + np.float32(1e-3)
-                    aa, ac, cc = saa[i] + held, sac[i], scc[i] + held
+                    s, sa, sc, r, ra, rc = sums[0, i], sums[1, i], sums[2, i], sums[6, i], sums[7, i], sums[8, i]
+                    held = np.float32(0.02) * (sums[3, i] + sums[5, i]) + np.float32(1e-3)
+                    aa, ac, cc = sums[3, i] + held, sums[4, i], sums[5, i] + held
                     scale = one / (aa * cc - ac * ac)
-                    from_a = (sa[i] * cc - sc[i] * ac) * scale
-                    from_c = (sc[i] * aa - sa[i] * ac) * scale
-                    left_over = max(s[i] - from_a * sa[i] - from_c * sc[i], np.float32(1e-6))
-                    first[y, x0 + i] = centre[i] + (r[i] - from_a * ra[i] - from_c * rc[i]) / left_over
-                    second[y, x0 + i] = left_over
+                    from_a = (sa * cc - sc * ac) * scale
+                    from_c = (sc * aa - sa * ac) * scale
+                    certain[i] = max(s - from_a * sa - from_c * sc, np.float32(1e-6))
+                    planes[i] = centre[i] + (r - from_a * ra - from_c * rc) / certain[i]

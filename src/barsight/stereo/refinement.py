@@ -16,7 +16,6 @@ turn the highlights beside it into detail.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -25,33 +24,20 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
-from barsight.stereo.curvature import curvature_across
 from barsight.stereo.plane_fits import SupportShape, fit_planes
+from barsight.stereo.pulls import compare, lengthen, noise_power, weigh
+from barsight.stereo.settling import Fit, blend, settle, variances
 from barsight.stereo.sgbm import image_noise
-from barsight.stereo.spline import row_coefficients, value_and_slope
-from barsight.stereo.supports import axis_means, tile_axes
-from barsight.stereo.windows import equalised_difference
+from barsight.stereo.spline import row_coefficients, row_slope, value_and_slope
+from barsight.stereo.supports import MARGIN, axis_means, empty_frame, inside, tile_axes
 
 _BLUR_PX = 0.5
 _FIRST_BLUR_PX = 0.7
-_LONGEST_STEP_PX = 1.5
-_CONTRAST_FLOOR = np.float32(4)
-_SLACK = np.float32(0.5)
-_BLEND_WINDOW_PX = 9
 _LONG_STEP_PX = 5
 _SHORT_STEP_PX = 3
-_BLOCK_PX = 3
 _ALIKE_BLUR_PX = 1.5
-_HOLD = np.float32(0.1)
-_HOLD_UNMATCHED = np.float32(0.02)
-_SUPPORT = np.float32(0.5 * 1.87)
-"""Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
-cost: measured on rendered planes. What noise in the slopes costs grows with what a step falls short of."""
-_MOST_UNDAMPED = np.float32(1.5)
-_SPREAD_ACROSS_PX2 = np.float32(3)
-"""Mean square distance across the axis that the supports average over: their own and the axis' error."""
-_SAG_WINDOW_PX = 11
-_LEAST_INFORMATION = np.float32(0.5)
+_HOLD = 0.1
+_HOLD_UNMATCHED = 0.02
 
 
 @dataclass(frozen=True)
@@ -104,149 +90,103 @@ class Refined:
 
 def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
-    axes = tile_axes(left.astype(np.float32))
-    usable = matched.astype(np.float32)
+    work = _Work.of(left, start, matched, settings)
     noise = 0.5 * (image_noise(left) ** 2 + image_noise(right) ** 2)
-    disparity, variance = start, np.full_like(start, np.inf)
+    variance = np.full_like(start, np.inf)
     for step in range(settings.steps):
         remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
         blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
-        left_grey, right_grey = _smooth(left, blur_px), _smooth(right, blur_px)
-        warped, right_slope = value_and_slope(row_coefficients(right_grey), disparity)
-        slope, slope_noise = _own_slope(row_coefficients(left_grey)), noise * _slope_gain(blur_px)
-        if remaining > 0:
-            slope, slope_noise = (slope + right_slope) * np.float32(0.5), 0.5 * slope_noise
-        residual = equalised_difference(left_grey, warped, usable, settings.window_px, _CONTRAST_FLOOR)
-        trust = usable / (1 + np.square(residual / np.float32(settings.outlier_grey)))
-        weight, pull = _evidence(residual, slope, trust, left_grey, axes, settings)
-        short_of = _undamped(weight, trust, slope_noise, settings.window_px)
-        if remaining > 0:
-            pull *= short_of
-        power = short_of * _power(weight, pull, usable, settings.window_px)
-        weight += _HOLD * (usable + _HOLD_UNMATCHED)
-        fitted, variance = _fit(disparity, weight, pull, power, usable, axes, settings)
-        sagged = _sag(fitted, axes)
-        move = np.clip(fitted - sagged - disparity, -_LONGEST_STEP_PX, _LONGEST_STEP_PX)
-        disparity = disparity + move
-        # What the last step fell short of, and half of what was put right for curvature, may still be wrong.
-        variance = variance + np.square((short_of - 1) * move) + np.float32(0.25) * np.square(sagged)
-    return Refined(disparity, variance)
+        variance = work.step(left, right, blur_px, noise * _slope_gain(blur_px), remaining == 0)
+    return Refined(inside(work.disparity, start.shape).copy(), variance)
 
 
-def _smooth(image: UInt8, blur_px: float) -> Float32:
-    smooth: Float32 = cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px)
-    return smooth
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What the steps share. usable, its mean over windows, hold: (H, W). The rest are frames."""
 
+    settings: RefinementSettings
+    axes: Float32
+    usable: Float32
+    mean_usable: Float32
+    hold: Float32
+    disparity: Float32
+    residual: Float32
+    slope: Float32
+    trust: Float32
+    alike: Float32
+    weight: Float32
+    pull: Float32
 
-def _own_slope(coefficients: Float32) -> Float32:
-    slope: Float32 = (coefficients[:, 2:-1] - coefficients[:, :-3]) * np.float32(0.5)
-    return slope
+    @classmethod
+    def of(cls, left: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> _Work:
+        usable = matched.astype(np.float32)
+        mean_usable = cv2.boxFilter(usable, -1, (settings.window_px, settings.window_px))
+        frames = [empty_frame(start.shape) for _ in range(7)]
+        inside(frames[0], start.shape)[:] = start
+        hold = np.float32(_HOLD) * (usable + np.float32(_HOLD_UNMATCHED))
+        return cls(settings, tile_axes(left.astype(np.float32)), usable, mean_usable, hold, *frames)
 
+    def step(self, left: UInt8, right: UInt8, blur_px: float, slope_noise: float, is_last: bool) -> Float32:
+        """One step of the disparity; its variance. slope_noise: variance of the left image's slope."""
+        settings, shape = self.settings, self.usable.shape
+        left_grey = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
+        warped, right_slope = value_and_slope(row_coefficients(right, blur_px), self.disparity, MARGIN)
+        slope = inside(self.slope, shape)
+        slope[:] = row_slope(left, blur_px)
+        if not is_last:
+            slope += right_slope
+            slope *= np.float32(0.5)
+            slope_noise *= 0.5
+        side = settings.window_px
+        compare(left_grey, warped, self.usable, side, settings.outlier_grey, self.residual, self.trust)
+        gloss = settings.gloss_px, settings.gloss_trust
+        weigh(
+            self.residual, self.slope, self.trust, self._along(left_grey), side, *gloss, self.weight, self.pull
+        )
+        mean_weight = np.empty(shape, dtype=np.float32)
+        short_of = lengthen(
+            self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight
+        )
+        power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
+        power *= short_of
+        weight = inside(self.weight, shape)
+        weight += self.hold
+        fitted, variance = self._fit(power)
+        settle(fitted, self.axes, short_of, self.disparity, variance)
+        return variance
 
-def _undamped(weight: Float32, trust: Float32, slope_noise: float, side: int) -> Float32:
-    """(H, W) what a step must be multiplied by: noise in the slopes adds to the weights and nothing to the
-    pulls, so that each step falls short by its share of the weights. At most 1.5, where a step may still not
-    overshoot by more than half.
-    """
-    spurious = np.float32(slope_noise) * _mean(trust, side)
-    mean_weight = _mean(weight, side)
-    factor: Float32 = mean_weight / np.maximum(
-        mean_weight - spurious, mean_weight / _MOST_UNDAMPED + np.float32(1e-6)
-    )
-    return factor
+    def _along(self, grey: Float32) -> tuple[Float32, Float32]:
+        """Means of residual and slope along the axis, (H, W)."""
+        settings, shape = self.settings, grey.shape
+        means = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+        if settings.gloss_px > 0:
+            inside(self.alike, shape)[:] = cv2.GaussianBlur(grey, (0, 0), _ALIKE_BLUR_PX)
+            images = self.residual, self.slope, self.trust, self.alike
+            axis_means(*images, settings.alike_grey, self.axes, settings.gloss_px, means)
+        return means
 
+    def _fit(self, power: Float32) -> tuple[Float32, Float32]:
+        settings = self.settings
+        long = self._planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX))
+        if settings.short_px == 0:
+            return long[0], variances(power, long[1])
+        short = self._planes(SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX))
+        return blend(long, short, power, self.usable)
 
-def _sag(fitted: Float32, axes: Float32) -> Float32:
-    """(H, W) what a plane over the support takes off a surface that is round across the axis: half its
-    curvature times the support's mean square width. A bar's curvature is the same all along, so that its
-    mean over a window adds hardly any noise.
-    """
-    return 0.5 * _SPREAD_ACROSS_PX2 * _mean(curvature_across(fitted, axes), _SAG_WINDOW_PX)
+    def _planes(self, support: SupportShape) -> Fit:
+        found = np.empty_like(self.usable), np.empty_like(self.usable)
+        # What the weights and pulls were made of isn't needed any more.
+        room = self.residual, self.trust
+        fit_planes(
+            self.disparity, self.weight, self.pull, self.axes, support, self.settings.same_surface_px, room,
+            *found,
+        )  # fmt: skip
+        return found
 
 
 @lru_cache
 def _slope_gain(blur_px: float) -> float:
-    """Variance of `_own_slope` per variance of a white noise in the image before `_smooth`."""
+    """Variance of `row_slope` per variance of a white noise in the image."""
     impulse = np.zeros((33, 33), dtype=np.uint8)
     impulse[16, 16] = 100
-    response = _own_slope(row_coefficients(_smooth(impulse, blur_px))) / 100
-    return float(np.square(response).sum())
-
-
-def _mean(image: Float32, side: int) -> Float32:
-    averaged: Float32 = cv2.boxFilter(image, -1, (side, side))
-    return averaged
-
-
-def _weighted_mean(image: Float32, weight: Float32, side: int) -> Float32:
-    return _mean(weight * image, side) / (_mean(weight, side) + np.float32(1e-6))
-
-
-def _evidence(
-    residual: Float32,
-    slope: Float32,
-    trust: Float32,
-    grey: Float32,
-    axes: Float32,
-    settings: RefinementSettings,
-) -> tuple[Float32, Float32]:
-    """Each pixel's weight and pull, with what is constant along the axis weighed by how well it agrees."""
-    if settings.gloss_px == 0:
-        return trust * slope * slope, -trust * slope * residual
-    alike = cv2.GaussianBlur(grey, (0, 0), _ALIKE_BLUR_PX) / np.float32(settings.alike_grey)
-    residual_mean, slope_mean = axis_means(residual, slope, trust, alike, axes, settings.gloss_px)
-    residual_detail, slope_detail = residual - residual_mean, slope - slope_mean
-    detail_power = _mean(trust * residual_detail * residual_detail, settings.window_px)
-    mean_power = _mean(trust * residual_mean * residual_mean, settings.window_px)
-    # So many independent samples stand behind a Gaussian mean: noise leaves that much less power in it.
-    samples = np.float32(2 * math.sqrt(math.pi) * settings.gloss_px)
-    agreement = (detail_power + np.float32(1e-3)) / (samples * mean_power + np.float32(1e-3))
-    share = np.minimum(np.float32(1), np.float32(settings.gloss_trust) * agreement)
-    weight: Float32 = trust * (slope_detail * slope_detail + share * slope_mean * slope_mean)
-    pull: Float32 = -trust * (slope_detail * residual_detail + share * slope_mean * residual_mean)
-    return weight, pull
-
-
-def _power(weight: Float32, pull: Float32, usable: Float32, side: int) -> Float32:
-    """The noise power (grey levels^2) that the pulls show, per unit of what holds a disparity in place: from
-    their sums over blocks, so that neighbours which err alike count as what they are. Where the images say
-    little the plain hold takes their place and the power grows.
-    """
-    blocks = cv2.boxFilter(pull, -1, (_BLOCK_PX, _BLOCK_PX), normalize=False)
-    block_power = _mean(usable * blocks * blocks, side) / np.float32(_BLOCK_PX * _BLOCK_PX)
-    mean_weight = _mean(weight, side) + np.float32(1e-3)
-    seen = _mean(usable, side) + np.float32(1e-6)
-    power: Float32 = block_power / mean_weight * (mean_weight + _HOLD * seen) / mean_weight
-    return power
-
-
-def _fit(
-    disparity: Float32,
-    weight: Float32,
-    pull: Float32,
-    power: Float32,
-    usable: Float32,
-    axes: Float32,
-    settings: RefinementSettings,
-) -> tuple[Float32, Float32]:
-    """The fitted disparity and its variance: of the long support, and of the short one as far as both differ
-    by more than the short one's noise: there the surface is no plane over the long one.
-    """
-    long_shape = SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX)
-    long, long_information = fit_planes(disparity, weight, pull, axes, long_shape, settings.same_surface_px)
-    long_variance = _variance(power, long_information)
-    if settings.short_px == 0:
-        return long, long_variance
-    short_shape = SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX)
-    short, short_information = fit_planes(
-        disparity, weight, pull, axes, short_shape, settings.same_surface_px
-    )
-    short_variance = _variance(power, short_information)
-    gap = long - short
-    excess = np.maximum(_weighted_mean(gap * gap - _SLACK * short_variance, usable, _BLEND_WINDOW_PX), 0)
-    share = short_variance / (short_variance + excess + np.float32(1e-9))
-    return short + share * gap, long_variance + (1 - share) * (short_variance - long_variance)
-
-
-def _variance(power: Float32, information: Float32) -> Float32:
-    return np.asarray(_SUPPORT * power / np.maximum(information, _LEAST_INFORMATION), dtype=np.float32)
+    return float(np.square(row_slope(impulse, blur_px) / 100).sum())

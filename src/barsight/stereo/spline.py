@@ -1,90 +1,99 @@
 """Cubic B-splines along the rows: an image read at fractional columns, with its exact derivative.
 
 Linear or Keys-cubic reading damps fine texture by an amount that depends on the fraction, and that pulls a
-match towards whole or half pixels. A B-spline with its prefilter nearly doesn't [Thevenaz 2000].
+match towards whole or half pixels. A B-spline with its prefilter nearly doesn't [Thevenaz 2000]. The prefilter
+falls off fourfold per pixel, so that it can be one convolution together with a blur.
 """
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
+import cv2
 import numpy as np
-from numba import prange
 
-from barsight.core.arrays import Float32, kernel
+from barsight.core.arrays import Float32, UInt8, kernel
+from barsight.core.parallel import in_bands
 
 _POLE = math.sqrt(3.0) - 2.0
-_TAIL = 16
+_PREFILTER_REACH = 12
+_BAND_ROWS = 64
 
 
-def row_coefficients(image: Float32) -> Float32:
-    """(H, W + 3) spline coefficients of each row of a (H, W) image, mirrored at the ends.
+def row_coefficients(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
+    """(H, W + 3) spline coefficients of each row of a (H, W) image, mirrored at the ends; of the image blurred
+    both ways by blur_px (one sigma) where that isn't 0.
 
     Coefficient k of the image is column k + 1, so that a reader needs no bounds check.
     """
-    coefficients = np.empty((image.shape[0], image.shape[1] + 3), dtype=np.float32)
-    _prefilter(image, coefficients)
+    inner = cv2.sepFilter2D(image, cv2.CV_32F, *_filters(blur_px))
+    coefficients: Float32 = cv2.copyMakeBorder(inner, 0, 0, 1, 2, cv2.BORDER_REFLECT_101)
     return coefficients
 
 
-def value_and_slope(coefficients: Float32, disparity: Float32) -> tuple[Float32, Float32]:
+def row_slope(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
+    """(H, W) x derivative at the pixels of the spline that `row_coefficients` gives."""
+    along, across = _filters(blur_px)
+    slope: Float32 = cv2.sepFilter2D(image, cv2.CV_32F, np.convolve(along, np.float32([-0.5, 0, 0.5])), across)
+    return slope
+
+
+@lru_cache
+def _filters(blur_px: float) -> tuple[Float32, Float32]:
+    """Along the rows: blur and prefilter; across them: the blur."""
+    around = np.abs(np.arange(-_PREFILTER_REACH, _PREFILTER_REACH + 1))
+    prefilter = math.sqrt(3.0) * _POLE**around
+    if blur_px == 0:
+        return prefilter.astype(np.float32), np.ones(1, dtype=np.float32)
+    side = round(8 * blur_px + 1) | 1
+    blur = cv2.getGaussianKernel(side, blur_px)[:, 0]
+    return np.convolve(blur, prefilter).astype(np.float32), blur.astype(np.float32)
+
+
+def value_and_slope(coefficients: Float32, disparity: Float32, margin: int = 0) -> tuple[Float32, Float32]:
     """The image and its x derivative at column x - disparity of each row, both (H, W) float32.
 
-    Beyond the image's ends the end column is read. `disparity` has no NaN.
+    Beyond the image's ends the end column is read. `disparity` has no NaN; its pixel (0, 0) lies `margin` rows
+    and columns inside.
     """
-    value = np.empty(disparity.shape, dtype=np.float32)
-    slope = np.empty(disparity.shape, dtype=np.float32)
-    _read(coefficients, disparity, value, slope)
+    shape = len(coefficients), coefficients.shape[1] - 3
+    value, slope = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+
+    def read(first: int, end: int) -> None:
+        _read(coefficients, disparity, margin, value, slope, first, end)
+
+    in_bands(read, shape[0], _BAND_ROWS)
     return value, slope
 
 
-@kernel(parallel=True, fastmath=True)
-def _prefilter(image: Float32, coefficients: Float32) -> None:
-    height, width = image.shape
-    pole = np.float32(_POLE)
-    for y in prange(height):
-        forward = np.empty(width, dtype=np.float32)
-        start = np.float32(0)
-        power = np.float32(1)
-        for x in range(min(width, _TAIL)):
-            start += power * image[y, x]
-            power *= pole
-        forward[0] = start
-        for x in range(1, width):
-            forward[x] = image[y, x] + pole * forward[x - 1]
-        last = width - 1
-        before = forward[last - 1] if width > 1 else forward[0]
-        forward[last] = (pole / (pole * pole - 1)) * (forward[last] + pole * before)
-        for x in range(width - 2, -1, -1):
-            forward[x] = pole * (forward[x + 1] - forward[x])
-        for x in range(width):
-            coefficients[y, x + 1] = np.float32(6) * forward[x]
-        coefficients[y, 0] = coefficients[y, min(2, width)]
-        coefficients[y, width + 1] = coefficients[y, max(width - 1, 1)]
-        coefficients[y, width + 2] = coefficients[y, max(width - 2, 1)]
-
-
-@kernel(parallel=True, fastmath=True)
-def _read(coefficients: Float32, disparity: Float32, value: Float32, slope: Float32) -> None:
-    height, width = disparity.shape
+@kernel(fastmath=True)
+def _read(
+    coefficients: Float32, disparity: Float32, margin: int, value: Float32, slope: Float32, first_row: int,
+    end_row: int,
+) -> None:  # fmt: skip
+    width = value.shape[1]
     one, two, three = np.float32(1), np.float32(2), np.float32(3)
     four, six, half, sixth = np.float32(4), np.float32(6), np.float32(0.5), np.float32(1 / 6)
-    for y in prange(height):
-        row = coefficients[y]
+    last, last_first = np.float32(width - 1), np.int32(max(width - 2, 0))
+    for y in range(first_row, end_row):
+        row, shift = coefficients[y], disparity[y + margin, margin : margin + width]
+        values, slopes = value[y], slope[y]
         for x in range(width):
-            place = min(max(np.float32(x) - disparity[y, x], np.float32(0)), np.float32(width - 1))
-            first = min(int(place), max(width - 2, 0))
+            place = min(max(np.float32(np.int32(x)) - shift[x], np.float32(0)), last)
+            first = min(np.int32(place), last_first)
             t = place - np.float32(first)
             t2 = t * t
             t3 = t2 * t
-            c0, c1, c2, c3 = row[first], row[first + 1], row[first + 2], row[first + 3]
-            value[y, x] = sixth * (
+            at = np.uint64(first)
+            c0, c1, c2, c3 = row[at], row[at + np.uint64(1)], row[at + np.uint64(2)], row[at + np.uint64(3)]
+            values[x] = sixth * (
                 c0 * (one - three * t + three * t2 - t3)
                 + c1 * (four - six * t2 + three * t3)
                 + c2 * (one + three * t + three * t2 - three * t3)
                 + c3 * t3
             )
-            slope[y, x] = half * (
+            slopes[x] = half * (
                 c1 * (three * t2 - four * t)
                 - c0 * (one - two * t + t2)
                 + c2 * (one + two * t - three * t2)

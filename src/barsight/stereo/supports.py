@@ -7,17 +7,22 @@ and the compiler makes vector instructions of it. Arrays read at offsets carry a
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import cv2
 import numpy as np
-from numba import prange
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
-from barsight.core.arrays import Float32, kernel
+from barsight.core.arrays import Float32, Int64, kernel
+from barsight.core.parallel import in_bands
+from barsight.stereo.vectors import FLOAT_LANES, FLOATS, Vectors
 
 TILE_ROWS = 16
 TILE_COLUMNS = 32
 MARGIN = 48
+BAND_TILES = 4
 _LEAST_COHERENCE = 0.35
 
 
@@ -55,75 +60,97 @@ def with_margin(array: Float32) -> Float32:
     return framed
 
 
+def empty_frame(shape: tuple[int, ...]) -> Float32:
+    """Room for an image with such a margin."""
+    height, width = shape
+    return np.zeros((height + 2 * MARGIN + TILE_ROWS, width + 2 * MARGIN + TILE_COLUMNS), dtype=np.float32)
+
+
+def inside(frame: Float32, shape: tuple[int, ...]) -> Float32:
+    """View of the image without its margin."""
+    return frame[MARGIN : MARGIN + shape[0], MARGIN : MARGIN + shape[1]]
+
+
 def axis_means(
-    first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, sigma_px: float
-) -> tuple[Float32, Float32]:
-    """Weighted Gaussian means of two images along each tile's axis, (H, W) each. Inputs: (H, W), no NaN.
+    first: Float32, second: Float32, weight: Float32, alike: Float32, alike_px: float, axes: Float32,
+    sigma_px: float, means: tuple[Float32, Float32],
+) -> None:  # fmt: skip
+    """Weighted Gaussian means of two images along each tile's axis. Frames in, no NaN; (H, W) each out.
 
-    alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at 1), so that
-    a strap or a shadow across the bars has a mean of its own.
+    alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at alike_px),
+    so that a strap or a shadow across the bars has a mean of its own.
     """
-    reach = min(int(2.5 * sigma_px), MARGIN - 1)
-    means = np.empty_like(first), np.empty_like(second)
-    _axis_means(
-        with_margin(first),
-        with_margin(second),
-        with_margin(weight),
-        with_margin(alike),
-        axes,
-        reach,
-        sigma_px,
-        means[0],
-        means[1],
+    steps = np.arange(-min(int(2.5 * sigma_px), MARGIN - 1), min(int(2.5 * sigma_px), MARGIN - 1) + 1)
+    shares = np.exp(-0.5 * (steps / sigma_px) ** 2).astype(np.float32)
+    nearness = np.float32(1 / alike_px)
+
+    def work(first_tile: int, end_tile: int) -> None:
+        _axis_means(
+            first, second, weight, alike, nearness, axes, steps, shares, *means, first_tile, end_tile
+        )
+
+    in_bands(work, len(axes), BAND_TILES)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _add_means(
+    _: Any, theres: Any, firsts: Any, seconds: Any, weights: Any, middle: Any, offsets: Any, shares: Any,
+    nearness: Any, sums: Any, at: Any, stride: Any,
+) -> Any:  # fmt: skip
+    """The sums of weights, of the first and of the second image for 16 pixels from `middle` on. They lie
+    `stride` apart; offsets: flat, from a pixel to its support's points. All arrays are flat."""
+    signature = types.void(
+        theres, firsts, seconds, weights, middle, offsets, shares, nearness, sums, at, stride
     )
-    return means
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        centre, nearness = v.load(v.data(0), arguments[4], FLOATS), v.all(arguments[7], FLOATS)
+        totals = v.zeros(3)
+        with cgutils.for_range(builder, v.length(5)) as loop:
+            there = builder.add(arguments[4], builder.load(builder.gep(v.data(5), [loop.index])))
+            alike = v.alike(v.difference(v.load(v.data(0), there, FLOATS), centre), nearness)
+            weight = v.product(v.number(6, loop.index, FLOATS), alike, v.load(v.data(3), there, FLOATS))
+            v.add_to(totals[0], weight)
+            for total, image in zip(totals[1:], (1, 2), strict=True):
+                v.add_to(total, v.product(weight, v.load(v.data(image), there, FLOATS)))
+        for one, place in enumerate(totals):
+            target = builder.add(arguments[9], builder.mul(arguments[10], arguments[10].type(one)))
+            v.store(builder.load(place), v.data(8), target)
+        return context.get_dummy_value()
+
+    return signature, generate
 
 
-@kernel(parallel=True, fastmath=True)
+@kernel(fastmath=True)
 def _axis_means(
-    first: Float32,
-    second: Float32,
-    weight: Float32,
-    alike: Float32,
-    axes: Float32,
-    reach: int,
-    sigma_px: float,
-    first_mean: Float32,
-    second_mean: Float32,
-) -> None:
+    first: Float32, second: Float32, weight: Float32, alike: Float32, nearness: np.float32, axes: Float32,
+    steps: Int64, shares: Float32, first_mean: Float32, second_mean: Float32, first_tile: int, end_tile: int,
+) -> None:  # fmt: skip
     height, width = first_mean.shape
     framed_width = first.shape[1]
-    firsts, seconds, weights = first.reshape(-1), second.reshape(-1), weight.reshape(-1)
-    theres, one, zero = alike.reshape(-1), np.float32(1), np.float32(0)
-    shares = np.empty(2 * reach + 1, dtype=np.float32)
-    for step in range(-reach, reach + 1):
-        shares[step + reach] = math.exp(-0.5 * (step / sigma_px) ** 2)
-    for tile_y in prange(axes.shape[0]):
-        sums = np.empty((3, TILE_COLUMNS), dtype=np.float32)
-        offsets = np.empty(2 * reach + 1, dtype=np.int64)
+    firsts, seconds, weights, theres = (
+        first.reshape(-1), second.reshape(-1), weight.reshape(-1), alike.reshape(-1),
+    )  # fmt: skip
+    sums = np.empty((3, TILE_COLUMNS), dtype=np.float32)
+    flat = sums.reshape(-1)
+    offsets = np.empty(len(steps), dtype=np.int64)
+    for tile_y in range(first_tile, end_tile):
         for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
-            for step in range(-reach, reach + 1):
-                offsets[step + reach] = round(step * axis_y) * framed_width + round(step * axis_x)
+            for j in range(len(steps)):
+                offsets[j] = round(steps[j] * axis_y) * framed_width + round(steps[j] * axis_x)
             x0 = tile_x * TILE_COLUMNS
             count = min(TILE_COLUMNS, width - x0)
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
-                total, total_first, total_second = sums[0], sums[1], sums[2]
-                total[:] = np.float32(1e-6)
-                total_first[:] = 0
-                total_second[:] = 0
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                centre = alike[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
-                for step in range(2 * reach + 1):
-                    at, share = np.uint64(middle + offsets[step]), shares[step]
-                    for index in range(count):
-                        u = np.uint64(index)
-                        gap = theres[at + u] - centre[u]
-                        same = max(one - gap * gap, zero)
-                        w = share * same * same * weights[at + u]
-                        total[u] += w
-                        total_first[u] += w * firsts[at + u]
-                        total_second[u] += w * seconds[at + u]
+                for part in range(0, count, FLOAT_LANES):
+                    _add_means(
+                        theres, firsts, seconds, weights, middle + part, offsets, shares, nearness, flat,
+                        part, TILE_COLUMNS,
+                    )  # fmt: skip
+                one, two = first_mean[y, x0 : x0 + count], second_mean[y, x0 : x0 + count]
                 for i in range(count):
-                    first_mean[y, x0 + i] = total_first[i] / total[i]
-                    second_mean[y, x0 + i] = total_second[i] / total[i]
+                    one[i] = sums[1, i] / (sums[0, i] + np.float32(1e-6))
+                for i in range(count):
+                    two[i] = sums[2, i] / (sums[0, i] + np.float32(1e-6))

@@ -40,6 +40,15 @@ class Vectors:
         """The members of the tuple that is argument number `place`."""
         return list(cgutils.unpack_tuple(self.builder, self._arguments[place]))
 
+    def length(self, place: int) -> Any:
+        """Elements of the array that is argument number `place`."""
+        array = self._context.make_array(self._kinds[place])
+        return array(self._context, self.builder, self._arguments[place]).nitems
+
+    def number(self, place: int, at: Any, kind: Any) -> Any:
+        """A vector of one element of the array that is argument number `place`."""
+        return self.all(self.builder.load(self.builder.gep(self.data(place), [at])), kind)
+
     def load(self, data: Any, at: Any, kind: Any = BYTES) -> Any:
         """A vector that begins with element `at`."""
         return self.builder.load(self._pointer(data, at, kind), align=1)
@@ -79,6 +88,20 @@ class Vectors:
     def sum(self, one: Any, other: Any) -> Any:
         """Of floats."""
         return self.builder.fadd(one, other, flags=_FAST)
+
+    def add_to(self, place: Any, term: Any) -> None:
+        """Floats, added to what lies at a pointer."""
+        self.builder.store(self.sum(self.builder.load(place), term), place)
+
+    def zeros(self, count: int) -> list[Any]:
+        """Pointers to float vectors of zeros, which the compiler keeps in registers where there are enough."""
+        return [cgutils.alloca_once_value(self.builder, self.all(0.0, FLOATS)) for _ in range(count)]
+
+    def alike(self, gap: Any, nearness: Any) -> Any:
+        """Tukey's biweight of a gap, whose reach is 1 / nearness."""
+        scaled = self.product(gap, nearness)
+        same = self.not_negative(self.difference(self.all(1.0, FLOATS), self.product(scaled, scaled)))
+        return self.product(same, same)
 
     def difference(self, one: Any, other: Any) -> Any:
         """Of floats."""

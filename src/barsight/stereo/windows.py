@@ -1,27 +1,19 @@
 """Sums over square windows, with nothing but the result written: what several box filters would do in turn.
 
-Beyond the image's ends it goes on mirrored at the last pixel, as OpenCV's filters have it.
+Beyond the image's ends it goes on mirrored at the last pixel, as OpenCV's filters have it. A band's rows roll
+by: each column's sum over a window's rows takes in the row ahead and lets go of the one behind (`roll_*`),
+and `slide` adds the columns up. The loops stay this short, with one array written in each, because the
+compiler makes vectors of no others.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from barsight.core.arrays import Float32, Float64, kernel
+from barsight.core.parallel import in_bands
 
-_BAND_ROWS = 128
-
-
-def equalised_difference(
-    left: Float32, right: Float32, usable: Float32, side: int, contrast_floor: np.float32
-) -> Float32:
-    """(H, W) left minus right after the means and contrasts of what is `usable` (0...1) in a window of
-    side x side pixels are made equal. contrast_floor: power, grey levels^2, added to both contrasts.
-    """
-    difference = np.empty_like(left)
-    _equalise(left, right, usable, side // 2, contrast_floor, difference)
-    return difference
+BAND_ROWS = 128
 
 
 def window_means(images: Float32, weight: Float32, side: int, every: int) -> Float32:
@@ -30,83 +22,94 @@ def window_means(images: Float32, weight: Float32, side: int, every: int) -> Flo
     """
     _, height, width = images.shape
     sums = np.empty((len(images), -(-height // every), -(-width // every)), dtype=np.float32)
-    _window_means(images, weight, side // 2, every, sums)
+
+    def add(first: int, end: int) -> None:
+        _window_means(images, weight, side // 2, every, sums, first, end)
+
+    in_bands(add, sums.shape[1], 8)
     return sums
 
 
 @kernel()
-def _mirrored(place: int, count: int) -> int:
+def mirrored(place: int, count: int) -> int:
+    """The place inside 0...count - 1 that `place` is a mirror image of."""
     while count > 1 and (place < 0 or place >= count):
         place = -place if place < 0 else 2 * (count - 1) - place
     return place if count > 1 else 0
 
 
 @kernel()
-def _add_row(left: Float32, right: Float32, usable: Float32, sign: np.float32, columns: Float64) -> None:
-    for x in range(left.shape[0]):
-        share = sign * usable[x]
-        one, other = share * left[x], share * right[x]
-        columns[0, x] += share
-        columns[1, x] += one
-        columns[2, x] += other
-        columns[3, x] += one * left[x]
-        columns[4, x] += other * right[x]
+def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> None:
+    """column: (W + 2 reach + 1,) sums; a row ahead comes in, one behind goes."""
+    for x in range(ahead.shape[0]):
+        column[reach + x] += np.float64(ahead[x]) - np.float64(behind[x])
 
 
 @kernel()
-def _slide(columns: Float64, reach: int, means: Float32) -> None:
-    """Means over windows of each of five rows, out of the sums of its columns."""
-    width = columns.shape[1]
-    scale = 1.0 / (2 * reach + 1) ** 2
-    for part in range(5):
-        row, total = columns[part], 0.0
-        for step in range(-reach, reach + 1):
-            total += row[_mirrored(step, width)]
-        means[part, 0] = total * scale
-        for x in range(1, width):
-            ahead, behind = x + reach, x - reach - 1
-            total += row[ahead] if ahead < width else row[_mirrored(ahead, width)]
-            total -= row[behind] if behind >= 0 else row[_mirrored(behind, width)]
-            means[part, x] = total * scale
-
-
-@kernel(parallel=True)
-def _equalise(
-    left: Float32, right: Float32, usable: Float32, reach: int, floor: np.float32, difference: Float32
+def roll_product(
+    column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
-    height, width = left.shape
-    plus, minus, zero = np.float32(1), np.float32(-1), np.float32(0)
-    for band in prange((height + _BAND_ROWS - 1) // _BAND_ROWS):
-        columns = np.zeros((5, width), dtype=np.float64)
-        means = np.empty((5, width), dtype=np.float32)
-        first = band * _BAND_ROWS
-        for y in range(first - reach, first + reach):
-            there = _mirrored(y, height)
-            _add_row(left[there], right[there], usable[there], plus, columns)
-        for y in range(first, min(height, first + _BAND_ROWS)):
-            there = _mirrored(y + reach, height)
-            _add_row(left[there], right[there], usable[there], plus, columns)
-            _slide(columns, reach, means)
-            for x in range(width):
-                share = means[0, x] + np.float32(1e-6)
-                left_mean, right_mean = means[1, x] / share, means[2, x] / share
-                left_power = max(means[3, x] / share - left_mean * left_mean, zero) + floor
-                right_power = max(means[4, x] / share - right_mean * right_mean, zero) + floor
-                gain = np.sqrt(left_power / right_power)
-                difference[y, x] = (left[y, x] - left_mean) - gain * (right[y, x] - right_mean)
-            there = _mirrored(y - reach, height)
-            _add_row(left[there], right[there], usable[there], minus, columns)
+    """The same of products."""
+    for x in range(ahead.shape[0]):
+        column[reach + x] += np.float64(ahead[x] * ahead_other[x]) - np.float64(behind[x] * behind_other[x])
 
 
-@kernel(parallel=True, fastmath=True)
-def _window_means(images: Float32, weight: Float32, reach: int, every: int, sums: Float32) -> None:
+@kernel()
+def roll_square(
+    column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
+) -> None:
+    """The same of the first times the square of the other."""
+    for x in range(ahead.shape[0]):
+        coming = ahead[x] * ahead_other[x] * ahead_other[x]
+        column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
+
+
+@kernel()
+def slide(column: Float64, reach: int, mean: Float32) -> None:
+    """The means (W,) over windows of 2 reach + 1 columns, whose sums are column[reach : reach + W].
+
+    Four quarters of the row go at once: one waits for the sum before.
+    """
+    width, side = mean.shape[0], 2 * reach + 1
+    for step in range(1, reach + 1):
+        column[reach - step] = column[reach + mirrored(-step, width)]
+        column[reach + width - 1 + step] = column[reach + mirrored(width - 1 + step, width)]
+    scale = 1.0 / (side * side)
+    quarter = width // 4
+    a = b = c = d = 0.0
+    for step in range(side):
+        a += column[step]
+        b += column[quarter + step]
+        c += column[2 * quarter + step]
+        d += column[3 * quarter + step]
+    for x in range(quarter):
+        mean[x] = a * scale
+        a += column[x + side] - column[x]
+        y = quarter + x
+        mean[y] = b * scale
+        b += column[y + side] - column[y]
+        y += quarter
+        mean[y] = c * scale
+        c += column[y + side] - column[y]
+        y += quarter
+        mean[y] = d * scale
+        d += column[y + side] - column[y]
+    for x in range(4 * quarter, width):
+        mean[x] = d * scale
+        d += column[x + side] - column[x]
+
+
+@kernel(fastmath=True)
+def _window_means(
+    images: Float32, weight: Float32, reach: int, every: int, sums: Float32, first: int, end: int
+) -> None:
     count, height, width = images.shape
     scale = np.float32(1.0 / (2 * reach + 1) ** 2)
-    for i in prange(sums.shape[1]):
-        columns = np.empty((count, width), dtype=np.float32)
+    columns = np.empty((count, width), dtype=np.float32)
+    for i in range(first, end):
         columns[:] = 0
         for step in range(-reach, reach + 1):
-            y = _mirrored(i * every + step, height)
+            y = mirrored(i * every + step, height)
             for part in range(count):
                 row = columns[part]
                 for x in range(width):
@@ -115,5 +118,5 @@ def _window_means(images: Float32, weight: Float32, reach: int, every: int, sums
             for part in range(count):
                 total = np.float32(0)
                 for step in range(-reach, reach + 1):
-                    total += columns[part, _mirrored(j * every + step, width)]
+                    total += columns[part, mirrored(j * every + step, width)]
                 sums[part, i, j] = scale * total
