@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.arrays import expect_shape, kernel
-from barsight.core.parallel import ordered_map, read_ahead
+from barsight.core.parallel import in_bands, ordered_map, read_ahead
 from barsight.core.timing import Stopwatch
 
 
@@ -108,3 +108,26 @@ def _doubled(value: float) -> float:
 def test_a_kernel_is_compiled() -> None:
     assert _doubled(1.5) == 3.0
     assert _doubled.signatures  # type: ignore[attr-defined]
+
+
+def test_bands_cover_every_row_once_from_any_number_of_threads() -> None:
+    def count(_: int) -> int:
+        rows = np.zeros(1000, dtype=int)
+
+        def work(first: int, end: int) -> None:
+            time.sleep(0.0005)
+            rows[first:end] += 1
+
+        in_bands(work, 1000, 64)
+        return int((rows == 1).sum())
+
+    assert list(ordered_map(count, range(8), 4)) == [1000] * 8
+
+
+def test_an_exception_in_a_band_comes_out() -> None:
+    def work(first: int, _: int) -> None:
+        if first == 30:
+            raise ValueError("row 30")
+
+    with pytest.raises(ValueError, match="row 30"):
+        in_bands(work, 100, 10)

@@ -10,14 +10,16 @@ from scipy.interpolate import CubicSpline
 from barsight.core.errors import ConfigError
 from barsight.stereo.confidence import bend_around, beside_edges, start_disagreement
 from barsight.stereo.consistency import agrees, without_islands
-from barsight.stereo.curvature import curvature_across
+from barsight.stereo.curvature import curvature_row
 from barsight.stereo.edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
 from barsight.stereo.filling import fill
 from barsight.stereo.plane_fits import SupportShape, fit_planes
+from barsight.stereo.pulls import compare, lengthen, noise_power, weigh
 from barsight.stereo.semiglobal import SemiGlobalSettings, match
-from barsight.stereo.spline import row_coefficients, value_and_slope
-from barsight.stereo.supports import TILE_COLUMNS, TILE_ROWS, axis_means, tile_axes
-from barsight.stereo.windows import equalised_difference, window_means
+from barsight.stereo.settling import blend, settle, variances
+from barsight.stereo.spline import row_coefficients, row_slope, value_and_slope
+from barsight.stereo.supports import TILE_COLUMNS, TILE_ROWS, axis_means, empty_frame, inside, tile_axes
+from barsight.stereo.windows import window_means
 
 HEIGHT, WIDTH = 40, 70
 
@@ -25,6 +27,16 @@ HEIGHT, WIDTH = 40, 70
 def _noise(seed: int, spread: float = 1.0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return (spread * rng.standard_normal((HEIGHT, WIDTH))).astype(np.float32)
+
+
+def _frame(image: np.ndarray) -> np.ndarray:
+    frame = empty_frame(image.shape)
+    inside(frame, image.shape)[:] = image
+    return frame
+
+
+def _mean(image: np.ndarray, side: int = 21) -> np.ndarray:
+    return cv2.boxFilter(image, -1, (side, side))
 
 
 def _axes(x: float, y: float) -> np.ndarray:
@@ -45,6 +57,13 @@ def test_spline_goes_through_the_samples_and_has_their_slope() -> None:
         at = np.arange(WIDTH)[inner] - 3.3
         np.testing.assert_allclose(value[row, inner], curve(at), atol=1e-3)
         np.testing.assert_allclose(slope[row, inner], curve(at, 1), atol=1e-3)
+    np.testing.assert_allclose(row_slope(image), value_and_slope(coefficients, 0 * image)[1], atol=1e-4)
+
+
+def test_spline_of_a_blurred_image_blurs_first() -> None:
+    image = (100 + _noise(1, 40)).clip(0, 255).astype(np.uint8)
+    blurred = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.7)
+    np.testing.assert_allclose(row_coefficients(image, 0.7), row_coefficients(blurred), atol=1e-3)
 
 
 def test_spline_reads_the_end_column_beyond_the_ends() -> None:
@@ -68,7 +87,9 @@ def test_axis_follows_stripes_and_is_the_column_on_noise() -> None:
 @pytest.mark.parametrize("direction", [(0.0, 1.0), (0.6, 0.8), (1.0, 0.0)])
 def test_axis_means_are_weighted_means_along_the_axis(direction: tuple[float, float]) -> None:
     first, second, weight, alike = _noise(3), _noise(4), np.abs(_noise(5)), _noise(15, 0.5)
-    found = axis_means(first, second, weight, alike, _axes(*direction), 3.0)
+    found = np.empty_like(first), np.empty_like(first)
+    frames = [_frame(image) for image in (first, second, weight, alike)]
+    axis_means(*frames, 1.0, _axes(*direction), 3.0, found)
     for y, x in ((0, 0), (13, 31), (39, 69), (20, 40)):
         total = sums = 0.0
         for step in range(-7, 8):
@@ -81,10 +102,20 @@ def test_axis_means_are_weighted_means_along_the_axis(direction: tuple[float, fl
         np.testing.assert_allclose([found[0][y, x], found[1][y, x]], sums / total, rtol=2e-4, atol=1e-5)
 
 
+def _planes(
+    disparity: np.ndarray, weight: np.ndarray, pull: np.ndarray, shape: SupportShape, same_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    found = np.empty_like(disparity), np.empty_like(disparity)
+    frames = [_frame(image) for image in (disparity, weight, pull)]
+    room = empty_frame(disparity.shape), empty_frame(disparity.shape)
+    fit_planes(*frames, _axes(0, 1), shape, same_px, room, *found)
+    return found
+
+
 def test_planes_are_weighted_least_squares_on_the_support() -> None:
     disparity, weight, pull = _noise(6, 0.2), 0.2 + np.abs(_noise(7)), _noise(8, 0.1)
     shape, same = SupportShape(4.0, 1.5), 1.0
-    fitted, information = fit_planes(disparity, weight, pull, _axes(0, 1), shape, same)
+    fitted, information = _planes(disparity, weight, pull, shape, same)
     for y, x in ((0, 0), (11, 20), (39, 69), (25, 33)):
         rows, values = [], []
         for down in range(-8, 9):
@@ -115,7 +146,7 @@ def test_planes_keep_a_plane_in_steps_and_stop_at_a_jump() -> None:
     plane[:, 35:] += 6
     ones, zeros = np.ones_like(plane), np.zeros_like(plane)
     for step in (1, 3, 5):
-        fitted, _ = fit_planes(plane, ones, zeros, _axes(0, 1), SupportShape(8.0, 1.5, step), 1.0)
+        fitted, _ = _planes(plane, ones, zeros, SupportShape(8.0, 1.5, step), 1.0)
         np.testing.assert_allclose(fitted, plane, atol=0.03)
 
 
@@ -276,16 +307,23 @@ def test_penalties_must_be_in_order() -> None:
         SemiGlobalSettings(small_jump=50, large_jump=40)
 
 
+def _curvature(disparity: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    curvature = np.empty_like(disparity)
+    for y, row in enumerate(curvature):
+        curvature_row(disparity, axes, y, row)
+    return curvature
+
+
 def test_curvature_is_taken_across_the_axis_and_not_over_a_jump() -> None:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     round_across_rows = 0.5 * 0.01 * (columns - 35) ** 2 + 0.3 * rows + 0.05 * columns
     inner = (slice(8, 32), slice(25, 45))
-    down = curvature_across(round_across_rows, _axes(0.0, 1.0))
+    down = _curvature(round_across_rows, _axes(0.0, 1.0))
     np.testing.assert_allclose(down[inner], 0.01, atol=1e-5)
-    along = curvature_across(round_across_rows, _axes(1.0, 0.0))
+    along = _curvature(round_across_rows, _axes(1.0, 0.0))
     np.testing.assert_allclose(along[inner], 0.0, atol=1e-5)
     stepped = np.where(columns > 35, np.float32(4), np.float32(0))
-    assert not curvature_across(stepped, _axes(0.0, 1.0)).any()
+    assert not _curvature(stepped, _axes(0.0, 1.0)).any()
 
 
 def test_disagreement_of_start_and_refinement_forgets_noise_and_holes() -> None:
@@ -308,18 +346,75 @@ def test_only_jumps_between_known_neighbours_are_edges() -> None:
 
 
 def test_windows_are_what_box_filters_say() -> None:
-    left, right = _noise(21, 20) + 100, _noise(22, 30) + 90
-    usable = (_noise(23) > -0.8).astype(np.float32)
+    images, weight = np.stack([_noise(21, 20) + 100, _noise(22, 30) + 90]), _noise(23)
+    sums = window_means(images, weight, 21, 10)
+    for image, summed in zip(images, sums, strict=True):
+        np.testing.assert_allclose(summed, _mean(weight * image)[::10, ::10], rtol=1e-4, atol=1e-4)
 
-    def mean(image: np.ndarray) -> np.ndarray:
-        return cv2.boxFilter(image, -1, (21, 21))
 
-    share = mean(usable) + 1e-6
-    means = [mean(usable * image) / share for image in (left, right)]
-    powers = [mean(usable * i * i) / share - m * m + 4 for i, m in zip((left, right), means, strict=True)]
+@pytest.mark.parametrize("rows", [HEIGHT, 300])
+def test_comparison_is_what_box_filters_say(rows: int) -> None:
+    rng = np.random.default_rng(21)
+    left, right = (rng.normal(95, 20, (rows, WIDTH)).astype(np.float32) for _ in range(2))
+    usable = (rng.random((rows, WIDTH)) > 0.2).astype(np.float32)
+    share = _mean(usable) + 1e-6
+    means = [_mean(usable * image) / share for image in (left, right)]
+    powers = [_mean(usable * i * i) / share - m * m + 4 for i, m in zip((left, right), means, strict=True)]
     wanted = left - means[0] - np.sqrt(powers[0] / powers[1]) * (right - means[1])
-    found = equalised_difference(left, right, usable, 21, np.float32(4))
-    np.testing.assert_allclose(found, wanted, atol=5e-3)
-    sums = window_means(np.stack([left, right]), usable, 21, 10)
-    for image, summed in zip((left, right), sums, strict=True):
-        np.testing.assert_allclose(summed, mean(usable * image)[::10, ::10], rtol=1e-4)
+    residual, trust = empty_frame(left.shape), empty_frame(left.shape)
+    compare(left, right, usable, 21, 8.0, residual, trust)
+    np.testing.assert_allclose(inside(residual, left.shape), wanted, atol=5e-3)
+    np.testing.assert_allclose(inside(trust, left.shape), usable / (1 + (wanted / 8) ** 2), atol=1e-3)
+
+
+def test_pulls_are_what_box_filters_say() -> None:
+    residual, slope, trust = _noise(31, 5), _noise(32, 10), np.abs(_noise(33))
+    means, usable = (_noise(34), _noise(35)), (_noise(36) > -0.8).astype(np.float32)
+    detail, slope_detail = residual - means[0], slope - means[1]
+    agreement = (_mean(trust * detail**2) + 1e-3) / (
+        2 * np.sqrt(np.pi) * 10 * _mean(trust * means[0] ** 2) + 1e-3
+    )
+    share = np.minimum(1, 0.5 * agreement)
+    wanted = trust * (slope_detail**2 + share * means[1] ** 2)
+    wanted_pull = -trust * (slope_detail * detail + share * means[1] * means[0])
+    weight, pull = empty_frame(usable.shape), empty_frame(usable.shape)
+    weigh(_frame(residual), _frame(slope), _frame(trust), means, 21, 10.0, 0.5, weight, pull)
+    np.testing.assert_allclose(inside(weight, usable.shape), wanted, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(inside(pull, usable.shape), wanted_pull, rtol=1e-3, atol=1e-2)
+
+    mean_weight = np.empty_like(usable)
+    short_of = lengthen(weight, _frame(trust), 20.0, 21, False, pull, mean_weight)
+    mean = _mean(wanted)
+    longer = mean / np.maximum(mean - 20 * _mean(trust), mean / 1.5 + 1e-6)
+    np.testing.assert_allclose(mean_weight, mean, rtol=1e-4)
+    np.testing.assert_allclose(short_of, longer, rtol=1e-3)
+    wanted_pull = wanted_pull * longer
+    np.testing.assert_allclose(inside(pull, usable.shape), wanted_pull, rtol=1e-3, atol=2e-2)
+
+    power = noise_power(pull, usable, _mean(usable), mean_weight, 0.1, 21)
+    blocks = cv2.boxFilter(wanted_pull, -1, (3, 3), normalize=False)
+    mean, seen = mean + 1e-3, _mean(usable) + 1e-6
+    wanted_power = _mean(usable * blocks**2) / 9 / mean * (mean + 0.1 * seen) / mean
+    np.testing.assert_allclose(power, wanted_power, rtol=2e-3)
+
+
+def test_supports_are_blended_and_steps_settled_as_written() -> None:
+    long, short = _noise(41), _noise(42, 0.5)
+    information, power = (1 + np.abs(_noise(43)), 1 + np.abs(_noise(44))), 0.1 * np.abs(_noise(45))
+    usable = (_noise(46) > -0.8).astype(np.float32)
+    variance = [variances(power, one) for one in information]
+    gap = long - short
+    excess = _mean(usable * (gap**2 - 0.5 * variance[1]), 9) / (_mean(usable, 9) + 1e-6)
+    share = variance[1] / (variance[1] + np.maximum(excess, 0) + 1e-9)
+    fitted, unsure = blend((long, information[0]), (short, information[1]), power, usable)
+    np.testing.assert_allclose(fitted, short + share * gap, atol=1e-4)
+    np.testing.assert_allclose(unsure, variance[0] + (1 - share) * (variance[1] - variance[0]), atol=1e-5)
+
+    fitted, axes, start, short_of = _noise(47, 0.1), _axes(0.6, 0.8), _noise(48), 1 + np.abs(_noise(49))
+    sag = 1.5 * _mean(_curvature(fitted, axes), 11)
+    move = np.clip(fitted - sag - start, -1.5, 1.5)
+    wanted = unsure + ((short_of - 1) * move) ** 2 + 0.25 * sag**2
+    disparity = _frame(start)
+    settle(fitted, axes, short_of, disparity, unsure)
+    np.testing.assert_allclose(inside(disparity, start.shape), start + move, atol=1e-5)
+    np.testing.assert_allclose(unsure, wanted, rtol=1e-4, atol=1e-5)

@@ -21,7 +21,7 @@ def curvature_row(disparity: Float32, axes: Float32, y: int, curvature: Float32)
     middle = disparity[y]
     for tile_x in range(axes.shape[1]):
         axis_x, axis_y = axes[y // TILE_ROWS, tile_x, 0], axes[y // TILE_ROWS, tile_x, 1]
-        down, right = int(round(-_REACH_PX * axis_x)), int(round(_REACH_PX * axis_y))
+        down, right = round(-_REACH_PX * axis_x), round(_REACH_PX * axis_y)
         after = disparity[min(max(y + down, 0), height - 1)]
         before = disparity[min(max(y - down, 0), height - 1)]
         start, end = tile_x * TILE_COLUMNS, min(width, tile_x * TILE_COLUMNS + TILE_COLUMNS)

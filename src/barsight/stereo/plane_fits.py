@@ -51,7 +51,7 @@ def fit_planes(
         near = np.arange(step) - step // 2
 
         def sum_up(first: int, end: int) -> None:
-            _sum_near(disparity, weight, pull, axes, near, nearness, *fitted.shape, *room, first, end)
+            _sum_near(disparity, weight, pull, axes, near, nearness, fitted.shape, *room, first, end)
 
         in_bands(sum_up, len(axes), BAND_TILES)
         weight, pull = room
@@ -59,9 +59,7 @@ def fit_planes(
     across = _gaussian(shape.across_px, int(_REACH * shape.across_px + 0.5), 1)
 
     def gather(first: int, end: int) -> None:
-        _gather(
-            disparity, weight, pull, axes, *along, *across, nearness, fitted, information, first, end
-        )
+        _gather(disparity, weight, pull, axes, *along, *across, nearness, fitted, information, first, end)
 
     in_bands(gather, len(axes), BAND_TILES)
 
@@ -129,9 +127,7 @@ def _add_near(
 ) -> Any:  # fmt: skip
     """The sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written from
     `at` on. All arrays are flat."""
-    signature = types.void(
-        theres, weights, pulls, middle, offsets, nearness, weight_sums, pull_sums, at
-    )
+    signature = types.void(theres, weights, pulls, middle, offsets, nearness, weight_sums, pull_sums, at)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
@@ -143,7 +139,9 @@ def _add_near(
             kept = v.alike(gap, nearness)
             weight = v.product(kept, v.load(v.data(1), there, FLOATS))
             v.add_to(totals[0], weight)
-            v.add_to(totals[1], v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, FLOATS))))
+            v.add_to(
+                totals[1], v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, FLOATS)))
+            )
         for place, total in zip((6, 7), totals, strict=True):
             v.store(builder.load(total), v.data(place), arguments[8])
         return context.get_dummy_value()
@@ -154,10 +152,11 @@ def _add_near(
 @kernel()
 def _sum_near(
     disparity: Float32, weight: Float32, pull: Float32, axes: Float32, near: Int64, nearness: np.float32,
-    height: int, width: int, weight_sum: Float32, pull_sum: Float32, first_tile: int, end_tile: int,
+    shape: tuple[int, int], weight_sum: Float32, pull_sum: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
     """Sums of weights and of pulls from each pixel's own disparity over the points `near` along the axis.
     Frames in and out."""
+    height, width = shape
     framed_width = disparity.shape[1]
     theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
     offsets = np.empty(len(near), dtype=np.int64)
@@ -226,7 +225,14 @@ def _gather(
                 planes, certain = fitted[y, x0 : x0 + count], information[y, x0 : x0 + count]
                 for i in range(count):
                     # A slope of zero is held with a small weight, so that a line of pixels still has a plane.
-                    s, sa, sc, r, ra, rc = sums[0, i], sums[1, i], sums[2, i], sums[6, i], sums[7, i], sums[8, i]
+                    s, sa, sc, r, ra, rc = (
+                        sums[0, i],
+                        sums[1, i],
+                        sums[2, i],
+                        sums[6, i],
+                        sums[7, i],
+                        sums[8, i],
+                    )
                     held = np.float32(0.02) * (sums[3, i] + sums[5, i]) + np.float32(1e-3)
                     aa, ac, cc = sums[3, i] + held, sums[4, i], sums[5, i] + held
                     scale = one / (aa * cc - ac * ac)

@@ -123,7 +123,11 @@ def _weigh(
             continue
         for part in range(2):
             slide(columns[part], reach, powers[part])
-        trusted, own, own_slope = trust[y + MARGIN, inner], residual[y + MARGIN, inner], slope[y + MARGIN, inner]
+        trusted, own, own_slope = (
+            trust[y + MARGIN, inner],
+            residual[y + MARGIN, inner],
+            slope[y + MARGIN, inner],
+        )
         mean, mean_slope = residual_mean[y], slope_mean[y]
         for x in range(width):
             share[x] = min(one, gloss_trust * (powers[0, x] + least) / (samples * powers[1, x] + least))
@@ -150,7 +154,16 @@ def lengthen(
 
     def work(first: int, end: int) -> None:
         _lengthen(
-            weight, trust, np.float32(slope_noise), side // 2, is_last, pull, mean_weight, short_of, first, end
+            weight,
+            trust,
+            np.float32(slope_noise),
+            side // 2,
+            is_last,
+            pull,
+            mean_weight,
+            short_of,
+            first,
+            end,
         )
 
     in_bands(work, len(mean_weight), BAND_ROWS)
@@ -196,9 +209,7 @@ def noise_power(
     power = np.empty_like(usable)
 
     def work(first: int, end: int) -> None:
-        _noise_power(
-            pull, usable, mean_usable, mean_weight, np.float32(hold), side // 2, power, first, end
-        )
+        _noise_power(pull, usable, mean_usable, mean_weight, np.float32(hold), side // 2, power, first, end)
 
     in_bands(work, len(usable), BAND_ROWS)
     return power

@@ -141,12 +141,17 @@ class _Work:
         compare(left_grey, warped, self.usable, side, settings.outlier_grey, self.residual, self.trust)
         gloss = settings.gloss_px, settings.gloss_trust
         weigh(
-            self.residual, self.slope, self.trust, self._along(left_grey), side, *gloss, self.weight, self.pull
+            self.residual,
+            self.slope,
+            self.trust,
+            self._along(left_grey),
+            side,
+            *gloss,
+            self.weight,
+            self.pull,
         )
         mean_weight = np.empty(shape, dtype=np.float32)
-        short_of = lengthen(
-            self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight
-        )
+        short_of = lengthen(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
         power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
         power *= short_of
         weight = inside(self.weight, shape)

@@ -1,8 +1,8 @@
 """Cubic B-splines along the rows: an image read at fractional columns, with its exact derivative.
 
 Linear or Keys-cubic reading damps fine texture by an amount that depends on the fraction, and that pulls a
-match towards whole or half pixels. A B-spline with its prefilter nearly doesn't [Thevenaz 2000]. The prefilter
-falls off fourfold per pixel, so that it can be one convolution together with a blur.
+match towards whole or half pixels. A B-spline with its prefilter nearly doesn't [Thevenaz 2000]. The
+prefilter falls off fourfold per pixel, so that it can be one convolution together with a blur.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from barsight.core.parallel import in_bands
 
 _POLE = math.sqrt(3.0) - 2.0
 _PREFILTER_REACH = 12
+_DIFFERENCE = np.array([-0.5, 0, 0.5], dtype=np.float32)
 _BAND_ROWS = 64
 
 
 def row_coefficients(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
-    """(H, W + 3) spline coefficients of each row of a (H, W) image, mirrored at the ends; of the image blurred
-    both ways by blur_px (one sigma) where that isn't 0.
+    """(H, W + 3) spline coefficients of each row of a (H, W) image, mirrored at the ends; of the image
+    blurred both ways by blur_px (one sigma) where that isn't 0.
 
     Coefficient k of the image is column k + 1, so that a reader needs no bounds check.
     """
@@ -35,7 +36,7 @@ def row_coefficients(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
 def row_slope(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
     """(H, W) x derivative at the pixels of the spline that `row_coefficients` gives."""
     along, across = _filters(blur_px)
-    slope: Float32 = cv2.sepFilter2D(image, cv2.CV_32F, np.convolve(along, np.float32([-0.5, 0, 0.5])), across)
+    slope: Float32 = cv2.sepFilter2D(image, cv2.CV_32F, np.convolve(along, _DIFFERENCE), across)
     return slope
 
 
@@ -54,8 +55,8 @@ def _filters(blur_px: float) -> tuple[Float32, Float32]:
 def value_and_slope(coefficients: Float32, disparity: Float32, margin: int = 0) -> tuple[Float32, Float32]:
     """The image and its x derivative at column x - disparity of each row, both (H, W) float32.
 
-    Beyond the image's ends the end column is read. `disparity` has no NaN; its pixel (0, 0) lies `margin` rows
-    and columns inside.
+    Beyond the image's ends the end column is read. `disparity` has no NaN; its pixel (0, 0) lies `margin`
+    rows and columns inside.
     """
     shape = len(coefficients), coefficients.shape[1] - 3
     value, slope = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)

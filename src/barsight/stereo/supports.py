@@ -85,9 +85,7 @@ def axis_means(
     nearness = np.float32(1 / alike_px)
 
     def work(first_tile: int, end_tile: int) -> None:
-        _axis_means(
-            first, second, weight, alike, nearness, axes, steps, shares, *means, first_tile, end_tile
-        )
+        _axis_means(first, second, weight, alike, nearness, axes, steps, shares, *means, first_tile, end_tile)
 
     in_bands(work, len(axes), BAND_TILES)
 

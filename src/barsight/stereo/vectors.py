@@ -94,7 +94,7 @@ class Vectors:
         self.builder.store(self.sum(self.builder.load(place), term), place)
 
     def zeros(self, count: int) -> list[Any]:
-        """Pointers to float vectors of zeros, which the compiler keeps in registers where there are enough."""
+        """Pointers to float vectors of zeros: registers, where there are enough."""
         return [cgutils.alloca_once_value(self.builder, self.all(0.0, FLOATS)) for _ in range(count)]
 
     def alike(self, gap: Any, nearness: Any) -> Any:
