@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from barsight.yard.types import HeightMap
 
@@ -79,3 +80,36 @@ def draw(
     sigma = np.where(known, sigma_m, np.nan).astype(np.float32)
     views = np.where(known, 5, 0).astype(np.float32)
     return HeightMap(float(xs[0]), float(ys[0]), CELL_M, z, sigma, views, known.astype(np.uint8))
+
+
+def photographed(
+    height_map: HeightMap, bundles: list[Laid], aside: float = 0.5, blur_m: float = 0.01
+) -> HeightMap:
+    """The same with an orthophoto, bars lit from above and, `aside` as strongly, from a side.
+
+    What is not floor is smoothed across X, so that the bars don't show in the heights.
+    """
+    x = height_map.x0_m + height_map.cell_m * np.arange(height_map.z_m.shape[1])
+    y = height_map.y0_m + height_map.cell_m * np.arange(height_map.z_m.shape[0])
+    grey = np.zeros(height_map.z_m.shape)
+    for part in np.linspace(-0.4, 0.4, 5) * height_map.cell_m:
+        xx, yy = np.meshgrid(x + part, y)
+        top, light = np.full(xx.shape, 0.0), np.full(xx.shape, 0.6)
+        for bundle in bundles:
+            yaw = np.radians(bundle.yaw_deg)
+            across = (xx - bundle.x_m) * np.cos(yaw) + (yy - bundle.y_m) * np.sin(yaw)
+            along = -(xx - bundle.x_m) * np.sin(yaw) + (yy - bundle.y_m) * np.cos(yaw)
+            for side, up in bundle.axes_m:
+                turned = 2 * (across - side) / bundle.diameter_m
+                rise = np.sqrt(np.maximum(1 - turned**2, 0))
+                height = bundle.z_m + up + rise * bundle.diameter_m / 2
+                seen = (np.abs(turned) < 1) & (np.abs(along) < bundle.length_m / 2) & (height > top)
+                top = np.where(seen, height, top)
+                light = np.where(seen, np.maximum(rise + aside * turned, 0), light)
+        grey += light / 5
+    noise = np.random.default_rng(5).normal(0, 6, grey.shape)
+    steel = height_map.z_m > 0.05
+    share = ndimage.gaussian_filter1d(steel.astype(float), blur_m / height_map.cell_m, axis=1)
+    total = ndimage.gaussian_filter1d(height_map.z_m * steel, blur_m / height_map.cell_m, axis=1)
+    z = np.where(steel, total / np.maximum(share, 1e-9), height_map.z_m).astype(np.float32)
+    return replace(height_map, z_m=z, grey=(40 + 100 * grey + noise).clip(1, 255).astype(np.uint8))

@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 from plyfile import PlyData, PlyParseError
 
-from barsight.core.arrays import Float32, Float64, Int64
+from barsight.core.arrays import Float32, Float64, Int64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
@@ -72,7 +72,7 @@ def age_s(summary: dict[str, Any]) -> float | None:
 
 
 def read_heights(folder: Path) -> HeightMap:
-    """height.tif, whole. Raises InputError where it is missing or torn."""
+    """height.tif, whole, and ortho.tif where there is one. Raises InputError where one is missing or torn."""
     path = folder / "height.tif"
     if not path.is_file():
         raise InputError(folder, "has no height.tif", _REMEDY)
@@ -86,7 +86,20 @@ def read_heights(folder: Path) -> HeightMap:
     except (tifffile.TiffFileError, zlib.error, OSError, ValueError, KeyError, IndexError) as error:
         raise InputError(path, f"is torn ({error})", _REMEDY) from error
     x0_m, y0_m = float(tie[3]) + cell_m / 2, float(tie[4]) - (z.shape[0] - 0.5) * cell_m
-    return HeightMap(x0_m, y0_m, cell_m, z, sigma, views, source.astype(np.uint8))
+    grey = _read_orthophoto(folder / "ortho.tif", z.shape)
+    return HeightMap(x0_m, y0_m, cell_m, z, sigma, views, source.astype(np.uint8), grey)
+
+
+def _read_orthophoto(path: Path, shape: tuple[int, ...]) -> UInt8 | None:
+    if not path.is_file():
+        return None
+    try:
+        picture = tifffile.imread(path)
+    except (tifffile.TiffFileError, zlib.error, OSError, ValueError) as error:
+        raise InputError(path, f"is torn ({error})", _REMEDY) from error
+    if picture.shape != shape or picture.dtype != np.uint8:
+        raise InputError(path, "doesn't fit height.tif", _REMEDY)
+    return np.ascontiguousarray(picture[::-1])
 
 
 def read_path(folder: Path) -> CameraPath | None:

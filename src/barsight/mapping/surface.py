@@ -40,6 +40,11 @@ class Layers:
         return cls(nan, nan.copy(), none, none.astype(np.uint8), nan.copy())
 
 
+def grey_levels(intensity: Float32) -> UInt8:
+    """Whole grey levels from 1, 0 where no view saw the cell."""
+    return np.where(np.isfinite(intensity), np.rint(intensity).clip(1, 255), 0).astype(np.uint8)
+
+
 @dataclass(frozen=True, eq=False)
 class CloudPart:
     """A tile's points: xyz_m (N, 3) float32 in the reference frame, intensity, sigma_z_m, views (N,)."""

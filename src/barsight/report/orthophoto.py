@@ -12,7 +12,7 @@ import tifffile
 import barsight
 from barsight.core.arrays import UInt8
 from barsight.core.files import atomic_path
-from barsight.mapping.surface import Surface
+from barsight.mapping.surface import Surface, grey_levels
 
 NO_DATA = 0
 _ROWS = 256
@@ -33,13 +33,12 @@ def georeference(surface: Surface) -> list[tuple[int, str, int, Any, bool]]:
 def orthophoto(surface: Surface) -> UInt8:
     """(rows, columns) grey levels from 1, NO_DATA where no view saw the cell; row 0 at the highest y."""
     rows, columns = surface.shape
-    picture = np.full((rows, columns), NO_DATA, np.uint8)
+    picture = np.empty((rows, columns), np.uint8)
     for row in range(0, rows, _ROWS):
         count = min(_ROWS, rows - row)
         lowest = surface.rows[1] - row - count
-        grey = surface.window(surface.columns[0], lowest, columns, count).intensity[::-1]
-        known = np.isfinite(grey)
-        picture[row : row + count][known] = grey[known].round().clip(1, 255).astype(np.uint8)
+        part = surface.window(surface.columns[0], lowest, columns, count)
+        picture[row : row + count] = grey_levels(part.intensity)[::-1]
     return picture
 
 

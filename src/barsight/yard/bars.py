@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, Int64
-from barsight.yard.bundle_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit
+from barsight.core.arrays import Float64, Int64
+from barsight.yard.bundle_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, Found
 from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.outline import STEP_M, turned_hexagon
+from barsight.yard.outline import STEP_M, highest_bars, turned_hexagon
 from barsight.yard.sheet import Sheet
 from barsight.yard.types import Bar
 
@@ -26,29 +26,22 @@ def visible_bars(fit: Fit) -> Int64:
 def _seen_share(fit: Fit) -> Float64:
     axes = turned_hexagon(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]))
     u = np.arange(-fit.width_m / 2, fit.width_m / 2, STEP_M)
-    highest, _ = _highest(axes, fit.values[DIAMETER] / 2, u)
+    highest, _ = highest_bars(axes, fit.values[DIAMETER] / 2, u)
     counts = np.bincount(highest[highest >= 0], minlength=len(axes))
     share: Float64 = counts * STEP_M / fit.values[DIAMETER]
     return share
 
 
-def _highest(axes: Float64, radius: float, u: Float64) -> tuple[Int64, Bool]:
-    """For each place the bar that is highest there, -1 where none is; and where the surface isn't steep."""
-    inside = radius**2 - (u[:, None] - axes[:, 0]) ** 2
-    heights = np.where(inside > 0, axes[:, 1] + np.sqrt(np.maximum(inside, 0)), -np.inf)
-    highest = np.where(np.isfinite(heights.max(axis=1)), heights.argmax(axis=1), -1)
-    level = np.abs(u - axes[highest, 0]) < _STEEPEST * radius
-    return highest.astype(np.int64), level & (highest >= 0)
-
-
-def fit_bars(sheet: Sheet, fit: Fit, settings: BundleSettings) -> tuple[Bar, ...]:
-    """A cylinder for each bar seen from above; none where the bars are thinner than three cells.
+def fit_bars(found: Found, settings: BundleSettings) -> tuple[Bar, ...]:
+    """A cylinder for each bar seen from above; none where neither heights nor pictures resolve them.
 
     Place, height, yaw and pitch of each axis come from the heights where that bar is highest, by least
-    squares from the bundle's outline on; the diameter is the bundle's, with its uncertainty.
+    squares from the bundle's outline on; the diameter is the bundle's, with its uncertainty. Bars thinner
+    than three cells lie as the packing says that the pictures show.
     """
+    sheet, fit = found.sheet, found.fit
     diameter = float(fit.values[DIAMETER])
-    if diameter < _RESOLVED_CELLS * sheet.cell_m:
+    if diameter < _RESOLVED_CELLS * sheet.cell_m and found.shades is None:
         return ()
     rows = np.flatnonzero(fit.state == AGREES)
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
@@ -64,8 +57,9 @@ def fit_bars(sheet: Sheet, fit: Fit, settings: BundleSettings) -> tuple[Bar, ...
     u = sheet.u0_m + sheet.cell_m * columns - middle[:, None]
     r = z - fit.values[2] - (fit.values[SLOPE_Z] * v)[:, None]
     axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
-    highest, level = _highest(axes, diameter / 2, u.ravel())
-    usable = level & np.isfinite(r.ravel())
+    highest, _ = highest_bars(axes, diameter / 2, u.ravel())
+    level = np.abs(u.ravel() - axes[highest, 0]) < _STEEPEST * diameter / 2
+    usable = level & (highest >= 0) & np.isfinite(r.ravel())
     along = np.broadcast_to(v[:, None], u.shape).ravel()
     bars = []
     for number in visible_bars(fit):

@@ -9,7 +9,7 @@ import numpy as np
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.yard.bundle_newton import Heights, Rules, fit_outline
 from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.outline import BARS_OF_RINGS, bundle_width, hexagon
+from barsight.yard.outline import BARS_OF_RINGS, bundle_width, hexagon, make_outline
 from barsight.yard.sheet import Sheet
 
 U, SLOPE_U, Z, SLOPE_Z, ROLL, DIAMETER = range(6)
@@ -53,6 +53,26 @@ class Fit:
         """Place across and height of the axis at v_m."""
         along = v_m - self.v_m
         return self.values[U] + self.values[SLOPE_U] * along, self.values[Z] + self.values[SLOPE_Z] * along
+
+
+@dataclass(frozen=True, eq=False)
+class Shades:
+    """Logarithms of grey levels (N,) at places (N,) across a bundle from its axis: medians along it."""
+
+    places_m: Float64
+    levels: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A fitted outline and the sheet that its figures belong to.
+
+    shades: what the pictures show of its bars, where they settle the packing.
+    """
+
+    sheet: Sheet
+    fit: Fit
+    shades: Shades | None = None
 
 
 def refine(
@@ -101,3 +121,12 @@ def refine(
         start, v_m=v_m, values=values, covariance=covariance, first=rows[0], last=rows[1], rms_m=rms,
         sigma_m=sigma,
     )  # fmt: skip
+
+
+def widened(fit: Fit, settings: BundleSettings) -> Fit:
+    """With the error of the width that the map's smoothing leaves: it moves the axis, not the top."""
+    share = settings.packing_share if fit.rings else settings.single_share
+    top_m = float(np.nanmax(make_outline(fit.rings, fit.values[DIAMETER], fit.values[ROLL], 0.0).exact_m))
+    change = np.zeros(6)
+    change[DIAMETER], change[Z] = share * fit.values[DIAMETER], -share * top_m
+    return replace(fit, covariance=fit.covariance + np.outer(change, change))

@@ -9,7 +9,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.bars import fit_bars, visible_bars
 from barsight.yard.bundle_ends import End, find_end
-from barsight.yard.bundle_fit import ABOVE, AGREES, BELOW, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
+from barsight.yard.bundle_fit import ABOVE, AGREES, BELOW, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, Found, U, Z
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.layers import find_layers, neighbours_of, on_top_of
 from barsight.yard.outline import BARS_OF_RINGS, LOOSENESS, make_outline
@@ -18,14 +18,6 @@ from barsight.yard.types import Bundle, BundleSigma
 
 _NARROW_M = 0.3
 _SURE_KNOWN = 0.7
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A fitted outline and the sheet that its figures belong to."""
-
-    sheet: Sheet
-    fit: Fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +84,7 @@ def _bundle(reading: Reading, settings: BundleSettings) -> Bundle:
         known_share=float((rows != 0).mean()),
         confidence=_confidence(reading, rows),
         reasons=reasons,
-        bar_axes=fit_bars(sheet, fit, settings),
+        bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
     )
 
@@ -111,8 +103,7 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings, shee
     at_middle[1, [Z, SLOPE_Z]] = 1, along
     at_middle[1, ROLL], at_middle[1, DIAMETER] = _top_changes(fit, top)
     lateral, height = np.sqrt(np.maximum(np.diag(at_middle @ covariance @ at_middle.T), 0))
-    share = settings.packing_share if fit.rings else settings.single_share
-    diameter = float(np.hypot(np.sqrt(covariance[DIAMETER, DIAMETER]), share * fit.values[DIAMETER]))
+    diameter = float(np.sqrt(covariance[DIAMETER, DIAMETER]))
     sigmas = np.array([end.sigma_m for end in ends])
     return BundleSigma(
         lateral_m=float(np.hypot(lateral, settings.shared_lateral_m)),

@@ -9,12 +9,13 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.parallel import ordered_map
 from barsight.core.types import Source
-from barsight.yard.bundle_fit import AGREES, Fit, U, Z, refine
+from barsight.yard.bundle_fit import AGREES, Fit, Found, U, Z, refine, widened
 from barsight.yard.bundle_growth import grow
-from barsight.yard.bundle_record import Found, Reading, describe
+from barsight.yard.bundle_record import Reading, describe
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.crossings import OVER_M, crossing_pieces, is_beam, rise_over
 from barsight.yard.floor import find_floor
+from barsight.yard.gullies import as_pictured, seen_smoothing
 from barsight.yard.headings import find_headings
 from barsight.yard.kinds import common_diameter, other_packings, with_company
 from barsight.yard.matching import Guess, Templates, guess, make_templates
@@ -58,7 +59,7 @@ def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundl
         across = _found(part, heading, floor, templates, close)
         found += [one for one in across if not is_beam(one.sheet, one.fit, settings)]
     weights, claims = _weighed(found, settings)
-    readings = _settled(found, weights, claims, settings)
+    readings = _settled(found, weights, claims, height_map, settings)
     return describe(readings, floor, settings)
 
 
@@ -77,38 +78,44 @@ def _weighed(found: list[Found], settings: BundleSettings) -> tuple[Float64, lis
 
 
 def _settled(
-    found: list[Found], weights: Float64, claims: list[Int64], settings: BundleSettings
+    found: list[Found], weights: Float64, claims: list[Int64], height_map: HeightMap, settings: BundleSettings
 ) -> list[Reading]:
-    """The best set of readings, once by itself and once more with regard to the kinds of bundles in it."""
+    """The best set of readings, once by itself and once more with regard to the kinds of bundles in it.
+
+    Which bars an outline holds is settled by the pictures where they show it, else by its neighbours.
+    """
     fits = [one.fit for one in found]
     first = choose(weights, claims)
     raised = with_company(fits, weights, first, overlaps(first, claims))
     chosen = choose(raised, claims)
     wanted = overlaps(chosen, claims)
-    kept = [fits[k] for k in chosen]
-    cell_m = found[0].sheet.cell_m if found else 0.0
-    resolved = 0.0 if settings.catalogue_mm else _RESOLVED_CELLS * cell_m
+    kept = [as_pictured(found[k], height_map, settings) for k in chosen]
+    smoothed = replace(settings, smoothing_m=seen_smoothing(kept, settings))
+    kept = [replace(one, fit=refine(one.sheet, one.fit, smoothed) or one.fit) for one in kept]
+    resolved = 0.0 if settings.catalogue_mm else _RESOLVED_CELLS * height_map.cell_m
     readings = []
-    for k, rival, other in zip(
+    for k, one, rival, other in zip(
         chosen.tolist(),
+        kept,
         strongest_rivals(chosen, raised, wanted),
         other_packings(fits, weights, chosen, wanted, resolved),
         strict=True,
     ):
-        one = _with_common_diameter(found[k], kept, settings)
+        final = _finished(one, [each.fit for each in kept], smoothed)
         weight = 0.0 if rival is None else float(raised[rival])
         against = None if rival is None else found[rival]
-        readings.append(Reading(one, float(raised[k]), against, weight, other))
+        packing = None if one.shades is not None else other
+        readings.append(Reading(final, float(raised[k]), against, weight, packing))
     return readings
 
 
-def _with_common_diameter(one: Found, kept: list[Fit], settings: BundleSettings) -> Found:
+def _finished(one: Found, kept: list[Fit], settings: BundleSettings) -> Found:
     """Fitted again with the diameter that the bundles of its kind have in common."""
-    common = common_diameter(one.fit, kept)
-    if common is None or settings.catalogue_mm:
-        return one
-    again = refine(one.sheet, one.fit, settings, common=common)
-    return one if again is None else replace(one, fit=again)
+    fit = one.fit
+    common = common_diameter(fit, kept)
+    if common is not None and not settings.catalogue_mm:
+        fit = refine(one.sheet, fit, settings, common=common) or fit
+    return replace(one, fit=widened(fit, settings))
 
 
 def _on(floor_m: float | None, fit: Fit) -> bool:

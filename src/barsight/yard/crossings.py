@@ -25,6 +25,9 @@ _LEAST_CELLS = 30
 _FLANK = (0.3, 0.45)
 """Of the width to either side: where a bundle falls off as round bars do."""
 _FOLLOWS_M = 0.03
+_FOLLOWED_SHARE = 0.4
+_READ_SHARE = 0.5
+_GAP_CELLS, _THIN_CELLS = 7, 5
 _LEVEL_M = 0.008
 _MARGIN_M = 0.6
 _SLENDER = 1.8
@@ -38,37 +41,44 @@ def crossing_pieces(
 ) -> Iterator[tuple[float, HeightMap]]:
     """For each long thing over the kept outlines its heading (rad) and the map around it.
 
-    Things that run as the bundles do are found with these and left out.
+    Left out is what runs as most bundles do, which is found with these, and what a kept outline follows.
     """
-    over = np.zeros(height_map.z_m.shape, np.uint8)
+    over, followed = (np.zeros(height_map.z_m.shape, np.uint8) for _ in range(2))
     for sheet, fit in kept:
-        row, column = _cells_over(sheet, fit, settings, height_map)
-        over[row, column] = 1
+        for cells, mask in zip(_cells_over(sheet, fit, settings, height_map), (over, followed), strict=True):
+            mask[cells] = 1
+    read = np.zeros(height_map.z_m.shape, bool)
     for piece in _pieces(_patches(height_map), over):
         row, column = np.nonzero(piece)
         heading = _heading(row, column, settings.least_length_m / height_map.cell_m)
-        if heading is None or _is_near(heading, headings, settings.max_skew_deg):
+        if heading is None or _is_near(heading, headings[:1], settings.max_skew_deg):
+            continue
+        if followed[piece].mean() > _FOLLOWED_SHARE or read[piece].mean() > _READ_SHARE:
             continue
         if _is_level(height_map.z_m[row, column], row, column, heading):
             continue
+        read |= piece
         yield heading, _around(height_map, row, column)
 
 
 def _cells_over(
     sheet: Sheet, fit: Fit, settings: BundleSettings, height_map: HeightMap
-) -> tuple[Int64, Int64]:
-    """Rows and columns of the map's cells that lie over the outline, or over where it may go on."""
+) -> tuple[tuple[Int64, Int64], tuple[Int64, Int64]]:
+    """Rows and columns of the map's cells over the outline or where it may go on, and of those on it."""
     further = round(_FURTHER_M / sheet.cell_m)
     rows = np.arange(max(fit.first - further, 0), min(fit.last + further + 1, sheet.z_m.shape[0]))
     v = sheet.v0_m + sheet.cell_m * rows
     across = np.arange(-0.5 * fit.width_m, 0.5 * fit.width_m, sheet.cell_m)
     u = fit.values[U] + fit.values[SLOPE_U] * (v - fit.v_m)[:, None] + across
-    found = rise_over(sheet, fit, rows, u, settings) > OVER_M
-    places = sheet.to_map(np.stack([u[found], np.broadcast_to(v[:, None], u.shape)[found]], axis=1))
-    cell = height_map.cell_m
-    column = np.rint((places[:, 0] - height_map.x0_m) / cell).astype(np.int64)
-    row = np.rint((places[:, 1] - height_map.y0_m) / cell).astype(np.int64)
-    return row.clip(0, height_map.z_m.shape[0] - 1), column.clip(0, height_map.z_m.shape[1] - 1)
+    rise = rise_over(sheet, fit, rows, u, settings)
+
+    def cells(chosen: Bool) -> tuple[Int64, Int64]:
+        places = sheet.to_map(np.stack([u[chosen], np.broadcast_to(v[:, None], u.shape)[chosen]], axis=1))
+        places = np.rint((places - (height_map.x0_m, height_map.y0_m)) / height_map.cell_m).astype(np.int64)
+        rows, columns = height_map.z_m.shape
+        return places[:, 1].clip(0, rows - 1), places[:, 0].clip(0, columns - 1)
+
+    return cells(rise > OVER_M), cells(np.abs(rise) <= OVER_M)
 
 
 def rise_over(sheet: Sheet, fit: Fit, rows: Int64, u: Float64, settings: BundleSettings) -> Float64:
@@ -89,7 +99,8 @@ def rise_over(sheet: Sheet, fit: Fit, rows: Int64, u: Float64, settings: BundleS
 
 def is_beam(sheet: Sheet, fit: Fit, settings: BundleSettings) -> bool:
     """Whether the mean section is level to where it ends, not round: a flank leaves the outline, the middle
-    is nearer to level than to the outline, or only bars thinner than any would make it so level.
+    is nearer to level than to the outline, or only bars thinner than any would make it so level. Where both
+    flanks fall off as the outline does, the middle may be level: two bars side by side are.
     """
     if fit.rings > 0 and fit.values[DIAMETER] < settings.least_bar_m:
         return True
@@ -110,8 +121,12 @@ def is_beam(sheet: Sheet, fit: Fit, settings: BundleSettings) -> bool:
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
     middle = known & (np.abs(across) < _FLANK[0] * fit.width_m)
-    height = outline.seen_m[np.rint((across[middle] + outline.reach_m) / STEP_M).astype(int)]
-    return bool(middle.sum() >= 3 and np.var(section[middle] + height) < np.var(section[middle]))
+    height = outline.seen_m[np.rint((across + outline.reach_m) / STEP_M).astype(int)]
+    fall = np.median(height[middle]) - np.median(height[known & ~middle]) if middle.sum() >= 3 else 0.0
+    if fall > _FOLLOWS_M and len(seen) == 2 and max(abs(one) for one in seen) < _FOLLOWS_M / 3:
+        return False
+    rest = section[middle]
+    return bool(middle.sum() >= 3 and np.var(rest + height[middle]) < np.var(rest))
 
 
 def _patches(height_map: HeightMap) -> Int32:
@@ -127,10 +142,16 @@ def _patches(height_map: HeightMap) -> Int32:
 
 
 def _pieces(patches: Int32, over: UInt8) -> Iterator[Bool]:
-    """The patches of which at least a part lies over an outline."""
-    numbers, cells = np.unique(patches[over > 0], return_counts=True)
-    for number in numbers[(numbers > 0) & (cells >= _LEAST_CELLS)]:
-        yield np.asarray(patches == number)
+    """The patches of which at least a part lies over an outline; then what lies over outlines, as one.
+
+    Noise may join a thing's patch to those beneath it. Over the outlines alone it stands by itself.
+    """
+    closed = cv2.morphologyEx(over, cv2.MORPH_CLOSE, np.ones((_GAP_CELLS, _GAP_CELLS), np.uint8))
+    closed = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((_THIN_CELLS, _THIN_CELLS), np.uint8))
+    for parts in (patches, np.asarray(cv2.connectedComponents(closed, connectivity=4)[1])):
+        numbers, cells = np.unique(parts[over > 0], return_counts=True)
+        for number in numbers[(numbers > 0) & (cells >= _LEAST_CELLS)]:
+            yield np.asarray(parts == number)
 
 
 def _heading(row: Int64, column: Int64, least_cells: float) -> float | None:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from barsight.core.arrays import Float64, kernel
+from barsight.core.arrays import Float64, Int64, kernel
 
 BARS_OF_RINGS = (1, 7, 19, 37, 61)
 """Bars of a full hexagon of 0, 1, 2, ... rings around the middle bar."""
@@ -40,6 +40,14 @@ def turned_hexagon(rings: int, diameter_m: float, roll_rad: float) -> Float64:
 def bundle_width(rings: int, diameter_m: float) -> float:
     """Diameter of the circle around all bars."""
     return diameter_m * (2 * LOOSENESS * rings + 1)
+
+
+def highest_bars(axes_m: Float64, radius_m: float, u_m: Float64) -> tuple[Int64, Float64]:
+    """For each place the bar that is highest there, -1 where none is, and its height (-inf where none)."""
+    inside = radius_m**2 - (u_m[:, None] - axes_m[:, 0]) ** 2
+    heights = np.where(inside > 0, axes_m[:, 1] + np.sqrt(np.maximum(inside, 0)), -np.inf)
+    top: Float64 = heights.max(axis=1)
+    return np.where(np.isfinite(top), heights.argmax(axis=1), -1).astype(np.int64), top
 
 
 @dataclass(frozen=True, eq=False)

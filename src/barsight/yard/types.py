@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
-from barsight.mapping.surface import Surface
+from barsight.mapping.surface import Surface, grey_levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,8 @@ class HeightMap:
     """The map that the yard's stages read: arrays [y, x] with y rising.
 
     Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
-    NaN where unknown. views: float32. source: `Source`.
+    NaN where unknown. views: float32. source: `Source`. grey: the orthophoto, levels from 1, 0 where nothing
+    was seen; None where there is none.
     """
 
     x0_m: float
@@ -29,6 +30,7 @@ class HeightMap:
     sigma_m: Float32
     views: Float32
     source: UInt8
+    grey: UInt8 | None = None
 
     @classmethod
     def of(cls, surface: Surface) -> HeightMap:
@@ -36,7 +38,8 @@ class HeightMap:
         rows, columns = surface.shape
         layers = surface.window(surface.columns[0], surface.rows[0], columns, rows)
         x0_m, y0_m = surface.columns[0] * surface.cell_m, surface.rows[0] * surface.cell_m
-        return cls(x0_m, y0_m, surface.cell_m, layers.z_m, layers.sigma_m, layers.views, layers.source)
+        grey = grey_levels(layers.intensity)
+        return cls(x0_m, y0_m, surface.cell_m, layers.z_m, layers.sigma_m, layers.views, layers.source, grey)
 
 
 @dataclass(frozen=True, eq=False)
