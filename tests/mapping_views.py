@@ -43,11 +43,13 @@ def fused(
     cell_m: float = 0.01,
     resident: int = 64,
 ) -> Surface:
-    """The finished surface of some views, every cell for itself: a rim asks nothing of the cells beside it
-    unless the settings say how much."""
+    """The finished surface of some views, every cell for itself: it asks nothing of the cells beside it and
+    takes nothing from them unless the settings say how much."""
     settings = settings or MapSettings(min_views=1)
-    if settings.rim_share == MapSettings().rim_share:
-        settings = replace(settings, rim_share=0.001)
+    if settings.along_share == MapSettings().along_share:
+        settings = replace(settings, along_share=0.001)
+    if settings.along_m == MapSettings().along_m:
+        settings = replace(settings, along_m=0.0)
     folder.mkdir(parents=True, exist_ok=True)
     store = TileStore(folder, resident)
     poses = []

@@ -69,10 +69,10 @@ def test_many_different_outliers_dont_fill_the_cell(tmp_path: Path) -> None:
 def test_the_highest_supported_height_wins(tmp_path: Path) -> None:
     """A bar over a floor that is seen past it more often, but not a height with too few views."""
     floor, bar = [(0.0, 0.01)] * 10, [(1.0, 0.01)]
-    assert at_origin(floor + bar * 4, tmp_path / "a", inner_share=0.25, rim_share=0.25)[0] == pytest.approx(
+    assert at_origin(floor + bar * 4, tmp_path / "a", own_share=0.25, along_share=1.0)[0] == pytest.approx(
         1.0
     )
-    assert at_origin(floor + bar * 3, tmp_path / "b", inner_share=0.25, rim_share=0.25)[0] == pytest.approx(
+    assert at_origin(floor + bar * 3, tmp_path / "b", own_share=0.25, along_share=1.0)[0] == pytest.approx(
         0.0
     )
 
@@ -124,7 +124,7 @@ def voted_slowly(heights: list[tuple[float, float]], settings: MapSettings) -> t
 
 def test_the_kernels_agree_with_the_slow_reference(tmp_path: Path) -> None:
     rng = np.random.default_rng(9)
-    settings = MapSettings(min_views=1, inner_share=0.01, fill_m=0)
+    settings = MapSettings(min_views=1, own_share=0.01, fill_m=0)
     x, y = block(200, 5)
     level = rng.choice(
         [0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.4], (12, 5, 200), p=[0.3, 0.3, 0.1, 0.1, 0.1, 0.05, 0.05]
@@ -208,7 +208,14 @@ def test_a_store_holds_no_more_than_it_may(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "setting",
-    [{"cell_m": 0.0}, {"min_views": 0}, {"resident_tiles": 1}, {"top_share": 0.0}, {"fill_m": -1.0}],
+    [
+        {"cell_m": 0.0},
+        {"min_views": 0},
+        {"resident_tiles": 1},
+        {"top_share": 0.0},
+        {"fill_m": -1.0},
+        {"along_m": -1.0},
+    ],
 )
 def test_settings_out_of_range_are_refused(setting: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(setting))):

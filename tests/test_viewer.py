@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.result_folder import read_cloud
-from barsight.viewer.cloud import COLOURINGS, colour
+from barsight.core.types import Source
+from barsight.result_folder import read_cloud, read_heights
+from barsight.viewer.cloud import SOURCE_RGB, colour, seen_layer, surface_layer
 from barsight.viewer.view import line_segments, serving, view
-from result_folders import write_folder
+from result_folders import surface_m, write_folder
 
 
 @pytest.fixture(scope="module")
@@ -92,21 +93,30 @@ def test_the_cloud_is_thinned_evenly(folder: Path) -> None:
     np.testing.assert_array_equal(thin.xyz_m, whole.xyz_m[np.arange(1700) * 5000 // 1700])
 
 
-@pytest.mark.parametrize("by", COLOURINGS)
+@pytest.mark.parametrize("by", ["height", "intensity", "sigma", "views"])
 def test_colours_follow_the_property(folder: Path, by: str) -> None:
-    cloud = read_cloud(folder / "cloud.ply", 10_000)
-    painted = colour(cloud, by)
+    layer = seen_layer(read_cloud(folder / "cloud.ply", 10_000))
+    painted = colour(layer, by)
     assert painted.rgb.shape == (5000, 3)
-    values = {
-        "height": cloud.xyz_m[:, 2] * 1e3,
-        "intensity": cloud.intensity,
-        "sigma": cloud.sigma_m * 1e3,
-        "views": cloud.views,
-    }[by]
-    highest = int(np.argmax(values))
-    at_top = values[highest] > painted.low
-    np.testing.assert_array_equal(painted.rgb[highest], painted.ramp[255 if at_top else 0])
-    np.testing.assert_array_equal(painted.rgb[int(np.argmin(values))], painted.ramp[0])
+    values = layer.properties[by]
+    highest, lowest = int(np.argmax(values)), int(np.argmin(values))
+    np.testing.assert_array_equal(painted.rgb[lowest], painted.ramp[0])
+    if values[highest] > values[lowest]:
+        np.testing.assert_array_equal(painted.rgb[highest], painted.ramp[255])
+
+
+def test_the_surface_shows_filled_cells_and_says_so(folder: Path) -> None:
+    """280 of 300 columns are known, a block of 10 x 10 cells among them is filled."""
+    layer = surface_layer(read_heights(folder), 10**6)
+    assert (layer.total, layer.xyz_m.shape) == (150 * 280, (150 * 280, 3))
+    assert list(layer.properties) == ["height", "source", "sigma", "views"]
+    np.testing.assert_allclose(layer.xyz_m[:, 2], surface_m(layer.xyz_m[:, 0].astype(np.float64)), atol=2e-3)
+    painted = colour(layer, "source")
+    filled = (painted.rgb == SOURCE_RGB[Source.FILLED][1]).all(axis=1)
+    assert filled.sum() == 100
+    assert (painted.rgb[~filled] == SOURCE_RGB[Source.VISION][1]).all()
+    assert painted.caption == "vision 99.8 %, filled 0.2 %"
+    assert surface_layer(read_heights(folder), 1000).xyz_m.shape == (1000, 3)
 
 
 def test_lines_are_open_where_unknown() -> None:

@@ -49,7 +49,7 @@ def carried_along(
     known = np.full(here.shape, np.nan, np.float32)
     known[_SMOOTH // 2 : -(_SMOOTH // 2), _SMOOTH // 2 : -(_SMOOTH // 2)] = 0.0
     moved = cv2.remap(there + known, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=float("nan"))
-    by_motion = _difference(here + known, np.asarray(moved, np.float32))
+    by_motion = _difference(here, np.asarray(np.where(np.isnan(moved + known), here, moved), np.float32))
     still = np.full(here.shape, np.inf, np.float32)
     edge = cv2.copyMakeBorder(there, _SWING, _SWING, _SWING, _SWING, cv2.BORDER_REPLICATE)
     for i in range(2 * _SWING + 1):
@@ -71,6 +71,5 @@ def _shrunk(image: UInt8) -> Float32:
 
 
 def _difference(here: Float32, there: Float32) -> Float32:
-    """Mean absolute difference over a window; what one of them doesn't show differs by nothing."""
-    off = np.abs(here - there)
-    return np.asarray(cv2.blur(np.nan_to_num(off), (_WINDOW, _WINDOW)), np.float32)
+    """Mean absolute difference over a window."""
+    return np.asarray(cv2.blur(cv2.absdiff(here, there), (_WINDOW, _WINDOW)), np.float32)

@@ -15,19 +15,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
+import cv2
 import numpy as np
 from numba import prange
 
 from barsight.core.arrays import Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
-from barsight.mapping.lines_of_sight import density, free, inside, may_be_covered
+from barsight.mapping.lines_of_sight import STRIDE, density, free, inside, may_be_covered
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
 
-_RIM_CELLS = 2
-_RIM_SLOPE = 2.5
-_ALONG = 5
+_ALONG = 30
 _ALIKE_CELLS = 3.0
 _NOTHING = np.float32(-1e6)
 
@@ -105,13 +104,12 @@ def elect(
     box = np.array([[*corner, held.min() / cell_m], [*(corner + TILE_CELLS), held.max() / cell_m]]) * cell_m
     sights = sights.near(*box)
     around = np.where(known, around, _NOTHING)
+    roof = np.asarray(cv2.dilate(around, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)), np.float32)
     share, expected = _supported(
-        tile, corner, around, ceiling, lens, size, sights.rotation, sights.translation, sights.eyes,
+        tile, corner, around, roof, ceiling, lens, size, sights.rotation, sights.translation, sights.eyes,
         cell_m, float(min_views), cell_m / sights.spacing_rad,
     )  # fmt: skip
-    return _elected(
-        tile, share, expected, around, cell_m, float(min_views), settings.inner_share, settings.rim_share
-    )
+    return _elected(tile, share, expected, cell_m, float(min_views), settings.own_share, settings.along_share)
 
 
 @kernel(parallel=True)
@@ -119,6 +117,7 @@ def _supported(
     tile: Float32,
     corner: Float64,
     around: Float32,
+    roof: Float32,
     ceiling: float,
     lens: Float64,
     size: Float64,
@@ -148,8 +147,8 @@ def _supported(
                 able, votes = 0, 0.0
                 for k in range(rotation.shape[0]):
                     if inside(point, lens, size, rotation[k], translation[k]):
-                        seen = free(point, i, j, eyes[k, 0], around, ceiling, cell_m)
-                        if seen and free(point, i, j, eyes[k, 1], around, ceiling, cell_m):
+                        seen = free(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
+                        if seen and free(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
                             able += 1
                             votes += density(point, eyes[k, 0], one_point_m)
                 covered = able >= min_views and may_be_covered(
@@ -166,11 +165,10 @@ def _elected(
     tile: Float32,
     share: Float32,
     expected: Float32,
-    around: Float32,
     cell_m: float,
     min_views: float,
-    inner_share: float,
-    rim_share: float,
+    own_share: float,
+    along_share: float,
 ) -> Int8:
     rows, columns = tile.shape[:2]
     winner = np.full((rows, columns), -1, np.int8)
@@ -182,11 +180,8 @@ def _elected(
                 if share[i, j, s] < 0 or (best >= 0 and z <= tile[i, j, best, Z]):
                     continue
                 # Where views expect less than min_views points a cell, an empty neighbour says nothing.
-                if expected[i, j, s] >= min_views and _at_rim(z, i, j, around, cell_m):
-                    enough = _share_along(tile, share, i, j, z, cell_m) >= rim_share
-                else:
-                    enough = share[i, j, s] >= inner_share
-                if enough:
+                needed = along_share if expected[i, j, s] < min_views else own_share
+                if share[i, j, s] >= needed or _share_along(tile, share, i, j, z, cell_m) >= along_share:
                     best = s
             winner[i, j] = best
     return winner
@@ -194,13 +189,13 @@ def _elected(
 
 @kernel()
 def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
-    """The mean share of a height and its like within `_ALONG` cells, along that of four directions in which
-    most of the tile's cells have one: the rim's own."""
+    """The mean share of a height and its like within `_ALONG` cells (every third is read), along that of four
+    directions in which most of the tile's cells have one: the bar's own, or the edge's."""
     most, result = -1, 0.0
     for direction in range(4):
         di, dj = (0, 1, 1, 1)[direction], (1, 0, 1, -1)[direction]
         alike, inside, total = 0, 0, 0.0
-        for n in range(-_ALONG, _ALONG + 1):
+        for n in range(-_ALONG, _ALONG + 1, 3):
             i, j = row + n * di, column + n * dj
             if i < 0 or j < 0 or i >= tile.shape[0] or j >= tile.shape[1]:
                 continue
@@ -213,14 +208,3 @@ def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float,
         if alike > most:
             most, result = alike, total / inside
     return result
-
-
-@kernel()
-def _at_rim(z: float, row: int, column: int, around: Float32, cell_m: float) -> bool:
-    """Whether the surface falls steeply, or nothing is known, within two cells."""
-    i, j = row + TILE_CELLS, column + TILE_CELLS
-    for di in range(-_RIM_CELLS, _RIM_CELLS + 1):
-        for dj in range(-_RIM_CELLS, _RIM_CELLS + 1):
-            if around[i + di, j + dj] < z - _RIM_SLOPE * _RIM_CELLS * cell_m:
-                return True
-    return False

@@ -40,8 +40,10 @@ def fuse(store: TileStore, view: CellObservations, settings: MapSettings) -> Non
         _vote(
             store.take(key),
             members,
-            view.x - key[0] * TILE_CELLS,
-            view.y - key[1] * TILE_CELLS,
+            key[0] * TILE_CELLS,
+            key[1] * TILE_CELLS,
+            view.x,
+            view.y,
             view.z_m,
             view.variance_m2,
             view.shared_m,
@@ -56,6 +58,8 @@ def fuse(store: TileStore, view: CellObservations, settings: MapSettings) -> Non
 def _vote(
     tile: Float32,
     members: Int64,
+    first_column: int,
+    first_row: int,
     x: Int32,
     y: Int32,
     z: Float32,
@@ -67,7 +71,7 @@ def _vote(
     least_gate: float,
 ) -> None:
     for m in members:
-        slots = tile[y[m], x[m]]
+        slots = tile[y[m] - first_row, x[m] - first_column]
         best, best_gap = -1, np.inf
         empty, weakest = -1, 0
         for s in range(SLOTS):

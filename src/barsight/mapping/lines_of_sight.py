@@ -11,6 +11,8 @@ _BORDER_PX = 3.0
 _CUT_CELLS = 30
 _CUT_MARGIN_CELLS = 3
 _OVERHANG_CELLS = 10.0
+STRIDE = 8
+"""Cells that a line of sight passes at once where all around lies below it."""
 
 
 @kernel()
@@ -82,15 +84,26 @@ def views_of(point: Float64, lens: Float64, size: Float64, rotation: Float64, tr
 
 @kernel()
 def free(
-    point: Float64, row: int, column: int, eye: Float64, around: Float32, ceiling: float, cell_m: float
+    point: Float64,
+    row: int,
+    column: int,
+    eye: Float64,
+    around: Float32,
+    roof: Float32,
+    ceiling: float,
+    cell_m: float,
 ) -> bool:
-    """Whether no cell between rises over the line from the point (in the middle tile) to the eye."""
+    """Whether no cell between rises over the line from the point (in the middle tile) to the eye above it.
+
+    roof: the highest of `around` within `STRIDE` cells. A line over the roof skips as many: it only rises.
+    """
     x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
     length = max(abs(x), abs(y)) / cell_m
     if length < 2:
         return True
     step_x, step_y, step_z = x / cell_m / length, y / cell_m / length, z / length
-    for n in range(2, int(length)):
+    n = 2
+    while n < int(length):
         height = point[2] + n * step_z
         if height > ceiling:
             return True
@@ -98,6 +111,10 @@ def free(
         j = int(np.rint(column + TILE_CELLS + n * step_x))
         if i < 0 or j < 0 or i >= around.shape[0] or j >= around.shape[1]:
             return True
+        if step_z >= 0 and roof[i, j] <= height + cell_m:
+            n += STRIDE
+            continue
         if around[i, j] > height + cell_m:
             return False
+        n += 1
     return True

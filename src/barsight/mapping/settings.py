@@ -20,14 +20,17 @@ class MapSettings:
     """A frame is matched once its picture has moved by this share of its shorter side; 0 matches them all."""
     top_share: float = 0.35
     """What may hide a cell: its highest height that has this share of the best-seen one's views."""
-    inner_share: float = 0.3
-    """A height needs the votes of this share of the views that have a free line of sight to it."""
-    rim_share: float = 0.4
-    """The same beside a steep fall, where matching stretches the higher side."""
+    own_share: float = 0.7
+    """A height stands that has the votes of this share of the views with a free line of sight to it."""
+    along_share: float = 0.3
+    """Another stands if, averaged along a bar or an edge, it and its like have the votes of this share."""
     gate_sigma: float = 3.0
     """Heights nearer than this many sigma are one surface."""
     least_gate_m: float = 0.015
     """Heights nearer than this are one surface however small their sigma."""
+    along_m: float = 0.12
+    """Heights are averaged so far to either side, along the direction in which they are most alike (a bar's
+    own); 0 leaves each cell as it is."""
     fill_m: float = 0.03
     """Unknown cells no further than this from seen ones on opposite sides are filled, and flagged so."""
     max_sigma_m: float = 0.5
@@ -47,8 +50,10 @@ class MapSettings:
             raise ConfigError("min_views must be at least 1 and resident_tiles at least 16")
         if not 0 <= self.least_shift <= 0.5:
             raise ConfigError(f"least_shift must lie in 0...0.5, not {self.least_shift}")
-        for name in ("top_share", "inner_share", "rim_share"):
+        for name in ("top_share", "own_share", "along_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must lie in 0...1, not {getattr(self, name)}")
-        if self.gate_sigma <= 0 or self.least_gate_m < 0 or self.fill_m < 0 or self.max_sigma_m <= 0:
-            raise ConfigError("gate_sigma, least_gate_m, fill_m and max_sigma_m can't be negative")
+        if self.gate_sigma <= 0 or self.max_sigma_m <= 0:
+            raise ConfigError("gate_sigma and max_sigma_m must be positive")
+        if min(self.least_gate_m, self.along_m, self.fill_m) < 0:
+            raise ConfigError("least_gate_m, along_m and fill_m can't be negative")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,7 +12,9 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Int8, UInt8
 from barsight.core.types import Source
 from barsight.mapping.election import Sights, elect, first_heights
+from barsight.mapping.filling import bridge
 from barsight.mapping.fusion import height_sigma
+from barsight.mapping.lengthways import lengthways
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
 
@@ -115,11 +117,10 @@ def finish(
         _write_cloud(folder, key, tile, cell_m, min_views)
         seen += int((elected.source == Source.VISION).sum())
         store.drop(key)
-    reach = round(settings.fill_m / cell_m)
     filled, sigmas = 0, []
     columns, rows = [], []
     for key in keys:
-        layers = _filled(folder, key, frozenset(keys), reach)
+        layers = _filled(folder, key, frozenset(keys), cell_m, settings)
         _write_tile(folder, key, layers, "surface")
         known = layers.source != Source.UNKNOWN
         filled += int((layers.source == Source.FILLED).sum())
@@ -173,9 +174,11 @@ def _layers(tile: Float32, winner: Int8) -> Layers:
     return layers
 
 
-def _filled(folder: Path, key: TileKey, keys: frozenset[TileKey], reach: int) -> Layers:
-    """The tile with its narrow gaps filled, looking `reach` cells (at most the halo) into its neighbours."""
-    reach = min(reach, _HALO)
+def _filled(
+    folder: Path, key: TileKey, keys: frozenset[TileKey], cell_m: float, settings: MapSettings
+) -> Layers:
+    """The tile averaged lengthways, its narrow gaps filled, looking at most the halo into its neighbours."""
+    along, reach = (min(round(way_m / cell_m), _HALO) for way_m in (settings.along_m, settings.fill_m))
     side = TILE_CELLS + 2 * _HALO
     around = Layers.unknown(side, side)
     column, row = key[0] * TILE_CELLS - _HALO, key[1] * TILE_CELLS - _HALO
@@ -184,6 +187,9 @@ def _filled(folder: Path, key: TileKey, keys: frozenset[TileKey], reach: int) ->
             neighbour = (key[0] + i, key[1] + j)
             if neighbour in keys:
                 _paste(_read_tile(folder, neighbour, "elected"), neighbour, around, column, row)
+    if along > 0:
+        weight = np.nan_to_num(around.sigma_m**-2)
+        around = replace(around, z_m=lengthways(around.z_m, weight, settings.least_gate_m, along))
     if reach > 0:
         fill_gaps(around, reach)
     inner = slice(_HALO, _HALO + TILE_CELLS)
@@ -200,38 +206,14 @@ def fill_gaps(layers: Layers, reach: int) -> None:
     unknown = ~seen
     if not unknown.any() or not seen.any():
         return
-    across_x = _bridge(layers.z_m, layers.sigma_m, seen, reach)
-    across_y = tuple(a.T for a in _bridge(layers.z_m.T, layers.sigma_m.T, seen.T, reach))
+    across_x = bridge(layers.z_m, layers.sigma_m, seen, reach)
+    across_y = tuple(a.T for a in bridge(layers.z_m.T, layers.sigma_m.T, seen.T, reach))
     take_x = across_x[2] <= across_y[2]
     gap = np.where(take_x, across_x[2], across_y[2])
     fill = unknown & np.isfinite(gap)
     layers.z_m[fill] = np.where(take_x, across_x[0], across_y[0])[fill]
     layers.sigma_m[fill] = np.where(take_x, across_x[1], across_y[1])[fill]
     layers.source[fill] = Source.FILLED
-
-
-def _bridge(z: Float32, sigma: Float32, seen: Bool, reach: int) -> tuple[Float32, Float32, Float32]:
-    """Along each row: height, sigma and gap (cells, inf if too wide) between the seen cells on both sides."""
-    width = z.shape[1]
-    index = np.arange(width)[None, :]
-    before = np.maximum.accumulate(np.where(seen, index, -(10**6)), axis=1)
-    after = np.minimum.accumulate(np.where(seen, index, 10**6)[:, ::-1], axis=1)[:, ::-1]
-    to_before, to_after = index - before, after - index
-    bridged = (to_before <= reach) & (to_after <= reach)
-    left = np.take_along_axis(z, before.clip(0, width - 1), axis=1)
-    right = np.take_along_axis(z, after.clip(0, width - 1), axis=1)
-    gap = np.maximum(to_before + to_after, 1)
-    share = (to_before / gap).astype(np.float32)
-    worst = np.maximum(
-        np.take_along_axis(sigma, before.clip(0, width - 1), axis=1),
-        np.take_along_axis(sigma, after.clip(0, width - 1), axis=1),
-    )
-    height = left * (1 - share) + right * share
-    return (
-        height.astype(np.float32),
-        np.hypot(worst, np.abs(right - left) / 2).astype(np.float32),
-        np.where(bridged, gap, np.inf).astype(np.float32),
-    )
 
 
 def _write_cloud(folder: Path, key: TileKey, tile: Float32, cell_m: float, min_views: int) -> None:

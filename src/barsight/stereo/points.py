@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Bool, Float32
+from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.core.types import Disparity, RectifiedPair, StereoPoints
 
 _LEAST_NOISE_PX = 0.02
@@ -32,26 +32,52 @@ def triangulate(
     per_pixel: points per pixel along each axis, for maps whose cells are finer than the pixels.
     """
     camera = pair.camera
-    strength = np.float32(camera.focal_px * camera.baseline_m)
     shift = refine_grid(disparity.disparity_px, per_pixel) + np.float32(camera.doffs_px)
-    sigma = _repeat(disparity.sigma_px, per_pixel)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = strength / shift
-        per_px = depth * depth / strength
-        usable = (shift > 0) & (depth <= max_depth_m) & (per_px * sigma <= max_sigma_m)
-    rows, columns = np.nonzero(usable)
-    depth, per_px, sigma = depth[usable], per_px[usable], sigma[usable]
-    ray_x = (((columns + 0.5) / per_pixel - 0.5 - camera.cx_px) / camera.focal_px).astype(np.float32)
-    ray_y = (((rows + 0.5) / per_pixel - 0.5 - camera.cy_px) / camera.focal_px).astype(np.float32)
-    along_ray = (per_px * np.sqrt(1 + ray_x * ray_x + ray_y * ray_y)).astype(np.float32)
-    noise_px = np.sqrt(np.maximum(sigma**2 - disparity.bias_sigma_px**2, _LEAST_NOISE_PX**2))
-    return StereoPoints(
-        stamp_ns=pair.stamp_ns,
-        xyz_m=np.column_stack([ray_x * depth, ray_y * depth, depth]),
-        range_sigma_m=(along_ray * noise_px).astype(np.float32),
-        shared_sigma_m=along_ray * np.float32(np.hypot(shared_sigma_px, disparity.bias_sigma_px)),
-        intensity=pair.left[rows // per_pixel, columns // per_pixel],
-    )
+    lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m])
+    shared_px = float(np.hypot(shared_sigma_px, disparity.bias_sigma_px))
+    points = _points(
+        shift, disparity.sigma_px, pair.left, per_pixel, lens, disparity.bias_sigma_px, shared_px,
+        max_depth_m, max_sigma_m,
+    )  # fmt: skip
+    return StereoPoints(pair.stamp_ns, *points)
+
+
+@kernel()
+def _points(
+    shift: Float32,
+    sigma_px: Float32,
+    left: UInt8,
+    per_pixel: int,
+    lens: Float64,
+    bias_px: float,
+    shared_px: float,
+    max_depth_m: float,
+    max_sigma_m: float,
+) -> tuple[Float32, Float32, Float32, UInt8]:
+    """Points, noise and shared sigma along the ray, and grey levels, row by row."""
+    focal, strength = lens[0], lens[0] * lens[3]
+    xyz = np.empty((shift.size, 3), np.float32)
+    noise, shared = np.empty(shift.size, np.float32), np.empty(shift.size, np.float32)
+    intensity = np.empty(shift.size, np.uint8)
+    n = 0
+    for i in range(shift.shape[0]):
+        ray_y = ((i + 0.5) / per_pixel - 0.5 - lens[2]) / focal
+        for j in range(shift.shape[1]):
+            if not shift[i, j] > 0:
+                continue
+            depth = strength / shift[i, j]
+            per_px = depth * depth / strength
+            sigma = sigma_px[i // per_pixel, j // per_pixel]
+            if not (depth <= max_depth_m and per_px * sigma <= max_sigma_m):
+                continue
+            ray_x = ((j + 0.5) / per_pixel - 0.5 - lens[1]) / focal
+            along_ray = per_px * np.sqrt(1 + ray_x * ray_x + ray_y * ray_y)
+            xyz[n, 0], xyz[n, 1], xyz[n, 2] = ray_x * depth, ray_y * depth, depth
+            noise[n] = along_ray * np.sqrt(max(sigma * sigma - bias_px * bias_px, _LEAST_NOISE_PX**2))
+            shared[n] = along_ray * shared_px
+            intensity[n] = left[i // per_pixel, j // per_pixel]
+            n += 1
+    return xyz[:n], noise[:n], shared[:n], intensity[:n]
 
 
 def refine_grid(disparity: Float32, per_pixel: int) -> Float32:

@@ -1,4 +1,4 @@
-"""`barsight view`: the cloud, the camera's way and the contours in the browser, served by this machine."""
+"""`barsight view`: surface, cloud, camera's way and contours in the browser, served by this machine."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from barsight.result_folder import (
     Cloud,
     read_cloud,
     read_contours,
+    read_heights,
     read_laser,
     read_path,
     read_summary,
 )
-from barsight.viewer.cloud import COLOURINGS, colour
+from barsight.viewer.cloud import Layer, colour, seen_layer, surface_layer
 from barsight.viewer.yard_lines import yard_lines
 
 HOST = "127.0.0.1"
@@ -63,6 +64,10 @@ def serving(out_dir: Path, port: int, most_points: int = MOST_POINTS) -> Iterato
     cloud = read_cloud(out_dir / "cloud.ply", most_points)
     path, laser, contours = read_path(out_dir), read_laser(out_dir), read_contours(out_dir)
     yard = yard_lines(out_dir)
+    layers = {
+        "surface": surface_layer(read_heights(out_dir), most_points),
+        "everything seen": seen_layer(cloud),
+    }
     _expect_free(port)
     with _quiet():
         server = viser.ViserServer(host=HOST, port=port, label="barsight", verbose=False)
@@ -72,12 +77,13 @@ def serving(out_dir: Path, port: int, most_points: int = MOST_POINTS) -> Iterato
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.scene.set_up_direction("+z")
         _aim(server, cloud, path)
-        _show_cloud(server, cloud)
+        _show_points(server, layers)
         _show_lines(server, path, laser, contours)
         _show_yard(server, yard)
         where = str(summary.get("reference", "world"))
         simulated = " **SIMULATED.**" if summary.get("is_simulated") else ""
-        server.gui.add_markdown(f"{len(cloud.xyz_m):,} of {cloud.total:,} points, {where} frame.{simulated}")
+        counts = (f"{name}: {len(layer.xyz_m):,} of {layer.total:,} points" for name, layer in layers.items())
+        server.gui.add_markdown(f"{'; '.join(counts)}. {where} frame.{simulated}")
         yield f"http://{HOST}:{server.get_port()}"
     finally:
         with _quiet():
@@ -118,23 +124,37 @@ def _aim(server: viser.ViserServer, cloud: Cloud, path: CameraPath | None) -> No
     server.initial_camera.far = max(1000.0, 50 * reach)
 
 
-def _show_cloud(server: viser.ViserServer, cloud: Cloud) -> None:
-    size_mm = _spacing_m(cloud) * 1e3
-    first = colour(cloud, "height")
-    node = server.scene.add_point_cloud(
-        "/cloud", cloud.xyz_m, first.rgb, point_size=size_mm / 1e3, point_shape="square", precision="float32"
-    )
-    by = server.gui.add_dropdown("Colour by", COLOURINGS, initial_value="height")
-    scale = server.gui.add_image(_legend(first.ramp))
-    caption = server.gui.add_markdown(f"{first.low:.0f} to {first.high:.0f} {first.unit}")
+def _show_points(server: viser.ViserServer, layers: dict[str, Layer]) -> None:
+    """One of the layers at a time, and what colours it."""
+    shown = server.gui.add_dropdown("Show", tuple(layers))
+    by = server.gui.add_dropdown("Colour by", tuple(layers[shown.value].properties))
+    scale = server.gui.add_image(_legend(np.zeros((256, 3), np.uint8)))
+    caption = server.gui.add_markdown("")
+    size_mm = _spacing_m(layers[shown.value].xyz_m) * 1e3
     size = server.gui.add_slider("Point size / mm", 1.0, 200.0, 0.5, round(size_mm * 2) / 2)
+
+    def place() -> viser.PointCloudHandle:
+        layer = layers[shown.value]
+        painted = colour(layer, by.value)
+        scale.image, caption.content = _legend(painted.ramp), painted.caption
+        return server.scene.add_point_cloud(
+            "/points", layer.xyz_m, painted.rgb,
+            point_size=size.value / 1e3, point_shape="square", precision="float32",
+        )  # fmt: skip
+
+    node = place()
+
+    @shown.on_update
+    def _exchange(_: object) -> None:
+        nonlocal node
+        by.options = tuple(layers[shown.value].properties)
+        node = place()
 
     @by.on_update
     def _recolour(_: object) -> None:
-        chosen = colour(cloud, by.value)
-        node.colors = chosen.rgb
-        scale.image = _legend(chosen.ramp)
-        caption.content = f"{chosen.low:.4g} to {chosen.high:.4g} {chosen.unit}"
+        painted = colour(layers[shown.value], by.value)
+        node.colors = painted.rgb
+        scale.image, caption.content = _legend(painted.ramp), painted.caption
 
     @size.on_update
     def _resize(_: object) -> None:
@@ -146,11 +166,11 @@ def _legend(ramp: UInt8) -> UInt8:
     return np.tile(ramp, (12, 1, 1))
 
 
-def _spacing_m(cloud: Cloud) -> float:
+def _spacing_m(xyz_m: Float32) -> float:
     """About the distance of neighbouring points: the bulk's area shared by the points, 2 mm to 100 mm."""
-    low, high = np.percentile(cloud.xyz_m[:, :2], (2, 98), axis=0)
+    low, high = np.percentile(xyz_m[:, :2], (2, 98), axis=0)
     area = float(np.prod(np.maximum(high - low, 0.01)))
-    return float(np.clip(np.sqrt(area / len(cloud.xyz_m)), 0.002, 0.1))
+    return float(np.clip(np.sqrt(area / len(xyz_m)), 0.002, 0.1))
 
 
 def _show_lines(

@@ -1,0 +1,52 @@
+"""Heights averaged lengthways: a bar is straight, so along it the same height is measured again and again."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from barsight.core.arrays import Float32, Int64, kernel
+
+_SAMPLE_CELLS = 2
+_DIRECTIONS = 16
+
+
+def lengthways(z: Float32, weight: Float32, gate_m: float, reach: int) -> Float32:
+    """(H, W) heights, each the weighted mean along that of 16 directions in which it is most alike.
+
+    weight: (H, W), 0 where there is no height (NaN). Heights further than gate_m from a cell's own are
+    another surface: they don't count in its mean, and against the direction. Every other cell up to `reach`
+    on either side is read; those that are missing or outside count against the direction too.
+    """
+    turn = np.arange(_DIRECTIONS)[:, None] * np.pi / _DIRECTIONS
+    onward = np.arange(_SAMPLE_CELLS, reach + 1, _SAMPLE_CELLS)
+    along = np.r_[-onward[::-1], 0, onward]
+    rows, columns = (np.rint(f(turn) * along).astype(np.int64) for f in (np.sin, np.cos))
+    return _lengthways(z, weight, gate_m, rows, columns)
+
+
+@kernel(parallel=True)
+def _lengthways(z: Float32, weight: Float32, gate_m: float, rows: Int64, columns: Int64) -> Float32:
+    height, width = z.shape
+    out = z.copy()
+    for i in prange(height):
+        for j in range(width):
+            if not weight[i, j] > 0:
+                continue
+            least = np.inf
+            for d in range(rows.shape[0]):
+                off, total, squares = 0.0, 0.0, 0.0
+                for k in range(rows.shape[1]):
+                    a, b = i + rows[d, k], j + columns[d, k]
+                    gap = gate_m
+                    if 0 <= a < height and 0 <= b < width and abs(z[a, b] - z[i, j]) <= gate_m:
+                        gap = z[a, b] - z[i, j]
+                        off += weight[a, b] * gap
+                        total += weight[a, b]
+                    squares += gap * gap
+                    if squares >= least:
+                        break
+                if squares < least:
+                    least = squares
+                    out[i, j] = z[i, j] + off / total
+    return out
