@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import prange
 
 from barsight.core.arrays import Bool, Float32, UInt8, kernel
+from barsight.core.parallel import in_bands
 
 _RADIUS_PX = 5
 _GREY = 10.0
@@ -14,6 +14,7 @@ _DISTANCE_PX = 4.0
 _BESIDE_PX = 3
 _LOWEST = -1e4
 _EXACT_PX = 0.02
+_BAND_ROWS = 32
 
 
 def sharpen_edges(disparity: Float32, grey: UInt8, jump_px: float) -> Float32:
@@ -23,7 +24,12 @@ def sharpen_edges(disparity: Float32, grey: UInt8, jump_px: float) -> Float32:
     offset = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
     near = np.exp(-np.add.outer(offset**2, offset**2) / (2 * _DISTANCE_PX**2)).astype(np.float32)
     alike = np.exp(-np.arange(256) / _GREY).astype(np.float32)
-    _weighted_medians(disparity, grey, _beside_jumps(disparity, jump_px), near, alike, sharpened)
+    wanted = _beside_jumps(disparity, jump_px)
+
+    def work(first: int, end: int) -> None:
+        _weighted_medians(disparity, grey, wanted, near, alike, sharpened, first, end)
+
+    in_bands(work, len(disparity), _BAND_ROWS)
     return sharpened
 
 
@@ -46,15 +52,16 @@ def _weight_below(values: Float32, weights: Float32, count: int, level: np.float
     return total
 
 
-@kernel(parallel=True)
+@kernel()
 def _weighted_medians(
-    disparity: Float32, grey: UInt8, wanted: Bool, near: Float32, alike: Float32, medians: Float32
-) -> None:
+    disparity: Float32, grey: UInt8, wanted: Bool, near: Float32, alike: Float32, medians: Float32,
+    first: int, end: int,
+) -> None:  # fmt: skip
     """The median is closed in by halving the interval of values: faster than to sort a hundred of them."""
     height, width = disparity.shape
-    for y in prange(height):
-        values = np.empty(near.size, dtype=np.float32)
-        weights = np.empty(near.size, dtype=np.float32)
+    values = np.empty(near.size, dtype=np.float32)
+    weights = np.empty(near.size, dtype=np.float32)
+    for y in range(first, end):
         for x in range(width):
             if not wanted[y, x]:
                 continue

@@ -12,9 +12,9 @@ import math
 
 import cv2
 import numpy as np
-from numba import prange
 
 from barsight.core.arrays import Float32, Float64, Int32, UInt8, kernel
+from barsight.core.parallel import in_bands
 
 _RAYS = 16
 _REACH_PX = 200
@@ -27,6 +27,7 @@ _GREY = 12.0
 _HIDDEN_QUANTILE = 0.3
 _SEEN_SHARE = 0.3
 _SPREAD_SHARE = 2.0
+_BAND_ROWS = 32
 
 
 def fill(
@@ -40,7 +41,11 @@ def fill(
     is less likely. Guesses stay within lowest_px...highest_px.
     """
     slope_x, slope_y = np.zeros_like(disparity), np.zeros_like(disparity)
-    _slopes_beside_holes(disparity, _PLANE_RADIUS_PX, _SAME_SURFACE_PX, slope_x, slope_y)
+
+    def find_slopes(first: int, end: int) -> None:
+        _slopes_beside_holes(disparity, _PLANE_RADIUS_PX, _SAME_SURFACE_PX, slope_x, slope_y, first, end)
+
+    in_bands(find_slopes, len(disparity), _BAND_ROWS)
     filled = disparity.copy()
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS
@@ -52,49 +57,64 @@ def fill(
         return filled, sigma
     # A ray may leap as far as no pixel in any direction is matched.
     leaps = cv2.distanceTransform(holes, cv2.DIST_C, 3).astype(np.int32)
-    _fill(disparity, smooth, leaps, slope_x, slope_y, right_px, rays, lowest_px, highest_px, filled, sigma)
+
+    def guess(first: int, end: int) -> None:
+        _fill(
+            disparity, smooth, leaps, slope_x, slope_y, right_px, rays, lowest_px, highest_px, filled, sigma,
+            first, end,
+        )  # fmt: skip
+
+    in_bands(guess, len(disparity), _BAND_ROWS)
     return filled, sigma
 
 
 def with_row_holes_filled(disparity: Float32) -> Float32:
     """NaN take the smaller, farther, neighbour in their row: what is hidden lies behind. Rows without any
     disparity take the median of all; a map without any is zero."""
-    known = disparity[np.isfinite(disparity)]
     filled = np.empty_like(disparity)
-    _fill_rows(disparity, np.float32(np.median(known) if known.size else 0), filled)
+    if not _fill_rows(disparity, filled):
+        known, empty = np.isfinite(disparity), np.isnan(filled)
+        filled[empty] = np.median(disparity[known]) if known.any() else 0
     return filled
 
 
-@kernel(parallel=True)
-def _fill_rows(disparity: Float32, empty: np.float32, filled: Float32) -> None:
+@kernel()
+def _fill_rows(disparity: Float32, filled: Float32) -> bool:
+    """Whether every row had a disparity; those that had none are NaN."""
     height, width = disparity.shape
-    for y in prange(height):
+    complete = True
+    for y in range(height):
         last = -1
         for x in range(width + 1):
             if x < width and np.isnan(disparity[y, x]):
                 continue
-            value = empty
+            value = np.float32(np.nan)
             if last >= 0 and x < width:
                 value = min(disparity[y, last], disparity[y, x])
             elif last >= 0:
                 value = disparity[y, last]
             elif x < width:
                 value = disparity[y, x]
-            filled[y, last + 1 : x] = value
+            else:
+                complete = False
+            for hole in range(last + 1, x):
+                filled[y, hole] = value
             if x < width:
                 filled[y, x] = disparity[y, x]
             last = x
+    return complete
 
 
-@kernel(parallel=True)
+@kernel()
 def _slopes_beside_holes(
-    disparity: Float32, radius: int, same_surface_px: float, slope_x: Float32, slope_y: Float32
-) -> None:
+    disparity: Float32, radius: int, same_surface_px: float, slope_x: Float32, slope_y: Float32, first: int,
+    end: int,
+) -> None:  # fmt: skip
     """Slopes (px per px) of the plane around each matched pixel that touches a hole: three rounds of least
     squares, each on the pixels near the plane before, held to zero slope where there are few. Every third
     pixel in each direction is enough for a slope."""
     height, width = disparity.shape
-    for y in prange(height):
+    for y in range(first, end):
         for x in range(width):
             centre = disparity[y, x]
             if np.isnan(centre):
@@ -149,7 +169,7 @@ def _sort_by_value(values: Float64, weights: Float64, count: int) -> None:
         values[j + 1], weights[j + 1] = value, weight
 
 
-@kernel(parallel=True)
+@kernel()
 def _fill(
     disparity: Float32,
     grey: Float32,
@@ -162,10 +182,12 @@ def _fill(
     highest: float,
     filled: Float32,
     sigma: Float32,
+    first: int,
+    end: int,
 ) -> None:
     height, width = disparity.shape
-    for y in prange(height):
-        values, weights = np.empty(_RAYS), np.empty(_RAYS)
+    values, weights, pixels = np.empty(_RAYS), np.empty(_RAYS), np.hypot(rays[:, 0], rays[:, 1])
+    for y in range(first, end):
         for x in range(width):
             if not np.isnan(disparity[y, x]):
                 continue
@@ -173,17 +195,16 @@ def _fill(
             beyond_border = True
             for ray in range(_RAYS):
                 way_x, way_y = rays[ray, 0], rays[ray, 1]
-                pixel = math.hypot(way_x, way_y)
                 j = leaps[y, x]
                 while j < _REACH_PX:
-                    xx, yy = round(x + j * way_x), round(y + j * way_y)
+                    xx, yy = math.floor(x + j * way_x + 0.5), math.floor(y + j * way_y + 0.5)
                     if xx < 0 or xx >= width or yy < 0 or yy >= height:
                         break
                     there = disparity[yy, xx]
                     if np.isnan(there):
                         j += leaps[yy, xx]
                         continue
-                    distance = j * pixel
+                    distance = j * pixels[ray]
                     # The plane's slope fades out with the distance: far off it says nothing.
                     fade = _SLOPE_LENGTH_PX * (1.0 - math.exp(-distance / _SLOPE_LENGTH_PX)) / distance
                     value = there + fade * (slope_x[yy, xx] * (x - xx) + slope_y[yy, xx] * (y - yy))

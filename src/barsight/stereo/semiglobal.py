@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numba import prange
 
 from barsight.core.arrays import Float32, Int32, UInt8, kernel
 from barsight.core.errors import ConfigError
+from barsight.core.parallel import in_bands
 from barsight.stereo.semiglobal_cost import (
     BESIDE_COST,
     Int16,
@@ -24,7 +24,7 @@ from barsight.stereo.semiglobal_cost import (
     row_costs,
 )
 from barsight.stereo.semiglobal_paths import UInt16, extend_row, fresh_paths, jump_costs
-from barsight.stereo.vectors import LANES
+from barsight.stereo.vectors import HALF_LANES
 
 _OVERLAP_ROWS = 20
 _STRIPE_BYTES = 128 * 2**20
@@ -69,17 +69,24 @@ def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiG
     """
     height, width = left.shape
     left_px, right_px = np.empty((2, height, width), dtype=np.float32)
-    threads, places = numba.get_num_threads(), -(-count // LANES) * LANES
+    threads, places = numba.get_num_threads(), -(-count // HALF_LANES) * HALF_LANES
     affordable = max(_STRIPE_BYTES // (3 * width * places) - 2 * _OVERLAP_ROWS, 16)
     stripes = threads * -(-height // (threads * min(affordable, 256)))
     rows = -(-height // stripes)
-    volume = (threads, min(height, rows + 2 * _OVERLAP_ROWS), width, places)
+    volume = (min(height, rows + 2 * _OVERLAP_ROWS), width, places)
+    rooms = [(np.empty(volume, dtype=np.uint8), np.empty(volume, dtype=np.uint16)) for _ in range(threads)]
     seen, others = described(left), candidates_in_order(described(right), lowest_px, places)
-    _match_stripes(
-        seen.codes, seen.slope, seen.grey, others.codes, others.slope, others.grey, lowest_px, count,
-        settings.small_jump, settings.large_jump, settings.least_jump, rows,
-        np.empty(volume, dtype=np.uint8), np.empty(volume, dtype=np.uint16), left_px, right_px,
-    )  # fmt: skip
+
+    def work(first: int, end: int) -> None:
+        room = rooms.pop()
+        _match_stripe(
+            seen.codes, seen.slope, seen.grey, others.codes, others.slope, others.grey, lowest_px, count,
+            settings.small_jump, settings.large_jump, settings.least_jump, *room, left_px, right_px, first,
+            end,
+        )  # fmt: skip
+        rooms.append(room)
+
+    in_bands(work, height, rows)
     return Match(left_px, right_px)
 
 
@@ -125,49 +132,32 @@ def _choose(
         right_px[x] = np.float32((found & 0xFFFF) + lowest) if found < _WORST else _FAR
 
 
-@kernel(parallel=True)
-def _match_stripes(
-    code: UInt8,
-    slope: Int16,
-    grey: UInt8,
-    codes: UInt8,
-    slopes: Int16,
-    greys: UInt8,
-    lowest: int,
-    count: int,
-    small: int,
-    large: int,
-    least_jump: int,
-    stripe_rows: int,
-    cost: UInt8,
-    down: UInt16,
-    left_px: Float32,
-    right_px: Float32,
-) -> None:
-    """Each worker takes every so-manieth stripe and uses its two volumes again and again: once down, where
-    the costs are made, and once up, where the winners are chosen row by row."""
+@kernel()
+def _match_stripe(
+    code: UInt8, slope: Int16, grey: UInt8, codes: UInt8, slopes: Int16, greys: UInt8, lowest: int,
+    count: int, small: int, large: int, least_jump: int, cost: UInt8, down: UInt16, left_px: Float32,
+    right_px: Float32, start: int, end: int,
+) -> None:  # fmt: skip
+    """Once down, where the costs are made, and once up, where the winners are chosen row by row. cost, down:
+    volumes for use inside."""
     height, width = left_px.shape
-    workers, places = cost.shape[0], cost.shape[3]
-    stripes = (height + stripe_rows - 1) // stripe_rows
+    places = cost.shape[2]
     jumps = jump_costs(large, least_jump)
-    for worker in prange(workers):
-        paths = fresh_paths(width, places, small)
-        leasts = np.empty((2, width, 3), dtype=np.uint8)
-        up, least = np.empty((width, places), dtype=np.uint16), np.empty(width, dtype=np.int32)
-        for stripe in range(worker, stripes, workers):
-            start, end = stripe * stripe_rows, min(height, stripe * stripe_rows + stripe_rows)
-            above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
-            for y in range(above, below):
-                here = cost[worker, y - above]
-                row_costs(code[y], slope[y], grey[y], codes[y], slopes[y], greys[y], lowest, count, here)
-                extend_row(
-                    here, grey[y], grey[max(y - 1, 0)], small, jumps, y == above, (y & 1) == 1, False,
-                    paths, leasts, down[worker, y - above],
-                )  # fmt: skip
-            for y in range(below - 1, start - 1, -1):
-                extend_row(
-                    cost[worker, y - above], grey[y], grey[min(y + 1, height - 1)], small, jumps,
-                    y == below - 1, (y & 1) == 1, True, paths, leasts, up,
-                )  # fmt: skip
-                if y < end:
-                    _choose(down[worker, y - above], up, count, lowest, least, left_px[y], right_px[y])
+    paths = fresh_paths(width, places, small)
+    leasts = np.empty((2, width, 3), dtype=np.uint8)
+    up, least = np.empty((width, places), dtype=np.uint16), np.empty(width, dtype=np.int32)
+    above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
+    for y in range(above, below):
+        here = cost[y - above]
+        row_costs(code[y], slope[y], grey[y], codes[y], slopes[y], greys[y], lowest, count, here)
+        extend_row(
+            here, grey[y], grey[max(y - 1, 0)], small, jumps, y == above, (y & 1) == 1, False, paths, leasts,
+            down[y - above],
+        )  # fmt: skip
+    for y in range(below - 1, start - 1, -1):
+        extend_row(
+            cost[y - above], grey[y], grey[min(y + 1, height - 1)], small, jumps, y == below - 1,
+            (y & 1) == 1, True, paths, leasts, up,
+        )  # fmt: skip
+        if y < end:
+            _choose(down[y - above], up, count, lowest, least, left_px[y], right_px[y])

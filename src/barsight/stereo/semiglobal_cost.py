@@ -7,13 +7,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import prange, types
-from numba.core import cgutils
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from barsight.core.arrays import UInt8, kernel
-from barsight.stereo.vectors import LANES, SHORTS, Vectors
+from barsight.core.parallel import in_bands
+from barsight.stereo.vectors import Vectors, bytes_of, shorts_of
 
 Int16 = NDArray[np.int16]
 
@@ -22,6 +22,7 @@ BESIDE_COST = 61
 """Of the places that fill up the last vector: dearer than any candidate, so that no path goes there."""
 _MOST_APART = 20
 _CODE_BYTES = 3
+_BAND_ROWS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,8 @@ def described(image: UInt8) -> Described:
     """See `Described`."""
     height, width = image.shape
     codes = np.empty((height, _CODE_BYTES, width), dtype=np.uint8)
-    _write_census(cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_REPLICATE), codes)
+    framed = cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
+    in_bands(lambda first, end: _write_census(framed, codes, first, end), height, _BAND_ROWS)
     slope: Int16 = cv2.filter2D(image, cv2.CV_16S, np.array([[-1, 0, 1]], dtype=np.float32))
     return Described(codes, slope, image)
 
@@ -57,12 +59,12 @@ def candidates_in_order(right: Described, lowest: int, places: int) -> Described
     return Described(*(np.ascontiguousarray(turned(a)) for a in (right.codes, right.slope, right.grey)))
 
 
-@kernel(parallel=True)
-def _write_census(framed: UInt8, codes: UInt8) -> None:
+@kernel()
+def _write_census(framed: UInt8, codes: UInt8, first: int, end: int) -> None:
     """A bit is set where a neighbour is brighter than the centre. framed: (H + 4, W + 4)."""
-    height, _, width = codes.shape
+    width = codes.shape[2]
     one = np.uint8(1)
-    for y in prange(height):
+    for y in range(first, end):
         centre = framed[y + 2, 2 : 2 + width]
         for part in range(_CODE_BYTES):
             row = codes[y, part]
@@ -86,22 +88,24 @@ def _write_costs(
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
-        own = [v.all(byte) for byte in v.members(0)]
-        own_slope, own_grey = v.all(arguments[1], SHORTS), v.all(arguments[2])
-        width = context.make_array(signature.args[4])(context, builder, arguments[4]).nitems
-        chunks = builder.udiv(arguments[9], arguments[9].type(LANES))
-        with cgutils.for_range(builder, chunks) as loop:
-            offset = builder.mul(loop.index, loop.index.type(LANES))
+        width = v.length(4)
+
+        def write(offset: Any, lanes: int) -> None:
+            kind, wide = bytes_of(lanes), shorts_of(lanes)
             there = builder.add(arguments[6], offset)
-            hamming = v.all(0)
-            for part, byte in enumerate(own):
+            hamming = v.all(0, kind)
+            for part, byte in enumerate(v.members(0)):
                 place = builder.add(there, builder.mul(width, width.type(part)))
-                hamming = builder.add(hamming, v.ones(builder.xor(byte, v.load(v.data(3), place))))
-            steep = v.apart(own_slope, v.load(v.data(4), there, SHORTS), signed=True)
-            steep = builder.trunc(v.least(steep, v.all(_MOST_APART, SHORTS)), hamming.type)
-            bright = v.least(v.apart(own_grey, v.load(v.data(5), there)), v.all(_MOST_APART))
-            apart = builder.lshr(builder.add(steep, bright), v.all(1))
+                changed = builder.xor(v.all(byte, kind), v.load(v.data(3), place, kind))
+                hamming = builder.add(hamming, v.ones(changed))
+            steep = v.apart(v.all(arguments[1], wide), v.load(v.data(4), there, wide), signed=True)
+            steep = builder.trunc(v.least(steep, v.all(_MOST_APART, wide)), kind)
+            bright = v.apart(v.all(arguments[2], kind), v.load(v.data(5), there, kind))
+            bright = v.least(bright, v.all(_MOST_APART, kind))
+            apart = builder.lshr(builder.add(steep, bright), v.all(1, kind))
             v.store(builder.add(hamming, apart), v.data(7), builder.add(arguments[8], offset))
+
+        v.by_chunks(arguments[9], write)
         return context.get_dummy_value()
 
     return signature, generate

@@ -15,7 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from barsight.core.arrays import UInt8, kernel
-from barsight.stereo.vectors import LANES, SHORTS, Vectors
+from barsight.stereo.vectors import HALF_LANES, LANES, Vectors, bytes_of, shorts_of
 
 UInt16 = NDArray[np.uint16]
 
@@ -40,26 +40,33 @@ def _extend_paths(
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
         starts, ends = v.members(3), v.members(4)
-        base, ceilings = [v.all(b) for b in v.members(5)], [v.all(c) for c in v.members(6)]
-        step = v.all(arguments[7])
-        lowest = [cgutils.alloca_once_value(builder, v.all(255)) for _ in range(_PATHS)]
-        chunks = builder.udiv(arguments[10], arguments[10].type(LANES))
-        with cgutils.for_range(builder, chunks) as loop:
-            offset = builder.mul(loop.index, loop.index.type(LANES))
-            own = v.load(v.data(0), builder.add(arguments[1], offset))
-            total = v.all(0, SHORTS)
+        lowest = {
+            lanes: [cgutils.alloca_once_value(builder, v.all(255, bytes_of(lanes))) for _ in range(_PATHS)]
+            for lanes in (LANES, HALF_LANES)
+        }
+
+        def extend(offset: Any, lanes: int) -> None:
+            kind = bytes_of(lanes)
+            base, ceilings = [v.all(b, kind) for b in v.members(5)], [v.all(c, kind) for c in v.members(6)]
+            own = v.load(v.data(0), builder.add(arguments[1], offset), kind)
+            total, step = v.all(0, shorts_of(lanes)), v.all(arguments[7], kind)
             for k in range(_PATHS):
                 below = builder.add(starts[k], offset)
                 same, above = (builder.add(below, below.type(i)) for i in (1, 2))
-                beside = v.least(v.load(v.data(2), below), v.load(v.data(2), above))
-                best = v.least(v.load(v.data(2), same), builder.add(beside, step))
+                beside = v.least(v.load(v.data(2), below, kind), v.load(v.data(2), above, kind))
+                best = v.least(v.load(v.data(2), same, kind), builder.add(beside, step))
                 value = builder.add(builder.sub(v.least(best, ceilings[k]), base[k]), own)
                 place = builder.add(ends[k], offset)
                 v.store(value, v.data(2), builder.add(place, place.type(1)))
-                builder.store(v.least(builder.load(lowest[k]), value), lowest[k])
-                total = builder.add(total, builder.zext(value, SHORTS))
+                builder.store(v.least(builder.load(lowest[lanes][k]), value), lowest[lanes][k])
+                total = builder.add(total, builder.zext(value, total.type))
             v.store(total, v.data(8), builder.add(arguments[9], offset))
-        found = [v.least_of(builder.load(place)) for place in lowest]
+
+        v.by_chunks(arguments[10], extend)
+        found = [
+            v.least(*(v.least_of(builder.load(lowest[lanes][k])) for lanes in (LANES, HALF_LANES)))
+            for k in range(_PATHS)
+        ]
         return context.make_tuple(builder, signature.return_type, found)
 
     return signature, generate

@@ -2,7 +2,7 @@
 
 The image is cut into tiles; each has one axis, the direction in which the image changes least. A support is
 a fixed pattern of whole-pixel offsets turned to that axis, so the innermost loop runs along a row of the tile
-and the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`with_margin`).
+and the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`empty_frame`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int64, kernel
 from barsight.core.parallel import in_bands
-from barsight.stereo.vectors import FLOAT_LANES, FLOATS, Vectors
+from barsight.stereo.vectors import FLOAT_LANES, Vectors
 
 TILE_ROWS = 16
 TILE_COLUMNS = 32
 MARGIN = 48
+_LINE_FLOATS = 16
 BAND_TILES = 4
 _LEAST_COHERENCE = 0.35
 
@@ -52,22 +53,19 @@ def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
     return axes
 
 
-def with_margin(array: Float32) -> Float32:
-    """The array with a margin of zeros that every support offset stays within."""
-    framed: Float32 = cv2.copyMakeBorder(
-        array, MARGIN, MARGIN + TILE_ROWS, MARGIN, MARGIN + TILE_COLUMNS, cv2.BORDER_CONSTANT, value=0
-    )
-    return framed
-
-
 def empty_frame(shape: tuple[int, ...]) -> Float32:
-    """Room for an image with such a margin."""
+    """Room for an image, with a margin of zeros that every support offset stays within.
+
+    An odd number of cache lines per row: with most even ones a column's rows compete for a few of the nearest
+    cache's places.
+    """
     height, width = shape
-    return np.zeros((height + 2 * MARGIN + TILE_ROWS, width + 2 * MARGIN + TILE_COLUMNS), dtype=np.float32)
+    lines = -(-(width + 2 * MARGIN + TILE_COLUMNS) // _LINE_FLOATS) | 1
+    return np.zeros((height + 2 * MARGIN + TILE_ROWS, lines * _LINE_FLOATS), dtype=np.float32)
 
 
 def inside(frame: Float32, shape: tuple[int, ...]) -> Float32:
-    """View of the image without its margin."""
+    """View of the image in a frame."""
     return frame[MARGIN : MARGIN + shape[0], MARGIN : MARGIN + shape[1]]
 
 
@@ -103,15 +101,15 @@ def _add_means(
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
-        centre, nearness = v.load(v.data(0), arguments[4], FLOATS), v.all(arguments[7], FLOATS)
+        centre, nearness = v.load(v.data(0), arguments[4], v.floats), v.all(arguments[7], v.floats)
         totals = v.zeros(3)
         with cgutils.for_range(builder, v.length(5)) as loop:
             there = builder.add(arguments[4], builder.load(builder.gep(v.data(5), [loop.index])))
-            alike = v.alike(v.difference(v.load(v.data(0), there, FLOATS), centre), nearness)
-            weight = v.product(v.number(6, loop.index, FLOATS), alike, v.load(v.data(3), there, FLOATS))
+            alike = v.alike(v.difference(v.load(v.data(0), there, v.floats), centre), nearness)
+            weight = v.product(v.number(6, loop.index, v.floats), alike, v.load(v.data(3), there, v.floats))
             v.add_to(totals[0], weight)
             for total, image in zip(totals[1:], (1, 2), strict=True):
-                v.add_to(total, v.product(weight, v.load(v.data(image), there, FLOATS)))
+                v.add_to(total, v.product(weight, v.load(v.data(image), there, v.floats)))
         for one, place in enumerate(totals):
             target = builder.add(arguments[9], builder.mul(arguments[10], arguments[10].type(one)))
             v.store(builder.load(place), v.data(8), target)

@@ -7,23 +7,36 @@ built here is the compiler's portable vector code, which it fits to each process
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils
 
 LANES = 32
+HALF_LANES = LANES // 2
 BYTE, SHORT = ir.IntType(8), ir.IntType(16)
-BYTES, SHORTS = ir.VectorType(BYTE, LANES), ir.VectorType(SHORT, LANES)
 FLOAT_LANES = 16
-FLOATS = ir.VectorType(ir.FloatType(), FLOAT_LANES)
 _FAST = ("fast",)
+
+
+def bytes_of(lanes: int) -> Any:
+    """The kind of a vector of so many bytes."""
+    return ir.VectorType(BYTE, lanes)
+
+
+def shorts_of(lanes: int) -> Any:
+    """The same of 16 bit numbers."""
+    return ir.VectorType(SHORT, lanes)
 
 
 class Vectors:
     """Writes vector instructions into one kernel: arguments are the kernel's values as Numba hands them."""
 
-    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
+    def __init__(
+        self, context: Any, builder: Any, signature: Any, arguments: Any, float_lanes: int = FLOAT_LANES
+    ) -> None:
+        self.floats = ir.VectorType(ir.FloatType(), float_lanes)
         self._context, self.builder, self._kinds, self._arguments = (
             context,
             builder,
@@ -40,6 +53,16 @@ class Vectors:
         """The members of the tuple that is argument number `place`."""
         return list(cgutils.unpack_tuple(self.builder, self._arguments[place]))
 
+    def by_chunks(self, count: Any, body: Callable[[Any, int], None]) -> None:
+        """Writes the loop over `count` bytes, a multiple of HALF_LANES: body(offset, lanes) for each vector
+        of LANES and for the half vector that may be left."""
+        chunks = self.builder.udiv(count, count.type(LANES))
+        with cgutils.for_range(self.builder, chunks) as loop:
+            body(self.builder.mul(loop.index, loop.index.type(LANES)), LANES)
+        whole = self.builder.mul(chunks, count.type(LANES))
+        with self.builder.if_then(self.builder.icmp_unsigned("<", whole, count)):
+            body(whole, HALF_LANES)
+
     def length(self, place: int) -> Any:
         """Elements of the array that is argument number `place`."""
         array = self._context.make_array(self._kinds[place])
@@ -49,7 +72,7 @@ class Vectors:
         """A vector of one element of the array that is argument number `place`."""
         return self.all(self.builder.load(self.builder.gep(self.data(place), [at])), kind)
 
-    def load(self, data: Any, at: Any, kind: Any = BYTES) -> Any:
+    def load(self, data: Any, at: Any, kind: Any) -> Any:
         """A vector that begins with element `at`."""
         return self.builder.load(self._pointer(data, at, kind), align=1)
 
@@ -60,7 +83,7 @@ class Vectors:
     def _pointer(self, data: Any, at: Any, kind: Any) -> Any:
         return self.builder.bitcast(self.builder.gep(data, [at]), ir.PointerType(kind))
 
-    def all(self, value: Any, kind: Any = BYTES) -> Any:
+    def all(self, value: Any, kind: Any) -> Any:
         """A vector of one value, or of one number."""
         if isinstance(value, int | float):
             return ir.Constant(kind, [value] * kind.count)
@@ -95,12 +118,12 @@ class Vectors:
 
     def zeros(self, count: int) -> list[Any]:
         """Pointers to float vectors of zeros: registers, where there are enough."""
-        return [cgutils.alloca_once_value(self.builder, self.all(0.0, FLOATS)) for _ in range(count)]
+        return [cgutils.alloca_once_value(self.builder, self.all(0.0, self.floats)) for _ in range(count)]
 
     def alike(self, gap: Any, nearness: Any) -> Any:
         """Tukey's biweight of a gap, whose reach is 1 / nearness."""
         scaled = self.product(gap, nearness)
-        same = self.not_negative(self.difference(self.all(1.0, FLOATS), self.product(scaled, scaled)))
+        same = self.not_negative(self.difference(self.all(1.0, self.floats), self.product(scaled, scaled)))
         return self.product(same, same)
 
     def difference(self, one: Any, other: Any) -> Any:
@@ -109,16 +132,19 @@ class Vectors:
 
     def not_negative(self, vector: Any) -> Any:
         """Floats, zero in place of what is less."""
-        zero = self.all(0.0, FLOATS)
-        return self.builder.select(self.builder.fcmp_ordered(">", vector, zero, flags=_FAST), vector, zero)
+        kind = ir.FunctionType(self.floats, [self.floats, self.floats])
+        function = cgutils.get_or_insert_function(
+            self.builder.module, kind, f"llvm.maxnum.v{self.floats.count}f32"
+        )
+        return self.builder.call(function, [vector, self.all(0.0, self.floats)], fastmath=_FAST)
 
     def ones(self, vector: Any) -> Any:
         """The number of bits set in each byte."""
-        return self._call("llvm.ctpop.v32i8", BYTES, vector)
+        return self._call(f"llvm.ctpop.v{vector.type.count}i8", vector.type, vector)
 
     def least_of(self, vector: Any) -> Any:
         """The least byte of a vector."""
-        return self._call("llvm.vector.reduce.umin.v32i8", BYTE, vector)
+        return self._call(f"llvm.vector.reduce.umin.v{vector.type.count}i8", BYTE, vector)
 
     def _call(self, name: str, result: Any, vector: Any) -> Any:
         kind = ir.FunctionType(result, [vector.type])
