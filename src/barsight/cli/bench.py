@@ -12,6 +12,7 @@ from rich.console import Console
 from barsight.cli import bench_matching
 from barsight.cli.arguments import call
 from barsight.cli.bench_bundles import bench_found_bundles
+from barsight.cli.bench_length import bench_length
 from barsight.cli.bench_lifts import bench_lift_targets
 from barsight.cli.bench_live import bench_live_estimate
 from barsight.cli.bench_yard import bench_yard
@@ -48,6 +49,7 @@ def run(arguments: Sequence[str]) -> None:
         "features": bench_matching.features,
         "matching": bench_matching.matching,
         "live": bench_live_estimate,
+        "length": bench_length,
     }
     names = " | ".join(benches)
     if not arguments or arguments[0] in ("-h", "--help"):

@@ -59,7 +59,7 @@ def bench_yard(
         for method in methods:
             console.print(f"measuring: {method} ...")
             out = Path(scratch) / method.replace(" ", "-")
-            _measure(place, out, VARIANTS[method])
+            measure_apart(place, out, VARIANTS[method])
             rows.append(yard_row(method, VARIANTS[method], place, out))
         what = f"{place.name}" if recording else f"{length:g} m, {frames} pairs, seed {seed}, {bars}"
         bench = YardBench(what, *laser_error_mm(source, place), tuple(rows), provenance())
@@ -68,7 +68,7 @@ def bench_yard(
         write_json(save, bench)
 
 
-def _measure(recording: Path, out: Path, flags: tuple[str, ...]) -> None:
+def measure_apart(recording: Path, out: Path, flags: tuple[str, ...]) -> None:
     """In a process of its own, so that memory and time are this method's alone."""
     command = [sys.executable, "-m", "barsight", "measure", str(recording), "-o", str(out), *flags]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
