@@ -20,7 +20,10 @@ from barsight.recording.open import open_recording
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
 
-Method = Literal["paper", "sgbm", "ours", "ours fast", "ours crane-only", "ours paper-contours"]
+Method = Literal[
+    "paper", "sgbm", "ours", "ours fast", "ours crane-only", "ours votes-alone", "ours self-calibrated",
+    "ours paper-contours",
+]  # fmt: skip
 
 
 def bench_yard(

@@ -20,9 +20,12 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "ours": (),
     "ours fast": ("--preset", "fast"),
     "ours crane-only": ("--motion.estimator", "crane"),
+    "ours votes-alone": ("--map.own-share", "0.01", "--map.along-m", "0"),
+    "ours self-calibrated": ("--self-calibrate", "yaw"),
     "ours paper-contours": ("--map.contours", "paper"),
 }
-"""What `barsight measure` is told. sgbm has our trajectory and fusion; the last rows are the ablation."""
+"""What `barsight measure` is told. sgbm has our trajectory and fusion. The last rows are the ablation:
+trajectory, fusion (any height that enough views see, each cell for itself), self-calibration, contours."""
 
 _HEADS = ("bias_mm", "mae_mm", "p95_mm", "max_mm", "coverage_pct", "within_95_pct")
 

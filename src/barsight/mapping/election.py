@@ -99,7 +99,9 @@ def elect(
     size = np.array([camera.width, camera.height], np.float64)
     known = np.isfinite(around)
     ceiling = float(around[known].max()) if known.any() else 0.0
-    held = tile[..., Z][tile[..., VIEWS] > 0]
+    held = tile[..., Z][tile[..., VIEWS] >= min_views]
+    if held.size == 0:
+        return np.full(tile.shape[:2], -1, np.int8)
     corner = np.array(key, np.float64) * TILE_CELLS
     box = np.array([[*corner, held.min() / cell_m], [*(corner + TILE_CELLS), held.max() / cell_m]]) * cell_m
     sights = sights.near(*box)
