@@ -111,7 +111,7 @@ def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Ma
         node, track = X(int(seen.node[k])), L(int(seen.track[k]))
         graph.add(gtsam.GenericStereoFactor3D(place, model, node, track, lens, mounted))
         if not values.exists(track):
-            values.insert(track, points[seen.track[k]])
+            values.insert(track, points[seen.track[k], :3])
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-10)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()

@@ -19,6 +19,7 @@ from barsight.motion.encoders import EncoderState, agreeing, disagreement, encod
 from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import Marginals, marginals
 from barsight.motion.problem import Problem, StereoSightings
+from barsight.motion.slides import with_slides
 from barsight.motion.solver import State, System, optimise, sighting_residuals
 from barsight.motion.stereo_factors import often, persistence, start_points
 
@@ -80,7 +81,7 @@ def solve(problem: Problem) -> Estimate:
             break
         agreed = now
         chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
-        problem = replace(everywhere, placed=chosen)
+        problem = replace(problem, placed=chosen)
         state, system = _optimised(problem, state, used)
     poses, found = _poses(state, problem), marginals(system)
     velocity, biases = _inertial(state, problem)
@@ -119,12 +120,11 @@ def _with_seen_noise(
     factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])))
     used = often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
     seen = replace(seen, sigma_px=factor * seen.sigma_px)
-    problem = replace(problem, sightings=seen)
-    state, system = _optimised(problem, state, used)
+    problem, state, system = with_slides(replace(problem, sightings=seen), state, used)
     wider = persistence(sighting_residuals(problem, state, used), seen, used)
     if wider > 1:
         problem = replace(problem, sightings=replace(seen, sigma_px=wider * seen.sigma_px))
-        state, system = _optimised(problem, state, used)
+        problem, state, system = with_slides(problem, state, used, rounds=1)
     return problem, state, system, used
 
 

@@ -27,8 +27,7 @@ def drifted(problem: Problem, state: State, system: System, used: Bool) -> tuple
     drift = weigh(best, np.linalg.inv(own)[-2:, -2:].astype(np.float64), problem)
     fixed = np.zeros(len(own))
     fixed[-2:] = np.array([drift.yaw_rad, drift.scale]) - state.drift
-    free = np.array([True] * problem.has_latency + [False, False])
-    return moved(problem, state, used, *system.step(free, fixed=fixed)), drift
+    return moved(problem, state, used, *system.step(problem.free, fixed=fixed)), drift
 
 
 def sought(problem: Problem, state: State, system: System, used: Bool) -> tuple[State, System, RigDrift]:

@@ -132,7 +132,7 @@ class LiveEstimator:
             offset_prior_px=settings.calibration_sigma_px, scale_prior=settings.scale_sigma,
             has_latency=now.crane is not None, has_imu=now.imu is not None,
         )  # fmt: skip
-        state = State(start_values(problem), np.empty((0, 3)), np.zeros(2))
+        state = State(start_values(problem), np.empty((0, 4)), np.zeros(2))
         window = Window(problem, (), state, np.empty(0, np.int64))
         return self._with_attitudes(window, 0, now)
 

@@ -35,12 +35,12 @@ def marginals(system: System) -> Marginals:
     poses = nodes[:, :6, :6]
     by_border = -solved[1:].T.reshape(count, size, -1)[:, :6]
     swing, latency = by_border[:, :, -2:], float("nan")
-    if len(own) == 3:
-        variance = 1 / own[0, 0]
-        latency = float(variance**0.5)
-        to_latency = by_border[:, :, :1]
-        poses = poses + variance * to_latency @ to_latency.transpose(0, 2, 1)
-        swing = swing - to_latency @ (own[:1, 1:] * variance)
+    if len(own) > 2:
+        variance = np.linalg.inv(own[:-2, :-2])
+        latency = float(variance[0, 0] ** 0.5)
+        to_border = by_border[:, :, :-2]
+        poses = poses + to_border @ variance @ to_border.transpose(0, 2, 1)
+        swing = swing - to_border @ variance @ own[:-2, -2:]
     return Marginals(poses, latency, swing, nodes)
 
 

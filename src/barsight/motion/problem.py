@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.inertial.model import ImuBias
@@ -88,6 +88,31 @@ class Attitude:
 
 
 @dataclass(frozen=True, eq=False)
+class Pieces:
+    """What slides (`slides`). piece: (T,) 0...S-1, which piece of the yard a point is of. own_sigma_rad: (S,)
+    by how much a piece's points slide apart; share: a piece as a whole slides by this times that (1 sigma),
+    half of the variance in common with all pieces.
+    """
+
+    piece: Int64
+    own_sigma_rad: Float64
+    share: float
+
+    @property
+    def count(self) -> int:
+        """How many."""
+        return len(self.own_sigma_rad)
+
+    @cached_property
+    def information(self) -> Float64:
+        """(S, S) the inverse of the slides' covariance."""
+        alike = (np.eye(self.count) + 1) / 2
+        scale = self.share * self.own_sigma_rad
+        result: Float64 = np.linalg.inv(alike) / np.outer(scale, scale)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
 class Prior:
     """What nodes that have left say of the first P ones that stay, to second order about `at`.
 
@@ -127,10 +152,24 @@ class Problem:
     """By which share baseline and encoders may disagree (1 sigma)."""
     prior: Prior | None = None
     """Takes the place of what fixes the first node, the biases and the latency."""
+    pieces: Pieces | None = None
+    """What slides together; None where nothing is held to slide."""
     has_latency: bool = False
     """Whether the encoders' latency is an unknown."""
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
+
+    @property
+    def border(self) -> int:
+        """Unknowns that all nodes share: the encoders' latency, the pieces' slides, the rig's drift."""
+        return int(self.has_latency) + (self.pieces.count if self.pieces else 0) + 2
+
+    @property
+    def free(self) -> Bool:
+        """(border,) all of these but the drift, which is sought apart."""
+        free = np.ones(self.border, np.bool_)
+        free[-2:] = False
+        return free
 
     @property
     def sees_scale(self) -> bool:

@@ -1,12 +1,13 @@
 """Gauss-Newton over all unknowns: points taken out by kernels, the rest linearised by GTSAM.
 
 Unknowns are ordered node by node (pose, with an IMU velocity and biases), so the matrix is a band as wide as
-the longest track; the encoders' latency and the rig's drift touch all nodes and stand at its border.
+the longest track; the encoders' latency, the pieces' slides and the rig's drift touch many nodes and stand at
+its border.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gtsam
@@ -15,11 +16,14 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
-from barsight.motion.point_kernels import Guess, Reduced, Rig, Sights, eliminate, residuals, substitute
+from barsight.motion.elimination import Reduced, eliminate, substitute
+from barsight.motion.point_kernels import Guess, Rig, Sights, residuals
 from barsight.motion.problem import Prior, Problem, StereoSightings
 from barsight.motion.rig_drift import HUBER_SIGMAS, LOOSE
 
 MOST_ITERATIONS = 25
+TIGHT = 1e6
+"""1 / rad: what holds points that don't slide."""
 RELATIVE_GAIN = 1e-5
 WIDTHS = {"x": 6, "v": 3, "b": 6, "e": 1}
 OFFSETS = {"x": 0, "v": 6, "b": 9}
@@ -27,25 +31,27 @@ OFFSETS = {"x": 0, "v": 6, "b": 9}
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """values: GTSAM's, of all but the points (T, 3) and the rig's drift (2,)."""
+    """values: GTSAM's, of all but the points (T, 4; the fourth is a point's slide, rad), the rig's
+    drift (2,) and the pieces' slides (S,), rad."""
 
     values: Any
     points: Float64
     drift: Float64
+    slides: Float64 = field(default_factory=lambda: np.zeros(0))
 
     def guess(self, nodes: int) -> Guess:
         """As the kernels take it."""
         poses = [self.values.atPose3(X(k)) for k in range(nodes)]
         turn = np.array([pose.rotation().matrix() for pose in poses])
         place = np.array([pose.translation() for pose in poses])
-        return Guess(turn, place, self.points, self.drift)
+        return Guess(turn, place, self.points, np.concatenate([self.slides, self.drift]))
 
 
 @dataclass(frozen=True, eq=False)
 class System:
     """Normal equations at a state. rows: (n, w), a band as `band` has it; gradient (n,). side: (b, n) with
-    the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one, then the
-    rig's drift. size: unknowns a node.
+    the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one, the
+    pieces' slides, then the rig's drift. size: unknowns a node.
     """
 
     rows: Float64
@@ -102,7 +108,11 @@ def sights_of(problem: Problem, used: Bool) -> Sights:
     seen = problem.sightings
     assert seen is not None
     scale = 1.0 if problem.sees_scale else 0.0
-    return Sights(seen.first, seen.node, used, seen.stereo, 1 / seen.sigma_px, scale)
+    points, pieces = len(seen.first) - 1, problem.pieces
+    piece, tight = np.zeros(points, np.int64), np.full(points, TIGHT)
+    if pieces is not None:
+        piece, tight = pieces.piece, 1 / pieces.own_sigma_rad[pieces.piece]
+    return Sights(seen.first, seen.node, used, seen.stereo, 1 / seen.sigma_px, piece, tight, scale)
 
 
 def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
@@ -122,7 +132,7 @@ def optimise(
     graph: GTSAM's factors of all but the sightings. The rig's drift stays. Raises LinAlgError where the
     measurements leave an unknown undetermined.
     """
-    free = np.array([True] * problem.has_latency + [False, False])
+    free = problem.free
     cost, damping = _cost(problem, graph, state, used), 0.0
     system = linearise(problem, graph, state, used)
     for _ in range(most):
@@ -148,7 +158,7 @@ def optimise(
 def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
     """The system at a state."""
     nodes, width = len(problem.start), 15 if problem.has_imu else 6
-    border = int(problem.has_latency) + 2
+    border, shared = problem.border, problem.border - int(problem.has_latency)
     span = 2 if problem.has_imu else 1
     seen = problem.sightings
     if seen is not None and len(seen.node):
@@ -162,15 +172,19 @@ def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
     corner, corner_gradient = np.zeros((border, border)), np.zeros(border)
     if seen is not None and used.any():
         reduced = Reduced(
-            np.zeros((nodes, span, 6, 6)), np.zeros((nodes, 6)), np.zeros((nodes, 6, 2)), np.zeros((2, 2)),
-            np.zeros(2),
+            np.zeros((nodes, span, 6, 6)), np.zeros((nodes, 6)), np.zeros((nodes, 6, shared)),
+            np.zeros((shared, shared)), np.zeros(shared),
         )  # fmt: skip
         eliminate(rig_of(seen), sights_of(problem, used), state.guess(nodes), reduced)
         band.add_blocks(reduced.band, width, rows)
         at = (np.arange(nodes)[:, None] * width + np.arange(6)).ravel()
         gradient[at] = reduced.gradient.ravel()
-        side[-2:, at] = reduced.side.reshape(-1, 2).T
-        corner[-2:, -2:], corner_gradient[-2:] = reduced.corner, reduced.corner_gradient
+        side[-shared:, at] = reduced.side.reshape(-1, shared).T
+        corner[-shared:, -shared:], corner_gradient[-shared:] = reduced.corner, reduced.corner_gradient
+    if problem.pieces is not None:
+        slide, information = slice(border - shared, border - 2), problem.pieces.information
+        corner[slide, slide] += information
+        corner_gradient[slide] += information @ state.slides
     first, at, values, right = _sparse_rows(graph, state.values, width, size)
     band.add_products(first, at, values, right, rows, gradient, side, corner, corner_gradient)
     if problem.prior is not None:
@@ -243,13 +257,16 @@ def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Flo
             vectors.insert(B(k), part[9:])
     if problem.has_latency:
         vectors.insert(E(0), border[:1])
-    points, drift = state.points, border[-2:]
+    points, shared = state.points, np.ascontiguousarray(border[int(problem.has_latency) :])
     if problem.sightings is not None:
         points = points.copy()
         poses = np.ascontiguousarray(by_node[:, :6])
         rig, sights = rig_of(problem.sightings), sights_of(problem, used)
-        substitute(rig, sights, state.guess(nodes), poses, np.ascontiguousarray(drift), points)
-    return replace(state, values=state.values.retract(vectors), points=points, drift=state.drift + drift)
+        substitute(rig, sights, state.guess(nodes), poses, shared, points, np.empty(len(points)))
+    return replace(
+        state, values=state.values.retract(vectors), points=points, drift=state.drift + shared[-2:],
+        slides=state.slides + shared[:-2],
+    )  # fmt: skip
 
 
 def _cost(problem: Problem, graph: Any, state: State, used: Bool) -> float:
@@ -257,6 +274,8 @@ def _cost(problem: Problem, graph: Any, state: State, used: Bool) -> float:
     if problem.prior is not None:
         since = _since(problem.prior, state)
         cost += float(since @ (problem.prior.gradient + problem.prior.matrix @ since / 2))
+    if problem.pieces is not None:
+        cost += float(state.slides @ problem.pieces.information @ state.slides) / 2
     if problem.sightings is None:
         return cost
     seen, guess = problem.sightings, state.guess(len(problem.start))

@@ -14,16 +14,16 @@ LEAST_PAIRS = 300
 
 
 def start_points(problem: Problem) -> Float64:
-    """(T, 3) in the reference, each as its first sighting has it."""
+    """(T, 4) place in the reference as the first sighting has it, and slide: none."""
     seen = problem.sightings
     if seen is None:
-        return np.empty((0, 3))
+        return np.empty((0, 4))
     begin = seen.first[:-1]
     in_body = seen.body_from_rect0.apply(triangulate(seen.stereo[begin], seen.camera))
     turn = np.array([pose.rotation for pose in problem.start])[seen.node[begin]]
     place = np.array([pose.translation for pose in problem.start])[seen.node[begin]]
-    points: Float64 = (turn @ in_body[:, :, None])[:, :, 0] + place
-    return points
+    points = (turn @ in_body[:, :, None])[:, :, 0] + place
+    return np.column_stack([points, np.zeros(len(points))])
 
 
 def often(seen: StereoSightings, used: Bool) -> Bool:

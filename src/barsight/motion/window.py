@@ -152,8 +152,7 @@ def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window
         state, drift = drifted(problem, state, system, used)
         covariance = drift.covariance
     elif used.any():
-        free = np.array([True] * problem.has_latency + [False, False])
-        state = moved(problem, state, used, *system.step(free))
+        state = moved(problem, state, used, *system.step(problem.free))
     kept = tuple(
         place for place, fits in zip(problem.placed, agreeing(state.values, problem), strict=True) if fits
     )

@@ -1,0 +1,51 @@
+"""Ribs and highlights that slide along their bars: found, and what they leave open is in the covariance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.calibration.rectification import Rectifier
+from barsight.evaluation.drift import compare
+from barsight.features.guided import triangulate
+from barsight.motion import slides
+from barsight.motion.sightings import Sighting
+from barsight.recording.truth import GroundTruth
+from test_motion_fusion import NoisyRecording, fused, simulated
+
+COMMON_RAD, OWN_RAD = 2.5e-4, 3e-4
+FLOOR_M = 0.4
+
+
+def sliding(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTruth]:
+    """Points over 0.4 m turn about the camera's axis by some share each and by another in common."""
+    recording, sightings, truth = simulated(seed)
+    rng = np.random.default_rng(100 + seed)
+    rectifier = Rectifier(recording.rig)
+    own = rng.normal(rng.choice([-1, 1]) * COMMON_RAD, OWN_RAD, 2000)
+    slid = []
+    for sighting, pose in zip(sightings, truth.poses, strict=True):
+        place = (pose @ rectifier.body_from_rect0).apply(triangulate(sighting.stereo, rectifier.camera))
+        turn = np.where(place[:, 2] > FLOOR_M, own[sighting.track], 0.0)
+        u, v = sighting.stereo[:, 0] - rectifier.camera.cx_px, sighting.stereo[:, 1] - rectifier.camera.cy_px
+        stereo = sighting.stereo + np.column_stack([-turn * v, turn * u, -turn * v])
+        slid.append(replace(sighting, stereo=stereo))
+    return recording, tuple(slid), truth
+
+
+def test_slides_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the slides as unknowns, and without: then attitude is surer than it may be."""
+
+    def nees() -> float:
+        found = []
+        for seed in range(2):
+            recording, sightings, truth = sliding(seed)
+            drift = compare(fused(recording, monkeypatch, sightings), truth, 0)
+            assert drift is not None
+            found.append(drift.nees_attitude)
+        return float(np.mean(found))
+
+    counted = nees()
+    monkeypatch.setattr(slides, "pieces_of", lambda *_: None)
+    assert counted < 1.5
+    assert nees() > 2 * counted
