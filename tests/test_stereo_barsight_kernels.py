@@ -385,7 +385,7 @@ def test_pulls_are_what_box_filters_say() -> None:
     mean_weight = np.empty_like(usable)
     short_of = lengthen(weight, _frame(trust), 20.0, 21, False, pull, mean_weight)
     mean = _mean(wanted)
-    longer = mean / np.maximum(mean - 20 * _mean(trust), mean / 1.5 + 1e-6)
+    longer = mean / np.maximum(mean - 20 * _mean(trust), mean / 3 + 1e-6)
     np.testing.assert_allclose(mean_weight, mean, rtol=1e-4)
     np.testing.assert_allclose(short_of, longer, rtol=1e-3)
     wanted_pull = wanted_pull * longer
@@ -410,11 +410,11 @@ def test_supports_are_blended_and_steps_settled_as_written() -> None:
     np.testing.assert_allclose(fitted, short + share * gap, atol=1e-4)
     np.testing.assert_allclose(unsure, variance[0] + (1 - share) * (variance[1] - variance[0]), atol=1e-5)
 
-    fitted, axes, start, short_of = _noise(47, 0.1), _axes(0.6, 0.8), _noise(48), 1 + np.abs(_noise(49))
+    fitted, axes, start = _noise(47, 0.1), _axes(0.6, 0.8), _noise(48)
     sag = 1.5 * _mean(_curvature(fitted, axes), 11)
     move = np.clip(fitted - sag - start, -1.5, 1.5)
-    wanted = unsure + ((short_of - 1) * move) ** 2 + 0.25 * sag**2
+    wanted = unsure + 0.25 * sag**2
     disparity = _frame(start)
-    settle(fitted, axes, short_of, disparity, unsure)
+    settle(fitted, axes, disparity, unsure)
     np.testing.assert_allclose(inside(disparity, start.shape), start + move, atol=1e-5)
     np.testing.assert_allclose(unsure, wanted, rtol=1e-4, atol=1e-5)

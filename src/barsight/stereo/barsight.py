@@ -49,7 +49,7 @@ class BarsightSettings:
     """Error per pixel by which the disparity bends within 3 px."""
     widest_edge_px: float = 0.5
     """A bend or an edge counts as no more than this."""
-    start_share: float = 0.12
+    start_share: float = 0.08
     """Error per pixel by which the start and its refinement disagree over a window."""
     wrong_side_px: float = 0.4
     """Error on a depth edge, where a pixel may belong to either side; it falls to 1 / e within 3 px."""

@@ -16,7 +16,7 @@ from barsight.stereo.windows import BAND_ROWS, mirrored, roll_product, roll_squa
 
 _CONTRAST_FLOOR = np.float32(4)
 _BLOCK_PX = 3
-_MOST_UNDAMPED = np.float32(1.5)
+_MOST_UNDAMPED = np.float32(3)
 
 
 def compare(
@@ -145,8 +145,8 @@ def lengthen(
     mean_weight: Float32,
 ) -> Float32:  # fmt: skip
     """(H, W) what a step must be multiplied by: noise in the slopes adds to the weights and nothing to the
-    pulls, so that each step falls short by its share of the weights. At most 1.5, where a step may still not
-    overshoot by more than half. The pulls, unless the step is the last, are multiplied by it.
+    pulls, so that each step falls short by its share of the weights; 3 at most. The pulls, unless the step is
+    the last, are multiplied by it.
 
     mean_weight: (H, W), is given the weights' means over the windows. The others are frames.
     """

@@ -38,6 +38,8 @@ _SHORT_STEP_PX = 3
 _ALIKE_BLUR_PX = 1.5
 _HOLD = 0.1
 _HOLD_UNMATCHED = 0.02
+_MOST_NOISIER = np.float32(1.5)
+"""By which the share that steps fall short of counts as noise, at most."""
 
 
 @dataclass(frozen=True)
@@ -153,12 +155,22 @@ class _Work:
         mean_weight = np.empty(shape, dtype=np.float32)
         short_of = lengthen(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
         power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
-        power *= short_of
+        power *= np.minimum(short_of, _MOST_NOISIER)
         weight = inside(self.weight, shape)
         weight += self.hold
         fitted, variance = self._fit(power)
-        settle(fitted, self.axes, short_of, self.disparity, variance)
+        before = inside(self.disparity, shape).copy()
+        settle(fitted, self.axes, self.disparity, variance)
+        if is_last:
+            self._complete(before, short_of)
         return variance
+
+    def _complete(self, before: Float32, short_of: Float32) -> None:
+        """Go the rest of a step that fell short, in the mean over a window: a start that gloss has bent is
+        off as a whole, while each pixel's own rest is mostly noise."""
+        now, side = inside(self.disparity, before.shape), self.settings.window_px
+        moved = cv2.boxFilter(self.usable * (now - before), -1, (side, side))
+        now += (short_of - 1) * moved / (self.mean_usable + np.float32(1e-6))
 
     def _along(self, grey: Float32) -> tuple[Float32, Float32]:
         """Means of residual and slope along the axis, (H, W)."""

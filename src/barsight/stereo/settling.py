@@ -89,30 +89,29 @@ def _blend(
             unsure[x] = other + (one - mean[x]) * (own - other)
 
 
-def settle(fitted: Float32, axes: Float32, short_of: Float32, disparity: Float32, variance: Float32) -> None:
+def settle(fitted: Float32, axes: Float32, disparity: Float32, variance: Float32) -> None:
     """Move the disparity (a frame) to what was fitted, put right for curvature; add to the variance.
 
     A plane over the support takes off a surface that is round across the axis half its curvature times the
     support's mean square width. A bar's curvature is the same all along, so that its mean over a window adds
-    hardly any noise. What the step fell short of, and half of what was put right, may still be wrong.
+    hardly any noise. Half of what was put right may still be wrong.
     """
 
     def work(first: int, end: int) -> None:
-        _settle(fitted, axes, short_of, _SAG_REACH_PX, disparity, variance, first, end)
+        _settle(fitted, axes, _SAG_REACH_PX, disparity, variance, first, end)
 
     in_bands(work, len(fitted), BAND_ROWS)
 
 
 @kernel(fastmath=True)
 def _settle(
-    fitted: Float32, axes: Float32, short_of: Float32, reach: int, disparity: Float32, variance: Float32,
-    first: int, end: int,
+    fitted: Float32, axes: Float32, reach: int, disparity: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = fitted.shape
     column = np.zeros(width + 2 * reach + 1)
     rows = np.zeros((4, width), dtype=np.float32)
     none, ahead, behind, sag = rows[0], rows[1], rows[2], rows[3]
-    half, one, quarter = np.float32(0.5) * _SPREAD_ACROSS_PX2, np.float32(1), np.float32(0.25)
+    half, quarter = np.float32(0.5) * _SPREAD_ACROSS_PX2, np.float32(0.25)
     for coming in range(first - reach, end + reach):
         y, going = coming - reach, coming - 2 * reach - 1
         curvature_row(fitted, axes, mirrored(coming, height), ahead)
@@ -124,7 +123,7 @@ def _settle(
         if y < first:
             continue
         slide(column, reach, sag)
-        wanted, short, unsure = fitted[y], short_of[y], variance[y]
+        wanted, unsure = fitted[y], variance[y]
         here = disparity[y + MARGIN, MARGIN : MARGIN + width]
         for x in range(width):
             off = wanted[x] - half * sag[x] - here[x]
@@ -132,5 +131,5 @@ def _settle(
         for x in range(width):
             here[x] += ahead[x]
         for x in range(width):
-            left_over, sagged = (short[x] - one) * ahead[x], half * sag[x]
-            unsure[x] += left_over * left_over + quarter * sagged * sagged
+            sagged = half * sag[x]
+            unsure[x] += quarter * sagged * sagged
