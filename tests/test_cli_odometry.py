@@ -20,7 +20,13 @@ def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     out = tmp_path / "a [b] c"
     assert run(["odometry", str(whole), "-o", str(out), "--use", "stereo,imu,crane"]) == 0
     assert "placed in yard" in capsys.readouterr().out
-    assert sorted(path.name for path in out.iterdir()) == ["odometry.json", "report.html", "trajectory.tum"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "odometry.json", "relative.csv", "report.html", "trajectory.tum",
+    ]  # fmt: skip
+    header, *rows = (out / "relative.csv").read_text().splitlines()
+    table = np.array([row.split(",") for row in rows], np.float64)
+    assert table.shape == (3, header.count(",") + 1) == (3, 30)
+    assert (table[:, [9, 15, 20, 24, 27, 29]] > 0).all()  # variances
     page = (out / "report.html").read_text()
     body = page.partition("<script>")[0]
     assert 'src="http' not in body and 'href="http' not in body
@@ -34,7 +40,7 @@ def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     frame = data["frames"][0]
     assert np.array(frame["covariance"]).shape == (6, 6)
     assert (np.array(frame["velocity_sigma_mps"]) > 0).all()
-    assert set(data["residuals_in_sigma"]) == {"pictures", "imu", "encoders"}
+    assert set(data["residuals_in_sigma"]) == {"pictures", "imu", "encoders", "innovations"}
     assert all(max(part["rms"]) < 3 for part in data["residuals_in_sigma"].values())
     assert data["drift"]["reference_rmse_mm"] < 20
     assert run(["odometry", str(whole), "-o", str(out), "--use=stereo"]) == 0

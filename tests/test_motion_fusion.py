@@ -90,14 +90,35 @@ def fused(
     )
 
 
+def relative_nees(trajectory: Trajectory, truth: GroundTruth) -> np.ndarray:
+    """(2,) squared errors of turn and way between neighbours over their covariance, per degree of freedom."""
+    assert trajectory.detail is not None
+    assert trajectory.detail.relative is not None
+    found = [frame.reference_from_body for frame in trajectory.frames]
+    sums = []
+    for k, covariance in enumerate(trajectory.detail.relative.covariance):
+        moved, truly = found[k].inverse() @ found[k + 1], truth.poses[k].inverse() @ truth.poses[k + 1]
+        off = truly.inverse() @ moved
+        error = np.concatenate([Rotation.from_matrix(off.rotation).as_rotvec(), off.translation])
+        parts = ((error[:3], covariance[:3, :3]), (error[3:], covariance[3:, 3:]))
+        sums.append([part @ np.linalg.solve(spread, part) / 3 for part, spread in parts])
+    mean: np.ndarray = np.mean(sums, axis=0)
+    return mean
+
+
 @pytest.mark.slow
 def test_the_covariance_is_right_over_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
-    drifts = []
+    drifts, relative = [], []
     for seed in range(20):
         recording, sightings, truth = simulated(seed)
-        drift = compare(fused(recording, monkeypatch, sightings), truth, 0)
+        trajectory = fused(recording, monkeypatch, sightings)
+        drift = compare(trajectory, truth, 0)
         assert drift is not None
         drifts.append(drift)
+        relative.append(relative_nees(trajectory, truth))
+    neighbours = np.mean(relative, axis=0)
+    assert (neighbours > 0.7).all()
+    assert (neighbours < 1.4).all()
     mean = np.mean([[d.nees_position, d.nees_attitude, d.reference_rmse_mm] for d in drifts], axis=0)
     assert 0.7 < mean[0] < 1.4
     assert 0.7 < mean[1] < 1.4

@@ -47,8 +47,15 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
     band.solve(rows, right)
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     blocks = np.empty((n // 3, 3, 3))
-    band.inverse_blocks(rows, 3, blocks)
+    pairs = np.array([[k, k + 1] for k in range(n // 3 - 1)], np.int64).reshape(-1, 2)
+    cross = np.empty((len(pairs), 3, 3))
+    band.inverse_blocks(rows, 3, blocks, pairs, cross)
     inverse = np.linalg.inv(matrix)
+    for k, block in enumerate(cross):
+        whole = inverse[3 * k : 3 * k + 3, 3 * k + 3 : 3 * k + 6]
+        near = np.subtract.outer(np.arange(3), np.arange(3, 6)) > -width
+        np.testing.assert_allclose(block[near], whole[near], rtol=1e-8, atol=1e-12)
+        assert np.isnan(block[~near]).all()
     for k, block in enumerate(blocks):
         np.testing.assert_allclose(
             block, inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-8, atol=1e-12

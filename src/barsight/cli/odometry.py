@@ -24,7 +24,7 @@ from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.recording.truth import GroundTruth, find_ground_truth, read_ground_truth
-from barsight.report.files import write_trajectory
+from barsight.report.files import write_relative, write_trajectory
 from barsight.report.odometry_page import OdometryResult, write_odometry_page
 
 
@@ -42,7 +42,8 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             recording: The recording.
-            out: Folder for trajectory.tum, report.html and odometry.json; nothing is written without it.
+            out: Folder for trajectory.tum, relative.csv (each frame against the one before, with covariance),
+                report.html and odometry.json; nothing is written without it.
             use: Sensors that may be used, where the recording has them: stereo,imu,crane if not given.
             reading: How to read the recording.
             settings: The estimate's settings.
@@ -68,6 +69,7 @@ def run(arguments: Sequence[str]) -> None:
             result = OdometryResult(recording.resolve().name, frames, trajectory, example, drift, errors)
             with atomic_directory(out, replace=True) as folder:
                 write_trajectory(trajectory, folder / "trajectory.tum")
+                write_relative(trajectory, folder / "relative.csv")
                 write_odometry_page(result, folder / "report.html", folder / "odometry.json")
         lines = [] if truth is None else _drift_lines(drift)
         for line in _summary(trajectory) + lines:

@@ -34,10 +34,21 @@ class Inertial:
 
 
 @dataclass(frozen=True, eq=False)
+class Relative:
+    """How each frame but the first stands to the one before. covariance: (F - 1, 6, 6) of its pose there,
+    rotation (rad) then translation (m) of a small motion that follows it, in its own body axes; NaN where the
+    two are too far apart to tell.
+    """
+
+    covariance: Float64
+
+
+@dataclass(frozen=True, eq=False)
 class MotionDetail:
     """inertial: None without IMU. pictures: u, v and right u of each frame, RMS over its points; imu: turn,
     way and speed between neighbours, RMS over the axes; encoders: x, y, z of each place, those left out
-    included. points: (F, 2) of each frame of `pictures`: used, and refused as ambiguous.
+    included. points: (F, 2) of each frame of `pictures`: used, and refused as ambiguous. innovations: turn
+    and way of `rect0` since the frame before, as pictures find them, against what the other sensors predicted.
     """
 
     inertial: Inertial | None
@@ -45,3 +56,5 @@ class MotionDetail:
     imu: InSigmas | None
     encoders: InSigmas | None
     points: Int64
+    relative: Relative | None = None
+    innovations: InSigmas | None = None

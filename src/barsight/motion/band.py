@@ -56,9 +56,10 @@ def solve(factor: Float64, right: Float64) -> None:
 
 
 @kernel(fastmath=True)
-def inverse_blocks(factor: Float64, size: int, blocks: Float64) -> None:
+def inverse_blocks(factor: Float64, size: int, blocks: Float64, pairs: Int64, cross: Float64) -> None:
     """blocks: (n / size, size, size) those on the inverse's diagonal, from the last column back [Takahashi
-    1973]: only the inverse's elements within the band are needed.
+    1973]: only the inverse's elements within the band are needed. cross: (P, size, size) those in the rows of
+    block pairs[:, 0] and the columns of the later pairs[:, 1]; NaN beyond the band.
     """
     n, width = factor.shape
     inverse = np.zeros((n, 2 * width - 1))  # element (i, j) at [i, j - i + width - 1], both halves
@@ -83,6 +84,13 @@ def inverse_blocks(factor: Float64, size: int, blocks: Float64) -> None:
         for i in range(size):
             for j in range(size):
                 blocks[b, i, j] = inverse[b * size + i, j - i + width - 1]
+    for p in range(len(pairs)):
+        apart = (pairs[p, 1] - pairs[p, 0]) * size
+        for i in range(size):
+            for j in range(size):
+                within = apart + j - i < width
+                row = pairs[p, 0] * size + i
+                cross[p, i, j] = inverse[row, apart + j - i + width - 1] if within else np.nan
 
 
 @kernel(fastmath=True)

@@ -10,7 +10,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.motion_detail import Inertial, InSigmas
-from barsight.core.pose import Pose
+from barsight.core.pose import Pose, skew
 from barsight.core.types import RigDrift
 from barsight.inertial.model import ImuBias
 from barsight.motion.detail import imu_in_sigmas, inertial, pictures_in_sigmas
@@ -32,7 +32,8 @@ LEAST_FACTOR = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """poses: (M,). covariance: (M, 6, 6) rotation then translation, reference axes. velocity_mps: (M, 3) or
+    """poses: (M,). covariance: (M, 6, 6) rotation then translation, reference axes. relative:
+    (F - 1, 6, 6) of a frame's pose in the frame before, in its own axes. velocity_mps: (M, 3) or
     None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
     drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
     without. encoder_off_m: (P, 3) of each place, encoder_used: (P,) those that agree. inertial, pictures,
@@ -41,6 +42,7 @@ class Estimate:
 
     poses: tuple[Pose, ...]
     covariance: Float64
+    relative: Float64
     velocity_mps: Float64 | None
     biases: tuple[ImuBias, ...]
     pixel_sigma_px: float
@@ -55,8 +57,10 @@ class Estimate:
     points: Int64
 
 
-def solve(problem: Problem) -> Estimate:
-    """After a first solution, drift of the rig included, sightings beyond 3.5 sigma leave and all sigmas
+def solve(problem: Problem, frames: Int64) -> Estimate:
+    """frames: (F,) the nodes whose relative covariance is wanted, each with the next.
+
+    After a first solution, drift of the rig included, sightings beyond 3.5 sigma leave and all sigmas
     grow or shrink to what was seen; then the drift is sought on and weighed against its prior, and encoder
     places beyond 5 sigma leave. (A cut before the drift is known would take the very sightings that show it
     best.) Raises LinAlgError where the measurements leave an unknown undetermined.
@@ -83,12 +87,14 @@ def solve(problem: Problem) -> Estimate:
         chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
         problem = replace(problem, placed=chosen)
         state, system = _optimised(problem, state, used)
-    poses, found = _poses(state, problem), marginals(system)
+    pairs = np.column_stack([frames[:-1], frames[1:]])
+    poses, found = _poses(state, problem), marginals(system, pairs)
     velocity, biases = _inertial(state, problem)
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
     pictures, points = pictures_in_sigmas(problem, state, used)
     return Estimate(
-        poses, covariances(found, poses, drift), velocity, biases, sigma, drift, used,
+        poses, covariances(found, poses, drift), relative(found, poses, drift, pairs), velocity, biases,
+        sigma, drift, used,
         encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
         disagreement(state.values, everywhere), agreeing(state.values, everywhere),
         inertial(problem, state, found.nodes), pictures, imu_in_sigmas(problem, state), points,
@@ -104,6 +110,23 @@ def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | Non
         turned[:3, :3] = turned[3:, 3:] = pose.rotation
         own = found.poses[k] + found.swing[k] @ shared @ found.swing[k].T
         result[k] = turned @ own @ turned.T
+    return result
+
+
+def relative(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None, pairs: Int64) -> Float64:
+    """(P, 6, 6) of the later pose in the earlier one, rotation then translation of a small motion that
+    follows it, in its own axes: what both are off by alike doesn't count.
+    """
+    shared = np.zeros((2, 2)) if drift is None else drift.covariance
+    result = np.empty((len(pairs), 6, 6))
+    for p, (old, new) in enumerate(pairs.tolist()):
+        moved = poses[new].inverse() @ poses[old]
+        carried = np.kron(np.eye(2), moved.rotation)
+        carried[3:, :3] = skew(moved.translation) @ moved.rotation
+        swing = found.swing[new] - carried @ found.swing[old]
+        both = carried @ found.cross[p]
+        own = found.poses[new] + carried @ found.poses[old] @ carried.T - both - both.T
+        result[p] = own + swing @ shared @ swing.T
     return result
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
-from barsight.core.motion_detail import Inertial, InSigmas, MotionDetail
+from barsight.core.motion_detail import Inertial, InSigmas, MotionDetail, Relative
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
@@ -22,7 +22,7 @@ from barsight.motion.nodes import Nodes, make_nodes, start_poses, tied_by_imu
 from barsight.motion.odometry import StereoOdometry
 from barsight.motion.plausibility import check_crane, frames_off, gyro_in_degrees
 from barsight.motion.prediction import CranePredictor
-from barsight.motion.sightings import FrontEndSettings, Sighting, follow
+from barsight.motion.sightings import FrontEndSettings, Sighting, follow, innovations
 from barsight.recording.base import Recording
 from barsight.recording.corners import CornerRecording
 
@@ -220,7 +220,7 @@ class FusedTrajectory:
             offset_prior_px=self.settings.calibration_sigma_px, scale_prior=self.settings.scale_sigma,
             has_latency=bool(placed), has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
-        estimate = solve(problem)
+        estimate = solve(problem, nodes.frame)
         warnings = encoder_warnings(
             estimate.encoders, nodes.stamp_ns, problem.placed, estimate.encoder_off_m, estimate.encoder_used
         )
@@ -244,7 +244,10 @@ def _detail(
         None if part is None else replace(part, stamp_ns=part.stamp_ns - shift)
         for part in (estimate.pictures, estimate.imu, encoders)
     ]
-    return MotionDetail(inertial, by_frames[0], by_frames[1], by_frames[2], points)
+    return MotionDetail(
+        inertial, by_frames[0], by_frames[1], by_frames[2], points, Relative(estimate.relative),
+        innovations(sightings),
+    )  # fmt: skip
 
 
 def _silent() -> None:

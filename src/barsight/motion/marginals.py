@@ -6,32 +6,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, Int64
 from barsight.motion.band import inverse_blocks
 from barsight.motion.solver import System
+
+NO_PAIRS = np.empty((0, 2), np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Marginals:
     """poses: (M, 6, 6) in GTSAM's order and body axes, the rig's drift taken as known. latency_sigma_s: nan
     without encoders. swing: (M, 6, 2) how the poses move with the drift. nodes: (M, n, n) of all that a node
-    has, the latency taken as known too.
+    has, the latency taken as known too. cross: (P, 6, 6) of pairs of poses, as `poses`; NaN for those too far
+    apart for the band.
     """
 
     poses: Float64
     latency_sigma_s: float
     swing: Float64
     nodes: Float64
+    cross: Float64
 
 
-def marginals(system: System) -> Marginals:
-    """Of a system at its best state."""
+def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
+    """Of a system at its best state. pairs: (P, 2) nodes, the earlier first."""
     factor, size = system.factor(), system.size
     solved = system.solved(factor)
     own, _ = system.schur(solved)
     count = len(factor) // size
     nodes = np.empty((count, size, size))
-    inverse_blocks(factor, size, nodes)
+    cross = np.empty((len(pairs), size, size))
+    inverse_blocks(factor, size, nodes, pairs, cross)
+    cross = cross[:, :6, :6]
     poses = nodes[:, :6, :6]
     by_border = -solved[1:].T.reshape(count, size, -1)[:, :6]
     swing, latency = by_border[:, :, -2:], float("nan")
@@ -41,7 +47,8 @@ def marginals(system: System) -> Marginals:
         to_border = by_border[:, :, :-2]
         poses = poses + to_border @ variance @ to_border.transpose(0, 2, 1)
         swing = swing - to_border @ variance @ own[:-2, -2:]
-    return Marginals(poses, latency, swing, nodes)
+        cross = cross + to_border[pairs[:, 0]] @ variance @ to_border[pairs[:, 1]].transpose(0, 2, 1)
+    return Marginals(poses, latency, swing, nodes, cross)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import Failed
+from barsight.core.motion_detail import InSigmas
 from barsight.core.parallel import ordered_map, read_ahead
 from barsight.core.types import RefusedFrame, StereoFrame
 from barsight.features.guided import GuidedMatches, PredictedMotion, predict_places, triangulate
@@ -40,6 +42,7 @@ class Sighting:
 
     motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
     one before. ambiguous: how many points were refused since the prediction was too coarse for the bars.
+    innovation: (6,) turn and way of `motion` minus the predicted ones in sigma, None without a prediction.
     """
 
     stamp_ns: int
@@ -48,6 +51,7 @@ class Sighting:
     sigma_px: Float64
     motion: PredictedMotion | None
     ambiguous: int
+    innovation: Float64 | None = None
 
 
 @dataclass(frozen=True)
@@ -124,12 +128,12 @@ def _see(
         kept = np.zeros(0, np.bool_)
         matches = GuidedMatches(np.empty((0, 3)), np.empty(0), kept, kept)
         tracks = Tracks(next_track=0 if state is None else state.next_track)
-        motion = None
+        motion, innovation = None, None
         if prediction is None:
             rough = look(pair, settings.rough)
             view = None if isinstance(rough, Failed) else rough
     else:
-        tracks = state.tracks
+        tracks, predicted = state.tracks, prediction
         found = None if prediction is None else consensus(tracks, pair, prediction, settings)
         if found is None or isinstance(found, Failed):
             rough_motion = _rough(state, tracks, pair, settings)
@@ -141,13 +145,34 @@ def _see(
             if isinstance(found, Failed):
                 return found
         kept, matches, motion = found
+        innovation = None if predicted is None else _innovation(predicted, motion)
     coarse = _coarse(pair, matches.stereo[kept])
     tracks = carry_on(tracks, pair, matches, kept, coarse, settings.tracks)
     if len(tracks.track) < settings.rough.least_inliers:
         return Failed("no-features", f"only {len(tracks.track)} points have a depth")
     ambiguous = int(matches.ambiguous.sum())
-    sighting = Sighting(pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous)
+    sighting = Sighting(
+        pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous, innovation
+    )
     return _State(tracks, tracks.next_track, pair.pair.stamp_ns, view), sighting
+
+
+def _innovation(predicted: PredictedMotion, found: PredictedMotion) -> Float64:
+    """(6,) turn and way of the found motion minus the predicted one, each over its sigma."""
+    turn = Rotation.from_matrix(found.rotation @ predicted.rotation.T)
+    way = found.translation - turn.as_matrix() @ predicted.translation
+    sigma = np.sqrt(np.diag(predicted.covariance + found.covariance))
+    return np.asarray(np.concatenate([turn.as_rotvec(), way]) / sigma, np.float64)
+
+
+def innovations(sightings: tuple[Sighting, ...]) -> InSigmas | None:
+    """Of all frames whose motion was predicted, None if there are none."""
+    told = [(s.stamp_ns, s.innovation) for s in sightings if s.innovation is not None]
+    if not told:
+        return None
+    names = tuple(f"{part} {axis}" for part in ("turn", "way") for axis in "xyz")
+    stamps = np.array([stamp for stamp, _ in told], np.int64)
+    return InSigmas(names, stamps, np.array([values for _, values in told]))
 
 
 def _coarse(pair: PatchPair, known: Float64) -> Float32:

@@ -63,6 +63,26 @@ def write_trajectory(trajectory: Trajectory, target: Path) -> None:
             file.write(f"{format_seconds(frame.stamp_ns)} {' '.join(f'{n:.9f}' for n in numbers)}\n")
 
 
+def write_relative(trajectory: Trajectory, target: Path) -> None:
+    """CSV, a row for each frame but the first: its pose in the body's axes of the frame before, x y z (m) and
+    quaternion, and the upper triangle of its covariance row by row (rotation in rad, then translation in m,
+    of a small motion that follows it); nan where it isn't known.
+    """
+    detail = trajectory.detail
+    if detail is None or detail.relative is None:
+        return
+    upper = np.triu_indices(6)
+    names = ",".join(f"c{i}{j}" for i, j in zip(*upper, strict=True))
+    with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
+        file.write(f"#from [ns],to [ns],x [m],y [m],z [m],qx,qy,qz,qw,{names}\n")
+        pairs = zip(trajectory.frames, trajectory.frames[1:], detail.relative.covariance, strict=False)
+        for old, new, covariance in pairs:
+            moved = old.reference_from_body.inverse() @ new.reference_from_body
+            pose = ",".join(f"{n:.9f}" for n in (*moved.translation, *moved.quaternion_xyzw))
+            spread = ",".join(f"{n:.6e}" for n in covariance[upper])
+            file.write(f"{old.stamp_ns},{new.stamp_ns},{pose},{spread}\n")
+
+
 def write_cloud(surface: Surface, target: Path) -> None:
     """Binary little-endian PLY of every height that enough views support."""
     count = sum(len(part.views) for part in surface.cloud())

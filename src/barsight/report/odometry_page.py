@@ -70,7 +70,8 @@ def odometry_summary(result: OdometryResult) -> dict[str, Any]:
         for k, frame in enumerate(frames):
             frame |= {name: rows[k] for name, rows in columns.items()}
     parts = {} if detail is None else {
-        "pictures": detail.pictures, "imu": detail.imu, "encoders": detail.encoders
+        "pictures": detail.pictures, "imu": detail.imu, "encoders": detail.encoders,
+        "innovations": detail.innovations,
     }  # fmt: skip
     example = result.example
     return {
@@ -177,7 +178,24 @@ def _in_sigmas(result: OdometryResult) -> list[Plot]:
     ):
         if part is not None and part.stamp_ns.size:
             plots.append(_sensor(name, part, caption, result.trajectory))
+    if detail.innovations is not None:
+        plots.append(_innovations(detail.innovations, result.trajectory))
     return plots
+
+
+def _innovations(part: InSigmas, trajectory: Trajectory) -> Plot:
+    """With the band in which 99.7 % lie where the prediction's sigma is right."""
+    time = _seconds(part.stamp_ns, trajectory)
+    traces = [_line(label, time, part.values[:, k], k) for k, label in enumerate(part.names)]
+    for side in (-3.0, 3.0):
+        edge = _line("3 sigma", time[[0, -1]], np.full(2, side), 0)
+        edge |= {"mode": "lines", "line": {"color": "gray", "dash": "dash", "width": 1}}
+        traces.append({**edge, "showlegend": False, "hoverinfo": "skip"})
+    caption = (
+        "Each frame's turn and way since the one before, as pictures find it, minus what gyro and encoders "
+        "predicted, over the sigma of both; in the left camera's axes. Dashed: 3 sigma."
+    )
+    return _over_time("innovations-step", "sigma", traces, caption)
 
 
 def _sensor(name: str, part: InSigmas, caption: str, trajectory: Trajectory) -> Plot:
