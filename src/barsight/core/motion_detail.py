@@ -48,7 +48,7 @@ class MotionDetail:
     """inertial: None without IMU. pictures: u, v and right u of each frame, RMS over its points; imu: turn,
     way and speed between neighbours, RMS over the axes; encoders: x, y, z of each place, those left out
     included. points: (F, 2) of each frame of `pictures`: used, and refused as ambiguous. innovations: turn
-    and way of `rect0` since the frame before, as pictures find them, against what the other sensors predicted.
+    and way of `rect0` since the frame before, as pictures find them, against what other sensors predicted.
     """
 
     inertial: Inertial | None
