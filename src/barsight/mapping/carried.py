@@ -36,19 +36,23 @@ def carried_along(
     shift = disparity_px[first::_SHRINK, first::_SHRINK][: here.shape[0], : here.shape[1]] + camera.doffs_px
     matched = np.isfinite(shift) & (shift > 0)
     depth = camera.focal_px * camera.baseline_m / np.where(matched, shift, np.inf).clip(1e-3, None)
-    rows, columns = np.indices(depth.shape)
-    u, v = ((_SHRINK * at + (_SHRINK - 1) / 2) for at in (columns, rows))
-    rays = np.dstack([(u - camera.cx_px) / camera.focal_px, (v - camera.cy_px) / camera.focal_px])
-    points = neighbour_from_here.apply(np.dstack([rays * depth[..., None], depth]))
-    ahead = matched & (points[..., 2] > 1e-3)
-    at = camera.focal_px * points[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None]
-    at += (camera.cx_px, camera.cy_px)
-    way = np.hypot(at[..., 0] - u, at[..., 1] - v)
-    place = ((at + 0.5) / _SHRINK - 0.5).astype(np.float32)
+    v, u = (
+        np.float32(_SHRINK) * np.arange(size, dtype=np.float32) + (_SHRINK - 1) / 2 for size in here.shape
+    )
+    x, y = (u[None] - camera.cx_px) / camera.focal_px, (v[:, None] - camera.cy_px) / camera.focal_px
+    turn, way_m = neighbour_from_here.rotation.astype(np.float32), neighbour_from_here.translation
+    there_x, there_y, there_z = (
+        (turn[k, 0] * x + turn[k, 1] * y + turn[k, 2]) * depth + np.float32(way_m[k]) for k in range(3)
+    )
+    ahead = matched & (there_z > 1e-3)
+    scale = camera.focal_px / np.where(ahead, there_z, 1.0)
+    at_x, at_y = scale * there_x + camera.cx_px, scale * there_y + camera.cy_px
+    way = np.hypot(at_x - u[None], at_y - v[:, None])
+    place_x, place_y = (((at + 0.5) / _SHRINK - 0.5).astype(np.float32) for at in (at_x, at_y))
     # Near the border the wide mean is another picture's.
     known = np.full(here.shape, np.nan, np.float32)
     known[_SMOOTH // 2 : -(_SMOOTH // 2), _SMOOTH // 2 : -(_SMOOTH // 2)] = 0.0
-    moved = cv2.remap(there + known, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=float("nan"))
+    moved = cv2.remap(there + known, place_x, place_y, cv2.INTER_LINEAR, borderValue=float("nan"))
     by_motion = _difference(here, np.asarray(np.where(np.isnan(moved + known), here, moved), np.float32))
     still = np.full(here.shape, np.inf, np.float32)
     edge = cv2.copyMakeBorder(there, _SWING, _SWING, _SWING, _SWING, cv2.BORDER_REPLICATE)
