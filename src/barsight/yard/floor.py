@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from barsight.core.arrays import Float32
 from barsight.core.types import Source
 from barsight.yard.types import HeightMap
 
@@ -11,6 +12,7 @@ _BLOCK_M = 0.3
 _FLAT_M = 0.012
 _LEVEL_M = 0.03
 _KNOWN_SHARE = 0.6
+_STRIP_BLOCKS = 64
 
 
 def find_floor(height_map: HeightMap) -> float | None:
@@ -22,18 +24,25 @@ def find_floor(height_map: HeightMap) -> float | None:
     rows, columns = (n // block for n in height_map.z_m.shape)
     if rows == 0 or columns == 0:
         return None
-    z = np.where(height_map.source == Source.VISION, height_map.z_m, np.nan)
-    cut = z[: rows * block, : columns * block].reshape(rows, block, columns, block)
-    blocks = cut.transpose(0, 2, 1, 3).reshape(rows * columns, -1)
-    known = np.isfinite(blocks).sum(axis=1)
-    enough = known >= _KNOWN_SHARE * blocks.shape[1]
-    if not enough.any():
-        return None
-    ordered, last = np.sort(blocks[enough], axis=1), known[enough] - 1  # NaN last
-    low, middle, high = (
-        ordered[np.arange(last.size), np.rint(q * last).astype(int)] for q in (0.1, 0.5, 0.9)
-    )
-    level = np.sort(middle[high - low < 2 * _FLAT_M])
+    strips = [
+        _levels(height_map, block, rows, first, min(first + _STRIP_BLOCKS, columns))
+        for first in range(0, columns, _STRIP_BLOCKS)
+    ]
+    level = np.sort(np.concatenate(strips))
     if level.size == 0:
         return None
     return float(np.median(level[level < level[max(level.size // 50, 0)] + _LEVEL_M]))
+
+
+def _levels(height_map: HeightMap, block: int, rows: int, first: int, last: int) -> Float32:
+    """The heights of those blocks, between the columns of blocks first and last, that are level."""
+    part = np.s_[: rows * block, first * block : last * block]
+    z = np.where(height_map.source[part] == Source.VISION, height_map.z_m[part], np.nan)
+    cut = z.reshape(rows, block, last - first, block)
+    blocks = cut.transpose(0, 2, 1, 3).reshape(rows * (last - first), -1)
+    known = np.isfinite(blocks).sum(axis=1)
+    enough = known >= _KNOWN_SHARE * blocks.shape[1]
+    ordered, at = np.sort(blocks[enough], axis=1), known[enough] - 1  # NaN last
+    low, middle, high = (ordered[np.arange(at.size), np.rint(q * at).astype(int)] for q in (0.1, 0.5, 0.9))
+    level: Float32 = middle[high - low < 2 * _FLAT_M]
+    return level

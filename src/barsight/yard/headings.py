@@ -12,6 +12,7 @@ from barsight.yard.types import HeightMap
 _BLOCK_M = 0.3
 _COHERENT = 0.5
 _STEEPEST = 1.5
+_STRIP_BLOCKS = 64
 _LEAST_SHARE = 0.02
 _LEAST_RELIEF = 0.15
 """Of the mean squared slope where most of the relief is: what a block needs to count."""
@@ -23,22 +24,15 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
     Bars slope across their axis only: the structure tensor of each block of 0.3 m says which way, and how
     clearly [Bigun 1987]. A heading within `apart_deg` of an axis of the map is that axis.
     """
-    z = np.where(height_map.source == Source.VISION, height_map.z_m, np.nan)
-    cell = height_map.cell_m
-    block = max(round(_BLOCK_M / cell), 1)
-    rows, columns = z.shape[0] // block, z.shape[1] // block
-    if rows < 1 or columns < 1 or min(z.shape) < 3:
+    block = max(round(_BLOCK_M / height_map.cell_m), 1)
+    rows, columns = (n // block for n in height_map.z_m.shape)
+    if rows < 1 or columns < 1 or min(height_map.z_m.shape) < 3:
         return (0.0,)
-    gy, gx = np.gradient(z.astype(np.float64), cell)
-    usable = np.isfinite(gx) & np.isfinite(gy) & (np.hypot(gx, gy) < _STEEPEST)
-    gx, gy = np.where(usable, gx, 0.0), np.where(usable, gy, 0.0)
-
-    def blocks(values: Float64) -> Float64:
-        part = values[: rows * block, : columns * block].reshape(rows, block, columns, block)
-        summed: Float64 = part.sum(axis=(1, 3))
-        return summed
-
-    even, odd, energy = blocks(gx * gx - gy * gy), blocks(2 * gx * gy), blocks(gx * gx + gy * gy)
+    strips = [
+        _slopes(height_map, block, rows, first, min(first + _STRIP_BLOCKS, columns))
+        for first in range(0, columns, _STRIP_BLOCKS)
+    ]
+    even, odd, energy = np.concatenate(strips, axis=2)
     # The ripples of a flat floor run as the pictures do, not as the bars: they have little relief.
     usual = float((energy**2).sum() / max(energy.sum(), 1e-12))
     clear = np.hypot(even, odd) > _COHERENT * np.maximum(energy, 1e-12)
@@ -60,6 +54,21 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
         if all(abs((heading - other + 90) % 180 - 90) > apart_deg for other in found):
             found.append(heading)
     return tuple(float(np.radians(h)) for h in found) or (0.0,)
+
+
+def _slopes(height_map: HeightMap, block: int, rows: int, first: int, last: int) -> Float64:
+    """(3, rows, last - first): structure tensor of those blocks, as the difference of both axes' squared
+    slopes, twice their product and their sum. By strips: a long yard's slopes are many times its map."""
+    low, high = max(first * block - 1, 0), min(last * block + 1, height_map.z_m.shape[1])
+    seen = height_map.source[:, low:high] == Source.VISION
+    z = np.where(seen, height_map.z_m[:, low:high], np.nan).astype(np.float64)
+    gy, gx = np.gradient(z, height_map.cell_m)
+    usable = np.isfinite(gx) & np.isfinite(gy) & (np.hypot(gx, gy) < _STEEPEST)
+    inner = np.s_[: rows * block, first * block - low : last * block - low]
+    gx, gy = np.where(usable, gx, 0.0)[inner], np.where(usable, gy, 0.0)[inner]
+    parts = np.stack([gx * gx - gy * gy, 2 * gx * gy, gx * gx + gy * gy])
+    summed: Float64 = parts.reshape(3, rows, block, last - first, block).sum(axis=(2, 4))
+    return summed
 
 
 def _snapped(heading_deg: float, apart_deg: float) -> float:

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64
+from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.types import Source
 from barsight.yard.types import HeightMap
+
+_VISION = Source.VISION
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,25 +39,41 @@ class Sheet:
 
 def turn(height_map: HeightMap, heading_rad: float, stock_over_m: float = -np.inf) -> Sheet:
     """The map's measured heights in a frame whose v axis is (-sin heading, cos heading); nearest cells."""
-    measured = height_map.source == Source.VISION
-    z = np.where(measured, height_map.z_m, np.float32(np.nan)).astype(np.float32)
-    sigma = np.where(measured, height_map.sigma_m, np.float32(np.nan)).astype(np.float32)
     cell = height_map.cell_m
     if heading_rad == 0.0:
+        measured = height_map.source == Source.VISION
+        z = np.where(measured, height_map.z_m, np.float32(np.nan))
+        sigma = np.where(measured, height_map.sigma_m, np.float32(np.nan))
         return Sheet(0.0, height_map.x0_m, height_map.y0_m, cell, z, sigma, stock_over_m)
-    rows, columns = z.shape
+    rows, columns = height_map.z_m.shape
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     x = height_map.x0_m + cell * np.array([0, columns - 1, 0, columns - 1])
     y = height_map.y0_m + cell * np.array([0, 0, rows - 1, rows - 1])
     u, v = c * x + s * y, -s * x + c * y
     width, height = (round(float(np.ptp(a)) / cell) + 1 for a in (u, v))
-    uu, vv = np.meshgrid(u.min() + cell * np.arange(width), v.min() + cell * np.arange(height))
-    column = np.rint((c * uu - s * vv - height_map.x0_m) / cell).astype(np.int32)
-    row = np.rint((s * uu + c * vv - height_map.y0_m) / cell).astype(np.int32)
-    inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-    column, row = column * inside, row * inside
-    nan = np.float32(np.nan)
-    return Sheet(
-        heading_rad, float(u.min()), float(v.min()), cell,
-        np.where(inside, z[row, column], nan), np.where(inside, sigma[row, column], nan), stock_over_m,
-    )  # fmt: skip
+    z, sigma = np.full((2, height, width), np.nan, np.float32)
+    # From cell (row, column) of the sheet to that of the map, about both first cells.
+    first_x, first_y = c * u.min() - s * v.min(), s * u.min() + c * v.min()
+    first = np.array([(first_x - height_map.x0_m) / cell, (first_y - height_map.y0_m) / cell])
+    _turned(height_map.z_m, height_map.sigma_m, height_map.source, first, float(c), float(s), z, sigma)
+    return Sheet(heading_rad, float(u.min()), float(v.min()), cell, z, sigma, stock_over_m)
+
+
+@kernel()
+def _turned(
+    z: Float32,
+    sigma: Float32,
+    source: UInt8,
+    first: Float64,
+    cosine: float,
+    sine: float,
+    z_turned: Float32,
+    sigma_turned: Float32,
+) -> None:
+    """Fill in, cell by cell, what was measured: whole arrays of places would be ten times the map."""
+    for i in range(z_turned.shape[0]):
+        for j in range(z_turned.shape[1]):
+            column = int(np.rint(first[0] + cosine * j - sine * i))
+            row = int(np.rint(first[1] + sine * j + cosine * i))
+            if 0 <= row < z.shape[0] and 0 <= column < z.shape[1] and source[row, column] == _VISION:
+                z_turned[i, j], sigma_turned[i, j] = z[row, column], sigma[row, column]
