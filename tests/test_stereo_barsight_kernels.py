@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from barsight.core.errors import ConfigError
 from barsight.stereo.confidence import bend_around, beside_edges, start_disagreement
-from barsight.stereo.consistency import agrees, without_islands
+from barsight.stereo.consistency import agrees, lands_on, without_islands
 from barsight.stereo.curvature import curvature_row
 from barsight.stereo.edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
 from barsight.stereo.filling import fill
@@ -236,6 +236,11 @@ def test_left_right_check_and_islands() -> None:
     assert not same[:, :3].any()
     assert not same[2, 8]
     assert same[:, 3:].sum() == 8 * 17 - 1
+    valid = np.ones((8, 20), dtype=bool)
+    valid[1, 0], valid[2, 5] = False, False
+    landed = lands_on(valid, left)
+    assert not landed[1, :4].any() and not landed[2, 8]
+    assert landed.sum() == 8 * 20 - 5
     left[4:6, 10:12] = 9
     cleaned = without_islands(left, 10, 1.0)
     assert np.isnan(cleaned[4:6, 10:12]).all()

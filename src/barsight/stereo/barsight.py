@@ -11,11 +11,11 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.confidence import bend_around, beside_edges, start_disagreement, vertical_error_px
-from barsight.stereo.consistency import agrees, without_islands
+from barsight.stereo.consistency import agrees, lands_on, without_islands
 from barsight.stereo.edges import sharpen_edges
 from barsight.stereo.filling import fill, with_row_holes_filled
 from barsight.stereo.refinement import Refined, RefinementSettings, refine
@@ -137,7 +137,7 @@ class BarsightStereo:
             return self._start_at_half_size(pair, candidates)
         found = match(pair.left, pair.right, candidates.lowest_px, candidates.count, settings.semiglobal)
         believed = agrees(found.left_px, found.right_px, settings.consistency_px) & pair.left_valid
-        believed &= _lands_on(pair.right_valid, found.left_px)
+        believed &= lands_on(pair.right_valid, found.left_px)
         left_px = np.where(believed, found.left_px, _NAN)
         return _Start(without_islands(left_px, settings.island_px, 1.0), found.right_px)
 
@@ -152,7 +152,7 @@ class BarsightStereo:
         left_px = np.where(believed, found.left_px, _NAN)
         left_px = _doubled(without_islands(left_px, settings.island_px // 4, 1.0), shape)
         believed = pair.left_valid & np.isfinite(left_px)
-        believed &= _lands_on(pair.right_valid, np.where(believed, left_px, np.float32(0)))
+        believed &= lands_on(pair.right_valid, np.where(believed, left_px, np.float32(0)))
         return _Start(np.where(believed, left_px, _NAN), _doubled(found.right_px, shape))
 
 
@@ -178,13 +178,6 @@ def _contrast(image: UInt8) -> float:
 def _inside(candidates: DisparityRange, width: int) -> DisparityRange:
     lowest = min(max(candidates.lowest_px, -width), width - 1)
     return DisparityRange(lowest, max(min(candidates.highest_px, width), lowest + 1))
-
-
-def _lands_on(valid: Bool, disparity: Float32) -> Bool:
-    width = disparity.shape[1]
-    column = np.rint(np.arange(width, dtype=np.float32)[None, :] - disparity).astype(np.int32)
-    landed: Bool = np.take_along_axis(valid, column.clip(0, width - 1), axis=1)
-    return landed
 
 
 def _with_sharp_edges(disparity: Float32, sigma: Float32, pair: RectifiedPair) -> tuple[Float32, Float32]:

@@ -5,21 +5,46 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32
+from barsight.core.arrays import Bool, Float32, kernel
 
 _STEPS = 16
 _NONE = -32768
 
 
 def agrees(left_px: Float32, right_px: Float32, tolerance_px: float) -> Bool:
-    """(H, W) bool: where the right image's disparity at the match is the same within the tolerance."""
-    width = left_px.shape[1]
-    landing = np.arange(width, dtype=np.float32)[None, :] - left_px
-    column = np.rint(landing).astype(np.int32)
-    inside = (column >= 0) & (column < width)
-    there = np.take_along_axis(right_px, column.clip(0, width - 1), axis=1)
-    same: Bool = inside & (np.abs(there - left_px) <= tolerance_px)
+    """(H, W) bool: where the right image's disparity at the match is the same within the tolerance.
+
+    No NaN in left_px.
+    """
+    same = np.empty(left_px.shape, dtype=np.bool_)
+    _agree(left_px, right_px, np.float32(tolerance_px), same)
     return same
+
+
+def lands_on(valid: Bool, disparity: Float32) -> Bool:
+    """(H, W) bool: where the match, or the border's pixel beside it, is valid in the right image. No NaN."""
+    landed = np.empty(valid.shape, dtype=np.bool_)
+    _land(valid, disparity, landed)
+    return landed
+
+
+@kernel()
+def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Bool) -> None:
+    height, width = left_px.shape
+    for y in range(height):
+        for x in range(width):
+            column = np.int32(np.rint(np.float32(x) - left_px[y, x]))
+            is_inside = column >= 0 and column < width
+            same[y, x] = is_inside and abs(right_px[y, column] - left_px[y, x]) <= tolerance
+
+
+@kernel()
+def _land(valid: Bool, disparity: Float32, landed: Bool) -> None:
+    height, width = valid.shape
+    for y in range(height):
+        for x in range(width):
+            column = np.int32(np.rint(np.float32(x) - disparity[y, x]))
+            landed[y, x] = valid[y, min(max(column, 0), width - 1)]
 
 
 def without_islands(disparity: Float32, least_size_px: int, step_px: float) -> Float32:
