@@ -66,3 +66,13 @@ def test_the_live_estimate_is_timed(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert 0.2 < bench["nees"] < 3
     assert len(bench["wall_ms"]) == len(bench["grown_mib"]) == 10
     assert bench["grown_mib"][-1] - bench["grown_mib"][2] < 20
+
+
+def test_the_front_end_is_timed(data: Path, tmp_path: Path) -> None:
+    saved = tmp_path / "front_end.json"
+    still = str(data / "euroc_v101_still")
+    assert run(["bench", "front-end", still, "--repeats", "1", "--json", str(saved)]) == 0
+    (row,) = json.loads(saved.read_text())["rows"]
+    assert row["predicted_by"] == "pictures" and row["pairs"] == 10 and row["refused"] == 0
+    assert row["points"] > 300
+    assert 0 < row["time"]["median_ms"] < 5000 and row["cpu_ms"] > 1

@@ -106,3 +106,16 @@ def test_the_kernel_agrees_with_a_slow_reference() -> None:
     assert len(checked) > 30
     expected = np.array([slowly(source, target, places[k]) for k in checked])
     np.testing.assert_allclose(again.pixels[checked], expected, atol=0.01)
+
+
+def test_a_middle_that_doesnt_fix_its_own_place_isnt_found() -> None:
+    """A plain beam, alike all along, over a floor that moves: only the rim of a patch shows it."""
+    v = np.arange(240.0)[:, None]
+    beam = np.abs(v - 120) < 6
+    shade = 128 + 40 * np.sin(0.8 * v)
+    source, target = (quantised(np.where(beam, shade, moved(dx, 0))) for dx in (0, 2))
+    x = np.arange(20.0, 300, 7)
+    for row, on_beam in ((118.0, True), (122.0, True), (104.0, False)):
+        places = np.column_stack([x, np.full(x.size, row)])
+        again = locate(patch_image(source), patch_image(target), places, places + np.array([1.0, 0]))
+        assert again.found.mean() < 0.1 if on_beam else again.found.mean() > 0.95

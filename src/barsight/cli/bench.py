@@ -48,6 +48,7 @@ def run(arguments: Sequence[str]) -> None:
         "lifts": bench_lift_targets,
         "features": bench_matching.features,
         "matching": bench_matching.matching,
+        "front-end": bench_matching.front_end,
         "live": bench_live_estimate,
         "length": bench_length,
     }

@@ -1,4 +1,4 @@
-"""`barsight bench features|matching`: detectors and filters against true poses and depth."""
+"""`barsight bench features|matching|front-end`: detectors and filters against truth, and their speed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from barsight.evaluation.front_end_speed import bench_front_end, front_end_table
 from barsight.evaluation.matching_bench import bench_features, bench_matching, feature_table, match_table
 from barsight.evaluation.stereo_provenance import write_json
 from barsight.features.detectors import DETECTORS, DetectorName
@@ -53,5 +54,21 @@ def matching(
     """
     bench = bench_matching(recordings, detectors, count)
     Console().print(match_table(bench))
+    if save is not None:
+        write_json(save, bench)
+
+
+def front_end(
+    recordings: tyro.conf.Positional[tuple[Path, ...]], repeats: int = 3, save: Json = None
+) -> None:
+    """Pairs a second from stored pictures to followed points, with and without the other sensors.
+
+    Args:
+        recordings: Any recordings.
+        repeats: Runs after one that compiles; times are medians and ranges.
+        save: JSON file for all figures, with commit and machine.
+    """
+    bench = bench_front_end(recordings, repeats)
+    Console().print(front_end_table(bench))
     if save is not None:
         write_json(save, bench)

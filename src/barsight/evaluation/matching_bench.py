@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.table import Table
+from scipy.spatial import cKDTree
 
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.core.errors import Failed, InputError
@@ -22,6 +23,7 @@ from barsight.evaluation.matching_truth import TrueStep, reprojected, true_steps
 from barsight.evaluation.stereo_provenance import Provenance, Timing, provenance, timed, timing
 from barsight.features.detectors import DETECTORS, DetectorName, Keypoints, make_detector
 from barsight.features.guided import (
+    PredictedMotion,
     match_across,
     match_left,
     predict_places,
@@ -29,6 +31,7 @@ from barsight.features.guided import (
 )
 from barsight.features.matching import follows_trend, is_mutual, nearest, on_one_plane, passes_ratio
 from barsight.features.patches import PatchPair
+from barsight.features.repeat import repeat_px
 from barsight.features.tracks import Tracks
 from barsight.inertial.model import GRAVITY_MPS2, ORDINARY_NOISE, BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrator
@@ -40,6 +43,9 @@ from barsight.stereo.disparity_range import coarse_disparity
 TRUE_PX = 2.0
 TREND_PX = 5.0
 """How near a match must be to the paper's motion trend."""
+NEIGHBOURS = 5
+GUESSED_PX = 2.0
+"""How far a disparity taken from neighbours that agree may be off (1 sigma)."""
 
 
 @dataclass(frozen=True)
@@ -228,12 +234,30 @@ def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple
         return kept, found
     kept[index[agreed[0]]] = True
     found[index] = agreed[1].stereo[:, :2]
-    points, sigma_px = triangulate(stereo[index], step.rectifier.camera), settings.tracks.sigma_px
-    predicted = predict_places(points, sigma_px, agreed[2], step.rectifier.camera)
-    alone, seen = match_left(step.old.left, stereo[index, :2], depth, step.new, predicted, sigma_px)
-    kept[index[seen]] = True
-    found[index[seen]] = alone[seen]
+    _alone(step, stereo, known, agreed[2], kept, found)
     return kept, found
+
+
+def _alone(
+    step: TrueStep, stereo: Float64, known: Bool, motion: PredictedMotion, kept: Bool, found: Float64
+) -> None:
+    """Adds to `kept` and `found` what only the left pictures show: features without a partner in the new
+    right picture, and those that had none in the old one, at the depth on which their neighbours agree.
+    """
+    camera, sigma_px = step.rectifier.camera, FrontEndSettings().tracks.sigma_px
+    nearest_known = cKDTree(stereo[known, :2]).query(stereo[:, :2], k=NEIGHBOURS)[1]
+    around = (stereo[known, 0] - stereo[known, 2])[nearest_known]
+    disparity = np.where(known, stereo[:, 0] - stereo[:, 2], np.median(around, axis=1))
+    points = triangulate(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
+    sigmas = np.where(known[:, None], sigma_px, [sigma_px, sigma_px, GUESSED_PX])
+    predicted = predict_places(points, sigmas, motion, camera)
+    repeats = repeat_px(step.old.pair.left, stereo[:, :2])
+    pixels, seen = match_left(
+        step.old.left, stereo[:, :2], points[:, 2], step.new, predicted, sigma_px, repeats
+    )
+    seen &= ~kept & (known | (np.ptp(around, axis=1) < GUESSED_PX))
+    kept |= seen
+    found[seen] = pixels[seen]
 
 
 def feature_table(bench: MatchingBench) -> Table:

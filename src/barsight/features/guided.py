@@ -17,8 +17,8 @@ from barsight.features.patches import Located, PatchImage, PatchPair, locate
 
 GATE_SIGMAS = 4.0
 MOST_OFF_ROW_PX = 1.0
-MARGIN_PX = 12.0
-"""Nearer to its border a picture doesn't show a patch whole."""
+MARGIN_PX = 8.0
+"""Nearer to its border a picture doesn't show a patch whole with what its spline needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +91,13 @@ def stereo_jacobian(points: Float64, camera: RectifiedCamera) -> Float64:
 
 def predict_places(
     points: Float64,
-    sigma_px: float,
+    sigma_px: float | Float64,
     motion: PredictedMotion,
     camera: RectifiedCamera,
-    margin_px: float = MARGIN_PX,
 ) -> Predicted:
-    """points: (N, 3) in the old `rect0`, seen there with `sigma_px` in u, v and right u."""
+    """points: (N, 3) in the old `rect0`, seen there with `sigma_px`, one for all or (N, 3), in u, v and
+    right u.
+    """
     moved = points @ motion.rotation.T + motion.translation
     stereo = project_stereo(moved, camera)
     safe = np.where(np.isfinite(stereo[:, :1]), moved, [0.0, 0.0, 1.0])
@@ -104,11 +105,12 @@ def predict_places(
     by_motion = np.concatenate([by_point @ -skew(safe), by_point], axis=2)
     covariance = by_motion @ motion.covariance @ by_motion.transpose(0, 2, 1)
     old = by_point @ motion.rotation @ np.linalg.inv(stereo_jacobian(points, camera))
-    covariance += sigma_px**2 * (old @ old.transpose(0, 2, 1))
+    variance = np.broadcast_to(np.square(sigma_px), (len(points), 3))
+    covariance += (old * variance[:, None, :]) @ old.transpose(0, 2, 1)
     with np.errstate(invalid="ignore"):
-        inside: Bool = (stereo[:, [0, 2]] > margin_px).all(1) & (stereo[:, 1] > margin_px)
-        inside &= (stereo[:, [0, 2]] < camera.width - margin_px).all(1)
-        inside &= stereo[:, 1] < camera.height - margin_px
+        inside: Bool = (stereo[:, [0, 2]] > MARGIN_PX).all(1) & (stereo[:, 1] > MARGIN_PX)
+        inside &= (stereo[:, [0, 2]] < camera.width - MARGIN_PX).all(1)
+        inside &= stereo[:, 1] < camera.height - MARGIN_PX
     return Predicted(stereo, covariance, inside)
 
 
@@ -148,16 +150,16 @@ def match_guided(
 
 def match_left(
     source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: Predicted,
-    sigma_px: float,
+    sigma_px: float, repeat_px: Float64,
 ) -> tuple[Float64, Bool]:  # fmt: skip
-    """(N, 2) and (N,): the patches that the left picture of `pair` shows and the right one doesn't.
+    """(N, 2) and (N,): patches that only the left picture of `pair` shows, and which are found.
 
     As `match_guided`, but for a prediction that consensus has checked already: one picture alone doesn't
     check the depth.
     """
     camera, guess = pair.pair.camera, predicted.stereo
     with np.errstate(invalid="ignore"):
-        shown = ~predicted.inside & (guess[:, :2] > MARGIN_PX).all(axis=1)
+        shown = (guess[:, :2] > MARGIN_PX).all(axis=1) & (2 * predicted.reach_px < repeat_px / 4)
         shown &= (guess[:, :2] < np.array([camera.width, camera.height]) - MARGIN_PX).all(axis=1)
     pixels, found = np.full((len(places), 2), np.nan), np.zeros(len(places), np.bool_)
     tried = np.flatnonzero(shown)

@@ -27,6 +27,10 @@ COARSE_REACH_PX = 6.0
 """How far from its guess the half-size picture may take a patch, full px."""
 FINE_REACH_PX = 2.5
 LEAST_LIKENESS = 0.7
+CORE_PX, LEAST_CORE_LIKENESS = 2, -0.5
+MIDDLE_PX, MOST_MIDDLE_SIGMA_PX = 3, 0.4
+"""The innermost pixels must be alike and the middle fix its own place: else it was the rim that has matched,
+and the rim may belong to another surface."""
 LEAST_CONTRAST_DN = 1.0
 _SIZE = 2 * HALF_PX + 1
 _POLE = 3.0**0.5 - 2.0
@@ -54,7 +58,7 @@ class PatchPair:
 class Located:
     """pixels: (N, 2) x, y in the target. sigma_px: (N,) of x and y each, from the patch's own misfit, along
     its weaker direction. likeness: (N,) share of the patch's variance that the other patch explains.
-    found: (N,) whether it settled near its guess and is alike.
+    found: (N,) whether it settled near its guess and is alike, also in its middle.
     """
 
     pixels: Float64
@@ -222,17 +226,37 @@ def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
 
 
 @kernel(fastmath=True)
-def _misfit(other: Float32, design: Float32, step: Float64) -> tuple[float, float]:
-    """Sums of squares over the patch: what the step leaves, and the other patch about its mean."""
-    mean = other.sum() / np.float32(_SIZE * _SIZE)
-    left, spread = np.float32(0), np.float32(0)
+def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[float, float]:
+    """Sums of squares over the middle (2 half + 1)^2 of the patch: what the step leaves, and the other patch
+    about its mean there.
+    """
     a, b, c, d = np.float32(step[0]), np.float32(step[1]), np.float32(step[2]), np.float32(step[3])
-    for k in range(_SIZE * _SIZE):
-        off = other[k] - design[4, k]
-        off -= a * design[0, k] + b * design[1, k] + c * design[2, k] + d
-        left += off * off
-        spread += (other[k] - mean) * (other[k] - mean)
-    return float(left), float(spread)
+    left, mean, square = np.float32(0), np.float32(0), np.float32(0)
+    first = other[_SIZE * _SIZE // 2]
+    for i in range(HALF_PX - half, HALF_PX + half + 1):
+        for k in range(i * _SIZE + HALF_PX - half, i * _SIZE + HALF_PX + half + 1):
+            off = other[k] - design[4, k]
+            off -= a * design[0, k] + b * design[1, k] + c * design[2, k] + d
+            left += off * off
+            mean += other[k] - first
+            square += (other[k] - first) * (other[k] - first)
+    return float(left), float(square - mean * mean / np.float32((2 * half + 1) ** 2))
+
+
+@kernel(fastmath=True)
+def _middle_holds(other: Float32, design: Float32, step: Float64, variance: float) -> bool:
+    """Whether the patch's middle alone is found at that place; variance: DN^2 of a pixel's noise."""
+    left, spread = _misfit(other, design, step, CORE_PX)
+    if 1 - left / max(spread, 1e-9) < LEAST_CORE_LIKENESS:
+        return False
+    along, both, down = 0.0, 0.0, 0.0
+    for i in range(HALF_PX - MIDDLE_PX, HALF_PX + MIDDLE_PX + 1):
+        for k in range(i * _SIZE + HALF_PX - MIDDLE_PX, i * _SIZE + HALF_PX + MIDDLE_PX + 1):
+            along += design[0, k] * design[0, k]
+            both += design[0, k] * design[1, k]
+            down += design[1, k] * design[1, k]
+    weaker = (along + down) / 2 - np.sqrt(((along - down) / 2) ** 2 + both * both)
+    return bool(variance < MOST_MIDDLE_SIGMA_PX**2 * weaker)
 
 
 @kernel()
@@ -276,8 +300,10 @@ def _locate(
                 break
         if not settled:
             continue
-        left, spread = _misfit(flat, design, step)
+        left, spread = _misfit(flat, design, step, HALF_PX)
         variance = left / (_SIZE * _SIZE - 4)
+        if not _middle_holds(flat, design, step, variance):
+            continue
         middle = variance * (inverse[0, 0] + inverse[1, 1]) / 2
         swing = np.sqrt(((inverse[0, 0] - inverse[1, 1]) / 2) ** 2 + inverse[0, 1] ** 2)
         sigma[n] = np.sqrt(middle + variance * swing)

@@ -73,11 +73,16 @@ def views(
         yield RefusedFrame(frame.stamp_ns, view.reason) if isinstance(view, Failed) else view
 
 
-def look(pair: PatchPair, settings: OdometrySettings) -> View | Failed:
-    """The ORB features of a pair that have a depth; Failed `no-features` where too few do."""
+def look(
+    pair: PatchPair, settings: OdometrySettings, span: tuple[float, float] | None = None
+) -> View | Failed:
+    """The ORB features of a pair that have a depth; Failed `no-features` where too few do.
+
+    span: the lowest and highest disparity to expect, px, where that is known.
+    """
     camera = pair.pair.camera
     features = detect_orb(pair.pair.left, settings.features)
-    coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px)
+    coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px, known=span, both_ways=False)
     row = (features.pixels[:, 1] * coarse.shape[0] / camera.height).astype(int)
     column = (features.pixels[:, 0] * coarse.shape[1] / camera.width).astype(int)
     guess = coarse[row, column]

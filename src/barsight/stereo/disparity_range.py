@@ -60,12 +60,13 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
 
 def coarse_disparity(
     left: UInt8, right: UInt8, doffs_px: float = 0.0, width_share: float = _USUAL_SHARE,
-    known: tuple[float, float] | None = None,
+    known: tuple[float, float] | None = None, both_ways: bool = True,
 ) -> Float32:  # fmt: skip
     """Left-right consistent disparities of a quarter-size match, else NaN, also where nothing changes.
 
     From 1 px above -doffs_px, which is infinitely far, over `width_share` of the width, and within that from
-    the lowest to the highest disparity `known` beforehand, px.
+    the lowest to the highest disparity `known` beforehand, px. Without `both_ways` the match from right to
+    left is left out, half of the time: for guesses whose places are looked for in both pictures anyhow.
     Returns (H / 4, W / 4) float32 in full-size px.
     """
     size = (max(left.shape[1] // _SCALE, 32), max(left.shape[0] // _SCALE, 32))
@@ -80,13 +81,14 @@ def coarse_disparity(
         last = min(lowest + count, int(np.ceil(known[1] / scale)))
         lowest, count = first, max(16, -(-(last - first) // 16) * 16)
     forward = _match(small_left, small_right, lowest, count)
-    # The right image's disparity: the same match with both images mirrored and exchanged.
-    backward = _match(cv2.flip(small_right, 1), cv2.flip(small_left, 1), lowest, count)[:, ::-1]
     column = np.arange(size[0], dtype=np.float32)[None, :]
     target = np.rint(column - forward).astype(np.int32)
-    inside = (forward > infinity + 1 / scale) & (target >= 0) & (target < size[0])
-    there = np.take_along_axis(backward, target.clip(0, size[0] - 1), axis=1)
-    consistent = inside & (np.abs(there - forward) <= 1)
+    consistent = (forward > infinity + 1 / scale) & (target >= 0) & (target < size[0])
+    if both_ways:
+        # The right image's disparity: the same match with both images mirrored and exchanged.
+        backward = _match(cv2.flip(small_right, 1), cv2.flip(small_left, 1), lowest, count)[:, ::-1]
+        there = np.take_along_axis(backward, target.clip(0, size[0] - 1), axis=1)
+        consistent &= np.abs(there - forward) <= 1
     consistent &= _changes(small_left)
     return np.where(consistent, forward * np.float32(scale), np.float32(np.nan))
 
