@@ -125,6 +125,7 @@ def test_bench_speed_times_methods_against_sgbm(tmp_path: Path) -> None:
     bench = bench_speed({"instant": instant}, repeats=5)
     assert bench.reference.median_ms > 20 and bench.reference.repeats == 5
     assert bench.methods[0].ratio < 0.1
+    assert bench.reference_error_px < 0.3 and 20 < bench.methods[0].median_error_px < 80
     assert speed_table(bench).row_count == 2
     write_json(tmp_path / "out.json", bench)
     assert json.loads((tmp_path / "out.json").read_text())["methods"][0]["method"] == "instant"
