@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.types import CraneSamples, ImuSamples
+from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame
 from barsight.evaluation.drift import compare
 from barsight.inertial.model import without_saturation
 from barsight.motion.crane import CraneSettings, with_seen_noise
-from barsight.motion.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.fusion import FusedTrajectory, FusionSettings, _untied
 from barsight.motion.plausibility import check_crane
+from barsight.motion.sightings import Sighting
 from barsight.recording.open import open_recording
 from barsight.recording.truth import read_ground_truth
 from spoiled_recording import SpoiledRecording, frozen_between, late, with_outliers
@@ -109,3 +110,13 @@ def test_frozen_encoders_dont_pull(data: Path) -> None:
     assert mm < 0.95
     assert deg < 0.02
     assert any("frozen from 8" in warning for warning in warnings)
+
+
+def test_pictures_that_dont_follow_from_each_other_are_told() -> None:
+    """Where encoders place every frame, nothing else would say that no picture was of use."""
+    none = np.empty(0, np.int64)
+    seen = tuple(Sighting(k, none, np.empty((0, 3)), np.empty(0), None, 0) for k in range(4))
+    assert _untied(seen[:1], ()) == ()
+    (warning,) = _untied(seen, (RefusedFrame(9, "no texture"),))
+    assert warning.startswith("the pictures of 4 of 5 frames can't be tied")
+    assert "different times" in warning

@@ -99,7 +99,8 @@ class FusedTrajectory:
         except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
             simple = self._simple(recording, rectifier, inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
-            return replace(simple, warnings=(*simple.warnings, f"{reason}: estimated one by one"))
+            told = dict.fromkeys((*simple.warnings, *inputs.warnings, f"{reason}: estimated one by one"))
+            return replace(simple, warnings=tuple(told))
         placed = tuple(
             PosedFrame(int(stamp), estimate.poses[k], estimate.covariance[k])
             for stamp, k in zip(frames, nodes.frame, strict=True)
@@ -149,6 +150,8 @@ class FusedTrajectory:
         warnings = (level.warnings if level else ()) + (checked.warnings if checked else ())
         if spoiled:
             warnings += (f"{spoiled} IMU samples are at the end of their scale and were left out",)
+        if "stereo" in use and crane is not None:
+            warnings += _untied(sightings, refused)
         return _Inputs(crane, imu, sightings, refused, level, warnings)
 
     def _refuse_wrong_sensors(
@@ -252,6 +255,16 @@ def _detail(
 
 def _silent() -> None:
     """The frames were told already."""
+
+
+def _untied(sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]) -> tuple[str, ...]:
+    """The warning that pictures don't follow from each other, though encoders place their frames."""
+    count = len(refused) + sum(sighting.motion is None for sighting in sightings[1:])
+    if count == 0:
+        return ()
+    total = len(sightings) + len(refused)
+    why = ": too little texture, or left and right pictures of different times" if 2 * count > total else ""
+    return (f"the pictures of {count} of {total} frames can't be tied to those before{why}",)
 
 
 def _placed_frames(
