@@ -102,7 +102,7 @@ def test_lost_frames_wild_and_late_encoders(data: Path) -> None:
     assert mm < 0.91
     assert deg < 0.0175
     assert len(warnings) == 1
-    assert "the encoders are 40 ms late" in warnings[0] or "the encoders are 41 ms late" in warnings[0]
+    assert any(f"the encoders are {ms} ms late" in warnings[0] for ms in (39, 40, 41))
 
 
 def test_frozen_encoders_dont_pull(data: Path) -> None:
