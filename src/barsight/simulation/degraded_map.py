@@ -33,8 +33,10 @@ class Defects:
     """Alike over 10 mm across and 0.1 m along the bars."""
     long_m: float = 0.004
     """Alike over 10 mm across and 1.5 m along the bars: gloss and shading of each bar."""
-    shared_m: float = 0.002
+    shared_m: float = 0.001
     """The same over the whole map."""
+    placed_m: float = 0.0014
+    """How far the trajectory places the whole map beside itself, along X and along Y."""
     stated_m: float = 0.0045
     """The sigma that the map states."""
     window_m: tuple[float, float] = (0.005, 0.014)
@@ -62,10 +64,11 @@ def degraded_map(
     z = z + _noise(z.shape, rng, defects)
     z, seen = _flying(z, seen, rng, defects)
     seen &= ~_patches(z.shape, rng, defects.hole_share)
+    beside = rng.normal(0, defects.placed_m, 2)
     sigma = np.where(seen, defects.stated_m * rng.uniform(0.9, 1.2, z.shape), np.nan)
     return HeightMap(
-        x0_m=float(xs[0]),
-        y0_m=float(ys[0]),
+        x0_m=float(xs[0] + beside[0]),
+        y0_m=float(ys[0] + beside[1]),
         cell_m=CELL_M,
         z_m=np.where(seen, z, np.nan).astype(np.float32),
         sigma_m=sigma.astype(np.float32),

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, Int64
+from barsight.yard.bars import visible_bars
 from barsight.yard.bundle_fit import DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.outline import STEP_M, make_outline
@@ -16,7 +17,12 @@ _LOOK_M = 1.3
 _PROOF_M = 0.1
 _RAGGED_M = 0.2
 _SOME, _MOST = 0.3, 0.6
-_SEEN_SIGMA_M = 0.02
+_GROWTH_CELLS = 0.5
+"""A map grows over ends by about half a cell."""
+_SEEN_SIGMA_M = 0.012
+"""What is left where all bars end alike: a cell of growth, straps and shadows."""
+_UNEVEN_M = (-0.15, 0.2)
+_ENDS_M = 0.03
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End
 
     It is seen where, over most of the bundle's width and for 0.1 m, the surface beyond lies lower than half
     the bundle's height. The bars end unevenly, so the end is put a quarter of the way from the last row that
-    agrees to the last that lies little lower: a map also grows a little over edges.
+    agrees to the last that lies little lower, less what a map grows over ends.
     """
     row = fit.first if step < 0 else fit.last
     known, misfit = _beyond(sheet, fit, row, step, settings)
@@ -55,14 +61,38 @@ def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End
             lower += 1
             if lower * cell >= _PROOF_M:
                 spread = ragged * cell
-                return End(v + step * spread / 4, float(np.hypot(_SEEN_SIGMA_M, spread / 6)), False)
+                end = v + step * (spread / 4 - _GROWTH_CELLS * cell)
+                uneven = _unevenness(sheet, fit, row, step, settings)
+                return End(end, float(np.linalg.norm([_SEEN_SIGMA_M, spread / 6, uneven])), False)
     return End(v, float("nan"), True, "the map doesn't show what lies beyond")
+
+
+def _unevenness(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
+    """How sure the middle of the visible bars' ends is (m), from how far apart they are."""
+    first, last = (round(reach / sheet.cell_m) for reach in _UNEVEN_M)
+    rows = row + step * np.arange(first, last + 1)
+    rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
+    follows = np.abs(_over(sheet, fit, rows, settings)) < _ENDS_M
+    ends = rows.size - 1 - follows[::-1].argmax(axis=0)[follows.any(axis=0)]
+    if ends.size == 0:
+        return _RAGGED_M
+    spread = sheet.cell_m * float(np.subtract(*np.percentile(ends, [84, 16]))) / 2
+    return float(1.25 * spread / np.sqrt(max(len(visible_bars(fit)), 1)))
 
 
 def _beyond(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSettings) -> tuple[Float64, Float64]:
     """For each row beyond: the share of the outline that is known, and the median height over it."""
     rows = row + step * np.arange(1, int(_LOOK_M / sheet.cell_m) + 1)
     rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
+    over = _over(sheet, fit, rows, settings)
+    known = np.isfinite(over).mean(axis=1)
+    misfit = np.full(rows.size, np.nan)
+    misfit[known > 0] = np.nanmedian(over[known > 0], axis=1)
+    return known, misfit
+
+
+def _over(sheet: Sheet, fit: Fit, rows: Int64, settings: BundleSettings) -> Float64:
+    """(rows, N) measured heights over the outline across most of its width; NaN where unknown."""
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
@@ -73,8 +103,5 @@ def _beyond(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSetting
     columns = np.rint((u - sheet.u0_m) / sheet.cell_m).astype(int)
     inside = (columns >= 0) & (columns < sheet.z_m.shape[1])
     z = np.where(inside, sheet.z_m[rows[:, None], columns.clip(0, sheet.z_m.shape[1] - 1)], np.nan)
-    over = z - (fit.values[2] + fit.values[SLOPE_Z] * along)[:, None] - height
-    known = np.isfinite(over).mean(axis=1)
-    misfit = np.full(rows.size, np.nan)
-    misfit[known > 0] = np.nanmedian(over[known > 0], axis=1)
-    return known, misfit
+    over: Float64 = z - (fit.values[2] + fit.values[SLOPE_Z] * along)[:, None] - height
+    return over

@@ -67,12 +67,14 @@ class Shades:
 class Found:
     """A fitted outline and the sheet that its figures belong to.
 
-    shades: what the pictures show of its bars, where they settle the packing.
+    shades: what the pictures show of its bars, where they settle the packing. doubt: rings of another packing
+    that the pictures would rather have, where they don't settle it.
     """
 
     sheet: Sheet
     fit: Fit
     shades: Shades | None = None
+    doubt: int | None = None
 
 
 def refine(
@@ -124,9 +126,12 @@ def refine(
 
 
 def widened(fit: Fit, settings: BundleSettings) -> Fit:
-    """With the error of the width that the map's smoothing leaves: it moves the axis, not the top."""
+    """With the error of the width that the map's smoothing leaves: it moves the axis, not the top.
+
+    A single bar's top is half as sure: its highlight is measured as far behind as its flanks grow.
+    """
     share = settings.packing_share if fit.rings else settings.single_share
     top_m = float(np.nanmax(make_outline(fit.rings, fit.values[DIAMETER], fit.values[ROLL], 0.0).exact_m))
     change = np.zeros(6)
-    change[DIAMETER], change[Z] = share * fit.values[DIAMETER], -share * top_m
+    change[DIAMETER], change[Z] = share * fit.values[DIAMETER], -share * top_m * (1.0 if fit.rings else 0.5)
     return replace(fit, covariance=fit.covariance + np.outer(change, change))

@@ -14,6 +14,8 @@ _RIM_M = 0.008
 _STEEPEST = 4.0
 _LEAST_HEIGHTS = 30
 _STILL_M = 1e-5
+_LEAST_SCATTER = 0.04
+"""Of the stated variance."""
 
 
 class Heights(NamedTuple):
@@ -33,7 +35,7 @@ class Heights(NamedTuple):
 class Rules(NamedTuple):
     """packing: (bars, 2), see `hexagon`. free: (6,) figures that are sought. widths_m: least, most allowed.
 
-    alike: heights that err as one, at least. common_m: diameter known from elsewhere and its sigma, which
+    alike: heights that err as one. common_m: diameter known from elsewhere and its sigma, which
     is infinite where none is known.
     """
 
@@ -65,7 +67,8 @@ def fit_outline(
         normal, right, moments = _normal_equations(heights, values, tables, rules.gate_m, rules.placing_m)
         if moments[0] < _LEAST_HEIGHTS:
             return False, values, normal, moments, alike
-        alike = rules.alike * max(1.0, moments[2] / moments[0])
+        # A height's sigma holds what all heights share, too: only what really scatters averages out.
+        alike = rules.alike * max(_LEAST_SCATTER, moments[2] / moments[0])
         weight = alike / rules.common_m[1] ** 2
         normal[_DIAMETER, _DIAMETER] += weight
         right[_DIAMETER] += weight * (rules.common_m[0] - values[_DIAMETER])

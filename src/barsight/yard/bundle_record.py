@@ -111,7 +111,7 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings, shee
         yaw_rad=float(np.hypot(np.sqrt(covariance[SLOPE_U, SLOPE_U]), np.radians(settings.shared_yaw_deg))),
         length_m=float(np.linalg.norm(sigmas)),
         width_m=(2 * LOOSENESS * fit.rings + 1) * diameter,
-        top_z_m=float(np.hypot(height, settings.shared_height_share * fit.sigma_m)),
+        top_z_m=float(np.hypot(height, settings.shared_height_m)),
         bar_diameter_m=diameter,
     )
 

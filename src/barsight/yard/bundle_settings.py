@@ -42,13 +42,12 @@ class BundleSettings:
     """Errors of heights along a bar are alike over this distance."""
     correlated_across_m: float = 0.03
     """Errors of heights across the bars are alike over this distance."""
-    shared_lateral_m: float = 0.0012
-    """Error of place that all of the map shares (one standard deviation)."""
-
-    shared_yaw_deg: float = 0.01
+    shared_lateral_m: float = 0.0018
+    """Error of place that all heights of a bundle share, mostly the trajectory's (one standard deviation)."""
+    shared_yaw_deg: float = 0.03
     """Error of direction that all of the map shares (one standard deviation)."""
-    shared_height_share: float = 0.5
-    """Share of the map's stated sigma that all heights of a bundle have in common."""
+    shared_height_m: float = 0.001
+    """The same of height, but for the calibration's part, which moves the whole map."""
     packing_share: float = 0.025
     """Error of a bundle's width that the map's smoothing leaves, as a share."""
     single_share: float = 0.05
@@ -69,6 +68,7 @@ class BundleSettings:
         if (
             min(lengths) <= 0
             or min(self.smoothing_m, self.placing_m, self.shared_lateral_m, self.shared_yaw_deg) < 0
+            or self.shared_height_m < 0
         ):
             raise ConfigError("bundles: lengths must be positive, smoothing, placing and shares not negative")
         if self.widest_m <= self.narrowest_m:

@@ -52,14 +52,15 @@ def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundl
     headings = find_headings(height_map, settings.max_skew_deg)
     for heading in headings:
         found += _found(height_map, heading, floor, templates, settings)
-    weights, claims = _weighed(found, settings)
-    kept = [(found[k].sheet, found[k].fit) for k in choose(weights, claims)]
+    places = [_claims(one, settings) for one in found]
+    chosen = choose(_weights(found), without_slivers(places, _SLIVER_SHARE))
+    kept = [(found[k].sheet, found[k].fit) for k in chosen]
     close = replace(settings, slice_step_m=_CROSSING_STEP_M)
     for heading, part in crossing_pieces(height_map, kept, headings, settings):
         across = _found(part, heading, floor, templates, close)
         found += [one for one in across if not is_beam(one.sheet, one.fit, settings)]
-    weights, claims = _weighed(found, settings)
-    readings = _settled(found, weights, claims, height_map, settings)
+    places += [_claims(one, settings) for one in found[len(places) :]]
+    readings = _settled(found, without_slivers(places, _SLIVER_SHARE), height_map, settings)
     return describe(readings, floor, settings)
 
 
@@ -71,27 +72,28 @@ def _found(
     return [Found(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
 
 
-def _weighed(found: list[Found], settings: BundleSettings) -> tuple[Float64, list[Int64]]:
-    """What each explains, and the places that it claims."""
-    claims = without_slivers([_claims(one, settings) for one in found], _SLIVER_SHARE)
-    return np.array([_weight(one.fit) for one in found]), claims
+def _weights(found: list[Found]) -> Float64:
+    """What each explains."""
+    return np.array([_weight(one.fit) for one in found])
 
 
 def _settled(
-    found: list[Found], weights: Float64, claims: list[Int64], height_map: HeightMap, settings: BundleSettings
+    found: list[Found], claims: list[Int64], height_map: HeightMap, settings: BundleSettings
 ) -> list[Reading]:
     """The best set of readings, once by itself and once more with regard to the kinds of bundles in it.
 
     Which bars an outline holds is settled by the pictures where they show it, else by its neighbours.
     """
-    fits = [one.fit for one in found]
+    fits, weights = [one.fit for one in found], _weights(found)
     first = choose(weights, claims)
     raised = with_company(fits, weights, first, overlaps(first, claims))
     chosen = choose(raised, claims)
     wanted = overlaps(chosen, claims)
-    kept = [as_pictured(found[k], height_map, settings) for k in chosen]
+    best = (found[k] for k in chosen)
+    kept = list(ordered_map(lambda one: as_pictured(one, height_map, settings), best, _THREADS))
     smoothed = replace(settings, smoothing_m=seen_smoothing(kept, settings))
-    kept = [replace(one, fit=refine(one.sheet, one.fit, smoothed) or one.fit) for one in kept]
+    again = ordered_map(lambda one: refine(one.sheet, one.fit, smoothed) or one.fit, kept, _THREADS)
+    kept = [replace(one, fit=fit) for one, fit in zip(kept, again, strict=True)]
     resolved = 0.0 if settings.catalogue_mm else _RESOLVED_CELLS * height_map.cell_m
     readings = []
     for k, one, rival, other in zip(
@@ -104,7 +106,7 @@ def _settled(
         final = _finished(one, [each.fit for each in kept], smoothed)
         weight = 0.0 if rival is None else float(raised[rival])
         against = None if rival is None else found[rival]
-        packing = None if one.shades is not None else other
+        packing = None if one.shades is not None else one.doubt if other is None else other
         readings.append(Reading(final, float(raised[k]), against, weight, packing))
     return readings
 

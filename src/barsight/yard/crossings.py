@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.types import Source
 from barsight.yard.bundle_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
 from barsight.yard.bundle_settings import BundleSettings
@@ -48,16 +48,15 @@ def crossing_pieces(
         for cells, mask in zip(_cells_over(sheet, fit, settings, height_map), (over, followed), strict=True):
             mask[cells] = 1
     read = np.zeros(height_map.z_m.shape, bool)
-    for piece in _pieces(_patches(height_map), over):
-        row, column = np.nonzero(piece)
+    for row, column in _pieces(_level(height_map), over):
         heading = _heading(row, column, settings.least_length_m / height_map.cell_m)
         if heading is None or _is_near(heading, headings[:1], settings.max_skew_deg):
             continue
-        if followed[piece].mean() > _FOLLOWED_SHARE or read[piece].mean() > _READ_SHARE:
+        if followed[row, column].mean() > _FOLLOWED_SHARE or read[row, column].mean() > _READ_SHARE:
             continue
         if _is_level(height_map.z_m[row, column], row, column, heading):
             continue
-        read |= piece
+        read[row, column] = True
         yield heading, _around(height_map, row, column)
 
 
@@ -129,29 +128,32 @@ def is_beam(sheet: Sheet, fit: Fit, settings: BundleSettings) -> bool:
     return bool(middle.sum() >= 3 and np.var(rest + height[middle]) < np.var(rest))
 
 
-def _patches(height_map: HeightMap) -> Int32:
-    """(rows, columns) numbers from 1 of the surfaces that steps bound, 0 where nothing was measured."""
+def _level(height_map: HeightMap) -> UInt8:
+    """1 where measured heights have no step beside them: surfaces that steps bound."""
     measured = height_map.source == Source.VISION
     z = height_map.z_m
     around = np.ones((3, 3), np.uint8)
     far = np.float32(1e6)
     highest = cv2.dilate(np.where(measured, z, -far), around)
     lowest = cv2.erode(np.where(measured, z, far), around)
-    level = measured & (highest - lowest < _STEP_M)
-    return np.asarray(cv2.connectedComponents(level.astype(np.uint8), connectivity=4)[1])
+    return np.asarray(measured & (highest - lowest < _STEP_M), dtype=np.uint8)
 
 
-def _pieces(patches: Int32, over: UInt8) -> Iterator[Bool]:
-    """The patches of which at least a part lies over an outline; then what lies over outlines, as one.
+def _pieces(level: UInt8, over: UInt8) -> Iterator[tuple[Int64, Int64]]:
+    """Rows and columns of the surfaces of which a part lies over an outline; then of what lies over, as one.
 
-    Noise may join a thing's patch to those beneath it. Over the outlines alone it stands by itself.
+    Noise may join a thing's surface to those beneath it. Over the outlines alone it stands by itself.
     """
     closed = cv2.morphologyEx(over, cv2.MORPH_CLOSE, np.ones((_GAP_CELLS, _GAP_CELLS), np.uint8))
     closed = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((_THIN_CELLS, _THIN_CELLS), np.uint8))
-    for parts in (patches, np.asarray(cv2.connectedComponents(closed, connectivity=4)[1])):
-        numbers, cells = np.unique(parts[over > 0], return_counts=True)
-        for number in numbers[(numbers > 0) & (cells >= _LEAST_CELLS)]:
-            yield np.asarray(parts == number)
+    for whole in (level, closed):
+        _, parts, boxes, _ = cv2.connectedComponentsWithStats(whole, connectivity=4)
+        cells = np.bincount(parts[over > 0], minlength=len(boxes))
+        cells[0] = 0
+        for number in np.flatnonzero(cells >= _LEAST_CELLS):
+            x, y, width, height = boxes[number, :4]
+            row, column = np.nonzero(parts[y : y + height, x : x + width] == number)
+            yield row + y, column + x
 
 
 def _heading(row: Int64, column: Int64, least_cells: float) -> float | None:

@@ -36,7 +36,9 @@ _SHIFTS_M = np.arange(-0.004, 0.0041, 0.002)
 _ROLLS_RAD = np.radians(np.arange(-6.0, 6.1, 3.0))
 _MOST_REST = 0.4
 """Of the shades' variance: what the best packing may leave."""
-_SURE = 3.0
+_MOST_DOUBTING = 0.5
+"""The same for a packing that is not sure, but speaks against the surface's."""
+_SURE = 4.5
 """Logarithm of how much likelier the best packing must be than the next."""
 _SMOOTHINGS_M = np.array([0.004, 0.007, 0.010, 0.013, 0.016])
 _MOST_SMOOTHED = 8
@@ -202,10 +204,11 @@ def as_pictured(found: Found, height_map: HeightMap, settings: BundleSettings) -
     shades = shades_across(height_map, found.sheet, found.fit)
     if shades is None:
         return found
-    packing = packing_by_shades(shades, found.fit, height_map.cell_m, settings)
-    if packing.rest > _MOST_REST or packing.lead < _SURE:
-        return found
     fit = found.fit
+    packing = packing_by_shades(shades, fit, height_map.cell_m, settings)
+    if packing.rest > _MOST_REST or packing.lead < _SURE:
+        doubts = packing.rest < _MOST_DOUBTING and packing.rings != fit.rings
+        return replace(found, doubt=packing.rings if doubts else None)
     if packing.rings != fit.rings:
         values = fit.values.copy()
         values[DIAMETER], values[ROLL] = packing.diameter_m, packing.roll_rad
