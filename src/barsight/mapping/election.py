@@ -17,7 +17,6 @@ from itertools import product
 
 import cv2
 import numpy as np
-from numba import prange
 
 from barsight.core.arrays import Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
@@ -114,7 +113,7 @@ def elect(
     return _elected(tile, share, expected, cell_m, float(min_views), settings.own_share, settings.along_share)
 
 
-@kernel(parallel=True)
+@kernel()
 def _supported(
     tile: Float32,
     corner: Float64,
@@ -139,7 +138,7 @@ def _supported(
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
-    for i in prange(rows):
+    for i in range(rows):
         for j in range(columns):
             for s in range(SLOTS):
                 if tile[i, j, s, VIEWS] < min_views:
@@ -162,7 +161,7 @@ def _supported(
     return share, expected
 
 
-@kernel(parallel=True)
+@kernel()
 def _elected(
     tile: Float32,
     share: Float32,
@@ -174,7 +173,7 @@ def _elected(
 ) -> Int8:
     rows, columns = tile.shape[:2]
     winner = np.full((rows, columns), -1, np.int8)
-    for i in prange(rows):
+    for i in range(rows):
         for j in range(columns):
             best = -1
             for s in range(SLOTS):

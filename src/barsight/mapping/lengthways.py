@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from barsight.core.arrays import Float32, Int64, kernel
 
@@ -25,11 +24,11 @@ def lengthways(z: Float32, weight: Float32, gate_m: float, reach: int) -> Float3
     return _lengthways(z, weight, gate_m, rows, columns)
 
 
-@kernel(parallel=True)
+@kernel()
 def _lengthways(z: Float32, weight: Float32, gate_m: float, rows: Int64, columns: Int64) -> Float32:
     height, width = z.shape
     out = z.copy()
-    for i in prange(height):
+    for i in range(height):
         for j in range(width):
             if not weight[i, j] > 0:
                 continue

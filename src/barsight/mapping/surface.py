@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int8, UInt8
+from barsight.core.parallel import ordered_map
 from barsight.core.types import Source
 from barsight.mapping.election import Sights, elect, first_heights
 from barsight.mapping.filling import bridge
@@ -19,6 +20,7 @@ from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
 
 _HALO = 16
+_WORKERS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,31 +105,38 @@ def finish(
     _read_tile.cache_clear()
     _read_first.cache_clear()
     keys = store.keys()
+    known = frozenset(keys)
     for key in keys:
         np.save(
             _tile_file(folder, key, "first"), first_heights(store.take(key), min_views, settings.top_share)
         )
-    seen = 0
-    for key in keys:
-        tile = store.take(key)
-        around = _first_around(folder, key, frozenset(keys))
-        winner = elect(tile, key, around, sights, cell_m, min_views, settings)
-        elected = _layers(tile, winner)
+
+    def elect_tile(item: tuple[TileKey, Float32]) -> tuple[TileKey, int]:
+        key, tile = item
+        around = _first_around(folder, key, known)
+        elected = _layers(tile, elect(tile, key, around, sights, cell_m, min_views, settings))
         _write_tile(folder, key, elected, "elected")
         _write_cloud(folder, key, tile, cell_m, min_views)
-        seen += int((elected.source == Source.VISION).sum())
+        return key, int((elected.source == Source.VISION).sum())
+
+    def finish_tile(key: TileKey) -> tuple[TileKey, Layers]:
+        layers = _filled(folder, key, known, cell_m, settings)
+        _write_tile(folder, key, layers, "surface")
+        return key, layers
+
+    seen = 0
+    for key, count in ordered_map(elect_tile, ((key, store.take(key)) for key in keys), _WORKERS):
+        seen += count
         store.drop(key)
     filled, sigmas = 0, []
     columns, rows = [], []
-    for key in keys:
-        layers = _filled(folder, key, frozenset(keys), cell_m, settings)
-        _write_tile(folder, key, layers, "surface")
-        known = layers.source != Source.UNKNOWN
+    for key, layers in ordered_map(finish_tile, keys, _WORKERS):
+        there = layers.source != Source.UNKNOWN
         filled += int((layers.source == Source.FILLED).sum())
-        if known.any():
+        if there.any():
             sigmas.append(layers.sigma_m[layers.source == Source.VISION][::17])
-            columns += [key[0] * TILE_CELLS + int(c) for c in _span(known.any(axis=0))]
-            rows += [key[1] * TILE_CELLS + int(r) for r in _span(known.any(axis=1))]
+            columns += [key[0] * TILE_CELLS + int(c) for c in _span(there.any(axis=0))]
+            rows += [key[1] * TILE_CELLS + int(r) for r in _span(there.any(axis=1))]
     for key in keys:
         for kind in ("first", "elected"):
             _tile_file(folder, key, kind).unlink()

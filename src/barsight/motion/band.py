@@ -34,25 +34,32 @@ def factorise(rows: Float64) -> bool:
     return True
 
 
-@kernel(fastmath=True)
 def solve(factor: Float64, right: Float64) -> None:
     """Replaces right (m, n), one right side a row, by the solutions."""
+    beside = right.T.copy()
+    _solve(factor, beside)
+    right[:] = beside.T
+
+
+@kernel(fastmath=True)
+def _solve(factor: Float64, x: Float64) -> None:
+    """x: (n, m), right sides beside each other, so that the factor is read once for all of them."""
     n, width = factor.shape
-    for m in range(len(right)):
-        x = right[m]
-        for i in range(n):
-            first = max(0, i - width + 1)
-            row = factor[i, first - i + width - 1 : width - 1]
-            total = 0.0
-            for k in range(len(row)):
-                total += row[k] * x[first + k]
-            x[i] = (x[i] - total) / factor[i, width - 1]
-        for i in range(n - 1, -1, -1):
-            x[i] /= factor[i, width - 1]
-            first = max(0, i - width + 1)
-            row = factor[i, first - i + width - 1 : width - 1]
-            for k in range(len(row)):
-                x[first + k] -= row[k] * x[i]
+    sides = x.shape[1]
+    for i in range(n):
+        for k in range(max(0, i - width + 1), i):
+            share = factor[i, k - i + width - 1]
+            for c in range(sides):
+                x[i, c] -= share * x[k, c]
+        for c in range(sides):
+            x[i, c] /= factor[i, width - 1]
+    for i in range(n - 1, -1, -1):
+        for c in range(sides):
+            x[i, c] /= factor[i, width - 1]
+        for k in range(max(0, i - width + 1), i):
+            share = factor[i, k - i + width - 1]
+            for c in range(sides):
+                x[k, c] -= share * x[i, c]
 
 
 @kernel(fastmath=True)

@@ -28,6 +28,8 @@ MOST_ROUNDS = 3
 LEAST_AGREEING = 0.5
 """Where fewer of the encoders' places agree, none is left out: who is wrong can't be told."""
 LEAST_FACTOR = 0.1
+START_GAIN = 1e-3
+"""The first solution only has to tell outliers: steps that gain less than this share of the cost end it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +71,11 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     if problem.sightings is not None:
         used = often(problem.sightings, used)
     state = State(start_values(problem), start_points(problem), np.zeros(2))
-    state, system = _optimised(problem, state, used)
+    state, system = optimise(problem, factors(problem), state, used, least_gain=START_GAIN)
     seeks_drift = problem.sightings is not None and problem.offset_prior_px > 0 and bool(used.any())
     if problem.sightings is not None and used.any():
         if problem.has_latency and seeks_drift:
-            state, system, _ = sought(problem, state, system, used)
+            state, system, _ = sought(problem, state, system, used, START_GAIN)
         problem, state, system, used = _with_seen_noise(problem, problem.sightings, state, used)
     drift: RigDrift | None = None
     everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)
@@ -86,7 +88,7 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
         agreed = now
         chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
         problem = replace(problem, placed=chosen)
-        state, system = _optimised(problem, state, used)
+        state, system = optimise(problem, factors(problem), state, used)
     pairs = np.column_stack([frames[:-1], frames[1:]])
     poses, found = _poses(state, problem), marginals(system, pairs)
     velocity, biases = _inertial(state, problem)
@@ -128,10 +130,6 @@ def relative(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None, 
         own = found.poses[new] + carried @ found.poses[old] @ carried.T - both - both.T
         result[p] = own + swing @ shared @ swing.T
     return result
-
-
-def _optimised(problem: Problem, state: State, used: Bool) -> tuple[State, System]:
-    return optimise(problem, factors(problem), state, used)
 
 
 def _with_seen_noise(

@@ -13,7 +13,7 @@ from barsight.core.types import RigDrift
 from barsight.motion.graph import factors
 from barsight.motion.problem import Problem
 from barsight.motion.rig_drift import columns, weigh
-from barsight.motion.solver import State, System, moved, optimise
+from barsight.motion.solver import RELATIVE_GAIN, State, System, moved, optimise
 
 MOST_STEPS = 6
 LEAST_STEP_PX = 0.02
@@ -30,15 +30,17 @@ def drifted(problem: Problem, state: State, system: System, used: Bool) -> tuple
     return moved(problem, state, used, *system.step(problem.free, fixed=fixed)), drift
 
 
-def sought(problem: Problem, state: State, system: System, used: Bool) -> tuple[State, System, RigDrift]:
-    """The best state with its drift, from one that is good without."""
+def sought(
+    problem: Problem, state: State, system: System, used: Bool, least_gain: float = RELATIVE_GAIN
+) -> tuple[State, System, RigDrift]:
+    """The best state with its drift, from one that is good without. least_gain: see `optimise`."""
     seen, graph = problem.sightings, factors(problem)
     assert seen is not None
     by_drift = columns(seen)
     for _ in range(MOST_STEPS):
         before = state.drift
         state, drift = drifted(problem, state, system, used)
-        state, system = optimise(problem, graph, state, used)
+        state, system = optimise(problem, graph, state, used, least_gain=least_gain)
         if np.abs(by_drift @ (state.drift - before)).max() < LEAST_STEP_PX:
             break
     return state, system, drift

@@ -34,8 +34,9 @@ STEPS = 2
 """Gauss-Newton's, in a round: each begins where the one before ended."""
 
 
-def pieces_of(problem: Problem, state: State) -> Pieces | None:
-    """Strips across the way, apart in height; None where there are too few to learn from."""
+def pieces_of(problem: Problem, state: State, used: Bool) -> Pieces | None:
+    """Strips across the way, apart in height; None where there are too few of them, or fewer points than
+    pieces that say how they slide."""
     seen = problem.sightings
     if seen is None or not problem.has_latency or problem.prior is not None:
         return None
@@ -47,7 +48,8 @@ def pieces_of(problem: Problem, state: State) -> Pieces | None:
     along = np.floor(state.points[:, :3] @ axes[0] / (LENGTH_SHARE * range_m))
     up = np.floor(state.points[:, 2] / (HEIGHT_SHARE * range_m) + 0.5)
     names, piece = np.unique(np.column_stack([along, up]), axis=0, return_inverse=True)
-    if len(names) < LEAST_PIECES:
+    telling = int((np.bincount(seen.track[used]) >= LEAST_SEEN).sum())
+    if len(names) < LEAST_PIECES or telling < len(names):
         return None
     return Pieces(piece.ravel().astype(np.int64), np.full(len(names), FIRST_SIGMA_RAD), 0.5)
 
@@ -56,7 +58,7 @@ def with_slides(
     problem: Problem, state: State, used: Bool, rounds: int = ROUNDS
 ) -> tuple[Problem, State, System]:
     """Solved with the slides as unknowns, and how far they go as they show it [EM: Dempster 1977]."""
-    pieces = problem.pieces or pieces_of(problem, state)
+    pieces = problem.pieces or pieces_of(problem, state, used)
     graph = factors(problem)
     if pieces is None:
         return problem, *optimise(problem, graph, state, used)

@@ -125,12 +125,18 @@ def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
 
 
 def optimise(
-    problem: Problem, graph: Any, state: State, used: Bool, most: int = MOST_ITERATIONS
+    problem: Problem,
+    graph: Any,
+    state: State,
+    used: Bool,
+    most: int = MOST_ITERATIONS,
+    least_gain: float = RELATIVE_GAIN,
 ) -> tuple[State, System]:
     """The state that fits best and its system. [Levenberg 1944, Marquardt 1963]
 
-    graph: GTSAM's factors of all but the sightings. The rig's drift stays. Raises LinAlgError where the
-    measurements leave an unknown undetermined.
+    graph: GTSAM's factors of all but the sightings. The rig's drift stays. least_gain: the share of the cost
+    that a step must save for another to follow. Raises LinAlgError where the measurements leave an unknown
+    undetermined.
     """
     free = problem.free
     cost, damping = _cost(problem, graph, state, used), 0.0
@@ -150,7 +156,7 @@ def optimise(
             continue
         gain, cost, state, damping = cost - lower, lower, trial, damping / 10 if damping > 1e-5 else 0.0
         system = linearise(problem, graph, state, used)
-        if gain < RELATIVE_GAIN * max(cost, 1e-9):
+        if gain < least_gain * max(cost, 1e-9):
             break
     return state, system
 
