@@ -17,8 +17,8 @@ _LOOK_M = 1.3
 _PROOF_M = 0.1
 _RAGGED_M = 0.2
 _SOME, _MOST = 0.3, 0.6
-_GROWTH_CELLS = 0.5
-"""A map grows over ends by about half a cell."""
+_GROWTH_CELLS = 1.5
+"""A map grows over ends by about one and a half cells."""
 _SEEN_SIGMA_M = 0.012
 """What is left where all bars end alike: a cell of growth, straps and shadows."""
 _UNEVEN_M = (-0.15, 0.2)
