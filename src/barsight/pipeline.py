@@ -56,7 +56,6 @@ from barsight.yard.types import HeightMap
 Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
-WORKERS = 2
 _FAST_SHIFT = 0.1
 
 
@@ -156,7 +155,7 @@ def measure(
     store = TileStore(scratch, settings.map.resident_tiles)
     preview = None
     placed: list[Pose] = []
-    for done, view in enumerate(ordered_map(look, _placed(source, poses), WORKERS), start=1):
+    for done, view in enumerate(ordered_map(look, _placed(source, poses)), start=1):
         if isinstance(view, Refusal):
             refusals.append(view)
         else:

@@ -35,7 +35,6 @@ from barsight.recording.open import open_recording
 from barsight.report.camera_imu_page import write_camera_imu_report
 
 COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.REDO: "red"}
-WORKERS = 2
 Recorded = tuple[list[BoardView], ImuSamples, ImuNoise | None]
 
 
@@ -154,7 +153,7 @@ def _from_pictures(
         if number % step == 0 and not isinstance(frame, RefusedFrame)
     )
     views = []
-    for done, view in enumerate(ordered_map(lambda frame: _detected(board, frame), chosen, WORKERS), 1):
+    for done, view in enumerate(ordered_map(lambda frame: _detected(board, frame), chosen), 1):
         advance("corners", done, -(-total // step))
         if view.cam0 is not None or view.cam1 is not None:
             views.append(view)

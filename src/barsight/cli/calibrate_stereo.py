@@ -30,7 +30,6 @@ from barsight.recording.picture_pairs import ReadPair, find_pairs, read_pair_fil
 from barsight.report.calibration_page import write_calibration_report
 
 COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.REDO: "red"}
-WORKERS = 2
 Size = tuple[int, int]
 
 
@@ -111,7 +110,7 @@ def _from_pictures(
     views: list[BoardView] = []
     left_out: list[Removed] = []
     sizes: list[Size | None] = [None, None]
-    found = ordered_map(lambda pair: _detected(board, pair), pairs, WORKERS)
+    found = ordered_map(lambda pair: _detected(board, pair), pairs)
     for done, (pair, corners) in enumerate(found, 1):
         advance("corners", done, count)
         left_out += [Removed(pair.name, camera, reason) for camera, reason in pair.problems]

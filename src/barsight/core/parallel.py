@@ -13,8 +13,13 @@ import numba
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+WORKERS = 2
+"""Items under way side by side: as many as a user's cores."""
 
-def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
+
+def ordered_map(
+    function: Callable[[Item], Result], items: Iterable[Item], workers: int = WORKERS
+) -> Iterator[Result]:
     """`map` over a pool of threads: results in the items' order, at most workers + 1 items under way.
 
     For functions that release the interpreter (OpenCV, compiled kernels). An exception of the function comes

@@ -35,7 +35,6 @@ LEAST_POSES = 10
 _RAISED_M = 0.3
 _MOST_GLOSS = 40.0
 _GUESS_ERROR = 0.15
-_FITS_AT_ONCE = 2
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def bench_target_size(
     poses_at = [(range_mm, pose) for range_mm in ranges_mm for pose in range(poses)]
     jobs = (job for range_mm, pose in poses_at for job in _matched(methods, range_mm, pose, seed))
     # Rendering and matching use all cores, but the fits behind them one each: so two run beside them.
-    measured = np.array(list(ordered_map(lambda job: measure_bar(*job), jobs, _FITS_AT_ONCE)))
+    measured = np.array(list(ordered_map(lambda job: measure_bar(*job), jobs)))
     found = measured.reshape(len(ranges_mm), poses, len(methods), 2)
     results = tuple(
         TargetSizeResult(

@@ -20,7 +20,6 @@ from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
 
 _HALO = 16
-_WORKERS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +124,12 @@ def finish(
         return key, layers
 
     seen = 0
-    for key, count in ordered_map(elect_tile, ((key, store.take(key)) for key in keys), _WORKERS):
+    for key, count in ordered_map(elect_tile, ((key, store.take(key)) for key in keys)):
         seen += count
         store.drop(key)
     filled, sigmas = 0, []
     columns, rows = [], []
-    for key, layers in ordered_map(finish_tile, keys, _WORKERS):
+    for key, layers in ordered_map(finish_tile, keys):
         there = layers.source != Source.UNKNOWN
         filled += int((layers.source == Source.FILLED).sum())
         if there.any():

@@ -26,10 +26,10 @@ from barsight.core.types import (
     RefusedFrame,
     StereoFrame,
 )
-from barsight.recording.base import FrameIndex, RecordingSettings
+from barsight.recording.base import RecordingSettings
 from barsight.recording.digest import file_digests
 from barsight.recording.imu_log import read_imu_log
-from barsight.recording.pairing import PairedStamps, pair_cameras
+from barsight.recording.pairing import PairedAtOpening, pair_cameras
 from barsight.recording.stored import StoredImage
 
 FIELDS = ("stamp_ns", "tag", "corner", "u", "v")
@@ -37,7 +37,7 @@ CORNERS_A_TAG = 4
 NO_PICTURES = "corners were recorded, no pictures"
 
 
-class CornerRecording:
+class CornerRecording(PairedAtOpening):
     """A `Recording` that has `points` in place of pictures: every frame is refused as a picture.
 
     The folder doesn't say how the cameras see: the settings must name a rig. Raises `InputError` and
@@ -65,16 +65,6 @@ class CornerRecording:
         """See `Recording.notes`."""
         imu = self._imu
         return () if imu is None else imu.notes
-
-    @property
-    def index(self) -> FrameIndex:
-        """See `Recording.index`."""
-        return self._pairs.index
-
-    @property
-    def camera_stamps(self) -> PairedStamps:
-        """All stamps, paired or not."""
-        return self._pairs
 
     def points(self) -> Iterator[NamedPoints]:
         """What both cameras see at each of the index's stamps."""

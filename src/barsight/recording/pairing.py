@@ -26,6 +26,22 @@ class PairedStamps:
     index: FrameIndex
 
 
+class PairedAtOpening:
+    """What a `Recording` says of its stamps where the reader pairs them, as `_pairs`, when it opens."""
+
+    _pairs: PairedStamps
+
+    @property
+    def index(self) -> FrameIndex:
+        """See `Recording.index`."""
+        return self._pairs.index
+
+    @property
+    def camera_stamps(self) -> PairedStamps:
+        """All stamps of both cameras, paired or not."""
+        return self._pairs
+
+
 def pair_cameras(path: Path, left_ns: Int64, right_ns: Int64, tolerance_s: float) -> PairedStamps:
     """Pair two cameras' stamps. Raises `InputError` about `path` where not a single pair comes together."""
     pairing = pair_stamps(left_ns, right_ns, seconds_to_ns(tolerance_s))

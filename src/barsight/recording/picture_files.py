@@ -7,13 +7,12 @@ from pathlib import Path
 
 from barsight.calibration.rig import StereoRig
 from barsight.core.types import RefusedFrame, StereoFrame
-from barsight.recording.base import FrameIndex
 from barsight.recording.images import TornImageError
-from barsight.recording.pairing import PairedStamps, decode_for
+from barsight.recording.pairing import PairedAtOpening, decode_for
 from barsight.recording.stored import StoredImage, merged
 
 
-class PictureFiles:
+class PictureFiles(PairedAtOpening):
     """The pictures' part of a `Recording`; the reader sets what is named here.
 
     _root: the folder below which refusals name a file. _left, _right: a file for each of the pairs' stamps.
@@ -21,19 +20,8 @@ class PictureFiles:
 
     rig: StereoRig
     _root: Path
-    _pairs: PairedStamps
     _left: Sequence[Path]
     _right: Sequence[Path]
-
-    @property
-    def index(self) -> FrameIndex:
-        """See `Recording.index`."""
-        return self._pairs.index
-
-    @property
-    def camera_stamps(self) -> PairedStamps:
-        """All pictures' stamps, paired or not."""
-        return self._pairs
 
     def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
         """See `Recording.frames`."""

@@ -31,7 +31,6 @@ _RIVAL_SHARE = 0.8
 _SUNKEN_M, _SUNKEN_SHARE = 0.04, 0.2
 """How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
 _RESOLVED_CELLS = 4.0
-_THREADS = 2
 _SLIVER_SHARE = 0.03
 _CROSSING_STEP_M = 0.4
 """What lies across may be short: cross-sections this far apart meet it."""
@@ -90,9 +89,9 @@ def _settled(
     chosen = choose(raised, claims)
     wanted = overlaps(chosen, claims)
     best = (found[k] for k in chosen)
-    kept = list(ordered_map(lambda one: as_pictured(one, height_map, settings), best, _THREADS))
+    kept = list(ordered_map(lambda one: as_pictured(one, height_map, settings), best))
     smoothed = replace(settings, smoothing_m=seen_smoothing(kept, settings))
-    again = ordered_map(lambda one: refine(one.sheet, one.fit, smoothed) or one.fit, kept, _THREADS)
+    again = ordered_map(lambda one: refine(one.sheet, one.fit, smoothed) or one.fit, kept)
     kept = [replace(one, fit=fit) for one, fit in zip(kept, again, strict=True)]
     resolved = 0.0 if settings.catalogue_mm else _RESOLVED_CELLS * height_map.cell_m
     readings = []
@@ -139,7 +138,7 @@ def _readings(sheet: Sheet, templates: Templates, settings: BundleSettings) -> l
         candidates = _worth_growing(guess(sheet, templates, v, settings))
         fresh = [one for one in candidates if not any(_same(one, fit, row) for fit in fits)]
         seeds = (_seed(one, row, rows, sheet, settings) for one in fresh)
-        grown = ordered_map(lambda seed: grow(sheet, seed, settings), seeds, _THREADS)
+        grown = ordered_map(lambda seed: grow(sheet, seed, settings), seeds)
         for one, fit in zip(fresh, grown, strict=True):
             if fit is None or any(_same(one, earlier, row) for earlier in fits):
                 continue
