@@ -177,8 +177,8 @@ def _sum_near(
     offsets = np.empty(len(near), dtype=np.int64)
     flat = np.empty((2, TILE_COLUMNS), dtype=np.float32)
     weight_part, pull_part = flat[0], flat[1]
-    for tile_y in range(first_tile, end_tile):
-        for tile_x in range(axes.shape[1]):
+    for tile_x in range(axes.shape[1]):
+        for tile_y in range(first_tile, end_tile):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
             for j in range(len(near)):
                 offsets[j] = round(near[j] * axis_y) * framed_width + round(near[j] * axis_x)
@@ -209,8 +209,8 @@ def _gather(
     flat = np.empty(9 * TILE_COLUMNS, dtype=np.float32)
     sums = flat.reshape(9, TILE_COLUMNS)
     offsets = np.empty(lines * 2 * points, dtype=np.int64)
-    for tile_y in range(first_tile, end_tile):
-        for tile_x in range(axes.shape[1]):
+    for tile_x in range(axes.shape[1]):
+        for tile_y in range(first_tile, end_tile):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
             for k in range(lines):
                 for j in range(2 * points):

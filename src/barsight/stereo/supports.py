@@ -23,7 +23,8 @@ TILE_ROWS = 16
 TILE_COLUMNS = 32
 MARGIN = 48
 _LINE_FLOATS = 16
-BAND_TILES = 4
+BAND_TILES = 16
+"""Rows of tiles that are worked through column by column: what their supports read fits into the cache."""
 _LEAST_COHERENCE = 0.35
 
 
@@ -131,8 +132,8 @@ def _axis_means(
     sums = np.empty((3, TILE_COLUMNS), dtype=np.float32)
     flat = sums.reshape(-1)
     offsets = np.empty(len(steps), dtype=np.int64)
-    for tile_y in range(first_tile, end_tile):
-        for tile_x in range(axes.shape[1]):
+    for tile_x in range(axes.shape[1]):
+        for tile_y in range(first_tile, end_tile):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
             for j in range(len(steps)):
                 offsets[j] = round(steps[j] * axis_y) * framed_width + round(steps[j] * axis_x)

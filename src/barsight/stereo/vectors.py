@@ -15,7 +15,7 @@ from numba.core import cgutils
 
 LANES = 32
 HALF_LANES = LANES // 2
-BYTE, SHORT = ir.IntType(8), ir.IntType(16)
+BYTE, SHORT, FLOAT = ir.IntType(8), ir.IntType(16), ir.FloatType()
 FLOAT_LANES = 16
 _FAST = ("fast",)
 
@@ -138,6 +138,14 @@ class Vectors:
         )
         return self.builder.call(function, [vector, self.all(0.0, self.floats)], fastmath=_FAST)
 
+    def sum_of(self, vector: Any) -> Any:
+        """The sum of a vector's floats."""
+        return self._call(f"llvm.vector.reduce.fadd.v{vector.type.count}f32", FLOAT, FLOAT(0.0), vector)
+
+    def extreme_of(self, vector: Any, which: str) -> Any:
+        """The "min" or "max" of a vector's floats."""
+        return self._call(f"llvm.vector.reduce.f{which}.v{vector.type.count}f32", FLOAT, vector)
+
     def ones(self, vector: Any) -> Any:
         """The number of bits set in each byte."""
         return self._call(f"llvm.ctpop.v{vector.type.count}i8", vector.type, vector)
@@ -146,7 +154,7 @@ class Vectors:
         """The least byte of a vector."""
         return self._call(f"llvm.vector.reduce.umin.v{vector.type.count}i8", BYTE, vector)
 
-    def _call(self, name: str, result: Any, vector: Any) -> Any:
-        kind = ir.FunctionType(result, [vector.type])
+    def _call(self, name: str, result: Any, *values: Any) -> Any:
+        kind = ir.FunctionType(result, [value.type for value in values])
         function = cgutils.get_or_insert_function(self.builder.module, kind, name)
-        return self.builder.call(function, [vector])
+        return self.builder.call(function, values, fastmath=_FAST if result == FLOAT else ())
