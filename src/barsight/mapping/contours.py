@@ -7,7 +7,6 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import median_filter
-from scipy.signal import savgol_filter
 
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.types import Contour, LaserProfile, Source
@@ -78,6 +77,9 @@ def smoothed(contour: Contour) -> Contour:
     step that they bridge as their sigma at the least; at the ends nothing is added. The filter is that of
     Savitzky and Golay (5 samples, second order), which the paper doesn't name.
     """
+    # Loaded where it is needed: its import takes most of a second.
+    from scipy.signal import savgol_filter
+
     known = np.flatnonzero(np.isfinite(contour.z_m))
     if known.size < _FILTER_SAMPLES:
         return contour

@@ -14,6 +14,9 @@ from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, ke
 from barsight.core.pose import Pose
 from barsight.core.types import StereoPoints
 
+_SAID = 6
+_HEIGHT, _NOISE, _POSE, _SHARED, _GREY, _MIDDLE = range(_SAID)
+
 
 @dataclass(frozen=True, eq=False)
 class CellObservations:
@@ -50,24 +53,15 @@ def observe(
     if len(points.xyz_m) == 0:
         return _no_observations()
     about = covariance[np.ix_((0, 1, 5), (0, 1, 5))]
-    x, y, z, off, variance, pose_variance, shared = _in_reference(
-        points.xyz_m,
-        points.range_sigma_m,
-        points.shared_sigma_m,
-        reference_from_rect0.rotation,
-        reference_from_rect0.translation,
-        body_origin_m,
-        about,
-        cell_m,
-    )
+    x, y, said = _in_reference(
+        points.xyz_m, points.range_sigma_m, points.shared_sigma_m, points.intensity,
+        reference_from_rect0.rotation, reference_from_rect0.translation, body_origin_m, about,
+        cell_m, 0.5 * spacing_rad,
+    )  # fmt: skip
     low_x, low_y = int(x.min()), int(y.min())
     width, height = int(x.max()) - low_x + 1, int(y.max()) - low_y + 1
-    flat = (y.astype(np.int64) - low_y) * width + (x - low_x)
-    order, starts = _by_cell(flat, width * height)
-    half_pixel = 0.5 * spacing_rad * points.xyz_m[:, 2]
-    cell, central, *heights = _gather(
-        order, starts, z, off, half_pixel, variance, pose_variance, shared, points.intensity, cell_m
-    )
+    by_cell, starts = _by_cell(x, y, said, low_x, low_y, width, height)
+    cell, central, *heights = _gather(by_cell, starts, cell_m)
     rows, columns = np.divmod(cell, width)
     return CellObservations(
         (columns + low_x).astype(np.int32), (rows + low_y).astype(np.int32), central, *heights
@@ -82,118 +76,103 @@ def _no_observations() -> CellObservations:
 
 @kernel()
 def _in_reference(
-    xyz: Float32,
-    range_sigma: Float32,
-    shared_sigma: Float32,
-    rotation: Float64,
-    translation: Float64,
-    origin: Float64,
-    about: Float64,
-    cell_m: float,
-) -> tuple[Int32, Int32, Float32, Float32, Float32, Float32, Float32]:
-    """Cell numbers, height, distance from the cell's middle (the larger of along x and y), matching variance,
-    pose variance and shared sigma of the height, each (N,).
+    xyz: Float32, range_sigma: Float32, shared_sigma: Float32, intensity: UInt8, rotation: Float64,
+    translation: Float64, origin: Float64, about: Float64, cell_m: float, half_rad: float,
+) -> tuple[Int32, Int32, Float32]:  # fmt: skip
+    """Cell numbers (N,) and, side by side in memory, what each point says (N, _SAID): its height, matching
+    variance, pose variance and shared sigma of the height, its grey level and whether it lies within half_rad
+    (half a pixel) of the cell's middle, along x and along y.
 
     The height's error is the range error along the ray times the ray's slope, plus that of the pose:
     dz = dt_z + theta_x * q_y - theta_y * q_x for a point q as seen from the body.
     """
     count = xyz.shape[0]
     x, y = np.empty(count, np.int32), np.empty(count, np.int32)
-    z, off, variance = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.float32)
-    pose_variance, shared = np.empty(count, np.float32), np.empty(count, np.float32)
+    said = np.empty((count, _SAID), np.float32)
+    half = np.float32(half_rad)
     for i in range(count):
         a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
         rx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
         ry = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
         rz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
         slope = rz / np.sqrt(a * a + b * b + c * c)
-        px, py, pz = rx + translation[0], ry + translation[1], rz + translation[2]
-        x[i] = np.int32(np.floor(px / cell_m + 0.5))
-        y[i] = np.int32(np.floor(py / cell_m + 0.5))
-        z[i] = pz
-        off[i] = max(abs(px - x[i] * cell_m), abs(py - y[i] * cell_m))
-        variance[i] = (range_sigma[i] * slope) ** 2
-        shared[i] = np.abs(shared_sigma[i] * slope)
+        px, py = rx + translation[0], ry + translation[1]
+        column, row = np.floor(px / cell_m + 0.5), np.floor(py / cell_m + 0.5)
+        x[i], y[i] = np.int32(column), np.int32(row)
+        said[i, _HEIGHT] = rz + translation[2]
+        said[i, _NOISE] = (range_sigma[i] * slope) ** 2
         jx, jy = py - origin[1], -(px - origin[0])
-        pose_variance[i] = (
+        said[i, _POSE] = (
             about[0, 0] * jx * jx
             + about[1, 1] * jy * jy
             + about[2, 2]
             + 2 * (about[0, 1] * jx * jy + about[0, 2] * jx + about[1, 2] * jy)
         )
-    return x, y, z, off, variance, pose_variance, shared
+        said[i, _SHARED] = np.abs(shared_sigma[i] * slope)
+        said[i, _GREY] = np.float32(intensity[i])
+        off = np.float32(max(abs(px - column * cell_m), abs(py - row * cell_m)))
+        said[i, _MIDDLE] = np.float32(off <= half * xyz[i, 2])
+    return x, y, said
 
 
 @kernel()
-def _by_cell(flat: Int64, cells: int) -> tuple[Int64, Int64]:
-    """Counting sort: the order that brings points of a cell together, and where each cell starts."""
-    starts = np.zeros(cells + 1, np.int64)
-    for i in range(flat.size):
-        starts[flat[i] + 1] += 1
-    for k in range(cells):
+def _by_cell(
+    x: Int32, y: Int32, said: Float32, low_x: int, low_y: int, width: int, height: int
+) -> tuple[Float32, Int64]:
+    """Counting sort: what is said, cell by cell and row by row, and where each cell starts."""
+    starts = np.zeros(width * height + 1, np.int64)
+    for i in range(x.size):
+        starts[(y[i] - low_y) * width + x[i] - low_x + 1] += 1
+    for k in range(width * height):
         starts[k + 1] += starts[k]
     cursor = starts[:-1].copy()
-    order = np.empty(flat.size, np.int64)
-    for i in range(flat.size):
-        order[cursor[flat[i]]] = i
-        cursor[flat[i]] += 1
-    return order, starts
+    by_cell = np.empty_like(said)
+    for i in range(x.size):
+        k = (y[i] - low_y) * width + x[i] - low_x
+        by_cell[cursor[k]] = said[i]
+        cursor[k] += 1
+    return by_cell, starts
 
 
 @kernel()
-def _highest_first(members: Int64, z: Float32) -> None:
+def _highest_first(said: Float32) -> None:
     """Order the few points of a cell in place; many (a wall seen from the side) by a real sort."""
-    if members.size > 32:
-        members[:] = members[np.argsort(-z[members])]
+    if said.shape[0] > 32:
+        said[:] = said[np.argsort(-said[:, _HEIGHT])]
         return
-    for i in range(1, members.size):
-        m = members[i]
+    for i in range(1, said.shape[0]):
         j = i
-        while j > 0 and z[members[j - 1]] < z[m]:
-            members[j] = members[j - 1]
+        while j > 0 and said[j - 1, _HEIGHT] < said[j, _HEIGHT]:
+            for k in range(_SAID):
+                said[j - 1, k], said[j, k] = said[j, k], said[j - 1, k]
             j -= 1
-        members[j] = m
 
 
 @kernel()
 def _gather(
-    order: Int64,
-    starts: Int64,
-    z: Float32,
-    off: Float32,
-    half_pixel: Float32,
-    variance: Float32,
-    pose_variance: Float32,
-    shared: Float32,
-    intensity: UInt8,
-    cell_m: float,
+    said: Float32, starts: Int64, cell_m: float
 ) -> tuple[Int64, Bool, Float32, Float32, Float32, Float32]:
     """Within each cell, from the top: points no deeper than 4 sigma below the first are one surface."""
-    count = order.size
+    count = said.shape[0]
     cell, middle = np.empty(count, np.int64), np.zeros(count, np.bool_)
     out = np.empty((4, count), np.float32)
     n = 0
     for k in range(starts.size - 1):
-        first, last = starts[k], starts[k + 1]
-        if first == last:
-            continue
-        members = order[first:last]
-        _highest_first(members, z)
-        i = 0
-        while i < members.size:
-            top = members[i]
-            floor = z[top] - max(4 * np.sqrt(variance[top]), 2 * cell_m)
+        i, last = starts[k], starts[k + 1]
+        if last - i > 1:
+            _highest_first(said[i:last])
+        while i < last:
+            floor = said[i, _HEIGHT] - max(4 * np.sqrt(said[i, _NOISE]), 2 * cell_m)
             weights = heights = variances = extra = grey = 0.0
             held = 0
-            while i < members.size and z[members[i]] >= floor:
-                m = members[i]
-                w = 1.0 / max(variance[m], 1e-10)
+            while i < last and said[i, _HEIGHT] >= floor:
+                w = 1.0 / max(said[i, _NOISE], 1e-10)
                 weights += w
-                heights += w * z[m]
-                variances += variance[m] + pose_variance[m]
-                extra += shared[m]
-                grey += intensity[m]
-                middle[n] |= off[m] <= half_pixel[m]
+                heights += w * said[i, _HEIGHT]
+                variances += said[i, _NOISE] + said[i, _POSE]
+                extra += said[i, _SHARED]
+                grey += said[i, _GREY]
+                middle[n] |= said[i, _MIDDLE] > 0
                 held += 1
                 i += 1
             cell[n] = k
