@@ -41,7 +41,7 @@ def test_a_killed_run_goes_on(
         assert keep.is_dir() and not out.exists()
     with monkeypatch.context() as patch:
         fused = killed_at(patch, "fuse", 0)
-        matched = counting_views(patch)
+        matched = counting_matches(patch)
         assert run(command) == 0
     assert (len(fused), len(matched)) == (4, 0)
     assert not keep.exists()
@@ -50,14 +50,14 @@ def test_a_killed_run_goes_on(
     capsys.readouterr()
 
 
-def counting_views(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    whole, calls = pipeline.Viewer.__call__, []
+def counting_matches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    whole, calls = pipeline.Matcher.__call__, []
 
     def counted(self: Any, *arguments: Any) -> Any:
         calls.append(1)
         return whole(self, *arguments)
 
-    monkeypatch.setattr(pipeline.Viewer, "__call__", counted)
+    monkeypatch.setattr(pipeline.Matcher, "__call__", counted)
     return calls
 
 

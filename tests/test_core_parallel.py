@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.arrays import expect_shape, kernel
-from barsight.core.parallel import in_bands, ordered_map, read_ahead
+from barsight.core.parallel import begun_map, beside, in_bands, ordered_map, read_ahead
 from barsight.core.timing import Stopwatch
 
 
@@ -78,6 +78,80 @@ def test_items_are_made_while_others_are_used() -> None:
     assert next(left) == 0
     left.close()
     assert threading.active_count() == before
+
+
+def test_what_is_begun_goes_on_before_anybody_asks() -> None:
+    running, most_at_once, done = 0, 0, threading.Semaphore(0)
+    lock = threading.Lock()
+
+    def square(k: int) -> int:
+        nonlocal running, most_at_once
+        with lock:
+            running += 1
+            most_at_once = max(most_at_once, running)
+        time.sleep(0.005)
+        with lock:
+            running -= 1
+        done.release()
+        return k * k
+
+    before = threading.active_count()
+    with begun_map(square, range(20), most=5, workers=3) as results:
+        assert all(done.acquire(timeout=5) for _ in range(5))
+        assert not done.acquire(timeout=0.05)  # the sixth waits until a result is taken
+        assert most_at_once == 1
+        assert list(results) == [k * k for k in range(20)]
+        assert 1 < most_at_once <= 3
+    assert threading.active_count() == before
+
+
+def test_leaving_what_is_begun_drops_the_rest() -> None:
+    started: list[int] = []
+
+    def slow(k: int) -> None:
+        started.append(k)
+        time.sleep(0.02)
+
+    before = threading.active_count()
+    with pytest.raises(KeyboardInterrupt), begun_map(slow, range(1000), most=8):
+        while not started:
+            time.sleep(0.001)
+        raise KeyboardInterrupt
+    assert started == [0]
+    assert threading.active_count() == before
+
+
+def test_an_exception_of_what_is_begun_comes_at_its_turn() -> None:
+    def items() -> Iterator[int]:
+        yield from (3, 2, 0, 1)
+        raise KeyError("torn")
+
+    with begun_map(lambda k: 6 // k, items(), most=9) as results:
+        assert [next(results), next(results)] == [2, 3]
+        with pytest.raises(ZeroDivisionError):
+            next(results)
+    with begun_map(lambda k: k, items(), most=2) as results, pytest.raises(KeyError):
+        list(results)
+
+
+def test_work_beside_a_block_is_done_at_its_end() -> None:
+    begun, done = threading.Event(), []
+
+    def work() -> None:
+        assert begun.wait(5)
+        done.append(1)
+
+    with beside(work):
+        assert done == []
+        begun.set()
+    assert done == [1]
+
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), beside(fail):
+        done.append(2)
+    assert done == [1, 2]
 
 
 def test_a_stopwatch_adds_up_and_survives_exceptions() -> None:

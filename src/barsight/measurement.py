@@ -43,6 +43,11 @@ class Refusal:
     stage: str
     frame: RefusedFrame
 
+    @property
+    def stamp_ns(self) -> int:
+        """The frame's."""
+        return self.frame.stamp_ns
+
 
 @dataclass(frozen=True, eq=False)
 class Preview:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -21,7 +22,7 @@ import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.parallel import ordered_map
+from barsight.core.parallel import begun_map, beside
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
@@ -34,9 +35,9 @@ from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.look import apart, choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import finish
+from barsight.mapping.surface import Surface, finish
 from barsight.mapping.tiles import TileStore
-from barsight.mapping.view import Placed, View, Viewer
+from barsight.mapping.view import Matched, Matcher, Neighbour, Placer
 from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, digest, plain
 from barsight.motion.self_calibration import self_calibrated
 from barsight.motion.settings import MotionSettings, make_estimator
@@ -57,6 +58,7 @@ Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
 _FAST_SHIFT = 0.1
+_MATCHED_AHEAD = 12
 
 
 @dataclass(frozen=True)
@@ -97,12 +99,14 @@ def measure(
     advance: Advance,
     resume: Path | None = None,
     magnet: Magnet | None = None,
+    write: Callable[[Surface], None] = lambda _: None,
 ) -> Measurement:
     """Measure a recording. `scratch` is an empty folder for the map's tiles; the caller removes it.
 
-    resume: a folder that keeps the trajectory and each frame's view (about 30 MB for 1.3 megapixels), so that
-    a killed run goes on where it was; the caller removes it when all is written.
+    resume: a folder that keeps the trajectory and each frame's disparity (about 16 MB for 1.3 megapixels), so
+    that a killed run goes on where it was; the caller removes it when all is written.
     magnet: what lifts are chosen for; the package's documented example where there is none.
+    write: given the surface as soon as it is finished, in a thread beside the search for bundles.
 
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
@@ -126,45 +130,46 @@ def measure(
     if resume is not None:
         kept = keeping_folder(resume, digest([barsight.__version__, configuration, inputs]))
 
-    with watch("trajectory", total):
-        estimate = make_estimator(settings.motion)
-        count = _counter("trajectory", total, advance)
-        trajectory = once(kept, "trajectory", lambda: estimate(source, rectifier, count))
-        calibrated = self_calibrated(
-            source.rig, rectifier, trajectory.drift, correct=settings.self_calibrate == "yaw"
-        )
-        rectifier = calibrated.rectifier
+    matcher = Matcher(stereo, make_method(settings.stereo.for_map()), rectifier, watch)
+    with ExitStack() as running:
+        # Pictures are matched on the core that the trajectory leaves idle, unless what to match hangs on it.
+        at_once = settings.map.least_shift == 0 and settings.self_calibrate == "none"
+        matched = running.enter_context(_matched(source.frames(), matcher, kept)) if at_once else None
+        with watch("trajectory", total):
+            estimate = make_estimator(settings.motion)
+            count = _counter("trajectory", total, advance)
+            trajectory = once(kept, "trajectory", lambda: estimate(source, rectifier, count))
+            calibrated = self_calibrated(
+                source.rig, rectifier, trajectory.drift, correct=settings.self_calibrate == "yaw"
+            )
+            rectifier = calibrated.rectifier
+        taken = apart(trajectory.frames, rectifier, first.range_m, settings.map.least_shift)
+        poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
+        if matched is None:
+            wanted = (frame for frame in source.frames() if frame.stamp_ns in poses)
+            matched = running.enter_context(_matched(wanted, replace(matcher, rectifier=rectifier), kept))
 
-    taken = apart(trajectory.frames, rectifier, first.range_m, settings.map.least_shift)
-    poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
-    refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
-    refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
-    method = make_method(settings.stereo.for_map())
-    per_pixel = points_per_pixel(first, cell_m)
-    viewer = Viewer(stereo, method, rectifier, cell_m, per_pixel, settings.map.max_sigma_m, watch)
-
-    def look(placed: tuple[StereoFrame | RefusedFrame, PosedFrame, list[Placed]]) -> View | Refusal:
-        frame, posed, beside = placed
-        if isinstance(frame, RefusedFrame):
-            return Refusal("recording", frame)
-        view = once(kept, f"view_{frame.stamp_ns}", lambda: viewer(frame, posed, beside))
-        if isinstance(view, Failed):
-            return Refusal("stereo", RefusedFrame(frame.stamp_ns, view.reason))
-        return view
-
-    store = TileStore(scratch, settings.map.resident_tiles)
-    preview = None
-    placed: list[Pose] = []
-    for done, view in enumerate(ordered_map(look, _placed(source, poses)), start=1):
-        if isinstance(view, Refusal):
-            refusals.append(view)
-        else:
-            with watch("fuse", 1):
-                fuse(store, view.cells, settings.map)
-            placed.append(poses[view.stamp_ns].reference_from_body @ rectifier.body_from_rect0)
-            if preview is None or abs(done - len(poses) / 2) < 1:
-                preview = Preview(view.left, view.disparity_px)
-        advance("map", done, len(poses))
+        refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
+        refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
+        per_pixel = points_per_pixel(first, cell_m)
+        body_from_rect0 = rectifier.body_from_rect0
+        placer = Placer(stereo, body_from_rect0, cell_m, per_pixel, settings.map.max_sigma_m, watch)
+        store = TileStore(scratch, settings.map.resident_tiles)
+        preview = None
+        placed: list[Pose] = []
+        for done, (frame, posed, neighbours) in enumerate(_placed(matched, poses), start=1):
+            view = frame if isinstance(frame, Refusal) else placer(frame, posed, neighbours)
+            if isinstance(view, Failed):
+                view = Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
+            if isinstance(view, Refusal):
+                refusals.append(view)
+            else:
+                with watch("fuse", 1):
+                    fuse(store, view.cells, settings.map)
+                placed.append(posed.reference_from_body @ body_from_rect0)
+                if preview is None or abs(done - len(poses) / 2) < 1:
+                    preview = Preview(view.left, view.disparity_px)
+            advance("map", done, len(poses))
     used = len(placed)
     if used == 0:
         raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
@@ -184,7 +189,7 @@ def measure(
         speed_mps = _speed_along_x(trajectory)
         agreed = [agree(by_number[p.profile], p, speed_mps) for p in laser if p.profile in by_number]
 
-    with watch("bundles"):
+    with watch("bundles"), beside(lambda: write(surface)):
         heights = HeightMap.of(surface)
         bundles = find_bundles(heights, settings.bundles)
         stock = (
@@ -246,16 +251,32 @@ def measure(
     )
 
 
+def _matched(
+    frames: Iterable[StereoFrame | RefusedFrame], matcher: Matcher, kept: Path | None
+) -> AbstractContextManager[Iterator[Matched | Refusal]]:
+    """The frames matched in order, begun at once."""
+
+    def match(frame: StereoFrame | RefusedFrame) -> Matched | Refusal:
+        if isinstance(frame, RefusedFrame):
+            return Refusal("recording", frame)
+        matched = once(kept, f"matched_{frame.stamp_ns}", lambda: matcher(frame))
+        if isinstance(matched, Failed):
+            return Refusal("stereo", RefusedFrame(frame.stamp_ns, matched.reason))
+        return matched
+
+    return begun_map(match, frames, _MATCHED_AHEAD)
+
+
 def _placed(
-    source: Recording, poses: dict[int, PosedFrame]
-) -> Iterator[tuple[StereoFrame | RefusedFrame, PosedFrame, list[Placed]]]:
+    matched: Iterator[Matched | Refusal], poses: dict[int, PosedFrame]
+) -> Iterator[tuple[Matched | Refusal, PosedFrame, list[Neighbour]]]:
     """The frames that are taken, each with those before and after it."""
-    known = ((frame, poses[frame.stamp_ns]) for frame in source.frames() if frame.stamp_ns in poses)
+    known = ((frame, poses[frame.stamp_ns]) for frame in matched if frame.stamp_ns in poses)
     before = None
     for here, after in pairwise(chain(known, (None,))):
         assert here is not None
-        beside = (other for other in (before, after) if other is not None)
-        yield *here, [(frame, pose) for frame, pose in beside if not isinstance(frame, RefusedFrame)]
+        both = (other for other in (before, after) if other is not None)
+        yield *here, [(frame, pose) for frame, pose in both if not isinstance(frame, Refusal)]
         before = here
 
 

@@ -20,7 +20,7 @@ from barsight.core.files import atomic_directory
 from barsight.evaluation.truth import score
 from barsight.pipeline import MeasureSettings, measure
 from barsight.recording.open import open_recording
-from barsight.report.files import RESULT_FILES, summary, write_results, write_summary
+from barsight.report.files import RESULT_FILES, summary, write_results, write_summary, write_surface
 from barsight.report.page import write_report
 from barsight.yard.magnet import load_magnet
 
@@ -90,7 +90,10 @@ def measure_into(
         scratch = staging / "scratch"
         scratch.mkdir()
         with stages(console) as advance:
-            measured = measure(recording, settings, scratch, advance, keep, described)
+            measured = measure(
+                recording, settings, scratch, advance, keep, described,
+                lambda surface: write_surface(surface, staging),
+            )  # fmt: skip
         content = summary(measured)
         write_results(measured, staging)
         shutil.rmtree(scratch)

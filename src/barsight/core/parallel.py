@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
+from queue import SimpleQueue
+from threading import Event, Semaphore
 from typing import TypeVar, cast
 
 import numba
@@ -38,6 +41,53 @@ def ordered_map(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+@contextmanager
+def begun_map(
+    function: Callable[[Item], Result], items: Iterable[Item], most: int, workers: int = WORKERS
+) -> Iterator[Iterator[Result]]:
+    """`ordered_map` that begins at once, in one thread beside whatever the caller does first; from the first
+    result asked for on it has all workers.
+
+    At most `most` results are under way or wait. An exception of the function or the items comes out at its
+    turn; leaving waits for what is under way and drops the rest.
+    """
+    pool, reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
+    at_once, room, left = Semaphore(1), Semaphore(most), Event()
+    begun: SimpleQueue[Future[Result] | None] = SimpleQueue()
+
+    def in_turn(item: Item) -> Result:
+        with at_once:
+            if left.is_set():
+                raise CancelledError
+            return function(item)
+
+    def read() -> None:
+        try:
+            for item in items:
+                room.acquire()
+                if left.is_set():
+                    return
+                begun.put(pool.submit(in_turn, item))
+        finally:
+            begun.put(None)
+
+    def results() -> Iterator[Result]:
+        at_once.release(workers)
+        while (future := begun.get()) is not None:
+            room.release()
+            yield future.result()
+        reading.result()
+
+    reading = reader.submit(read)
+    try:
+        yield results()
+    finally:
+        left.set()
+        room.release()
+        reader.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
 def read_ahead(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
     """The items in order, the next `count` of them made in a thread of their own while one is used.
 
@@ -57,6 +107,15 @@ def read_ahead(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
             yield cast(Item, item)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def beside(work: Callable[[], None]) -> Iterator[None]:
+    """Do `work` in a thread of its own while the block under it runs; what it raises comes out at the end."""
+    with ThreadPoolExecutor(1) as pool:
+        working = pool.submit(work)
+        yield
+        working.result()
 
 
 def in_bands(work: Callable[[int, int], None], rows: int, band_rows: int) -> None:

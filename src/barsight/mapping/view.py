@@ -1,4 +1,4 @@
-"""One frame's way: rectified pair, disparity, points, and what they say of the map's cells."""
+"""One frame's way: rectified pair and disparity, then points and what they say of the map's cells."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import Failed
+from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair, StereoFrame
 from barsight.mapping.carried import carried_along
@@ -18,43 +19,50 @@ from barsight.stereo.method import StereoMethod
 from barsight.stereo.points import triangulate
 from barsight.stereo.settings import StereoSettings
 
-Placed = tuple[StereoFrame, PosedFrame]
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """A frame before anybody knows where it was taken: its rectified pair, and its disparity or why not."""
+
+    pair: RectifiedPair
+    disparity: Disparity | Failed
+
+    @property
+    def stamp_ns(self) -> int:
+        """The pair's."""
+        return self.pair.stamp_ns
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """cells: what the frame says of the map. left, disparity_px: (H, W), for people to look at."""
 
-    stamp_ns: int
     cells: CellObservations
     left: UInt8
     disparity_px: Float32
 
 
-@dataclass(frozen=True, eq=False)
-class Viewer:
-    """From a frame and its pose to a `View`: without state, so that frames run side by side.
+Neighbour = tuple[Matched, PosedFrame]
 
-    per_pixel, max_sigma_m: see `triangulate`.
-    """
+
+@dataclass(frozen=True, eq=False)
+class Matcher:
+    """From a frame to what it shows by itself: without state, so that frames run side by side."""
 
     stereo: StereoSettings
     method: StereoMethod
     rectifier: Rectifier
-    cell_m: float
-    per_pixel: int
-    max_sigma_m: float
     watch: Stopwatch
 
-    def __call__(self, frame: StereoFrame, posed: PosedFrame, beside: Sequence[Placed] = ()) -> View | Failed:
-        """beside: the frames before and after, against which the crane's own parts stand still.
-
-        Failed where the images have the wrong size, are swapped, have no texture or show no depth.
+    def __call__(self, frame: StereoFrame) -> Matched | Failed:
+        """Failed where the images have the wrong size; the disparity Failed where they are swapped or have no
+        texture.
         """
         with self.watch("rectify", 1):
             pair = self.rectifier(frame)
-        if isinstance(pair, Failed):
-            return pair
+        return pair if isinstance(pair, Failed) else Matched(pair, self._disparity(pair))
+
+    def _disparity(self, pair: RectifiedPair) -> Disparity | Failed:
         candidates = disparity_range(pair, self.stereo)
         if isinstance(candidates, Failed):
             return candidates
@@ -63,12 +71,42 @@ class Viewer:
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.watch("stereo", 1):
-            matched = self.method(pair, candidates)
-            sure = surer_than(matched, self.stereo.max_sigma_px)
-            disparity = without_gaps(sure, pair.left, self.stereo.gap_darkness)
+            sure = surer_than(self.method(pair, candidates), self.stereo.max_sigma_px)
+            return without_gaps(sure, pair.left, self.stereo.gap_darkness)
+
+
+@dataclass(frozen=True, eq=False)
+class Placer:
+    """From a matched frame and its pose to what it says of the map. per_pixel, max_sigma_m: see
+    `triangulate`.
+    """
+
+    stereo: StereoSettings
+    body_from_rect0: Pose
+    cell_m: float
+    per_pixel: int
+    max_sigma_m: float
+    watch: Stopwatch
+
+    def __call__(
+        self, matched: Matched, posed: PosedFrame, beside: Sequence[Neighbour] = ()
+    ) -> View | Failed:
+        """beside: the frames before and after, against which the crane's own parts stand still.
+
+        Failed where there is no disparity, or no depth within max_depth_m and max_sigma_m.
+        """
+        pair, disparity = matched.pair, matched.disparity
+        if isinstance(disparity, Failed):
+            return disparity
+        reference_from_rect0 = posed.reference_from_body @ self.body_from_rect0
         with self.watch("carried", 1):
-            for other in beside:
-                disparity = self._without_carried(pair, disparity, posed, other)
+            for other, pose in beside:
+                there_from_here = (pose.reference_from_body @ self.body_from_rect0).inverse()
+                still = carried_along(
+                    pair.left, disparity.disparity_px, pair.camera, other.pair.left,
+                    there_from_here @ reference_from_rect0,
+                )  # fmt: skip
+                disparity = keep(disparity, ~still)
         with self.watch("points", 1):
             points = triangulate(
                 pair,
@@ -78,28 +116,14 @@ class Viewer:
                 self.max_sigma_m,
                 self.per_pixel,
             )
-            body = posed.reference_from_body
-            reference_from_rect0 = body @ self.rectifier.body_from_rect0
             spacing_rad = 1 / (pair.camera.focal_px * self.per_pixel)
             cells = observe(
-                points, reference_from_rect0, body.translation, posed.covariance, self.cell_m, spacing_rad
-            )
+                points, reference_from_rect0, posed.reference_from_body.translation, posed.covariance,
+                self.cell_m, spacing_rad,
+            )  # fmt: skip
         if cells.z_m.size == 0:
             return Failed("no-depth", "no pixel has a depth within max_depth_m and max_sigma_m")
-        return View(pair.stamp_ns, cells, pair.left, disparity.disparity_px)
-
-    def _without_carried(
-        self, pair: RectifiedPair, disparity: Disparity, posed: PosedFrame, other: Placed
-    ) -> Disparity:
-        frame, pose = other
-        if frame.left.shape != pair.left.shape:
-            return disparity
-        here, there = (p.reference_from_body @ self.rectifier.body_from_rect0 for p in (posed, pose))
-        still = carried_along(
-            pair.left, disparity.disparity_px, pair.camera, self.rectifier.left(frame.left),
-            there.inverse() @ here,
-        )  # fmt: skip
-        return keep(disparity, ~still)
+        return View(cells, pair.left, disparity.disparity_px)
 
 
 def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:

@@ -37,12 +37,16 @@ _CLOUD_POINT = np.dtype(
 )
 
 
+def write_surface(surface: Surface, folder: Path) -> None:
+    """What the surface alone fills, into an existing folder: cloud, heights, orthophoto."""
+    write_height(surface, folder / "height.tif")
+    write_orthophoto(surface, folder)
+    write_cloud(surface, folder / "cloud.ply")
+
+
 def write_results(measurement: Measurement, folder: Path) -> None:
-    """All files that a measurement fills but result.json, into an existing folder."""
+    """All other files that a measurement fills but result.json, into an existing folder."""
     write_trajectory(measurement.trajectory, folder / "trajectory.tum")
-    write_cloud(measurement.surface, folder / "cloud.ply")
-    write_height(measurement.surface, folder / "height.tif")
-    write_orthophoto(measurement.surface, folder)
     write_contours(measurement.contours, folder / "contour.csv")
     reference = measurement.trajectory.reference
     write_bundles(measurement.bundles, measurement.stock, reference, folder / "bundles.json")
