@@ -13,6 +13,7 @@ from barsight.core.types import RectifiedCamera
 from barsight.features.guided import project_stereo
 from barsight.inertial.model import ImuBias
 from barsight.motion import band
+from barsight.motion.gaps import Chain, with_gaps, without_gaps
 from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import marginals
 from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
@@ -44,7 +45,10 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
     right = rng.normal(size=(2, n))
     expected = np.linalg.solve(matrix, right.T).T
     assert band.factorise(rows)
-    band.solve(rows, right)
+    beside = right.T.copy()
+    band.solve_forward(rows, beside)
+    band.solve_back(rows, beside)
+    right = beside.T
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     blocks = np.empty((n // 3, 3, 3))
     pairs = np.array([[k, k + 1] for k in range(n // 3 - 1)], np.int64).reshape(-1, 2)
@@ -65,6 +69,28 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
 def test_an_undetermined_band_is_told() -> None:
     rows = np.array([[0.0, 1.0], [1.0, 1.0]])
     assert not band.factorise(rows)
+
+
+def test_nodes_between_frames_are_taken_out() -> None:
+    """A chain of seven nodes of which three are kept, against the whole one solved."""
+    rng, size, count = np.random.default_rng(3), 3, 7
+    matrix, rows = banded(rng, size * count, size + 1)
+    wide = np.zeros((size * count, 2 * size))
+    wide[:, -size - 1 :] = rows
+    gradient, side = rng.normal(size=(2, size * count))
+    kept, latency = np.array([1, 2, 5]), 0.7
+    left, gaps = without_gaps(Chain(wide, gradient, side, 9.0, 0.5), kept)
+    small = np.zeros((9, 9))
+    for i in range(9):
+        for j in range(max(0, i - 2 * size + 1), i + 1):
+            small[i, j] = small[j, i] = left.rows[i, 2 * size - 1 - i + j]
+    step = -np.linalg.solve(small, left.gradient + latency * left.side)
+    found = with_gaps(step.reshape(3, 3), latency, kept, gaps, count)
+    np.testing.assert_allclose(found.ravel(), -np.linalg.solve(matrix, gradient + latency * side), atol=1e-12)
+    whole = np.linalg.solve(matrix, np.column_stack([side, gradient]))
+    rest = np.linalg.solve(small, np.column_stack([left.side, left.gradient]))
+    np.testing.assert_allclose(left.corner - left.side @ rest[:, 0], 9.0 - side @ whole[:, 0])
+    np.testing.assert_allclose(left.corner_gradient - left.side @ rest[:, 1], 0.5 - side @ whole[:, 1])
 
 
 def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple[Problem, np.ndarray]:

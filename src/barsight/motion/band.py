@@ -34,32 +34,55 @@ def factorise(rows: Float64) -> bool:
     return True
 
 
-def solve(factor: Float64, right: Float64) -> None:
-    """Replaces right (m, n), one right side a row, by the solutions."""
-    beside = right.T.copy()
-    _solve(factor, beside)
-    right[:] = beside.T
-
-
 @kernel(fastmath=True)
-def _solve(factor: Float64, x: Float64) -> None:
-    """x: (n, m), right sides beside each other, so that the factor is read once for all of them."""
+def solve_forward(factor: Float64, x: Float64) -> None:
+    """Replaces x (n, m), right sides beside each other so that the factor is read once for all of them, by
+    the factor's inverse times these. Four rows at a time, so that the sums stay in the registers.
+    """
     n, width = factor.shape
     sides = x.shape[1]
     for i in range(n):
-        for k in range(max(0, i - width + 1), i):
-            share = factor[i, k - i + width - 1]
+        first = max(0, i - width + 1)
+        own = i - width + 1
+        fours = first + (i - first) // 4 * 4
+        for k in range(first, fours, 4):
+            p, q = factor[i, k - own], factor[i, k + 1 - own]
+            r, s = factor[i, k + 2 - own], factor[i, k + 3 - own]
             for c in range(sides):
-                x[i, c] -= share * x[k, c]
+                x[i, c] -= p * x[k, c] + q * x[k + 1, c] + r * x[k + 2, c] + s * x[k + 3, c]
+        for k in range(fours, i):
+            p = factor[i, k - own]
+            for c in range(sides):
+                x[i, c] -= p * x[k, c]
+        p = 1 / factor[i, width - 1]
         for c in range(sides):
-            x[i, c] /= factor[i, width - 1]
+            x[i, c] *= p
+
+
+@kernel(fastmath=True)
+def solve_back(factor: Float64, x: Float64) -> None:
+    """Replaces x (n, m) by the inverse of the factor's transpose times it."""
+    n, width = factor.shape
+    sides = x.shape[1]
     for i in range(n - 1, -1, -1):
+        p = 1 / factor[i, width - 1]
         for c in range(sides):
-            x[i, c] /= factor[i, width - 1]
+            x[i, c] *= p
         for k in range(max(0, i - width + 1), i):
             share = factor[i, k - i + width - 1]
             for c in range(sides):
                 x[k, c] -= share * x[i, c]
+
+
+@kernel(fastmath=True)
+def products(x: Float64, result: Float64) -> None:
+    """result (m, m): x^T x of x (n, m). BLAS's threads wait for each other where the machine is busy."""
+    result[:] = 0
+    for i in range(x.shape[0]):
+        for a in range(x.shape[1]):
+            share = x[i, a]
+            for b in range(x.shape[1]):
+                result[a, b] += share * x[i, b]
 
 
 @kernel(fastmath=True)
@@ -128,14 +151,18 @@ def add_products(
 
 @kernel(fastmath=True)
 def add_blocks(blocks: Float64, size: int, rows: Float64) -> None:
-    """Adds blocks (M, S, b, b) of unknowns from k size on (rows) with those from (k + s) size on."""
-    width = rows.shape[1]
+    """Adds blocks (M, b, R b): of node k's first b unknowns with those of the nodes k - R + 1...k; a node has
+    `size` unknowns. Of its own block the lower half counts.
+    """
+    width, own = rows.shape[1], blocks.shape[1]
+    reach = blocks.shape[2] // own
     for k in range(blocks.shape[0]):
-        for s in range(min(blocks.shape[1], blocks.shape[0] - k)):
-            for i in range(blocks.shape[2]):
-                for j in range(i if s == 0 else 0, blocks.shape[3]):
-                    row, column = (k + s) * size + j, k * size + i
-                    rows[row, column - row + width - 1] += blocks[k, s, i, j]
+        for s in range(min(reach, k + 1)):
+            for i in range(own):
+                row, begin = k * size + i, (reach - 1 - s) * own
+                column = row - i - s * size
+                for j in range(i + 1 if s == 0 else own):
+                    rows[row, column + j - row + width - 1] += blocks[k, i, begin + j]
 
 
 @kernel(fastmath=True)

@@ -20,8 +20,9 @@ from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import Marginals, marginals
 from barsight.motion.problem import Problem, StereoSightings
 from barsight.motion.slides import with_slides
-from barsight.motion.solver import State, System, optimise, sighting_residuals
+from barsight.motion.solver import State, optimise, sighting_residuals
 from barsight.motion.stereo_factors import often, persistence, start_points
+from barsight.motion.system import System
 
 FARTHEST_OUTLIER_SIGMAS = 3.5
 MOST_ROUNDS = 3
@@ -34,7 +35,7 @@ START_GAIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """poses: (M,). covariance: (M, 6, 6) rotation then translation, reference axes. relative:
+    """poses: (M,). covariance: (F, 6, 6) of the frames, rotation then translation, reference axes. relative:
     (F - 1, 6, 6) of a frame's pose in the frame before, in its own axes. velocity_mps: (M, 3) or
     None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
     drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
@@ -60,13 +61,14 @@ class Estimate:
 
 
 def solve(problem: Problem, frames: Int64) -> Estimate:
-    """frames: (F,) the nodes whose relative covariance is wanted, each with the next.
+    """frames: (F,) the nodes whose covariance is wanted, also relative, each with the next.
 
     After a first solution, drift of the rig included, sightings beyond 3.5 sigma leave and all sigmas
     grow or shrink to what was seen; then the drift is sought on and weighed against its prior, and encoder
     places beyond 5 sigma leave. (A cut before the drift is known would take the very sightings that show it
     best.) Raises LinAlgError where the measurements leave an unknown undetermined.
     """
+    problem = replace(problem, asked=frames)
     used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
     if problem.sightings is not None:
         used = often(problem.sightings, used)
@@ -89,22 +91,25 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
         chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
         problem = replace(problem, placed=chosen)
         state, system = optimise(problem, factors(problem), state, used)
-    pairs = np.column_stack([frames[:-1], frames[1:]])
+    pairs = np.column_stack([np.arange(len(frames) - 1), np.arange(1, len(frames))])
     poses, found = _poses(state, problem), marginals(system, pairs)
+    shown = tuple(poses[k] for k in frames)
+    everything = np.full((len(poses), system.size, system.size), np.nan)
+    everything[frames] = found.nodes
     velocity, biases = _inertial(state, problem)
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
     pictures, points = pictures_in_sigmas(problem, state, used)
     return Estimate(
-        poses, covariances(found, poses, drift), relative(found, poses, drift, pairs), velocity, biases,
+        poses, covariances(found, shown, drift), relative(found, shown, drift, pairs), velocity, biases,
         sigma, drift, used,
         encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
         disagreement(state.values, everywhere), agreeing(state.values, everywhere),
-        inertial(problem, state, found.nodes), pictures, imu_in_sigmas(problem, state), points,
+        inertial(problem, state, everything), pictures, imu_in_sigmas(problem, state), points,
     )  # fmt: skip
 
 
 def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None) -> Float64:
-    """(M, 6, 6) of the poses in the reference's axes, what the rig's drift leaves open included."""
+    """(F, 6, 6) of the poses in the reference's axes, what the rig's drift leaves open included."""
     shared = np.zeros((2, 2)) if drift is None else drift.covariance
     result = np.zeros((len(poses), 6, 6))
     for k, pose in enumerate(poses):

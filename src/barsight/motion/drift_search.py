@@ -13,7 +13,8 @@ from barsight.core.types import RigDrift
 from barsight.motion.graph import factors
 from barsight.motion.problem import Problem
 from barsight.motion.rig_drift import columns, weigh
-from barsight.motion.solver import RELATIVE_GAIN, State, System, moved, optimise
+from barsight.motion.solver import RELATIVE_GAIN, State, moved, optimise
+from barsight.motion.system import System
 
 MOST_STEPS = 6
 LEAST_STEP_PX = 0.02
@@ -21,8 +22,7 @@ LEAST_STEP_PX = 0.02
 
 def drifted(problem: Problem, state: State, system: System, used: Bool) -> tuple[State, RigDrift]:
     """The state moved to the drift that sightings and prior together show, and that drift."""
-    solved = system.solved(system.factor())
-    own, slope = system.schur(solved)
+    own, slope = system.schur(system.forward)
     best = state.drift - np.linalg.solve(own, slope)[-2:]
     drift = weigh(best, np.linalg.inv(own)[-2:, -2:].astype(np.float64), problem)
     fixed = np.zeros(len(own))

@@ -1,7 +1,8 @@
 """Points taken out of the normal equations: what is left binds poses and what is shared only.
 
 A point is seen from a few nodes and binds only these, so its four unknowns are eliminated where it stands
-(Schur's complement), which costs a few hundred products a sighting.
+(Schur's complement). With L L^T its own matrix, what it binds loses U^T U, U being L's inverse times what
+it shares with each: products along rows as long as its track, which the processor takes four at a time.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from barsight.core.arrays import Float64, kernel
+from barsight.core.arrays import Float64, Int64, kernel
 from barsight.motion.point_kernels import Guess, Rig, Sights, rows, slide_off
 
 
 class Reduced(NamedTuple):
-    """Normal equations of poses and what is shared. band: (M, R, 6, 6) of node k with node k + r; gradient
-    (M, 6); side (M, 6, S + 2) with what is shared; corner (S + 2, S + 2), corner_gradient (S + 2,) of itself.
+    """Normal equations of poses and what is shared. band: (M, 6, 6 R) as `band.add_blocks` takes it; gradient
+    (6 M,); side (S + 2, 6 M) with what is shared; corner (S + 2, S + 2), corner_gradient (S + 2,) of itself.
     """
 
     band: Float64
@@ -27,164 +28,193 @@ class Reduced(NamedTuple):
 
 
 @kernel(fastmath=True)
-def _inverse(m: Float64, result: Float64) -> None:
-    """Of a symmetric (4, 4): its first three rows' inverse, and the fourth by its Schur complement."""
-    result[0, 0] = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
-    result[0, 1] = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
-    result[0, 2] = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-    result[1, 1] = m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]
-    result[1, 2] = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]
-    result[2, 2] = m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
-    size = m[0, 0] * result[0, 0] + m[0, 1] * result[0, 1] + m[0, 2] * result[0, 2]
-    for i in range(3):
-        for j in range(i, 3):
-            result[i, j] /= size
-            result[j, i] = result[i, j]
-    own = m[3, 3]
-    for i in range(3):
-        result[3, i] = result[i, 0] * m[0, 3] + result[i, 1] * m[1, 3] + result[i, 2] * m[2, 3]
-        own -= result[3, i] * m[i, 3]
-    result[3, 3] = 1 / own
-    for i in range(3):
-        for j in range(3):
-            result[i, j] += result[3, i] * result[3, j] / own
-    for i in range(3):
-        result[3, i] /= -own
-        result[i, 3] = result[3, i]
+def _factorise(m: Float64) -> None:
+    """Replaces the lower half of a symmetric (4, 4) by its Cholesky factor, the diagonal by its inverse."""
+    for i in range(4):
+        for j in range(i):
+            total = m[i, j]
+            for k in range(j):
+                total -= m[i, k] * m[j, k]
+            m[i, j] = total * m[j, j]
+        own = m[i, i]
+        for k in range(i):
+            own -= m[i, k] * m[i, k]
+        m[i, i] = 1 / np.sqrt(own)
+
+
+@kernel(fastmath=True)
+def _add_point(error: Float64, by_point: Float64, normal: Float64, gradient: Float64) -> None:
+    """A sighting's share of its point's own equations; of the matrix the lower half."""
+    for a in range(4):
+        gradient[a] += by_point[0, a] * error[0] + by_point[1, a] * error[1] + by_point[2, a] * error[2]
+        for b in range(a + 1):
+            normal[a, b] += (
+                by_point[0, a] * by_point[0, b] + by_point[1, a] * by_point[1, b]
+                + by_point[2, a] * by_point[2, b]
+            )  # fmt: skip
+
+
+@kernel(fastmath=True)
+def _add_pose(
+    error: Float64, by_pose: Float64, by_point: Float64, by_drift: Float64, node: int, at: int, band: Float64,
+    gradient: Float64, side: Float64, bound: Float64,
+) -> None:  # fmt: skip
+    """A sighting's share of its pose's own equations and of those with the drift; bound (4, 6 R) from column
+    `at` on with its point.
+    """
+    drift, own = len(side) - 2, band.shape[2] - 6
+    for a in range(6):
+        x, y, z = by_pose[0, a], by_pose[1, a], by_pose[2, a]
+        for b in range(a + 1):
+            band[node, a, own + b] += x * by_pose[0, b] + y * by_pose[1, b] + z * by_pose[2, b]
+        gradient[6 * node + a] += x * error[0] + y * error[1] + z * error[2]
+        side[drift, 6 * node + a] += by_drift[0] * z
+        side[drift + 1, 6 * node + a] += by_drift[1] * z
+        for b in range(4):
+            bound[b, at + a] = x * by_point[0, b] + y * by_point[1, b] + z * by_point[2, b]
+
+
+@kernel(fastmath=True)
+def _take_out(
+    bound: Float64, width: int, first: int, factor: Float64, rest: Float64, at: Int64, begin: int,
+    band: Float64, gradient: Float64, side: Float64, corner: Float64, corner_gradient: Float64,
+) -> None:  # fmt: skip
+    """Takes U^T U off, U being the factor's inverse times what the point shares: bound (4, width) with the
+    poses of nodes from `first` on, rest (4, 4) with piece, drift and gradient. at: (3,) where the shared ones
+    stand, those from `begin` on count.
+    """
+    for i in range(4):
+        mine = bound[i, :width]
+        for j in range(i):
+            share, other = factor[i, j], bound[j, :width]
+            for a in range(width):
+                mine[a] -= share * other[a]
+            for b in range(4):
+                rest[i, b] -= share * rest[j, b]
+        share = factor[i, i]
+        for a in range(width):
+            mine[a] *= share
+        for b in range(4):
+            rest[i, b] *= share
+    b0, b1, b2, b3 = bound[0, :width], bound[1, :width], bound[2, :width], bound[3, :width]
+    for i in range(width // 6):
+        for a in range(6):
+            x, y, z, w = b0[6 * i + a], b1[6 * i + a], b2[6 * i + a], b3[6 * i + a]
+            line = band[first + i, a, band.shape[2] - 6 * (i + 1) :]
+            for b in range(len(line)):
+                line[b] -= x * b0[b] + y * b1[b] + z * b2[b] + w * b3[b]
+    for c in range(begin, 4):
+        x, y, z, w = rest[0, c], rest[1, c], rest[2, c], rest[3, c]
+        whole = gradient if c == 3 else side[at[c]]
+        line = whole[6 * first : 6 * first + width]
+        for a in range(len(line)):
+            line[a] -= x * b0[a] + y * b1[a] + z * b2[a] + w * b3[a]
+    for c in range(begin, 3):
+        for k in range(4):
+            corner_gradient[at[c]] -= rest[k, c] * rest[k, 3]
+            for d in range(begin, 3):
+                corner[at[c], at[d]] -= rest[k, c] * rest[k, d]
 
 
 @kernel(fastmath=True)
 def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
     """Adds all used sightings to `result`."""
-    most = 1
-    for t in range(len(sights.first) - 1):
-        most = max(most, sights.first[t + 1] - sights.first[t])
-    error, by_pose, by_point, by_drift = np.empty(3), np.empty((3, 6)), np.empty((3, 4)), np.empty(2)
-    room, nodes = np.empty((3, 3)), np.empty(most, np.int64)
-    # A point's share of the rows of poses and of what is shared: (6, 4) a node, and its inverse times these.
-    cross, solved, shared_cross = np.empty((most, 6, 4)), np.empty((6, 4)), np.empty((3, 4))
-    normal, inverse, gradient, best = np.empty((4, 4)), np.empty((4, 4)), np.empty(4), np.empty(4)
-    last = len(guess.shared) - 1
+    lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
+    first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
+    camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
+    band, slope, side, corner, corner_slope = result
+    error, q, by_drift, by_pose, by_point = (
+        np.empty(3), np.empty(3), np.empty(2), np.empty((3, 6)), np.empty((3, 4)),
+    )  # fmt: skip
+    normal, gradient, rest, last = np.empty((4, 4)), np.empty(4), np.empty((4, 4)), len(shared) - 1
+    bound, at = np.empty((4, band.shape[2])), np.array([0, last - 1, last])
     begin = 0 if last > 1 else 1
-    at = np.array([0, last - 1, last])
-    for t in range(len(sights.first) - 1):
-        normal[:] = 0
-        gradient[:] = 0
-        shared_cross[:] = 0
-        count = 0
-        for k in range(sights.first[t], sights.first[t + 1]):
-            if not sights.used[k]:
+    for t in range(len(first) - 1):
+        normal[:], gradient[:], rest[:] = 0.0, 0.0, 0.0
+        begun = end = -1
+        for k in range(first[t], first[t + 1]):
+            if not used[k]:
                 continue
-            rows(rig, sights, guess, k, t, error, by_pose, by_point, by_drift, room)
-            node = sights.node[k]
-            nodes[count] = node
-            block = result.band[node, 0]
-            for a in range(6):
-                for b in range(6):
-                    block[a, b] += (
-                        by_pose[0, a] * by_pose[0, b] + by_pose[1, a] * by_pose[1, b]
-                        + by_pose[2, a] * by_pose[2, b]
-                    )  # fmt: skip
-                for b in range(4):
-                    cross[count, a, b] = (
-                        by_pose[0, a] * by_point[0, b] + by_pose[1, a] * by_point[1, b]
-                        + by_pose[2, a] * by_point[2, b]
-                    )  # fmt: skip
-                result.gradient[node, a] += (
-                    by_pose[0, a] * error[0] + by_pose[1, a] * error[1] + by_pose[2, a] * error[2]
-                )
-                for i in range(2):
-                    result.side[node, a, at[i + 1]] += by_drift[i] * by_pose[2, a]
-            for a in range(4):
-                for i in range(3):
-                    gradient[a] += by_point[i, a] * error[i]
-                    for b in range(4):
-                        normal[a, b] += by_point[i, a] * by_point[i, b]
-                for i in range(2):
-                    shared_cross[i + 1, a] += by_drift[i] * by_point[2, a]
-            for i in range(2):
-                result.corner_gradient[at[i + 1]] += by_drift[i] * error[2]
-                for j in range(2):
-                    result.corner[at[i + 1], at[j + 1]] += by_drift[i] * by_drift[j]
-            count += 1
-        if count == 0 or normal[0, 0] == 0:
+            n = node[k]
+            if begun < 0:
+                begun = n
+                bound[:] = 0.0
+            end = n + 1
+            rows(
+                lens, mount, huber, camera, points, shared, scale, stereo, weight, n, k, t, error, q, by_pose,
+                by_point, by_drift,
+            )  # fmt: skip
+            _add_point(error, by_point, normal, gradient)
+            _add_pose(error, by_pose, by_point, by_drift, n, 6 * (n - begun), band, slope, side, bound)
+            for c in range(2):
+                corner_slope[last - 1 + c] += by_drift[c] * error[2]
+                for d in range(2):
+                    corner[last - 1 + c, last - 1 + d] += by_drift[c] * by_drift[d]
+                for a in range(4):
+                    rest[a, 1 + c] += by_drift[c] * by_point[2, a]
+        if begun < 0 or normal[0, 0] == 0:
             continue
-        held = sights.tight[t] ** 2
-        off = slide_off(sights, guess, t)
+        held = tight[t] ** 2
+        pull = held * slide_off(points, shared, piece, t)
         normal[3, 3] += held
-        gradient[3] += held * off
+        gradient[3] += pull
         if begin == 0:
-            at[0] = sights.piece[t]
-            shared_cross[0, 3] = -held
-            result.corner[at[0], at[0]] += held
-            result.corner_gradient[at[0]] -= held * off
-        _inverse(normal, inverse)
-        best[:] = 0
+            at[0] = piece[t]
+            rest[3, 0] = -held
+            corner[at[0], at[0]] += held
+            corner_slope[at[0]] -= pull
         for a in range(4):
-            for b in range(4):
-                best[a] += inverse[a, b] * gradient[b]
-        for i in range(begin, 3):
-            for a in range(4):
-                result.corner_gradient[at[i]] -= shared_cross[i, a] * best[a]
-                for b in range(4):
-                    for j in range(begin, 3):
-                        result.corner[at[i], at[j]] -= shared_cross[i, a] * inverse[a, b] * shared_cross[j, b]
-        for i in range(count):
-            for a in range(6):
-                for b in range(4):
-                    solved[a, b] = (
-                        cross[i, a, 0] * inverse[0, b] + cross[i, a, 1] * inverse[1, b]
-                        + cross[i, a, 2] * inverse[2, b] + cross[i, a, 3] * inverse[3, b]
-                    )  # fmt: skip
-                for b in range(4):
-                    result.gradient[nodes[i], a] -= cross[i, a, b] * best[b]
-                    for j in range(begin, 3):
-                        result.side[nodes[i], a, at[j]] -= solved[a, b] * shared_cross[j, b]
-            for j in range(i + 1):
-                block = result.band[nodes[j], nodes[i] - nodes[j]]
-                for a in range(6):
-                    for b in range(6):
-                        block[a, b] -= (
-                            cross[j, a, 0] * solved[b, 0] + cross[j, a, 1] * solved[b, 1]
-                            + cross[j, a, 2] * solved[b, 2] + cross[j, a, 3] * solved[b, 3]
-                        )  # fmt: skip
+            rest[a, 3] = gradient[a]
+        _factorise(normal)
+        width = 6 * (end - begun)
+        _take_out(bound, width, begun, normal, rest, at, begin, band, slope, side, corner, corner_slope)
 
 
 @kernel(fastmath=True)
 def substitute(
-    rig: Rig, sights: Sights, guess: Guess, pose_step: Float64, shared_step: Float64, points: Float64,
+    rig: Rig, sights: Sights, guess: Guess, pose_step: Float64, shared_step: Float64, moved: Float64,
     variance: Float64,
 ) -> None:  # fmt: skip
-    """The points (T, 4) after steps (M, 6) of the poses and (S + 2,) of what is shared; variance (T,) of each
-    point's slide, all else taken as known.
+    """The points `moved` (T, 4) after steps (M, 6) of the poses and (S + 2,) of what is shared; variance (T,)
+    of each point's slide, all else taken as known.
     """
-    error, by_pose, by_point, by_drift = np.empty(3), np.empty((3, 6)), np.empty((3, 4)), np.empty(2)
-    room, normal, inverse, gradient = np.empty((3, 3)), np.empty((4, 4)), np.empty((4, 4)), np.empty(4)
-    for t in range(len(sights.first) - 1):
-        normal[:] = 0
-        gradient[:] = 0
-        for k in range(sights.first[t], sights.first[t + 1]):
-            if not sights.used[k]:
+    lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
+    first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
+    camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
+    error, q, by_drift, by_pose, by_point = (
+        np.empty(3), np.empty(3), np.empty(2), np.empty((3, 6)), np.empty((3, 4)),
+    )  # fmt: skip
+    normal, gradient, last = np.empty((4, 4)), np.empty(4), len(shared_step) - 1
+    for t in range(len(first) - 1):
+        normal[:], gradient[:] = 0.0, 0.0
+        for k in range(first[t], first[t + 1]):
+            if not used[k]:
                 continue
-            rows(rig, sights, guess, k, t, error, by_pose, by_point, by_drift, room)
-            error[2] += by_drift[0] * shared_step[-2] + by_drift[1] * shared_step[-1]
+            n = node[k]
+            rows(
+                lens, mount, huber, camera, points, shared, scale, stereo, weight, n, k, t, error, q, by_pose,
+                by_point, by_drift,
+            )  # fmt: skip
+            error[2] += by_drift[0] * shared_step[last - 1] + by_drift[1] * shared_step[last]
             for i in range(3):
                 for a in range(6):
-                    error[i] += by_pose[i, a] * pose_step[sights.node[k], a]
-            for a in range(4):
-                for i in range(3):
-                    gradient[a] += by_point[i, a] * error[i]
-                    for b in range(4):
-                        normal[a, b] += by_point[i, a] * by_point[i, b]
+                    error[i] += by_pose[i, a] * pose_step[n, a]
+            _add_point(error, by_point, normal, gradient)
         if normal[0, 0] == 0:
             continue
-        held, off = sights.tight[t] ** 2, slide_off(sights, guess, t)
-        if len(shared_step) > 2:
-            off -= shared_step[sights.piece[t]]
+        held, off = tight[t] ** 2, slide_off(points, shared, piece, t)
+        if last > 1:
+            off -= shared_step[piece[t]]
         normal[3, 3] += held
         gradient[3] += held * off
-        _inverse(normal, inverse)
-        variance[t] = inverse[3, 3]
-        for a in range(4):
-            for b in range(4):
-                points[t, a] -= inverse[a, b] * gradient[b]
+        _factorise(normal)
+        variance[t] = normal[3, 3] ** 2
+        for i in range(4):
+            for j in range(i):
+                gradient[i] -= normal[i, j] * gradient[j]
+            gradient[i] *= normal[i, i]
+        for i in range(3, -1, -1):
+            for j in range(i + 1, 4):
+                gradient[i] -= normal[j, i] * gradient[j]
+            gradient[i] *= normal[i, i]
+            moved[t, i] -= gradient[i]

@@ -102,8 +102,8 @@ class FusedTrajectory:
             told = dict.fromkeys((*simple.warnings, *inputs.warnings, f"{reason}: estimated one by one"))
             return replace(simple, warnings=tuple(told))
         placed = tuple(
-            PosedFrame(int(stamp), estimate.poses[k], estimate.covariance[k])
-            for stamp, k in zip(frames, nodes.frame, strict=True)
+            PosedFrame(int(stamp), estimate.poses[k], covariance)
+            for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
         )
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])

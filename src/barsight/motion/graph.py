@@ -1,5 +1,5 @@
 """GTSAM's factors of all but the sightings: preintegrated IMU between neighbouring nodes, the encoders'
-places (Huber), and priors on attitude, biases and, where the body stands still, velocity.
+places (Huber), priors on attitude, biases and, where the body stands still, velocity; and these linearised.
 """
 
 from __future__ import annotations
@@ -10,9 +10,16 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, E, V, X
 
+from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
+from barsight.motion import band
 from barsight.motion.encoders import add_encoders
+from barsight.motion.gaps import Chain
 from barsight.motion.problem import Problem
+
+WIDTHS = {"x": 6, "v": 3, "b": 6, "e": 1}
+OFFSETS = {"x": 0, "v": 6, "b": 9}
+"""Where a node's unknowns stand: pose, with an IMU velocity and biases."""
 
 
 def factors(problem: Problem, before: int | None = None) -> Any:
@@ -40,6 +47,38 @@ def start_values(problem: Problem) -> Any:
     if problem.has_latency:
         values.insert(E(0), np.zeros(1))
     return values
+
+
+def chain_of(graph: Any, values: Any, width: int, nodes: int) -> Chain:
+    """A graph's normal equations: each node with the next and the latency. width: unknowns a node."""
+    size = nodes * width
+    rows, gradient, side = np.zeros((size, 2 * width)), np.zeros(size), np.zeros((1, size))
+    corner, corner_gradient = np.zeros((1, 1)), np.zeros(1)
+    first, at, found, right = _sparse_rows(graph, values, width, size)
+    band.add_products(first, at, found, right, rows, gradient, side, corner, corner_gradient)
+    return Chain(rows, gradient, side[0], float(corner[0, 0]), float(corner_gradient[0]))
+
+
+def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64, Int64, Float64, Float64]:
+    """GTSAM's whitened rows as `band.add_products` takes them; the latency is unknown `size`."""
+    linear = graph.linearize(values)
+    if linear.size() == 0:
+        return np.zeros(1, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)
+    row, column, value = linear.sparseJacobian_()
+    where: list[Int64] = []
+    for key in linear.keyVector():
+        kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
+        begin = size if kind == "e" else node * width + OFFSETS[kind]
+        where.append(begin + np.arange(WIDTHS[kind]))
+    unknown = np.concatenate(where)
+    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
+    right = np.zeros(int(row.max()) + 1)
+    of_right = column == len(unknown)
+    right[row[of_right]] = value[of_right]
+    row, column, value = row[~of_right], column[~of_right], value[~of_right]
+    order = np.argsort(row, kind="stable")
+    first = np.searchsorted(row[order], np.arange(len(right) + 1)).astype(np.int64)
+    return first, unknown[column[order]], np.ascontiguousarray(value[order]), right
 
 
 def _add_priors(graph: Any, problem: Problem) -> None:

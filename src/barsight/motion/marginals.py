@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.motion.band import inverse_blocks
-from barsight.motion.solver import System
+from barsight.motion.band import inverse_blocks, solve_back
+from barsight.motion.system import System
 
 NO_PAIRS = np.empty((0, 2), np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Marginals:
-    """poses: (M, 6, 6) in GTSAM's order and body axes, the rig's drift taken as known. latency_sigma_s: nan
-    without encoders. swing: (M, 6, 2) how the poses move with the drift. nodes: (M, n, n) of all that a node
-    has, the latency taken as known too. cross: (P, 6, 6) of pairs of poses, as `poses`; NaN for those too far
-    apart for the band.
+    """Of the system's K nodes. poses: (K, 6, 6) in GTSAM's order and body axes, the rig's drift taken as
+    known. latency_sigma_s: nan without encoders. swing: (K, 6, 2) how the poses move with the drift. nodes:
+    (K, n, n) of all that a node has, the latency taken as known too. cross: (P, 6, 6) of pairs of poses, as
+    `poses`; NaN for those too far apart for the band.
     """
 
     poses: Float64
@@ -29,17 +29,18 @@ class Marginals:
 
 
 def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
-    """Of a system at its best state. pairs: (P, 2) nodes, the earlier first."""
-    factor, size = system.factor(), system.size
-    solved = system.solved(factor)
-    own, _ = system.schur(solved)
+    """Of a system at its best state. pairs: (P, 2) of these nodes, the earlier first."""
+    factor, size = system.factor, system.size
+    own, _ = system.schur(system.forward)
     count = len(factor) // size
     nodes = np.empty((count, size, size))
     cross = np.empty((len(pairs), size, size))
     inverse_blocks(factor, size, nodes, pairs, cross)
     cross = cross[:, :6, :6]
     poses = nodes[:, :6, :6]
-    by_border = -solved[1:].T.reshape(count, size, -1)[:, :6]
+    to_border = system.forward[:, 1:].copy()
+    solve_back(factor, to_border)
+    by_border = -to_border.reshape(count, size, -1)[:, :6]
     swing, latency = by_border[:, :, -2:], float("nan")
     if len(own) > 2:
         variance = np.linalg.inv(own[:-2, :-2])
@@ -63,16 +64,15 @@ class Newest:
 
 def newest(system: System) -> Newest:
     """Of a system at its best state, without the work for all the other nodes."""
-    factor, size = system.factor(), system.size
-    solved = system.solved(factor)
-    own, _ = system.schur(solved)
+    factor, size = system.factor, system.size
+    own, _ = system.schur(system.forward)
     last = len(factor) - size
     row, column = np.nonzero(np.tri(size))
     lower = np.zeros((size, size))
     lower[row, column] = factor[last + row, column - row + factor.shape[1] - 1]
     inverse = np.linalg.inv(lower)
     covariance = inverse.T @ inverse
-    by_border = -solved[1:, last:].T
+    by_border = -inverse.T @ system.forward[last:, 1:]
     swing = by_border[:, -2:]
     if len(own) == 3:
         to_latency = by_border[:, :1]

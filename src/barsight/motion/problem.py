@@ -154,10 +154,18 @@ class Problem:
     """Takes the place of what fixes the first node, the biases and the latency."""
     pieces: Pieces | None = None
     """What slides together; None where nothing is held to slide."""
+    asked: Int64 | None = None
+    """Nodes whose covariances are asked for, all that pictures see among them; None: all. The others are
+    taken out of the system beforehand (`gaps`)."""
     has_latency: bool = False
     """Whether the encoders' latency is an unknown."""
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
+
+    @cached_property
+    def kept(self) -> Int64:
+        """(K,) the nodes of the system."""
+        return np.arange(len(self.start)) if self.asked is None else self.asked
 
     @property
     def border(self) -> int:

@@ -17,7 +17,8 @@ from barsight.core.arrays import Bool, Float64
 from barsight.motion.elimination import substitute
 from barsight.motion.graph import factors
 from barsight.motion.problem import Pieces, Problem
-from barsight.motion.solver import State, System, optimise, rig_of, sights_of
+from barsight.motion.solver import State, guess_of, optimise, rig_of, sights_of
+from barsight.motion.system import System
 
 LENGTH_SHARE = 0.2
 HEIGHT_SHARE = 0.07
@@ -74,9 +75,8 @@ def with_slides(
 def _learnt(problem: Problem, state: State, system: System, pieces: Pieces, used: Bool) -> Pieces:
     seen = problem.sightings
     assert seen is not None
-    nodes = len(problem.start)
     variance = np.zeros(len(state.points))
-    still, guess = np.zeros((nodes, 6)), state.guess(nodes)
+    still, guess = np.zeros((len(problem.kept), 6)), guess_of(problem, state)
     none, points = np.zeros(pieces.count + 2), state.points.copy()
     substitute(rig_of(seen), sights_of(problem, used), guess, still, none, points, variance)
     counts = np.bincount(seen.track[used], minlength=len(variance))
@@ -94,6 +94,6 @@ def _learnt(problem: Problem, state: State, system: System, pieces: Pieces, used
 
 def _covariance(system: System, count: int) -> Float64:
     """(S, S) of the slides, the drift taken as known."""
-    own, _ = system.schur(system.solved(system.factor()))
+    own, _ = system.schur(system.forward)
     first = len(own) - 2 - count
     return np.asarray(np.linalg.inv(own[:-2, :-2])[first:, first:], np.float64)

@@ -17,16 +17,17 @@ from gtsam.symbol_shorthand import B, E, V, X
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
 from barsight.motion.elimination import Reduced, eliminate, substitute
+from barsight.motion.gaps import without_gaps
+from barsight.motion.graph import OFFSETS, chain_of
 from barsight.motion.point_kernels import Guess, Rig, Sights, residuals
 from barsight.motion.problem import Prior, Problem, StereoSightings
-from barsight.motion.rig_drift import HUBER_SIGMAS, LOOSE
+from barsight.motion.rig_drift import HUBER_SIGMAS
+from barsight.motion.system import System
 
 MOST_ITERATIONS = 25
 TIGHT = 1e6
 """1 / rad: what holds points that don't slide."""
 RELATIVE_GAIN = 1e-5
-WIDTHS = {"x": 6, "v": 3, "b": 6, "e": 1}
-OFFSETS = {"x": 0, "v": 6, "b": 9}
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,68 +40,13 @@ class State:
     drift: Float64
     slides: Float64 = field(default_factory=lambda: np.zeros(0))
 
-    def guess(self, nodes: int) -> Guess:
-        """As the kernels take it."""
-        poses = [self.values.atPose3(X(k)) for k in range(nodes)]
-        turn = np.array([pose.rotation().matrix() for pose in poses])
-        place = np.array([pose.translation() for pose in poses])
-        return Guess(turn, place, self.points, np.concatenate([self.slides, self.drift]))
-
-
-@dataclass(frozen=True, eq=False)
-class System:
-    """Normal equations at a state. rows: (n, w), a band as `band` has it; gradient (n,). side: (b, n) with
-    the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one, the
-    pieces' slides, then the rig's drift. size: unknowns a node.
-    """
-
-    rows: Float64
-    gradient: Float64
-    side: Float64
-    corner: Float64
-    corner_gradient: Float64
-    size: int
-
-    def factor(self, damping: float = 0.0) -> Float64:
-        """The band's factor. Raises LinAlgError where the measurements leave it undetermined."""
-        factor = self.rows.copy()
-        factor[:, -1] *= 1 + damping
-        if not band.factorise(factor):
-            raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
-        return factor
-
-    def solved(self, factor: Float64) -> Float64:
-        """(1 + b, n) the band's inverse times gradient and side."""
-        result = np.vstack([self.gradient, self.side])
-        band.solve(factor, result)
-        return result
-
-    def schur(self, solved: Float64) -> tuple[Float64, Float64]:
-        """The border's own matrix (b, b) and gradient (b,)."""
-        loose = np.zeros(len(self.corner))
-        loose[-2:] = 1 / np.array(LOOSE) ** 2
-        left = self.corner - self.side @ solved[1:].T + np.diag(loose)
-        return left, self.corner_gradient - self.side @ solved[0]
-
-    def step(self, free: Bool, damping: float = 0.0, fixed: Float64 | None = None) -> tuple[Float64, Float64]:
-        """(n,) and (b,): the border's `free` (b,) unknowns step too, the others as `fixed` (b,) says."""
-        solved = self.solved(self.factor(damping))
-        border = np.zeros(len(free)) if fixed is None else np.where(free, 0.0, fixed)
-        if free.any():
-            left, right = self.schur(solved)
-            left = left + damping * np.diag(np.diag(left))
-            right = right + left @ border
-            border[free] = -np.linalg.solve(left[np.ix_(free, free)], right[free])
-        return -(solved[0] + border @ solved[1:]), border
-
 
 def rig_of(seen: StereoSightings) -> Rig:
     """The cameras as the kernels take them."""
     c = seen.camera
     lens = np.array([c.focal_px, c.cx_px, c.cy_px, c.focal_px * c.baseline_m, c.doffs_px])
     mount = seen.body_from_rect0
-    turn, place = np.ascontiguousarray(mount.rotation), np.ascontiguousarray(mount.translation)
-    return Rig(lens, turn, place, HUBER_SIGMAS)
+    return Rig(lens, np.ascontiguousarray(mount.matrix[:3]), HUBER_SIGMAS)
 
 
 def sights_of(problem: Problem, used: Bool) -> Sights:
@@ -112,15 +58,33 @@ def sights_of(problem: Problem, used: Bool) -> Sights:
     piece, tight = np.zeros(points, np.int64), np.full(points, TIGHT)
     if pieces is not None:
         piece, tight = pieces.piece, 1 / pieces.own_sigma_rad[pieces.piece]
-    return Sights(seen.first, seen.node, used, seen.stereo, 1 / seen.sigma_px, piece, tight, scale)
+    return Sights(
+        seen.first, _places(problem)[seen.node], used, seen.stereo, 1 / seen.sigma_px, piece, tight, scale
+    )
+
+
+def _places(problem: Problem) -> Int64:
+    """(M,) where the system has each node; those taken out beforehand: nowhere."""
+    places = np.full(len(problem.start), -1)
+    places[problem.kept] = np.arange(len(problem.kept))
+    return places
+
+
+def guess_of(problem: Problem, state: State) -> Guess:
+    """The state as the kernels take it."""
+    assert problem.sightings is not None
+    camera_from_body = problem.sightings.body_from_rect0.inverse().matrix[:3]
+    bodies = [np.linalg.inv(state.values.atPose3(X(k)).matrix()) for k in problem.kept.tolist()]
+    return Guess(
+        camera_from_body @ np.array(bodies), state.points, np.concatenate([state.slides, state.drift])
+    )
 
 
 def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
     """(N, 3) px seen minus predicted, 0 where unused."""
     assert problem.sightings is not None
     result = np.zeros((len(used), 3))
-    guess = state.guess(len(problem.start))
-    residuals(rig_of(problem.sightings), sights_of(problem, used), guess, result)
+    residuals(rig_of(problem.sightings), sights_of(problem, used), guess_of(problem, state), result)
     return result
 
 
@@ -163,39 +127,47 @@ def optimise(
 
 def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
     """The system at a state."""
-    nodes, width = len(problem.start), 15 if problem.has_imu else 6
+    width, nodes = 15 if problem.has_imu else 6, len(problem.kept)
     border, shared = problem.border, problem.border - int(problem.has_latency)
-    span = 2 if problem.has_imu else 1
+    span = 2
     seen = problem.sightings
     if seen is not None and len(seen.node):
-        span = max(span, 1 + int(seen.reach.max()))
+        place = _places(problem)[seen.node]
+        span = max(span, 1 + int((place[seen.first[1:] - 1] - place[seen.first[:-1]]).max()))
     if problem.prior is not None:
         span = nodes
     span = min(span, nodes)
     size = nodes * width
     rows = np.zeros((size, span * width))
-    gradient, side = np.zeros(size), np.zeros((border, size))
-    corner, corner_gradient = np.zeros((border, border)), np.zeros(border)
+    side, corner, corner_gradient = np.zeros((border, size)), np.zeros((border, border)), np.zeros(border)
+    chain, gaps = without_gaps(chain_of(graph, state.values, width, len(problem.start)), problem.kept)
+    near = min(rows.shape[1], 2 * width)
+    rows[:, -near:] = chain.rows[:, -near:]
+    gradient = chain.gradient
+    if problem.has_latency:
+        side[0], corner[0, 0], corner_gradient[0] = chain.side, chain.corner, chain.corner_gradient
     if seen is not None and used.any():
         reduced = Reduced(
-            np.zeros((nodes, span, 6, 6)), np.zeros((nodes, 6)), np.zeros((nodes, 6, shared)),
+            np.zeros((nodes, 6, 6 * span)), np.zeros(6 * nodes), np.zeros((shared, 6 * nodes)),
             np.zeros((shared, shared)), np.zeros(shared),
         )  # fmt: skip
-        eliminate(rig_of(seen), sights_of(problem, used), state.guess(nodes), reduced)
+        eliminate(rig_of(seen), sights_of(problem, used), guess_of(problem, state), reduced)
         band.add_blocks(reduced.band, width, rows)
         at = (np.arange(nodes)[:, None] * width + np.arange(6)).ravel()
-        gradient[at] = reduced.gradient.ravel()
-        side[-shared:, at] = reduced.side.reshape(-1, shared).T
-        corner[-shared:, -shared:], corner_gradient[-shared:] = reduced.corner, reduced.corner_gradient
+        gradient[at] += reduced.gradient
+        side[-shared:, at] += reduced.side
+        corner[-shared:, -shared:] += reduced.corner
+        corner_gradient[-shared:] += reduced.corner_gradient
     if problem.pieces is not None:
         slide, information = slice(border - shared, border - 2), problem.pieces.information
         corner[slide, slide] += information
         corner_gradient[slide] += information @ state.slides
-    first, at, values, right = _sparse_rows(graph, state.values, width, size)
-    band.add_products(first, at, values, right, rows, gradient, side, corner, corner_gradient)
     if problem.prior is not None:
         _add_prior(problem.prior, state, rows, gradient, side, corner, corner_gradient)
-    return System(rows, gradient, side, corner, corner_gradient, width)
+    return System(
+        rows, gradient, side, corner, corner_gradient, width, problem.kept, gaps, len(problem.start),
+        problem.has_latency,
+    )  # fmt: skip
 
 
 def _add_prior(
@@ -229,32 +201,9 @@ def _since(prior: Prior, state: State) -> Float64:
     return np.concatenate([*(move for _, _, move in moves), state.drift - prior.drift])
 
 
-def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64, Int64, Float64, Float64]:
-    """GTSAM's whitened rows as `band.add_products` takes them; the latency is unknown `size`."""
-    linear = graph.linearize(values)
-    if linear.size() == 0:
-        return np.zeros(1, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)
-    row, column, value = linear.sparseJacobian_()
-    where: list[Int64] = []
-    for key in linear.keyVector():
-        kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
-        begin = size if kind == "e" else node * width + OFFSETS[kind]
-        where.append(begin + np.arange(WIDTHS[kind]))
-    unknown = np.concatenate(where)
-    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
-    right = np.zeros(int(row.max()) + 1)
-    of_right = column == len(unknown)
-    right[row[of_right]] = value[of_right]
-    row, column, value = row[~of_right], column[~of_right], value[~of_right]
-    order = np.argsort(row, kind="stable")
-    first = np.searchsorted(row[order], np.arange(len(right) + 1)).astype(np.int64)
-    return first, unknown[column[order]], np.ascontiguousarray(value[order]), right
-
-
 def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Float64) -> State:
     """The state after a step of the band's and the border's unknowns; the points follow."""
-    nodes = len(problem.start)
-    by_node = step.reshape(nodes, -1)
+    by_node = step.reshape(len(problem.start), -1)
     vectors = gtsam.VectorValues()
     for k, part in enumerate(by_node):
         vectors.insert(X(k), part[:6])
@@ -266,9 +215,9 @@ def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Flo
     points, shared = state.points, np.ascontiguousarray(border[int(problem.has_latency) :])
     if problem.sightings is not None:
         points = points.copy()
-        poses = np.ascontiguousarray(by_node[:, :6])
+        poses = np.ascontiguousarray(by_node[problem.kept, :6])
         rig, sights = rig_of(problem.sightings), sights_of(problem, used)
-        substitute(rig, sights, state.guess(nodes), poses, shared, points, np.empty(len(points)))
+        substitute(rig, sights, guess_of(problem, state), poses, shared, points, np.empty(len(points)))
     return replace(
         state, values=state.values.retract(vectors), points=points, drift=state.drift + shared[-2:],
         slides=state.slides + shared[:-2],
@@ -284,5 +233,5 @@ def _cost(problem: Problem, graph: Any, state: State, used: Bool) -> float:
         cost += float(state.slides @ problem.pieces.information @ state.slides) / 2
     if problem.sightings is None:
         return cost
-    seen, guess = problem.sightings, state.guess(len(problem.start))
+    seen, guess = problem.sightings, guess_of(problem, state)
     return cost + residuals(rig_of(seen), sights_of(problem, used), guess, np.zeros((len(used), 3)))

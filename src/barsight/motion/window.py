@@ -24,8 +24,9 @@ from barsight.motion.graph import factors
 from barsight.motion.marginals import Newest, newest
 from barsight.motion.problem import Prior, Problem, StereoSightings
 from barsight.motion.sightings import Sighting
-from barsight.motion.solver import State, System, linearise, moved, optimise, sighting_residuals
+from barsight.motion.solver import State, linearise, moved, optimise, sighting_residuals
 from barsight.motion.stereo_factors import often, persistence, start_points
+from barsight.motion.system import System
 
 STEPS = 1
 """Before outliers leave; one more follows. The frame before was solved, so little is left to do."""
