@@ -13,6 +13,7 @@ from barsight.stereo.consistency import agrees, lands_on, without_islands
 from barsight.stereo.curvature import curvature_row
 from barsight.stereo.edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
 from barsight.stereo.filling import fill
+from barsight.stereo.half_size import carried_up, halved
 from barsight.stereo.plane_fits import SupportShape, fit_planes
 from barsight.stereo.pulls import compare, lengthen, noise_power, weigh
 from barsight.stereo.semiglobal import SemiGlobalSettings, match
@@ -401,6 +402,22 @@ def test_pulls_are_what_box_filters_say() -> None:
     mean, seen = mean + 1e-3, _mean(usable) + 1e-6
     wanted_power = _mean(usable * blocks**2) / 9 / mean * (mean + 0.1 * seen) / mean
     np.testing.assert_allclose(power, wanted_power, rtol=2e-3)
+
+
+def test_a_step_at_half_size_is_carried_up_without_mixing_surfaces() -> None:
+    y, x = np.mgrid[0:41, 0:63].astype(np.float32)
+    start = np.where(x < 30, 20 + 0.05 * x + 0.03 * y, 40 - 0.04 * x).astype(np.float32)
+    small = halved(start)
+    assert small.shape == (21, 32)
+    np.testing.assert_allclose(small[3, 5], start[6:8, 10:12].mean(), rtol=1e-6)
+    moved = np.where(np.arange(32)[None, :] < 15, 0.1, -0.2).astype(np.float32) * np.ones((21, 1), np.float32)
+    carried = carried_up(0.5 * small, moved, start, 1.0)
+    np.testing.assert_allclose(carried - start, np.where(x < 30, 0.2, -0.4), atol=1e-5)
+
+    ramp = np.broadcast_to(np.arange(32, dtype=np.float32) * 0.01, (21, 32)).copy()
+    rising = carried_up(np.full_like(small, 10), ramp, np.full_like(start, 20), 1.0)
+    inner = slice(1, 61)
+    np.testing.assert_allclose(rising[:, inner] - 20, (0.01 * (x - 0.5))[:, inner], atol=1e-5)
 
 
 def test_supports_are_blended_and_steps_settled_as_written() -> None:

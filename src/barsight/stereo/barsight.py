@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
@@ -18,6 +17,7 @@ from barsight.stereo.confidence import bend_around, beside_edges, start_disagree
 from barsight.stereo.consistency import agrees, lands_on, without_islands
 from barsight.stereo.edges import sharpen_edges
 from barsight.stereo.filling import fill, with_row_holes_filled
+from barsight.stereo.half_size import halved
 from barsight.stereo.refinement import Refined, RefinementSettings, refine
 from barsight.stereo.semiglobal import SemiGlobalSettings, match
 
@@ -144,8 +144,7 @@ class BarsightStereo:
     def _start_at_half_size(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         """The same, an eighth of the work: refinement makes up for the coarser steps."""
         settings, shape = self.settings, pair.left.shape
-        size = -(-shape[1] // 2), -(-shape[0] // 2)
-        left, right = (_halved(image, size) for image in (pair.left, pair.right))
+        left, right = (halved(image) for image in (pair.left, pair.right))
         lowest = candidates.lowest_px // 2
         found = match(left, right, lowest, -(-candidates.highest_px // 2) - lowest, settings.semiglobal)
         believed = agrees(found.left_px, found.right_px, settings.consistency_px)
@@ -154,15 +153,6 @@ class BarsightStereo:
         believed = pair.left_valid & np.isfinite(left_px)
         believed &= lands_on(pair.right_valid, np.where(believed, left_px, np.float32(0)))
         return _Start(np.where(believed, left_px, _NAN), _doubled(found.right_px, shape))
-
-
-def _halved(image: UInt8, size: tuple[int, int]) -> UInt8:
-    """Means of 2 x 2 pixels; odd images go on with their last row and column."""
-    framed = cv2.copyMakeBorder(
-        image, 0, 2 * size[1] - image.shape[0], 0, 2 * size[0] - image.shape[1], cv2.BORDER_REPLICATE
-    )
-    half: UInt8 = cv2.resize(framed, size, interpolation=cv2.INTER_AREA)
-    return half
 
 
 def _doubled(disparity: Float32, shape: tuple[int, ...]) -> Float32:

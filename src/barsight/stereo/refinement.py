@@ -2,10 +2,10 @@
 
 Each step warps the right image with the current disparity and asks every pixel how far it should move
 (Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
-offset of the images are taken off in a window. The first steps see the images a little softer and use the
-mean gradient of both [Malis 2004], which carries them further; the last one uses the left gradient alone: an
-interpolated image's noise falls with the fraction of the disparity, and its own gradient turns that into
-pixel locking.
+offset of the images are taken off in a window. The first step sees the images at half the size. All but the
+last see them softer and use the mean gradient of both [Malis 2004], which carries them further; the last one
+uses the left gradient alone: an interpolated image's noise falls with the fraction of the disparity, and its
+own gradient turns that into pixel locking.
 
 Gloss: a highlight is constant along a bar but lies behind its surface, so what is constant along the axis
 bends the match. Residual and gradient are therefore split into their mean along the axis and the detail; the
@@ -16,7 +16,7 @@ turn the highlights beside it into detail.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -24,6 +24,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
+from barsight.stereo.half_size import carried_up, halved
 from barsight.stereo.plane_fits import SupportShape, fit_planes
 from barsight.stereo.pulls import compare, lengthen, noise_power, weigh
 from barsight.stereo.settling import Fit, blend, settle, variances
@@ -31,10 +32,19 @@ from barsight.stereo.sgbm import image_noise
 from barsight.stereo.spline import row_coefficients, row_slope, value_and_slope
 from barsight.stereo.supports import MARGIN, axis_means, empty_frame, inside, tile_axes
 
+Image = UInt8 | Float32
+
 _BLUR_PX = 0.5
 _FIRST_BLUR_PX = 0.7
 _LONG_STEP_PX = 5
 _SHORT_STEP_PX = 3
+_HALF_STEP_PX = 3
+_HALF_ACROSS = 0.75
+_HALF_HOLD = 4
+"""A pixel at half the size stands for four."""
+_LONGEST_HALF_STEP_PX = 0.4
+"""In pixels of half the size: a longer step takes places beside depth edges to the other side."""
+_LEAST_HALVED_PX = 128
 _ALIKE_BLUR_PX = 1.5
 _HOLD = 0.1
 _HOLD_UNMATCHED = 0.02
@@ -92,14 +102,40 @@ class Refined:
 
 def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
-    work = _Work.of(left, start, matched, settings)
-    noise = 0.5 * (image_noise(left) ** 2 + image_noise(right) ** 2)
+    at_half_size = settings.steps > 1 and min(left.shape) >= _LEAST_HALVED_PX
+    if at_half_size:
+        start = _after_half_size_step(left, right, start, matched, settings)
+    work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
+    noise = _noise(left, right)
     variance = np.full_like(start, np.inf)
-    for step in range(settings.steps):
+    for step in range(int(at_half_size), settings.steps):
         remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
         blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
         variance = work.step(left, right, blur_px, noise * _slope_gain(blur_px), remaining == 0)
     return Refined(inside(work.disparity, start.shape).copy(), variance)
+
+
+def _after_half_size_step(
+    left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
+) -> Float32:
+    """`start` after a step at half the size with the long support: a quarter of the work, and softer images
+    carry further."""
+    half = replace(
+        settings,
+        along_px=settings.along_px / 2,
+        across_px=settings.across_px * _HALF_ACROSS,
+        gloss_px=settings.gloss_px / 2,
+        same_surface_px=settings.same_surface_px / 2,
+        window_px=max(settings.window_px // 4 * 2 + 1, 3),
+    )
+    small_left, small_right = (halved(image.astype(np.float32)) for image in (left, right))
+    started = np.float32(0.5) * halved(start)
+    work = _Work.of(small_left, started, halved(matched.astype(np.float32)), half, _HALF_HOLD * _HOLD)
+    slope_noise = _noise(small_left, small_right) * _slope_gain(_BLUR_PX)
+    work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
+    fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
+    moved = np.clip(fitted - started, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
+    return carried_up(started, moved, start, settings.same_surface_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +156,33 @@ class _Work:
     pull: Float32
 
     @classmethod
-    def of(cls, left: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> _Work:
-        usable = matched.astype(np.float32)
+    def of(
+        cls, left: Float32, start: Float32, usable: Float32, settings: RefinementSettings, hold: float = _HOLD
+    ) -> _Work:
         mean_usable = cv2.boxFilter(usable, -1, (settings.window_px, settings.window_px))
         frames = [empty_frame(start.shape) for _ in range(7)]
         inside(frames[0], start.shape)[:] = start
-        hold = np.float32(_HOLD) * (usable + np.float32(_HOLD_UNMATCHED))
-        return cls(settings, tile_axes(left.astype(np.float32)), usable, mean_usable, hold, *frames)
+        hold_each = np.float32(hold) * (usable + np.float32(_HOLD_UNMATCHED))
+        return cls(settings, tile_axes(left), usable, mean_usable, hold_each, *frames)
 
-    def step(self, left: UInt8, right: UInt8, blur_px: float, slope_noise: float, is_last: bool) -> Float32:
+    def step(self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool) -> Float32:
         """One step of the disparity; its variance. slope_noise: variance of the left image's slope."""
+        shape, side = self.usable.shape, self.settings.window_px
+        short_of, mean_weight = self.pulls(left, right, blur_px, slope_noise, is_last)
+        power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
+        power *= np.minimum(short_of, _MOST_NOISIER)
+        fitted, variance = self._fit(power)
+        before = inside(self.disparity, shape).copy()
+        settle(fitted, self.axes, self.disparity, variance)
+        if is_last:
+            self._complete(before, short_of)
+        return variance
+
+    def pulls(
+        self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool
+    ) -> tuple[Float32, Float32]:
+        """Weights and pulls of this step, weights with the hold. What a step falls short by, and the
+        weights' means over windows, (H, W)."""
         settings, shape = self.settings, self.usable.shape
         left_grey = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
         warped, right_slope = value_and_slope(row_coefficients(right, blur_px), self.disparity, MARGIN)
@@ -142,28 +195,13 @@ class _Work:
         side = settings.window_px
         compare(left_grey, warped, self.usable, side, settings.outlier_grey, self.residual, self.trust)
         gloss = settings.gloss_px, settings.gloss_trust
-        weigh(
-            self.residual,
-            self.slope,
-            self.trust,
-            self._along(left_grey),
-            side,
-            *gloss,
-            self.weight,
-            self.pull,
-        )
+        evidence = self.residual, self.slope, self.trust
+        weigh(*evidence, self._along(left_grey), side, *gloss, self.weight, self.pull)
         mean_weight = np.empty(shape, dtype=np.float32)
         short_of = lengthen(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
-        power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
-        power *= np.minimum(short_of, _MOST_NOISIER)
         weight = inside(self.weight, shape)
         weight += self.hold
-        fitted, variance = self._fit(power)
-        before = inside(self.disparity, shape).copy()
-        settle(fitted, self.axes, self.disparity, variance)
-        if is_last:
-            self._complete(before, short_of)
-        return variance
+        return short_of, mean_weight
 
     def _complete(self, before: Float32, short_of: Float32) -> None:
         """Go the rest of a step that fell short, in the mean over a window: a start that gloss has bent is
@@ -184,13 +222,13 @@ class _Work:
 
     def _fit(self, power: Float32) -> tuple[Float32, Float32]:
         settings = self.settings
-        long = self._planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX))
+        long = self.planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX))
         if settings.short_px == 0:
             return long[0], variances(power, long[1])
-        short = self._planes(SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX))
+        short = self.planes(SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX))
         return blend(long, short, power, self.usable)
 
-    def _planes(self, support: SupportShape) -> Fit:
+    def planes(self, support: SupportShape) -> Fit:
         found = np.empty_like(self.usable), np.empty_like(self.usable)
         # What the weights and pulls were made of isn't needed any more.
         room = self.residual, self.trust
@@ -199,6 +237,11 @@ class _Work:
             *found,
         )  # fmt: skip
         return found
+
+
+def _noise(left: Image, right: Image) -> float:
+    """Mean variance of both images' noise."""
+    return 0.5 * (image_noise(left) ** 2 + image_noise(right) ** 2)
 
 
 @lru_cache

@@ -116,7 +116,7 @@ def _noise_sigma(texture: Float32, noise: float) -> Float32:
     return sigma.clip(max=1)
 
 
-def image_noise(image: UInt8) -> float:
+def image_noise(image: UInt8 | Float32) -> float:
     """The image's noise, one sigma in grey levels: robust, from a Laplacian that planes don't excite
     [Immerkaer 1996], with the median instead of the mean so that texture counts less.
     """

@@ -1,0 +1,65 @@
+"""Images at half the size, and what was found there carried up again without mixing surfaces."""
+
+from __future__ import annotations
+
+from typing import TypeVar, cast
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Float32, UInt8, kernel
+from barsight.core.parallel import in_bands
+
+_BAND_ROWS = 64
+
+
+Image = TypeVar("Image", UInt8, Float32)
+
+
+def halved(image: Image) -> Image:
+    """Means of 2 x 2 pixels; odd images go on with their last row and column."""
+    height, width = image.shape
+    framed = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    size = framed.shape[1] // 2, framed.shape[0] // 2
+    return cast(Image, cv2.resize(framed, size, interpolation=cv2.INTER_AREA))
+
+
+def carried_up(started: Float32, moved: Float32, disparity: Float32, same_surface_px: float) -> Float32:
+    """`disparity` (H, W) moved by what was found at half the size: by the bilinear mean of the four nearest
+    places, where those on another surface don't count. started, moved: (H / 2, W / 2), in half pixels.
+    """
+    result = np.empty_like(disparity)
+    seen, pulled = (
+        cv2.copyMakeBorder(2 * image, 1, 1, 1, 1, cv2.BORDER_REPLICATE) for image in (started, moved)
+    )
+
+    def work(first: int, end: int) -> None:
+        _carry_up(seen, pulled, disparity, np.float32(1 / same_surface_px), result, first, end)
+
+    in_bands(work, len(disparity), _BAND_ROWS)
+    return result
+
+
+@kernel(fastmath=True)
+def _carry_up(
+    started: Float32, moved: Float32, disparity: Float32, nearness: np.float32, result: Float32, first: int,
+    end: int,
+) -> None:  # fmt: skip
+    width = disparity.shape[1]
+    zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
+    shares = np.array([9, 3, 3, 1], dtype=np.float32)
+    for y in range(first, end):
+        near = y // 2 + 1
+        far = near - 1 + 2 * (y & 1)
+        for x in range(width):
+            column = x // 2 + 1
+            beside = column - 1 + 2 * (x & 1)
+            here, total, weights = disparity[y, x], zero, tiny
+            for k in range(4):
+                row, place = (near if k < 2 else far), (beside if k & 1 else column)
+                gap = (started[row, place] - here) * nearness
+                alike = max(one - gap * gap, zero)
+                weight = shares[k] * alike * alike
+                weights += weight
+                total += weight * moved[row, place]
+            result[y, x] = here + total / weights
