@@ -18,10 +18,12 @@ from barsight.cli.arguments import call
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_directory
 from barsight.core.types import Trajectory
+from barsight.evaluation.board_poses import board_poses, by_gyro_alone_deg
 from barsight.evaluation.drift import Drift, compare, frame_errors
 from barsight.motion.example import matching_example
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
+from barsight.recording.corners import CornerRecording
 from barsight.recording.open import open_recording
 from barsight.recording.truth import GroundTruth, find_ground_truth, read_ground_truth
 from barsight.report.files import write_relative, write_trajectory
@@ -72,6 +74,8 @@ def run(arguments: Sequence[str]) -> None:
                 write_relative(trajectory, folder / "relative.csv")
                 write_odometry_page(result, folder / "report.html", folder / "odometry.json")
         lines = [] if truth is None else _drift_lines(drift)
+        if isinstance(source, CornerRecording):
+            lines += _board_lines(source, trajectory)
         for line in _summary(trajectory) + lines:
             console.print(escape(line), soft_wrap=True, highlight=False)
 
@@ -95,6 +99,21 @@ def _truth(source: Recording) -> GroundTruth | None:
     if find_ground_truth(source.path) is None:
         return None
     return read_ground_truth(source.path, np.array(source.index.stamps_ns, np.int64))
+
+
+def _board_lines(source: CornerRecording, trajectory: Trajectory) -> list[str]:
+    poses, imu, shift = board_poses(source), source.imu(), source.rig.timeshift_cam_imu_ns
+    drift = None if poses is None else compare(trajectory, poses, 0)
+    if poses is None or drift is None:
+        return ["too few corners for a PnP of the board"]
+    lines = [
+        f"against a PnP of the board by cam0: {drift.aligned_rmse_mm:.2f} mm, "
+        f"{drift.aligned_rmse_deg:.3f} deg RMSE, aligned"
+    ]
+    gyro_deg = float("nan") if imu is None else by_gyro_alone_deg(imu, poses, shift)
+    if not math.isnan(gyro_deg):
+        lines.append(f"the gyro alone, one bias fitted to those poses, is {gyro_deg:.3f} deg off them")
+    return lines
 
 
 def _drift_lines(drift: Drift | None) -> list[str]:

@@ -21,7 +21,7 @@ from barsight.motion.marginals import Marginals, marginals
 from barsight.motion.problem import Problem, StereoSightings
 from barsight.motion.slides import with_slides
 from barsight.motion.solver import State, optimise, sighting_residuals
-from barsight.motion.stereo_factors import often, persistence, start_points
+from barsight.motion.stereo_factors import nearness, often, persistence, start_points, taken_up
 from barsight.motion.system import System
 
 FARTHEST_OUTLIER_SIGMAS = 3.5
@@ -143,11 +143,12 @@ def _with_seen_noise(
     """The problem with the sightings' sigma as their residuals show it, and without the far ones, solved."""
     residual = sighting_residuals(problem, state, used)
     share = np.abs(residual) / seen.sigma_px[:, None]
-    factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])))
+    factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])) * taken_up(seen, used))
     used = often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
     seen = replace(seen, sigma_px=factor * seen.sigma_px)
     problem, state, system = with_slides(replace(problem, sightings=seen), state, used)
-    wider = persistence(sighting_residuals(problem, state, used), seen, used)
+    residual = sighting_residuals(problem, state, used)
+    wider = persistence(residual, seen, used) * nearness(residual, seen, used)
     if wider > 1:
         problem = replace(problem, sightings=replace(seen, sigma_px=wider * seen.sigma_px))
         problem, state, system = with_slides(problem, state, used, rounds=1)

@@ -11,6 +11,9 @@ from barsight.motion.problem import Problem, StereoSightings
 LEAST_SIGHTINGS = 2
 LEAST_PERSISTENT = 5
 LEAST_PAIRS = 300
+CELLS = 8
+MOST_WHITENED = 4.0
+"""Single far residuals say nothing of what neighbours share."""
 
 
 def start_points(problem: Problem) -> Float64:
@@ -31,6 +34,29 @@ def often(seen: StereoSightings, used: Bool) -> Bool:
     counts = np.bincount(seen.track[used], minlength=len(seen.first) - 1)
     result: Bool = used & (counts[seen.track] >= LEAST_SIGHTINGS)
     return result
+
+
+def taken_up(seen: StereoSightings, used: Bool) -> float:
+    """By how much errors are larger than the residuals that a fit of points (three unknowns) and frames (six)
+    leaves of them; at most sqrt(3).
+    """
+    rows = 3 * int(used.sum())
+    unknowns = 3 * len(np.unique(seen.track[used])) + 6 * len(np.unique(seen.node[used]))
+    return float((rows / max(rows - unknowns, rows / 3, 1)) ** 0.5)
+
+
+def nearness(residual: Float64, seen: StereoSightings, used: Bool) -> float:
+    """By how much errors that neighbours in a picture share widen sigma, at least 1.
+
+    Points of one bar share its gloss, and corners less than a patch apart share pixels. So the residuals of a
+    cell, an eighth of the picture wide, don't add up like independent ones: the sums' squares over the
+    single ones' is the variance that counts.
+    """
+    scaled = np.clip(residual[used] / seen.sigma_px[used, None], -MOST_WHITENED, MOST_WHITENED)
+    cell = (seen.stereo[used, :2] * CELLS // seen.camera.width).astype(np.int64)
+    _, name = np.unique(np.column_stack([seen.node[used], cell]), axis=0, return_inverse=True)
+    sums = np.array([np.bincount(name.ravel(), axis) for axis in scaled.T])
+    return float(max(1.0, (sums**2).sum() / max(float((scaled**2).sum()), 1e-12)) ** 0.5)
 
 
 def persistence(residual: Float64, seen: StereoSightings, used: Bool) -> float:

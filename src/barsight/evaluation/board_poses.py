@@ -1,0 +1,84 @@
+"""Recorded corners of a board: the poses that PnP gives, and how near the gyro alone comes to them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation, Slerp
+
+from barsight.calibration.detection_files import NAMES, read_rows
+from barsight.core.arrays import Float64
+from barsight.core.pose import Pose
+from barsight.core.stamps import NS_PER_S
+from barsight.core.types import ImuSamples
+from barsight.motion.corners import LEAST_POINTS
+from barsight.recording.corners import CornerRecording
+from barsight.recording.truth import GroundTruth
+
+FIELDS = ("stamp_ns", "u", "v", "x", "y", "z")
+LEAST_POSES = 3
+
+
+def board_poses(recording: CornerRecording) -> GroundTruth | None:
+    """The body over the board at each frame: PnP of cam0's corners alone, by the board's places as stored.
+
+    It takes the board as stored and the lens as calibrated: what both are off by is in these poses. Frames
+    of fewer than 12 corners are left out; None for fewer than three. Raises CalibrationError where the
+    corners have no place on the board.
+    """
+    rows = read_rows(recording.path / NAMES[0], FIELDS)
+    rows = rows[np.argsort(rows["stamp_ns"], kind="stable")]
+    camera, body_from_cam0 = recording.rig.cam0, recording.rig.body_from_cam0
+    stamps, poses = [], []
+    for stamp in recording.index.stamps_ns:
+        seen = rows[slice(*np.searchsorted(rows["stamp_ns"], (stamp, stamp + 1)))]
+        if len(seen) < LEAST_POINTS:
+            continue
+        board = np.column_stack([seen["x"], seen["y"], seen["z"]]).astype(np.float64)
+        rays = camera.rays(np.column_stack([seen["u"], seen["v"]]).astype(np.float64))
+        straight = np.ascontiguousarray((rays @ camera.matrix.T)[:, :2])
+        good, turn, place = cv2.solvePnP(board, straight, camera.matrix, None)
+        if good:
+            rotation = Rotation.from_rotvec(turn.ravel()).as_matrix()
+            cam0_from_board = Pose("cam0", "world", rotation, place.ravel())
+            stamps.append(stamp)
+            poses.append((body_from_cam0 @ cam0_from_board).inverse())
+    if len(poses) < LEAST_POSES:
+        return None
+    return GroundTruth(np.array(stamps, np.int64), tuple(poses))
+
+
+def by_gyro_alone_deg(imu: ImuSamples, truth: GroundTruth, shift_ns: int) -> float:
+    """RMSE of the gyro's turns against the poses, NaN where it covers fewer than three of them.
+
+    The rates are integrated step by step; the start and one constant bias, fitted to the poses themselves,
+    are all that is free. An estimate that believes the gyro comes hardly nearer.
+    """
+    stamps = truth.stamp_ns + shift_ns
+    known = (stamps >= imu.stamp_ns[0]) & (stamps <= imu.stamp_ns[-1])
+    if known.sum() < LEAST_POSES:
+        return float("nan")
+    turns = Rotation.from_matrix([pose.rotation for pose in truth.poses])[known]
+    samples_s = (imu.stamp_ns - imu.stamp_ns[0]) / NS_PER_S
+    frames_s = (stamps[known] - imu.stamp_ns[0]) / NS_PER_S
+
+    def off(unknowns: Float64) -> Float64:
+        """(K * 3,) turns from the gyro's attitude to the pose's, rad. unknowns: bias, turn of the start."""
+        gyro = Slerp(samples_s, _integrated(imu, unknowns[:3]))(frames_s)
+        start = turns[0] * gyro[0].inv() * Rotation.from_rotvec(unknowns[3:])
+        return np.asarray((turns.inv() * start * gyro).as_rotvec().ravel())
+
+    found = off(least_squares(off, np.zeros(6), x_scale=(*[0.01] * 3, *[0.01] * 3)).x)
+    return float(np.degrees(np.sqrt((found**2).sum() / known.sum())))
+
+
+def _integrated(imu: ImuSamples, bias: Float64) -> Rotation:
+    """(N,) attitude at each sample, the first one's own being none."""
+    rate = (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) / 2 - bias
+    steps = Rotation.from_rotvec(rate * np.diff(imu.stamp_ns)[:, None] / NS_PER_S).as_matrix()
+    attitude = np.empty((len(steps) + 1, 3, 3))
+    attitude[0] = np.eye(3)
+    for k, step in enumerate(steps):
+        attitude[k + 1] = attitude[k] @ step
+    return Rotation.from_matrix(attitude)

@@ -1,0 +1,68 @@
+"""What residuals say of the sightings' noise: what a fit took up of it, and what neighbours share."""
+
+import numpy as np
+
+from barsight.calibration.rectification import Rectifier
+from barsight.core.arrays import Float64
+from barsight.core.pose import Pose
+from barsight.motion.problem import StereoSightings
+from barsight.motion.stereo_factors import nearness, taken_up
+from motion_recordings import ideal_rig
+
+FRAMES, POINTS = 20, 800
+
+
+def seen_once_each(rng: np.random.Generator) -> StereoSightings:
+    """Points all over each picture, none of them seen again."""
+    camera = Rectifier(ideal_rig(1280, 1024)).camera
+    place = rng.uniform((0, 0), (camera.width, camera.height), (FRAMES * POINTS, 2))
+    stereo = np.column_stack([place, place[:, 0] - 80])
+    node = np.repeat(np.arange(FRAMES), POINTS)
+    mount = Pose("body", "rect0", np.eye(3), np.zeros(3))
+    return StereoSightings(
+        node, np.arange(len(node)), stereo, np.full(len(node), 0.1), camera, mount
+    )  # fmt: skip
+
+
+def spread_of_means(residual: Float64) -> float:
+    """By how much frames' mean errors scatter more than independent ones would."""
+    means = residual.reshape(FRAMES, POINTS, 3).mean(axis=1)
+    return float(np.sqrt((means**2).mean() / ((residual**2).mean() / POINTS)))
+
+
+def test_independent_errors_are_taken_as_such() -> None:
+    rng = np.random.default_rng(1)
+    seen = seen_once_each(rng)
+    residual = rng.normal(0, 0.1, (len(seen.node), 3))
+    assert nearness(residual, seen, np.ones(len(seen.node), np.bool_)) < 1.03
+
+
+def test_what_neighbours_share_widens_sigma_by_what_their_mean_scatters_more() -> None:
+    """Squares of 90 px whose points err alike, and which don't lie as the cells that are looked at do."""
+    found, true = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        seen = seen_once_each(rng)
+        square = ((seen.stereo[:, :2] + 37) // 90).astype(int)
+        shared = rng.normal(0, 0.04, (FRAMES, 20, 20, 3))[seen.node, square[:, 0], square[:, 1]]
+        residual = shared + rng.normal(0, 0.1, (len(seen.node), 3))
+        found.append(nearness(residual, seen, np.ones(len(seen.node), np.bool_)))
+        true.append(spread_of_means(residual))
+    assert 1.2 < np.mean(true) < 2.0
+    assert 0.85 * np.mean(true) < np.mean(found) < 1.05 * np.mean(true)
+
+
+def test_what_a_fit_takes_up_is_given_back() -> None:
+    """Each point's residuals without their mean, as a fit leaves them."""
+    rng = np.random.default_rng(2)
+    for often in (2, 4, 10):
+        seen = seen_once_each(rng)
+        track = np.arange(len(seen.node)) // often
+        node = np.tile(np.arange(often), len(seen.node) // often)
+        seen = StereoSightings(
+            node, track, seen.stereo, seen.sigma_px, seen.camera, seen.body_from_rect0
+        )  # fmt: skip
+        error = rng.normal(0, 0.1, (len(node) // often, often, 3))
+        residual = error - error.mean(axis=1, keepdims=True)
+        used = np.ones(len(node), np.bool_)
+        assert abs(residual.std() * taken_up(seen, used) / 0.1 - 1) < 0.02
