@@ -138,16 +138,17 @@ def _supported(
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
+    point = np.empty(3)
     for i in range(rows):
         for j in range(columns):
             for s in range(SLOTS):
                 if tile[i, j, s, VIEWS] < min_views:
                     continue
                 z = float(tile[i, j, s, Z])
-                point = np.array([(corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z])
+                point[0], point[1], point[2] = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z
                 able, votes = 0, 0.0
                 for k in range(rotation.shape[0]):
-                    if inside(point, lens, size, rotation[k], translation[k]):
+                    if inside(point[0], point[1], z, lens, size, rotation, translation, k):
                         seen = free(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
                         if seen and free(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
                             able += 1

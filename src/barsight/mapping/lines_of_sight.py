@@ -24,19 +24,22 @@ def density(point: Float64, eye: Float64, one_point_m: float) -> float:
 
 
 @kernel()
-def inside(point: Float64, lens: Float64, size: Float64, rotation: Float64, translation: Float64) -> bool:
-    """Whether both cameras of a view have the point in their pictures."""
-    x, y, depth = translation[0], translation[1], translation[2]
-    for a in range(3):
-        x += rotation[0, a] * point[a]
-        y += rotation[1, a] * point[a]
-        depth += rotation[2, a] * point[a]
+def inside(
+    x_m: float, y_m: float, z_m: float, lens: Float64, size: Float64, rotation: Float64, translation: Float64,
+    k: int,
+) -> bool:  # fmt: skip
+    """Whether both cameras of view k have the point in their pictures."""
+    depth = translation[k, 2] + rotation[k, 2, 0] * x_m + rotation[k, 2, 1] * y_m + rotation[k, 2, 2] * z_m
     if depth <= 0:
         return False
-    u, v = lens[0] * x / depth + lens[1], lens[0] * y / depth + lens[2]
+    y = translation[k, 1] + rotation[k, 1, 0] * x_m + rotation[k, 1, 1] * y_m + rotation[k, 1, 2] * z_m
+    v = lens[0] * y / depth + lens[2]
+    if not _BORDER_PX <= v <= size[1] - 1 - _BORDER_PX:
+        return False
+    x = translation[k, 0] + rotation[k, 0, 0] * x_m + rotation[k, 0, 1] * y_m + rotation[k, 0, 2] * z_m
+    u = lens[0] * x / depth + lens[1]
     right = u - (lens[0] * lens[3] / depth - lens[4])
-    across = min(u, right) >= _BORDER_PX and max(u, right) <= size[0] - 1 - _BORDER_PX
-    return bool(across and _BORDER_PX <= v <= size[1] - 1 - _BORDER_PX)
+    return bool(min(u, right) >= _BORDER_PX and max(u, right) <= size[0] - 1 - _BORDER_PX)
 
 
 @kernel()
@@ -56,30 +59,34 @@ def may_be_covered(
     """Whether, within `_CUT_CELLS` along x or y, a much higher surface ends where fewer than min_views views
     could see it go on towards the point: their pictures end there.
     """
-    above = point.copy()
-    above[2] = ceiling
-    if views_of(above, lens, size, rotation, translation) >= min_views:
+    x_m, y_m = point[0], point[1]
+    if enough_views(x_m, y_m, ceiling, lens, size, rotation, translation, min_views):
         return False
     for direction in range(4):
         di, dj = (0, 0, 1, -1)[direction], (1, -1, 0, 0)[direction]
         for n in range(1, _CUT_CELLS + 1):
-            height = around[row + TILE_CELLS + n * di, column + TILE_CELLS + n * dj]
+            height = float(around[row + TILE_CELLS + n * di, column + TILE_CELLS + n * dj])
             if height > point[2] + _OVERHANG_CELLS * cell_m:
                 outward = max(n - _CUT_MARGIN_CELLS, 0) * cell_m
-                above[0], above[1], above[2] = point[0] + dj * outward, point[1] + di * outward, height
-                if views_of(above, lens, size, rotation, translation) < min_views:
+                x_there, y_there = x_m + dj * outward, y_m + di * outward
+                if not enough_views(x_there, y_there, height, lens, size, rotation, translation, min_views):
                     return True
                 break
     return False
 
 
 @kernel()
-def views_of(point: Float64, lens: Float64, size: Float64, rotation: Float64, translation: Float64) -> int:
-    """How many views have the point in both pictures."""
+def enough_views(
+    x_m: float, y_m: float, z_m: float, lens: Float64, size: Float64, rotation: Float64, translation: Float64,
+    least: float,
+) -> bool:  # fmt: skip
+    """Whether at least so many views have the point in both pictures."""
     count = 0
     for k in range(rotation.shape[0]):
-        count += inside(point, lens, size, rotation[k], translation[k])
-    return count
+        count += inside(x_m, y_m, z_m, lens, size, rotation, translation, k)
+        if count >= least:
+            return True
+    return False
 
 
 @kernel()
