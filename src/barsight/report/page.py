@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -77,7 +78,10 @@ def render_page(out_dir: Path) -> str:
     path = read_path(out_dir)
     height = out_dir / "height.tif"
     raster = read_raster(height) if height.is_file() else None
-    maps: tuple[MapFigure, ...] = map_figures(raster, laser) if raster else ()
+    with ThreadPoolExecutor(1) as beside:
+        drawn = beside.submit(yard_part, out_dir, raster)
+        maps: tuple[MapFigure, ...] = map_figures(raster, laser) if raster else ()
+        yard = drawn.result()
     contours = [contour_plot(item) for item in compared]
     agreement = [
         found
@@ -90,7 +94,7 @@ def render_page(out_dir: Path) -> str:
         result=result,
         figures=key_figures(result),
         maps=maps,
-        yard=yard_part(out_dir, raster),
+        yard=yard,
         contours=contours,
         agreement_plots=agreement,
         ways=ways,
