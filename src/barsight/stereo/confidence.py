@@ -17,6 +17,8 @@ from barsight.stereo.windows import window_means
 _BLUR_PX = 0.7
 _WINDOW_PX = 21
 _EVERY_PX = 10
+_STRIPES = 4
+_STRIPE_ROWS = 81
 _OUTLIER_GREY = np.float32(8)
 _LEAST_SLOPE_POWER = 4.0
 _LEAST_INDEPENDENCE = 0.05
@@ -34,9 +36,16 @@ _UNSURE_SIDE_PX = 2.5
 def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bool) -> float:
     """Robust sigma (px) of the vertical shifts between the matched images, less what noise explains.
 
-    disparity: (H, W), no NaN. 0 where fewer than 30 windows of 21 px tell anything.
+    disparity: (H, W), no NaN. 0 where fewer than 30 windows of 21 px tell anything. Of a large image four
+    stripes are asked: one number for the whole needs no more.
     """
-    shift, variance = _vertical_shifts(left, right, disparity, matched.astype(np.float32))
+    height, usable = len(left), matched.astype(np.float32)
+    stripes = [slice(0, height)]
+    if height >= 2 * _STRIPES * _STRIPE_ROWS:
+        firsts = np.linspace(0, height - _STRIPE_ROWS, _STRIPES).astype(int)
+        stripes = [slice(first, first + _STRIPE_ROWS) for first in firsts]
+    found = [_vertical_shifts(left[rows], right[rows], disparity[rows], usable[rows]) for rows in stripes]
+    shift, variance = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if shift.size < _FEWEST_WINDOWS:
         return 0.0
     spread = 1.4826 * float(np.median(np.abs(shift)))
@@ -71,10 +80,11 @@ def start_disagreement(start: Float32, refined: Float32) -> Float32:
     return disagreement
 
 
-def beside_edges(disparity: Float32, jump_px: float) -> tuple[Float32, Float32]:
+def beside_edges(disparity: Float32, jump_px: float, other_side: bool = True) -> tuple[Float32, Float32]:
     """Two arrays (H, W) for pixels that may have been given to the wrong side of a jump of more than jump_px
     between neighbours: 1 on the jump, falling to 1 / e within 3 px; and how far away (px) the other side lies
-    within 4 px, zero further than 2.5 px from the jump. NaN in `disparity` is no jump.
+    within 4 px, zero further than 2.5 px from the jump, or everywhere where that isn't asked for. NaN in
+    `disparity` is no jump.
     """
     known = np.isfinite(disparity)
     for_highest = np.where(known, disparity, np.float32(-_FAR_PX))
@@ -83,6 +93,8 @@ def beside_edges(disparity: Float32, jump_px: float) -> tuple[Float32, Float32]:
     level = (cv2.dilate(for_highest, three) - cv2.erode(for_lowest, three) <= jump_px).astype(np.uint8)
     distance = cv2.distanceTransform(level, cv2.DIST_L2, 5)
     beside: Float32 = np.exp(-distance / np.float32(_EDGE_REACH_PX))
+    if not other_side:
+        return beside, np.zeros_like(beside)
     window = np.ones((2 * _OTHER_SIDE_PX + 1,) * 2, dtype=np.uint8)
     away = np.maximum(cv2.dilate(for_highest, window) - disparity, disparity - cv2.erode(for_lowest, window))
     other: Float32 = np.where(known & (distance < _UNSURE_SIDE_PX) & (away > jump_px), away, np.float32(0))
@@ -108,6 +120,8 @@ def _vertical_shifts(
     chosen = (slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX))
     determinant = xx * yy - xy * xy
     told = (usable[chosen] > 0) & (determinant > _LEAST_INDEPENDENCE * xx * yy) & (yy > _LEAST_SLOPE_POWER)
+    # Half of these windows is a mirror image.
+    told[[0, -1]] = False
     xx, xy, yy, xr, yr, power, determinant = (a[told] for a in (xx, xy, yy, xr, yr, power, determinant))
     variance = power * np.square(xx / determinant) / np.float32(_WINDOW_PX * _WINDOW_PX)
     sure = variance < _LARGEST_VARIANCE_PX2

@@ -120,7 +120,12 @@ def image_noise(image: UInt8 | Float32) -> float:
     """The image's noise, one sigma in grey levels: robust, from a Laplacian that planes don't excite
     [Immerkaer 1996], with the median instead of the mean so that texture counts less.
     """
-    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
-    response = cv2.filter2D(image, cv2.CV_32F, mask)[1:-1, 1:-1]
-    spread = float(np.median(np.abs(response[::3, ::3]))) / 0.6745
+    response = _bends(_bends(image.astype(np.float32)).T)
+    spread = float(np.median(np.abs(response))) / 0.6745
     return max(spread / 6.0, 0.5)
+
+
+def _bends(image: Float32) -> Float32:
+    """Second differences down the columns at every third row."""
+    bends: Float32 = image[:-2:3] - 2 * image[1:-1:3] + image[2::3]
+    return bends
