@@ -1,5 +1,6 @@
-"""`measure --resume`: killed at any moment and started again, the same files as in one go."""
+"""The same files from one recording: killed at any moment and gone on with, whatever is matched early."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,8 @@ import pytest
 from barsight import pipeline
 from barsight.cli.main import run
 from barsight.kept import keeping_folder, once
+from barsight.recording.base import RecordingSettings
+from barsight.recording.open import open_recording
 from cli_runs import FAST
 
 SAME = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
@@ -47,6 +50,27 @@ def test_a_killed_run_goes_on(
     assert not keep.exists()
     for name in SAME:
         assert (out / name).read_bytes() == (in_one_go / name).read_bytes(), name
+    capsys.readouterr()
+
+
+def test_what_is_matched_early_changes_nothing(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stamps = open_recording(recording, RecordingSettings()).index.stamps_ns
+    written = {}
+    for early in ((), (0, 1), (0, 3), None):
+        out = recording.parent / f"out{early}"
+        with monkeypatch.context() as patch:
+            if early is not None:
+                guess = frozenset(stamps[k] for k in early)
+                patch.setattr(pipeline, "_known_early", lambda *_, guess=guess: guess)
+            matched = counting_matches(patch)
+            assert run(["measure", str(recording), "-o", str(out), *FAST, "--map.least-shift", "0.2"]) == 0
+        written[early] = [(out / name).read_bytes() for name in SAME]
+        if early is None:
+            used = json.loads((out / "result.json").read_text())["frames"]["used"]
+            assert len(matched) == used < 4  # the encoders' guess is right: none is matched in vain
+    assert all(files == written[()] for files in written.values())
     capsys.readouterr()
 
 

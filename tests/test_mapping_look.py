@@ -10,8 +10,8 @@ import pytest
 
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
-from barsight.core.types import PosedFrame, RectifiedCamera
-from barsight.mapping.look import apart
+from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera
+from barsight.mapping.look import apart, apart_by_encoders
 from barsight.mapping.settings import MapSettings
 from barsight.pipeline import MeasureSettings
 
@@ -40,6 +40,16 @@ def test_frames_are_taken_once_the_picture_has_moved_far_enough() -> None:
     assert apart(frames, _rectifier(), RANGE_M, 0.0) == set(range(7))
     turned = _frames([0.0] * 4, [0.0, 0.05, 0.1, 0.1])
     assert apart(turned, _rectifier(), RANGE_M, 0.1) == {0, 2, 3}
+
+
+def test_encoders_choose_as_the_trajectory_does() -> None:
+    frames = _frames([0.0, 0.3, 0.65, 0.9, 1.2, 1.3, 1.4], [0.0] * 7)
+    read = np.array([0.0, 0.65, 1.3, 1.4])
+    places = np.column_stack([read, 0 * read + 2, 0 * read + 8])
+    crane = CraneSamples(np.array([100, 102, 105, 106]), places, np.zeros(3), np.eye(3), 0.001)
+    for share in (0.0, 0.1, 0.15):
+        chosen = apart_by_encoders(range(7), crane, 100, CAMERA, RANGE_M, share)
+        assert set(chosen) == apart(frames, _rectifier(), RANGE_M, share)
 
 
 def test_preset_fast_says_what_it_changes() -> None:

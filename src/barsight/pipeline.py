@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
-from itertools import chain, pairwise
+from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -22,7 +21,7 @@ import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.parallel import begun_map, beside
+from barsight.core.parallel import begun_map, beside, ordered_map
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
@@ -33,7 +32,7 @@ from barsight.kept import keeping_folder, once
 from barsight.mapping.contours import cut_contours
 from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
-from barsight.mapping.look import apart, choose_cell, first_look, points_per_pixel
+from barsight.mapping.look import apart, apart_by_encoders, choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import Surface, finish
 from barsight.mapping.tiles import TileStore
@@ -131,10 +130,11 @@ def measure(
         kept = keeping_folder(resume, digest([barsight.__version__, configuration, inputs]))
 
     matcher = Matcher(stereo, make_method(settings.stereo.for_map()), rectifier, watch)
-    with ExitStack() as running:
-        # Pictures are matched on the core that the trajectory leaves idle, unless what to match hangs on it.
-        at_once = settings.map.least_shift == 0 and settings.self_calibrate == "none"
-        matched = running.enter_context(_matched(source.frames(), matcher, kept)) if at_once else None
+    early = _known_early(source, settings, rectifier, first.range_m)
+    match = _match(matcher, kept)
+    # Pictures are matched on the core that the trajectory leaves idle.
+    begun = islice((frame for frame in source.frames() if frame.stamp_ns in early), len(early))
+    with begun_map(match, begun, _MATCHED_AHEAD) as ahead:
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = _counter("trajectory", total, advance)
@@ -145,9 +145,12 @@ def measure(
             rectifier = calibrated.rectifier
         taken = apart(trajectory.frames, rectifier, first.range_m, settings.map.least_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
-        if matched is None:
-            wanted = (frame for frame in source.frames() if frame.stamp_ns in poses)
-            matched = running.enter_context(_matched(wanted, replace(matcher, rectifier=rectifier), kept))
+        late = min((stamp for stamp in poses if stamp not in early), default=None)
+        matched: Iterator[Matched | Refusal] = ahead
+        if late is not None:
+            rest = (f for f in source.frames() if f.stamp_ns in poses and f.stamp_ns >= late)
+            after = ordered_map(_match(replace(matcher, rectifier=rectifier), kept), rest)
+            matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
 
         refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
         refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
@@ -251,11 +254,26 @@ def measure(
     )
 
 
-def _matched(
-    frames: Iterable[StereoFrame | RefusedFrame], matcher: Matcher, kept: Path | None
-) -> AbstractContextManager[Iterator[Matched | Refusal]]:
-    """The frames matched in order, begun at once."""
+def _known_early(
+    source: Recording, settings: MeasureSettings, rectifier: Rectifier, range_m: float
+) -> frozenset[int]:
+    """Stamps of frames that may be matched before the trajectory is known: all, or the first few that lie
+    apart by the encoders. Where the trajectory says otherwise, it decides.
+    """
+    stamps, least_shift = source.index.stamps_ns, settings.map.least_shift
+    if settings.self_calibrate != "none":
+        return frozenset()
+    if least_shift == 0:
+        return frozenset(stamps)
+    crane = source.crane()
+    if crane is None or crane.stamp_ns.size == 0:
+        return frozenset()
+    shift_ns = source.rig.timeshift_cam_imu_ns
+    chosen = apart_by_encoders(stamps, crane, shift_ns, rectifier.camera, range_m, least_shift)
+    return frozenset(chosen[:_MATCHED_AHEAD])
 
+
+def _match(matcher: Matcher, kept: Path | None) -> Callable[[StereoFrame | RefusedFrame], Matched | Refusal]:
     def match(frame: StereoFrame | RefusedFrame) -> Matched | Refusal:
         if isinstance(frame, RefusedFrame):
             return Refusal("recording", frame)
@@ -264,7 +282,7 @@ def _matched(
             return Refusal("stereo", RefusedFrame(frame.stamp_ns, matched.reason))
         return matched
 
-    return begun_map(match, frames, _MATCHED_AHEAD)
+    return match
 
 
 def _placed(

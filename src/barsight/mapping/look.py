@@ -11,7 +11,14 @@ import numpy as np
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
-from barsight.core.types import DisparityRange, PosedFrame, RectifiedPair, RefusedFrame
+from barsight.core.types import (
+    CraneSamples,
+    DisparityRange,
+    PosedFrame,
+    RectifiedCamera,
+    RectifiedPair,
+    RefusedFrame,
+)
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import find_range
 from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
@@ -92,16 +99,38 @@ def apart(frames: Sequence[PosedFrame], rectifier: Rectifier, range_m: float, le
     """The stamps of the frames whose picture has moved, since the last one taken, by least_shift of its
     shorter side on a surface range_m away; the first and the last always.
     """
-    camera = rectifier.camera
-    least_m = least_shift * min(camera.width, camera.height) * range_m / camera.focal_px
     ahead = np.array([0.0, 0.0, range_m])
-    taken: set[int] = set()
+    seen = [(frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead) for frame in frames]
+    stamps = [frame.stamp_ns for frame in frames]
+    return set(_spread(stamps, np.array(seen), _least_way_m(rectifier.camera, range_m, least_shift)))
+
+
+def apart_by_encoders(
+    stamps_ns: Sequence[int], crane: CraneSamples, shift_ns: int, camera: RectifiedCamera, range_m: float,
+    least_shift: float,
+) -> list[int]:  # fmt: skip
+    """About the same before a trajectory is known: as if the crane carried the camera without a sway.
+
+    shift_ns: from the frames' clock to the encoders'.
+    """
+    start = int(crane.stamp_ns[0])
+    at, known = (np.asarray(times) - start for times in (np.array(stamps_ns) + shift_ns, crane.stamp_ns))
+    places = np.column_stack([np.interp(at, known, axis) for axis in crane.position_m.T])
+    return _spread(stamps_ns, places, _least_way_m(camera, range_m, least_shift))
+
+
+def _least_way_m(camera: RectifiedCamera, range_m: float, least_shift: float) -> float:
+    return least_shift * min(camera.width, camera.height) * range_m / camera.focal_px
+
+
+def _spread(stamps_ns: Sequence[int], places_m: Float64, least_m: float) -> list[int]:
+    """The stamps whose place (N, 3) lies least_m from the last one taken; the first and the last always."""
+    taken: list[int] = []
     last: Float64 | None = None
-    for frame in frames:
-        seen = (frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead)
-        if last is None or np.linalg.norm(seen - last) >= least_m or frame is frames[-1]:
-            taken.add(frame.stamp_ns)
-            last = seen
+    for stamp, place in zip(stamps_ns, places_m, strict=True):
+        if last is None or np.linalg.norm(place - last) >= least_m or stamp == stamps_ns[-1]:
+            taken.append(stamp)
+            last = place
     return taken
 
 
