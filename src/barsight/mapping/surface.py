@@ -15,7 +15,7 @@ from barsight.core.types import Source
 from barsight.mapping.election import Sights, elect, first_heights
 from barsight.mapping.filling import bridge
 from barsight.mapping.fusion import height_sigma
-from barsight.mapping.lengthways import lengthways
+from barsight.mapping.lengthways import lengthways, sharpened
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
 
@@ -185,7 +185,7 @@ def _layers(tile: Float32, winner: Int8) -> Layers:
 def _filled(
     folder: Path, key: TileKey, keys: frozenset[TileKey], cell_m: float, settings: MapSettings
 ) -> Layers:
-    """The tile averaged lengthways, its narrow gaps filled, looking at most the halo into its neighbours."""
+    """The tile averaged lengthways, sharpened, its narrow gaps filled, looking at most the halo around it."""
     along, reach = (min(round(way_m / cell_m), _HALO) for way_m in (settings.along_m, settings.fill_m))
     side = TILE_CELLS + 2 * _HALO
     around = Layers.unknown(side, side)
@@ -197,7 +197,8 @@ def _filled(
                 _paste(_read_tile(folder, neighbour, "elected"), neighbour, around, column, row)
     if along > 0:
         weight = np.nan_to_num(around.sigma_m**-2)
-        around = replace(around, z_m=lengthways(around.z_m, weight, settings.least_gate_m, along))
+        z, direction = lengthways(around.z_m, weight, settings.least_gate_m, along)
+        around = replace(around, z_m=sharpened(z, direction, settings.sharpen))
     if reach > 0:
         fill_gaps(around, reach)
     inner = slice(_HALO, _HALO + TILE_CELLS)
