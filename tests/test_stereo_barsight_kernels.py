@@ -430,7 +430,8 @@ def test_supports_are_blended_and_steps_settled_as_written() -> None:
     share = variance[1] / (variance[1] + np.maximum(excess, 0) + 1e-9)
     fitted, unsure = blend((long, information[0]), (short, information[1]), power, usable)
     np.testing.assert_allclose(fitted, short + share * gap, atol=1e-4)
-    np.testing.assert_allclose(unsure, variance[0] + (1 - share) * (variance[1] - variance[0]), atol=1e-5)
+    mixture = share * variance[0] + (1 - share) * (variance[1] + share * gap**2)
+    np.testing.assert_allclose(unsure, mixture, atol=1e-5)
 
     fitted, axes, start = _noise(47, 0.1), _axes(0.6, 0.8), _noise(48)
     sag = 1.5 * _mean(_curvature(fitted, axes), 11)

@@ -45,13 +45,13 @@ class BarsightSettings:
     """The least error of the method itself (1 sigma)."""
     vertical_share: float = 1.5
     """Error of the disparity per vertical error that the images show: parallax adds its own."""
-    edge_share: float = 0.6
+    edge_share: float = 0.55
     """Error per pixel by which the disparity bends within 3 px."""
     widest_edge_px: float = 0.5
     """A bend or an edge counts as no more than this."""
-    start_share: float = 0.08
+    start_share: float = 0.09
     """Error per pixel by which the start and its refinement disagree over a window."""
-    wrong_side_px: float = 0.4
+    wrong_side_px: float = 0.3
     """Error on a depth edge, where a pixel may belong to either side; it falls to 1 / e within 3 px."""
     other_side_share: float = 0.5
     """Error within 2.5 px of a depth edge per pixel that its other side lies away: with a half, 2 sigma
@@ -177,6 +177,6 @@ def _both(one: Float32, other: Float32) -> Float32:
 
 
 def _with_sharp_edges(disparity: Float32, sigma: Float32, pair: RectifiedPair) -> tuple[Float32, Float32]:
-    """Edges sharpened; half of what a pixel was moved by counts as one sigma more."""
+    """Edges sharpened; what a pixel was moved by counts as one sigma more."""
     sharp = sharpen_edges(disparity, pair.left, _JUMP_PX)
-    return sharp, _both(sigma, np.float32(0.5) * (sharp - disparity))
+    return sharp, _both(sigma, sharp - disparity)

@@ -48,8 +48,9 @@ _LEAST_HALVED_PX = 128
 _ALIKE_BLUR_PX = 1.5
 _HOLD = 0.1
 _HOLD_UNMATCHED = 0.02
-_MOST_NOISIER = np.float32(1.5)
-"""By which the share that steps fall short of counts as noise, at most."""
+_MOST_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
+"""What steps fall short of counts as noise up to here, measured on rendered planes. Beyond, a sixth of it is
+taken off again, measured on rendered bars: a step that is short by half damps its own noise."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ class _Work:
         shape, side = self.usable.shape, self.settings.window_px
         short_of, mean_weight = self.pulls(left, right, blur_px, slope_noise, is_last)
         power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
-        power *= np.minimum(short_of, _MOST_NOISIER)
+        power *= np.minimum(short_of, _MOST_NOISIER - (short_of - _MOST_NOISIER) / _DAMPED)
         fitted, variance = self._fit(power)
         before = inside(self.disparity, shape).copy()
         settle(fitted, self.axes, self.disparity, variance)

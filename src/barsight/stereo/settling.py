@@ -32,7 +32,8 @@ def variances(power: Float32, information: Float32) -> Float32:
 
 def blend(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[Float32, Float32]:
     """The fitted disparity and its variance: of the long support, and of the short one as far as both differ
-    by more than the short one's noise: there the surface is no plane over the long one. All (H, W).
+    by more than the short one's noise: there the surface is no plane over the long one. All (H, W). Which of
+    the two is right isn't known where they share: the variance is that of the mixture.
     """
     fitted, variance = np.empty_like(power), np.empty_like(power)
 
@@ -86,7 +87,8 @@ def _blend(
         for x in range(width):
             own = _SUPPORT * noise[x] / max(certain[x], _LEAST_INFORMATION)
             other = _SUPPORT * noise[x] / max(long_certain[x], _LEAST_INFORMATION)
-            unsure[x] = other + (one - mean[x]) * (own - other)
+            gap, share = near[x] - far[x], one - mean[x]
+            unsure[x] = other + share * (own - other) + share * mean[x] * gap * gap
 
 
 def settle(fitted: Float32, axes: Float32, disparity: Float32, variance: Float32) -> None:
