@@ -114,8 +114,8 @@ def test_sigma_is_right_on_a_plane(noise: float) -> None:
         share = (np.abs(found.disparity_px - truth) / found.sigma_px)[_inner(truth)]
         within.append(((share < 1).mean(), (share < 2).mean()))
     one, two = np.mean(within, axis=0)
-    assert 0.62 < one < 0.82
-    assert 0.93 < two < 0.996  # with little noise what else may be wrong rules
+    assert 0.62 < one < 0.84
+    assert 0.93 < two < 0.997  # with little noise what else may be wrong rules
 
 
 def test_error_falls_with_noise_towards_the_bound() -> None:
