@@ -8,6 +8,7 @@ from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position
+from barsight.motion.parabola import ROUNDS, fit_parabola
 from barsight.motion.sway import sway_at, turned_angle
 from motion_recordings import MemoryRecording, ideal_rig
 
@@ -171,3 +172,22 @@ def test_settings() -> None:
     for setting in ({"window_s": 0.0}, {"attitude_std_deg": -1.0}):
         with pytest.raises(ConfigError, match=next(iter(setting))):
             CraneSettings(**setting)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_the_kernels_parabola_is_the_slow_one(degree: int) -> None:
+    rng = np.random.default_rng(degree)
+    time = np.sort(rng.uniform(-1, 1, 14))
+    design = np.vander(time, degree + 1, increasing=True)
+    values = design @ rng.normal(size=(degree + 1, 3)) + rng.normal(0, 0.01, (14, 3))
+    values[4] += 1.0
+    fitted = np.empty((degree + 1, 4))
+    fit_parabola(time, values, 0.02, fitted)
+    weights = np.ones(14)
+    for _ in range(ROUNDS):
+        expected, *_ = np.linalg.lstsq(design * weights[:, None], values * weights[:, None])
+        used = weights
+        weights = 1 / np.sqrt(1 + (np.linalg.norm(values - design @ expected, axis=1) / 0.02) ** 2)
+    np.testing.assert_allclose(fitted[:, :3], expected, atol=1e-10)
+    inverse = np.linalg.inv((design * used[:, None] ** 2).T @ design)
+    np.testing.assert_allclose(fitted[:, 3], inverse[:, 0], atol=1e-10)

@@ -89,6 +89,16 @@ def stereo_jacobian(points: Float64, camera: RectifiedCamera) -> Float64:
     return np.stack([by_u, by_v, by_right], axis=1)
 
 
+def triangulated_by(points: Float64, camera: RectifiedCamera) -> Float64:
+    """(N, 3, 3) how `triangulate`d points move with their u, v and right u, m per px."""
+    depth = points[:, 2]
+    along_ray = points * (depth / (camera.focal_px * camera.baseline_m))[:, None]
+    by_places = np.stack([-along_ray, np.zeros_like(points), along_ray], axis=2)
+    by_places[:, 0, 0] += depth / camera.focal_px
+    by_places[:, 1, 1] += depth / camera.focal_px
+    return by_places
+
+
 def predict_places(
     points: Float64,
     sigma_px: float | Float64,
@@ -104,7 +114,7 @@ def predict_places(
     by_point = stereo_jacobian(safe, camera)
     by_motion = np.concatenate([by_point @ -skew(safe), by_point], axis=2)
     covariance = by_motion @ motion.covariance @ by_motion.transpose(0, 2, 1)
-    old = by_point @ motion.rotation @ np.linalg.inv(stereo_jacobian(points, camera))
+    old = by_point @ motion.rotation @ triangulated_by(points, camera)
     variance = np.broadcast_to(np.square(sigma_px), (len(points), 3))
     covariance += (old * variance[:, None, :]) @ old.transpose(0, 2, 1)
     with np.errstate(invalid="ignore"):

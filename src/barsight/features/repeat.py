@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy.fft import irfft, rfft
 
-from barsight.core.arrays import Float64, UInt8
+from barsight.core.arrays import Float32, Float64, UInt8
 
 TILES = (4, 4)
 NEAREST_PX = 5
@@ -23,28 +24,30 @@ def repeat_px(image: UInt8, places: Float64) -> Float64:
     bands = max(1, image.shape[0] // ROW_STEP)
     rows_of = cv2.resize(image, (image.shape[1], bands), interpolation=cv2.INTER_AREA).astype(np.float32)
     detail = rows_of - cv2.blur(rows_of, (81, 11))
-    places = places / (1, ROW_STEP)
-    rows = np.linspace(0, detail.shape[0], TILES[0] + 1).astype(int)
-    columns = np.linspace(0, image.shape[1], TILES[1] + 1).astype(int)
-    table = np.full(TILES, np.inf)
-    for i in range(TILES[0]):
-        for j in range(TILES[1]):
-            table[i, j] = _first_peak(detail[rows[i] : rows[i + 1], columns[j] : columns[j + 1]])
-    row = (places[:, 1] * TILES[0] / detail.shape[0]).astype(int).clip(0, TILES[0] - 1)
+    rows, columns = detail.shape[0] // TILES[0], detail.shape[1] // TILES[1]
+    tiles = detail[: TILES[0] * rows, : TILES[1] * columns].reshape(TILES[0], rows, TILES[1], columns)
+    likeness = _likeness(tiles.transpose(0, 2, 1, 3))
+    table = np.array([[_first_peak(tile) for tile in line] for line in likeness])
+    row = (places[:, 1] * TILES[0] / image.shape[0]).astype(int).clip(0, TILES[0] - 1)
     column = (places[:, 0] * TILES[1] / image.shape[1]).astype(int).clip(0, TILES[1] - 1)
     result: Float64 = table[row, column]
     return result
 
 
-def _first_peak(tile: Float64) -> float:
+def _likeness(tiles: Float32) -> Float64:
+    """(..., W / 2) mean autocorrelation of the rows of tiles (..., H, W), 1 at no lag; 0 for a blank one."""
+    width = tiles.shape[-1]
+    centred = tiles - tiles.mean(axis=-1, keepdims=True)
+    power = (np.abs(rfft(centred, 2 * width)) ** 2).mean(axis=-2)
+    likeness = irfft(power.astype(np.float64))[..., : width // 2]
+    likeness *= width / (width - np.arange(width // 2))
+    return likeness / np.maximum(likeness[..., :1], 1e-9)
+
+
+def _first_peak(likeness: Float64) -> float:
     """The lag of the first peak after the autocorrelation has fallen, or infinity."""
-    width = tile.shape[1]
-    centred = tile - tile.mean(axis=1, keepdims=True)
-    power = (np.abs(np.fft.rfft(centred, 2 * width, axis=1)) ** 2).mean(axis=0)
-    likeness = np.fft.irfft(power)[: width // 2]
     if likeness[0] <= 0:
         return float("inf")
-    likeness = likeness / likeness[0] * width / (width - np.arange(width // 2))
     fallen = np.flatnonzero(likeness < LEAST_LIKENESS / 2)
     if fallen.size == 0:
         return float("inf")

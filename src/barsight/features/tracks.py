@@ -18,10 +18,8 @@ from barsight.core.types import RectifiedPair
 from barsight.features.guided import (
     GuidedMatches,
     Predicted,
-    PredictedMotion,
     match_across,
     match_guided,
-    predict_places,
     triangulate,
 )
 from barsight.features.patches import PatchImage, PatchPair
@@ -84,12 +82,10 @@ class Tracks:
 
 
 def find_again(
-    tracks: Tracks, pair: PatchPair, motion: PredictedMotion, settings: TrackSettings,
+    tracks: Tracks, pair: PatchPair, predicted: Predicted, settings: TrackSettings,
     repeat_px: Float64 | None = None,
 ) -> GuidedMatches:  # fmt: skip
-    """Where the followed points are in a new pair."""
-    camera = pair.pair.camera
-    predicted = predict_places(triangulate(tracks.stereo, camera), settings.sigma_px, motion, camera)
+    """Where the followed points are in a new pair, in which they are `predicted`."""
     count = len(tracks.track)
     stereo, sigma = np.full((count, 3), np.nan), np.full(count, np.nan)
     found, ambiguous = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
@@ -153,8 +149,12 @@ def detect_corners(image: UInt8, settings: TrackSettings, taken: Float64) -> Flo
     """
     small = cv2.pyrDown(image)
     mask = np.full(small.shape, 255, np.uint8)
-    for x, y in (taken / 2).round().astype(int).tolist():
-        cv2.circle(mask, (x, y), settings.spacing_px // 2, 0, -1)
+    away = settings.spacing_px // 2
+    near = np.zeros((2 * away + 1, 2 * away + 1), np.uint8)
+    cv2.circle(near, (away, away), away, 1, -1)
+    down, along = np.nonzero(near)
+    x, y = (taken / 2).round().astype(int).T[:, :, None] - away
+    mask[(y + down).clip(0, small.shape[0] - 1), (x + along).clip(0, small.shape[1] - 1)] = 0
     rows, columns = (np.linspace(7, size - 7, TILES + 1).astype(int) for size in small.shape)
     there, _, _ = np.histogram2d(taken[:, 1] / 2, taken[:, 0] / 2, [rows, columns])
     found = [np.empty((0, 2), np.float32)]

@@ -14,6 +14,7 @@ from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame, RefusedFrame, Trajectory
+from barsight.motion.parabola import fit_parabola
 from barsight.motion.sway import sway_at, turned_angle
 from barsight.recording.base import Recording
 
@@ -113,15 +114,10 @@ def fit_position(crane: CraneSamples, stamp_ns: int, window_ns: int) -> FittedPl
         )
     time = (stamps - stamp_ns) / window_ns
     degree = 2 if stamps.size >= 6 else 1
-    design = np.vander(time, degree + 1, increasing=True)
-    values = crane.position_m[first:last]
-    weights = np.ones(stamps.size)
-    for _ in range(10):
-        coefficients, *_ = np.linalg.lstsq(design * weights[:, None], values * weights[:, None], rcond=None)
-        residual = np.linalg.norm(values - design @ coefficients, axis=1) / (3**0.5 * crane.position_std_m)
-        weights = 1 / np.sqrt(1 + (residual / CAUCHY_SIGMAS) ** 2)
-    information = (design * weights[:, None] ** 2).T @ design
-    variance = np.linalg.inv(information)[0, 0] * crane.position_std_m**2
+    fitted = np.empty((degree + 1, 4))
+    length = CAUCHY_SIGMAS * 3**0.5 * crane.position_std_m
+    fit_parabola(time, np.ascontiguousarray(crane.position_m[first:last]), length, fitted)
+    coefficients, variance = fitted[:, :3], fitted[0, 3] * crane.position_std_m**2
     window_s = window_ns / NS_PER_S
     bend = 2 * coefficients[2] / window_s**2 if degree == 2 else np.zeros(3)
     return FittedPlace(coefficients[0], coefficients[1] / window_s, bend, np.eye(3) * variance)

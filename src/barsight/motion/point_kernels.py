@@ -67,7 +67,8 @@ def _error(
         q[i] = camera[node, i, 0] * x + camera[node, i, 1] * y + camera[node, i, 2] * z + camera[node, i, 3]
     if q[2] < NEAREST_M:
         return False
-    x, y, z, last = q[0] / q[2], q[1] / q[2], 1 / q[2], len(shared) - 1
+    z, last = 1 / q[2], len(shared) - 1
+    x, y = q[0] * z, q[1] * z
     slide = points[t, 3] * lens[0]
     u = lens[0] * x + lens[1]
     # By the predicted place: by the seen one, a scale would shrink the right picture's noise and be liked.
@@ -131,12 +132,15 @@ def rows(
         by_point[:] = 0
         by_drift[:] = 0
         return
-    size = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2) * weights[k]
-    weight = weights[k] * np.sqrt(min(1.0, huber / max(size, 1e-9)))
+    weight = weights[k]
+    square = (error[0] ** 2 + error[1] ** 2 + error[2] ** 2) * weight**2
+    if square > huber**2:
+        weight *= np.sqrt(huber / np.sqrt(square))
     x = mount[0, 0] * q[0] + mount[0, 1] * q[1] + mount[0, 2] * q[2] + mount[0, 3]
     y = mount[1, 0] * q[0] + mount[1, 1] * q[1] + mount[1, 2] * q[2] + mount[1, 3]
     z = mount[2, 0] * q[0] + mount[2, 1] * q[1] + mount[2, 2] * q[2] + mount[2, 3]
-    along, slope = weight * lens[0] / q[2], weight / q[2] ** 2
+    flat = 1 / q[2]
+    along, slope = weight * lens[0] * flat, weight * flat**2
     for i in range(3):
         axis = 1 if i == 1 else 0
         deep = -slope * lens[0] * q[axis]

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import Pose
@@ -124,6 +126,35 @@ class Prior:
     drift: Float64
     matrix: Float64
     gradient: Float64
+
+    @cached_property
+    def poses(self) -> tuple[Any, ...]:
+        """(P,) GTSAM's, of the nodes."""
+        count = len(gtsam.utilities.extractPose3(self.at))
+        return tuple(self.at.atPose3(X(k)) for k in range(count))
+
+    @cached_property
+    def inertial(self) -> Float64:
+        """(P, 9) velocities and biases; (P, 0) without an IMU."""
+        return inertial_of(self.at, len(self.poses))
+
+    @cached_property
+    def latency(self) -> Float64:
+        """(1,) of the encoders; (0,) without."""
+        return latency_of(self.at)
+
+
+def inertial_of(values: Any, count: int) -> Float64:
+    """(count, 9) of the first nodes' velocities and biases in GTSAM's values; (count, 0) without an IMU."""
+    if not values.exists(V(0)):
+        return np.empty((count, 0))
+    velocity = [values.atVector(V(k)) for k in range(count)]
+    return np.column_stack([velocity, [values.atConstantBias(B(k)).vector() for k in range(count)]])
+
+
+def latency_of(values: Any) -> Float64:
+    """(1,) the encoders' latency in GTSAM's values; (0,) without encoders."""
+    return np.asarray(values.atVector(E(0))) if values.exists(E(0)) else np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)

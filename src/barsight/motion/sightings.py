@@ -130,9 +130,6 @@ def _see(
         matches = GuidedMatches(np.empty((0, 3)), np.empty(0), kept, kept)
         tracks = Tracks(next_track=0 if state is None else state.next_track)
         motion, innovation = None, None
-        if prediction is None:
-            rough = look(pair, settings.rough)
-            view = None if isinstance(rough, Failed) else rough
     else:
         tracks, predicted = state.tracks, prediction
         found = None if prediction is None else consensus(tracks, pair, prediction, settings)
@@ -208,14 +205,17 @@ def consensus(
     """Points found again in their ellipses that agree on one motion in 3D, and that motion."""
     assert tracks.last is not None
     repeats = repeat_px(tracks.last.left, tracks.stereo[:, :2])
-    matches = find_again(tracks, pair, prediction, settings.tracks, repeats)
+    camera = pair.pair.camera
+    predicted = predict_places(
+        triangulate(tracks.stereo, camera), settings.tracks.sigma_px, prediction, camera
+    )
+    matches = find_again(tracks, pair, predicted, settings.tracks, repeats)
     index = np.flatnonzero(matches.found)
     least = settings.rough.least_inliers
     if index.size < least:
         alike = int(matches.ambiguous.sum())
         why = f", {alike} can't be told from the next bar's" if alike else ""
         return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again{why}")
-    camera = pair.pair.camera
     points, target = triangulate(tracks.stereo[index], camera), matches.stereo[index]
     start = ransac(points, target[:, :2], camera, settings.rough)
     if isinstance(start, Failed):
@@ -225,11 +225,7 @@ def consensus(
         return step
     kept = np.zeros(len(tracks.track), np.bool_)
     kept[index[step.kept]] = True
-    camera = pair.pair.camera
-    expected = predict_places(
-        triangulate(tracks.stereo, camera), settings.tracks.sigma_px, prediction, camera
-    )
-    share = kept.sum() / max(1, int((expected.inside & ~matches.ambiguous).sum()))
+    share = kept.sum() / max(1, int((predicted.inside & ~matches.ambiguous).sum()))
     if share < LEAST_SHARE:
         return Failed(
             "ambiguous",

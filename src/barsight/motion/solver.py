@@ -8,6 +8,7 @@ its border.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -18,9 +19,9 @@ from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
 from barsight.motion.elimination import Reduced, eliminate, substitute
 from barsight.motion.gaps import without_gaps
-from barsight.motion.graph import OFFSETS, chain_of
+from barsight.motion.graph import chain_of
 from barsight.motion.point_kernels import Guess, Rig, Sights, residuals
-from barsight.motion.problem import Prior, Problem, StereoSightings
+from barsight.motion.problem import Prior, Problem, StereoSightings, inertial_of, latency_of
 from barsight.motion.rig_drift import HUBER_SIGMAS
 from barsight.motion.system import System
 
@@ -39,6 +40,14 @@ class State:
     points: Float64
     drift: Float64
     slides: Float64 = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def poses(self) -> Float64:
+        """(M, 4, 4) reference_from_body."""
+        flat = gtsam.utilities.extractPose3(self.values)
+        result = np.tile(np.eye(4), (len(flat), 1, 1))
+        result[:, :3, :3], result[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
+        return result
 
 
 def rig_of(seen: StereoSightings) -> Rig:
@@ -73,11 +82,10 @@ def _places(problem: Problem) -> Int64:
 def guess_of(problem: Problem, state: State) -> Guess:
     """The state as the kernels take it."""
     assert problem.sightings is not None
-    camera_from_body = problem.sightings.body_from_rect0.inverse().matrix[:3]
-    bodies = [np.linalg.inv(state.values.atPose3(X(k)).matrix()) for k in problem.kept.tolist()]
-    return Guess(
-        camera_from_body @ np.array(bodies), state.points, np.concatenate([state.slides, state.drift])
-    )
+    left = state.poses[problem.kept] @ problem.sightings.body_from_rect0.matrix
+    turn = left[:, :3, :3].transpose(0, 2, 1)
+    camera = np.concatenate([turn, -turn @ left[:, :3, 3:]], axis=2)
+    return Guess(camera, state.points, np.concatenate([state.slides, state.drift]))
 
 
 def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
@@ -186,19 +194,12 @@ def _add_prior(
 
 def _since(prior: Prior, state: State) -> Float64:
     """(n,) how far the state has moved from where the prior stands."""
-    moves = []
-    for key in prior.at.keys():  # noqa: SIM118
-        kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
-        place = 1_000_000_000 if kind == "e" else node
-        if kind == "x":
-            move = prior.at.atPose3(key).localCoordinates(state.values.atPose3(key))
-        elif kind == "b":
-            move = state.values.atConstantBias(key).vector() - prior.at.atConstantBias(key).vector()
-        else:
-            move = state.values.atVector(key) - prior.at.atVector(key)
-        moves.append((place, OFFSETS.get(kind, 0), np.asarray(move)))
-    moves.sort(key=lambda move: move[:2])
-    return np.concatenate([*(move for _, _, move in moves), state.drift - prior.drift])
+    count = len(prior.poses)
+    turned = [pose.localCoordinates(state.values.atPose3(X(k))) for k, pose in enumerate(prior.poses)]
+    nodes = np.column_stack([turned, inertial_of(state.values, count) - prior.inertial])
+    return np.concatenate(
+        [nodes.ravel(), latency_of(state.values) - prior.latency, state.drift - prior.drift]
+    )
 
 
 def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Float64) -> State:

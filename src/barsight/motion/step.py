@@ -12,7 +12,7 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import skew
 from barsight.core.types import RectifiedCamera
-from barsight.features.guided import match_across
+from barsight.features.guided import match_across, triangulated_by
 from barsight.features.matching import match_mutual
 from barsight.features.patches import locate
 from barsight.motion.step_kernel import MOST_SIGMAS, step_equations
@@ -56,16 +56,6 @@ def move(old: View, new: View, settings: OdometrySettings) -> Step | Failed:
     return refine(points, target, rotation, translation, camera, settings)
 
 
-def _by_old_places(points: Float64, camera: RectifiedCamera) -> Float64:
-    """(N, 3, 3) how triangulated points move with the u, v and u_right that they were seen at, m per px."""
-    depth = points[:, 2]
-    along_ray = points * (depth / (camera.focal_px * camera.baseline_m))[:, None]
-    by_places = np.stack([-along_ray, np.zeros_like(points), along_ray], axis=2)
-    by_places[:, 0, 0] += depth / camera.focal_px
-    by_places[:, 1, 1] += depth / camera.focal_px
-    return by_places
-
-
 def ransac(
     points: Float64,
     pixels: Float64,
@@ -106,7 +96,7 @@ def refine(
     """
     base = camera.focal_px * camera.baseline_m
     lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, base, camera.doffs_px])
-    by_old_places, target = _by_old_places(points, camera), np.ascontiguousarray(target)
+    by_old_places, target = triangulated_by(points, camera), np.ascontiguousarray(target)
     kept: Bool = np.ones(len(points), dtype=np.bool_)
     distance, normal, gradient = np.empty(len(points)), np.empty((6, 6)), np.empty(6)
     for _ in range(10):

@@ -16,16 +16,19 @@ MOST_WHITENED = 4.0
 """Single far residuals say nothing of what neighbours share."""
 
 
-def start_points(problem: Problem) -> Float64:
-    """(T, 4) place in the reference as the first sighting has it, and slide: none."""
+def start_points(problem: Problem, poses: Float64 | None = None) -> Float64:
+    """(T, 4) place in the reference as the first sighting has it, and slide: none. poses: (M, 4, 4), the
+    problem's own start if None.
+    """
     seen = problem.sightings
     if seen is None:
         return np.empty((0, 4))
+    if poses is None:
+        poses = np.array([pose.matrix for pose in problem.start])
     begin = seen.first[:-1]
     in_body = seen.body_from_rect0.apply(triangulate(seen.stereo[begin], seen.camera))
-    turn = np.array([pose.rotation for pose in problem.start])[seen.node[begin]]
-    place = np.array([pose.translation for pose in problem.start])[seen.node[begin]]
-    points = (turn @ in_body[:, :, None])[:, :, 0] + place
+    first = poses[seen.node[begin]]
+    points = (first[:, :3, :3] @ in_body[:, :, None])[:, :, 0] + first[:, :3, 3]
     return np.column_stack([points, np.zeros(len(points))])
 
 
@@ -67,9 +70,9 @@ def persistence(residual: Float64, seen: StereoSightings, used: Bool) -> float:
     take off each track's mean, which lowers the correlation seen by about 1 / n.
     """
     order = np.flatnonzero(used)
-    _, inverse, counts = np.unique(seen.track[order], return_inverse=True, return_counts=True)
-    length = counts[inverse][:-1]
-    pair = (inverse[:-1] == inverse[1:]) & (length >= LEAST_PERSISTENT)
+    track = seen.track[order]
+    length = np.bincount(track)[track[:-1]]
+    pair = (track[:-1] == track[1:]) & (length >= LEAST_PERSISTENT)
     if pair.sum() < LEAST_PAIRS:
         return 1.0
     scaled = residual[order] / seen.sigma_px[order, None]

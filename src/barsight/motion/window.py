@@ -24,12 +24,10 @@ from barsight.motion.graph import factors
 from barsight.motion.marginals import Newest, newest
 from barsight.motion.problem import Prior, Problem, StereoSightings
 from barsight.motion.sightings import Sighting
-from barsight.motion.solver import State, linearise, moved, optimise, sighting_residuals
+from barsight.motion.solver import State, linearise, moved, sighting_residuals
 from barsight.motion.stereo_factors import often, persistence, start_points
 from barsight.motion.system import System
 
-STEPS = 1
-"""Before outliers leave; one more follows. The frame before was solved, so little is left to do."""
 NOISE_SHARE = 0.2
 """By how much one window's noise moves the running one."""
 
@@ -137,7 +135,9 @@ def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window
         used = often(seen, np.ones(len(seen.node), np.bool_))
     state = replace(window.state, points=points)
     graph = factors(problem)
-    state, system = optimise(problem, graph, state, used, most=STEPS)
+    # The frame before was solved, so little is left to do: one step before outliers leave, one after.
+    system = linearise(problem, graph, state, used)
+    state = moved(problem, state, used, *system.step(problem.free))
     noise = window.noise
     if seen is not None and used.any():
         residual = sighting_residuals(problem, state, used)
@@ -168,8 +168,7 @@ def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window
 
 def _points(window: Window, problem: Problem, names: Int64) -> Float64:
     """Of each point its place as known, else as its first sighting has it from the pose as known."""
-    poses = tuple(window.pose(k) for k in range(len(problem.start)))
-    points = start_points(replace(problem, start=poses))
+    points = start_points(problem, window.state.poses)
     at = np.searchsorted(window.names, names).clip(0, max(0, len(window.names) - 1))
     if len(window.names):
         known = window.names[at] == names
@@ -193,8 +192,12 @@ def without_first(window: Window, problem: Problem, used: Bool, count: int) -> W
     matrix, gradient = _without(system, count * system.size)
     values = _renumbered(state, problem, count)
     prior = Prior(values, state.drift, matrix, gradient)
-    first = window.names[ended] if seen is not None else window.names[:0]
-    sightings = [(node - count, _without_tracks(s, first)) for node, s in window.sightings if node >= count]
+    stays = ~ended if seen is not None else np.ones(0, np.bool_)
+    sightings = [
+        (node - count, _chosen(s, stays[np.searchsorted(window.names, s.track)]))
+        for node, s in window.sightings
+        if node >= count
+    ]
     left = replace(
         window.problem, start=problem.start[count:], stamp_ns=problem.stamp_ns[count:],
         preintegrated=problem.preintegrated[count:], prior=prior,
@@ -216,10 +219,9 @@ def _without(system: System, count: int) -> tuple[Float64, Float64]:
     n, width = system.rows.shape
     border = len(system.corner)
     whole = np.zeros((n + border, n + border))
-    for i in range(n):
-        first = max(0, i - width + 1)
-        whole[i, first : i + 1] = system.rows[i, first - i + width - 1 :]
-    whole[:n, :n] += np.tril(whole[:n, :n], -1).T
+    apart = np.subtract.outer(np.arange(n), np.arange(n))
+    row, column = np.nonzero((apart >= 0) & (apart < width))
+    whole[row, column] = whole[column, row] = system.rows[row, width - 1 - apart[row, column]]
     whole[n:, :n], whole[:n, n:] = system.side, system.side.T
     whole[n:, n:] = system.corner
     slope = np.concatenate([system.gradient, system.corner_gradient])
@@ -240,8 +242,7 @@ def _renumbered(state: State, problem: Problem, count: int) -> gtsam.Values:
     return values
 
 
-def _without_tracks(sighting: Sighting, gone: Int64) -> Sighting:
-    kept = ~np.isin(sighting.track, gone)
+def _chosen(sighting: Sighting, kept: Bool) -> Sighting:
     return replace(
         sighting, track=sighting.track[kept], stereo=sighting.stereo[kept], sigma_px=sighting.sigma_px[kept]
     )
