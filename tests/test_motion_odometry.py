@@ -11,9 +11,9 @@ from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose, skew
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame, Trajectory
-from barsight.features.guided import project_stereo, stereo_jacobian, triangulate
+from barsight.features.guided import project_stereo, stereo_jacobian, triangulate, triangulated_by
 from barsight.motion.odometry import StereoOdometry
-from barsight.motion.step import Step, _by_old_places, carried, in_world, refine
+from barsight.motion.step import Step, carried, in_world, refine
 from barsight.motion.step_kernel import step_equations
 from barsight.motion.views import OdometrySettings
 from barsight.recording.open import open_recording
@@ -91,7 +91,7 @@ def test_how_points_move_with_their_places() -> None:
         moved = np.eye(3)[k] * 1e-5
         expected[:, :, k] = (triangulate(places + moved, HALL) - triangulate(places - moved, HALL)) / 2e-5
     np.testing.assert_allclose(
-        _by_old_places(triangulate(places, HALL), HALL), expected, rtol=1e-6, atol=1e-9
+        triangulated_by(triangulate(places, HALL), HALL), expected, rtol=1e-6, atol=1e-9
     )
 
 
@@ -102,7 +102,7 @@ def test_the_kernel_against_matrices() -> None:
     turn, variance = Rotation.from_rotvec(TURN).as_matrix(), 0.09
     target = project_stereo(points @ turn.T + MOVE, HALL) + rng.normal(0, 0.5, (80, 3))
     target[:10] += rng.uniform(-20, 20, (10, 3))
-    by_old = _by_old_places(points, HALL)
+    by_old = triangulated_by(points, HALL)
     base = HALL.focal_px * HALL.baseline_m
     lens = np.array([HALL.focal_px, HALL.cx_px, HALL.cy_px, base, HALL.doffs_px])
     distance, normal, gradient = np.empty(80), np.empty((6, 6)), np.empty(6)

@@ -33,10 +33,11 @@ def nearest(first: UInt8 | Float32, second: UInt8 | Float32) -> Nearest:
     count = len(first)
     index, distance = np.full(count, -1, np.int64), np.full((count, 2), np.inf)
     if count and len(second):
-        matcher = cv2.BFMatcher(cv2.NORM_HAMMING if first.dtype == np.uint8 else cv2.NORM_L2)
-        for k, found in enumerate(matcher.knnMatch(first, second, k=2)):
-            index[k] = found[0].trainIdx
-            distance[k, : len(found)] = [match.distance for match in found]
+        bits = first.dtype == np.uint8
+        kind, norm = (cv2.CV_32S, cv2.NORM_HAMMING) if bits else (cv2.CV_32F, cv2.NORM_L2)
+        sides = min(2, len(second))
+        found, which = cv2.batchDistance(first, second, kind, normType=norm, K=sides)
+        index, distance[:, :sides] = which[:, 0].astype(np.int64), found
     return Nearest(index, distance[:, 0], distance[:, 1])
 
 

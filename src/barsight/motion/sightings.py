@@ -145,8 +145,12 @@ def _see(
         kept, matches, motion = found
         innovation = None if predicted is None else _innovation(predicted, motion)
     camera = pair.pair.camera
-    span = _span(matches.stereo[kept], camera)
-    coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px, known=span, both_ways=False)
+    if view is None:
+        span = _span(matches.stereo[kept], camera)
+        left, right = pair.pair.left, pair.pair.right
+        coarse = coarse_disparity(left, right, camera.doffs_px, known=span, both_ways=False)
+    else:
+        coarse = view.coarse
     tracks = carry_on(tracks, pair, matches, kept, coarse, settings.tracks)
     if len(tracks.track) < settings.rough.least_inliers:
         return Failed("no-features", f"only {len(tracks.track)} points have a depth")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float32, Float64
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.types import RefusedFrame
 from barsight.features.guided import match_across, triangulate
@@ -46,12 +46,15 @@ class OdometrySettings:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One frame's features with a stereo disparity. points: (N, 3) in `rect0`."""
+    """One frame's features with a stereo disparity. points: (N, 3) in `rect0`. coarse: (h, w) the pair's
+    coarse disparity, px of the full picture, NaN unknown.
+    """
 
     pair: PatchPair
     features: Features
     disparity: Float64
     points: Float64
+    coarse: Float32
 
     @property
     def stamp_ns(self) -> int:
@@ -97,4 +100,4 @@ def look(
     if kept.sum() < settings.least_inliers:
         return Failed("no-features", f"only {int(kept.sum())} features have a depth")
     disparity = places[kept, 0] - right.pixels[kept, 0]
-    return View(pair, features.chosen(kept), disparity, points[kept])
+    return View(pair, features.chosen(kept), disparity, points[kept], coarse)
