@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64
-from barsight.core.stamps import NS_PER_S, interpolate_at
+from barsight.core.errors import Failed
+from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples
+from barsight.motion.crane import fit_position
 from barsight.motion.sightings import Sighting
 from barsight.motion.sway import turned_angle
 
@@ -21,7 +23,11 @@ LEAST_JUMP_M = 0.01
 LEAST_FROZEN = 5
 LEAST_FROZEN_SPEED_MPS = 0.05
 MOST_FRAMES_OFF = 2
-LEAST_STEPS = 8
+MANY_STEPS = 8
+"""Recordings that leave fewer steps are looked at for one frame off only."""
+LEAST_STEPS = 2
+"""Five frames. They tell seven times in ten, seven frames always (docs/motion.md)."""
+WINDOW_S = 0.35
 TURN_SIGMA_RAD = 5e-4
 WAY_SIGMA_M = 0.005
 CLEARLY_BETTER = 0.1
@@ -81,23 +87,31 @@ class Steps:
 
 def compare_steps(
     sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
-    rectifier: Rectifier, shift_ns: int, off: int = 0,
-) -> Steps:  # fmt: skip
-    """The steps of all frames but the outer ones, the other sensors taken `off` frames further on."""
-    count = len(sightings)
-    steps = [k for k, s in enumerate(sightings) if s.motion is not None]
-    steps = [k for k in steps if MOST_FRAMES_OFF < k < count - MOST_FRAMES_OFF]
+    rectifier: Rectifier, shift_ns: int, offs: tuple[int, ...] = (0,),
+) -> tuple[Steps, ...]:  # fmt: skip
+    """For each of `offs` the steps with the other sensors taken that many frames further on; the same steps
+    for all, those of the outer frames left out.
+    """
+    count, ends = len(sightings), max(abs(off) for off in offs)
+    steps = [k for k in range(1 + ends, count - ends) if sightings[k].motion is not None]
     stamps = np.array([s.stamp_ns for s in sightings]) + shift_ns
-    old, new = stamps[[k + off - 1 for k in steps]], stamps[[k + off for k in steps]]
     turn, way = _seen(sightings, steps, rectifier)
-    gyro, travel = np.full((len(steps), 3), np.nan), np.full(len(steps), np.nan)
+    angle, place = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
     if imu is not None:
-        angle = turned_angle(imu)
-        gyro = interpolate_at(new, imu.stamp_ns, angle) - interpolate_at(old, imu.stamp_ns, angle)
+        angle = interpolate_at(stamps, imu.stamp_ns, turned_angle(imu))
     if crane is not None:
-        place = interpolate_at(new, crane.stamp_ns, crane.position_m)
-        travel = np.linalg.norm(place - interpolate_at(old, crane.stamp_ns, crane.position_m), axis=1)
-    return Steps(turn, way, gyro, travel, (new - old) / NS_PER_S)
+        # A fit, since single readings may be wild.
+        for k, stamp in enumerate(stamps.tolist()):
+            fit = fit_position(crane, stamp, seconds_to_ns(WINDOW_S))
+            place[k] = np.nan if isinstance(fit, Failed) else fit.position_m
+    found = []
+    for off in offs:
+        old, new = [k + off - 1 for k in steps], [k + off for k in steps]
+        travel = np.linalg.norm(place[new] - place[old], axis=1)
+        found.append(
+            Steps(turn, way, angle[new] - angle[old], travel, (stamps[new] - stamps[old]) / NS_PER_S)
+        )
+    return tuple(found)
 
 
 def frames_off(
@@ -109,9 +123,10 @@ def frames_off(
     The turns and ways that pictures show between neighbouring frames are held against those of the other
     sensors between the stamps of neighbours further on or back. The gyro's bias is fitted each time.
     """
+    most = MOST_FRAMES_OFF if len(sightings) > 2 * MOST_FRAMES_OFF + MANY_STEPS else 1
+    offs = tuple(range(-most, most + 1))
     cost = {}
-    for off in range(-MOST_FRAMES_OFF, MOST_FRAMES_OFF + 1):
-        steps = compare_steps(sightings, imu, crane, rectifier, shift_ns, off)
+    for off, steps in zip(offs, compare_steps(sightings, imu, crane, rectifier, shift_ns, offs), strict=True):
         turned = _gyro_residual(steps)
         travelled = np.isfinite(steps.travel)
         terms = []
@@ -130,7 +145,7 @@ def gyro_in_degrees(
     sightings: tuple[Sighting, ...], imu: ImuSamples, rectifier: Rectifier, shift_ns: int
 ) -> bool:
     """Whether the gyro turns some 57 times as far as the pictures, step by step."""
-    steps = compare_steps(sightings, imu, None, rectifier, shift_ns)
+    (steps,) = compare_steps(sightings, imu, None, rectifier, shift_ns)
     radians, degrees = _gyro_residual(steps), _gyro_residual(steps, DEGREES)
     if len(radians) < LEAST_STEPS:
         return False
