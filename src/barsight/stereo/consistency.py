@@ -52,9 +52,8 @@ def without_islands(disparity: Float32, least_size_px: int, step_px: float) -> F
     known = np.isfinite(disparity)
     if not known.any() or least_size_px < 2:
         return disparity
-    offset = np.float32(np.nanmean(disparity))
-    fixed = np.where(known, np.rint((disparity - offset) * _STEPS).clip(-32000, 32000), _NONE).astype(
-        np.int16
-    )
+    offset = cv2.mean(disparity, known.view(np.uint8))[0]
+    fixed = cv2.addWeighted(disparity, _STEPS, disparity, 0, -_STEPS * offset, dtype=cv2.CV_16S)
+    fixed[~known] = _NONE
     cv2.filterSpeckles(fixed, _NONE, least_size_px, step_px * _STEPS)
     return np.where(fixed == _NONE, np.float32(np.nan), disparity)

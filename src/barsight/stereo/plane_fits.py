@@ -47,13 +47,16 @@ def fit_planes(
     so that a support doesn't cross a depth edge. Frames in, no NaN, and two more (`room`) for use inside;
     (H, W) out.
     """
-    step, nearness = shape.step, np.float32(1 / same_surface_px)
+    step, unit = shape.step, np.float32(same_surface_px)
+    # In units of same_surface_px, each point takes one product less.
+    if unit != 1:
+        disparity, pull = disparity / unit, pull / unit
     if step > 1:
         # Summed over a step along the axis first, the support can go in steps and still hear every pixel.
         near = np.arange(step) - step // 2
 
         def sum_up(first: int, end: int) -> None:
-            _sum_near(disparity, weight, pull, axes, near, nearness, fitted.shape, *room, first, end)
+            _sum_near(disparity, weight, pull, axes, near, fitted.shape, *room, first, end)
 
         in_bands(sum_up, len(axes), BAND_TILES)
         weight, pull = room
@@ -66,17 +69,19 @@ def fit_planes(
 
     def gather(first: int, end: int) -> None:
         _gather(
-            disparity, weight, pull, axes, alongs, factors, acrosses, across_shares, nearness, fitted,
+            disparity, weight, pull, axes, alongs, factors, acrosses, across_shares, fitted,
             information, first, end,
         )  # fmt: skip
 
     in_bands(gather, len(axes), BAND_TILES)
+    if unit != 1:
+        fitted *= unit
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _add_up(
     _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, factors: Any, stride: Any,
-    across_shares: Any, acrosses: Any, nearness: Any, sums: Any, at: Any,
+    across_shares: Any, acrosses: Any, sums: Any, at: Any,
 ) -> Any:  # fmt: skip
     """The nine sums of a plane's normal equations for 8 pixels from `middle` on: the weights times 1, a, c,
     a a, a c, c c and the pulls times 1, a, c; a along, c across the axis. They lie TILE_COLUMNS apart.
@@ -86,20 +91,20 @@ def _add_up(
     factors: (3, stride), a point's share times 1, a, a a. All arrays are flat.
     """
     signature = types.void(
-        theres, weights, pulls, middle, offsets, factors, stride, across_shares, acrosses, nearness, sums, at
+        theres, weights, pulls, middle, offsets, factors, stride, across_shares, acrosses, sums, at
     )
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments, _PLANE_LANES)
         index, stride = arguments[3].type, arguments[6]
-        centre, nearness = v.load(v.data(0), arguments[3], v.floats), v.all(arguments[9], v.floats)
+        centre = v.load(v.data(0), arguments[3], v.floats)
         totals = v.zeros(9)
 
         def heard(place: Any) -> tuple[Any, Any]:
             """Weight and pull of the points whose offset lies at `place`."""
             there = builder.add(arguments[3], builder.load(builder.gep(v.data(4), [place])))
             gap = v.difference(v.load(v.data(0), there, v.floats), centre)
-            alike = v.alike(gap, nearness)
+            alike = v.biweight(gap)
             weight = v.product(alike, v.load(v.data(1), there, v.floats))
             return weight, v.sum(v.product(weight, gap), v.product(alike, v.load(v.data(2), there, v.floats)))
 
@@ -129,7 +134,7 @@ def _add_up(
             for place, term in zip(totals, outer_terms, strict=True):
                 v.add_to(place, term)
         for one, place in enumerate(totals):
-            v.store(builder.load(place), v.data(10), builder.add(arguments[11], index(one * TILE_COLUMNS)))
+            v.store(builder.load(place), v.data(9), builder.add(arguments[10], index(one * TILE_COLUMNS)))
         return context.get_dummy_value()
 
     return signature, generate
@@ -137,28 +142,28 @@ def _add_up(
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _add_near(
-    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, nearness: Any, weight_sums: Any,
+    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, weight_sums: Any,
     pull_sums: Any, at: Any,
 ) -> Any:  # fmt: skip
     """The sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written from
     `at` on. All arrays are flat."""
-    signature = types.void(theres, weights, pulls, middle, offsets, nearness, weight_sums, pull_sums, at)
+    signature = types.void(theres, weights, pulls, middle, offsets, weight_sums, pull_sums, at)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
-        centre, nearness = v.load(v.data(0), arguments[3], v.floats), v.all(arguments[5], v.floats)
+        centre = v.load(v.data(0), arguments[3], v.floats)
         totals = v.zeros(2)
         with cgutils.for_range(builder, v.length(4)) as loop:
             there = builder.add(arguments[3], builder.load(builder.gep(v.data(4), [loop.index])))
             gap = v.difference(v.load(v.data(0), there, v.floats), centre)
-            kept = v.alike(gap, nearness)
+            kept = v.biweight(gap)
             weight = v.product(kept, v.load(v.data(1), there, v.floats))
             v.add_to(totals[0], weight)
             v.add_to(
                 totals[1], v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, v.floats)))
             )
-        for place, total in zip((6, 7), totals, strict=True):
-            v.store(builder.load(total), v.data(place), arguments[8])
+        for place, total in zip((5, 6), totals, strict=True):
+            v.store(builder.load(total), v.data(place), arguments[7])
         return context.get_dummy_value()
 
     return signature, generate
@@ -166,7 +171,7 @@ def _add_near(
 
 @kernel()
 def _sum_near(
-    disparity: Float32, weight: Float32, pull: Float32, axes: Float32, near: Int64, nearness: np.float32,
+    disparity: Float32, weight: Float32, pull: Float32, axes: Float32, near: Int64,
     shape: tuple[int, int], weight_sum: Float32, pull_sum: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
     """Sums of weights and of pulls from each pixel's own disparity over the points `near` along the axis.
@@ -187,9 +192,7 @@ def _sum_near(
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
                 for part in range(0, count, FLOAT_LANES):
-                    _add_near(
-                        theres, weights, pulls, middle + part, offsets, nearness, weight_part, pull_part, part
-                    )
+                    _add_near(theres, weights, pulls, middle + part, offsets, weight_part, pull_part, part)
                 for i in range(count):
                     weight_sum[y + MARGIN, x0 + MARGIN + i] = weight_part[i]
                     pull_sum[y + MARGIN, x0 + MARGIN + i] = pull_part[i]
@@ -198,7 +201,7 @@ def _sum_near(
 @kernel(fastmath=True)
 def _gather(
     disparity: Float32, weight: Float32, pull: Float32, axes: Float32, alongs: Int64, factors: Float32,
-    acrosses: Int64, across_shares: Float32, nearness: np.float32, fitted: Float32, information: Float32,
+    acrosses: Int64, across_shares: Float32, fitted: Float32, information: Float32,
     first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
     height, width = fitted.shape
@@ -228,7 +231,7 @@ def _gather(
                     for part in range(0, count, _PLANE_LANES):
                         _add_up(
                             theres, weights, pulls, middle + part, offsets, flat_factors, points,
-                            across_shares, float_acrosses, nearness, flat, part,
+                            across_shares, float_acrosses, flat, part,
                         )  # fmt: skip
                     centre = disparity[y + MARGIN, x0 + MARGIN : x0 + MARGIN + count]
                     _solve(sums, centre, fitted[y, x0 : x0 + count], information[y, x0 : x0 + count])

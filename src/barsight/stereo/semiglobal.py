@@ -9,9 +9,14 @@ height.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int32, UInt8, kernel
 from barsight.core.errors import ConfigError
@@ -24,7 +29,7 @@ from barsight.stereo.semiglobal_cost import (
     row_costs,
 )
 from barsight.stereo.semiglobal_paths import UInt16, extend_row, fresh_paths, jump_costs
-from barsight.stereo.vectors import HALF_LANES
+from barsight.stereo.vectors import HALF_LANES, NUMBER, Vectors, shorts_of
 
 _OVERLAP_ROWS = 20
 _STRIPE_BYTES = 128 * 2**20
@@ -90,45 +95,72 @@ def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiG
     return Match(left_px, right_px)
 
 
+@intrinsic  # type: ignore[untyped-decorator]
+def _compete(
+    _: Any, downs: Any, ups: Any, at: Any, count: Any, places: Any, least: Any, right: Any
+) -> Any:  # fmt: skip
+    """The least key of one left pixel. Its keys are written to `least` where they are less, that of candidate
+    k at `right` + k. A key is a candidate's sum and below it, in 16 bits, the candidate: the least number is
+    the winner. downs, ups: flat, the pixel's sums from `at` on."""
+    signature = types.int32(downs, ups, at, count, places, least, right)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        kind = ir.VectorType(NUMBER, HALF_LANES)
+        worst = v.all(int(_WORST), kind)
+        lanes = ir.Constant(kind, list(range(HALF_LANES)))
+        end = v.all(builder.trunc(arguments[3], NUMBER), kind)
+        winner = cgutils.alloca_once_value(builder, worst)
+
+        def smaller(one: Any, other: Any) -> Any:
+            return builder.select(builder.icmp_signed("<", one, other), one, other)
+
+        chunks = builder.udiv(arguments[4], arguments[4].type(HALF_LANES))
+        with cgutils.for_range(builder, chunks) as loop:
+            offset = builder.mul(loop.index, loop.index.type(HALF_LANES))
+            place = builder.add(arguments[2], offset)
+            down, up = (
+                builder.zext(v.load(v.data(part), place, shorts_of(HALF_LANES)), kind) for part in (0, 1)
+            )
+            candidate = builder.add(lanes, v.all(builder.trunc(offset, NUMBER), kind))
+            key = builder.or_(builder.shl(builder.add(down, up), v.all(16, kind)), candidate)
+            key = builder.select(builder.icmp_signed("<", candidate, end), key, worst)
+            builder.store(smaller(builder.load(winner), key), winner)
+            there = builder.add(arguments[6], offset)
+            v.store(smaller(v.load(v.data(5), there, kind), key), v.data(5), there)
+        return v.least_number(builder.load(winner))
+
+    return signature, generate
+
+
 @kernel()
 def _choose(
     down: UInt16, up: UInt16, count: int, lowest: int, least: Int32, left_px: Float32, right_px: Float32
 ) -> None:
     """Winners of one row for both images; the left one to a fraction with the equiangular line fit, which
-    suits a cost that rises linearly [Shimizu 2002]. A sum and its candidate share one number, so that the
-    least number is the winner. The right ones are kept reversed meanwhile, so that a left pixel's candidates
-    meet them in memory's order. down, up: (W, places) sums of four paths each. least: (W,) for use inside."""
+    suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that a
+    left pixel's candidates meet them in memory's order. down, up: (W, places) sums of four paths each. least:
+    for use inside, with a margin on both sides that takes what falls beside the right image."""
     width, places = down.shape
     downs, ups = down.reshape(-1), up.reshape(-1)
-    keys = np.empty(places, dtype=np.int32)
+    margin = (len(least) - width) // 2
     least[:] = _WORST
     for x in range(width):
-        at, winner = np.uint64(x * places), _WORST
-        for candidate in range(count):
-            k = np.uint64(candidate)
-            key = np.int32((np.int32(downs[at + k]) + np.int32(ups[at + k])) << 16 | candidate)
-            keys[k] = key
-            winner = min(winner, key)
+        at = x * places
+        winner = _compete(downs, ups, at, count, places, least, margin + width - 1 - x + lowest)
         best = winner & 0xFFFF
         fraction = np.float32(0)
         if 0 < best < count - 1:
+            here, one = np.uint64(at + best), np.uint64(1)
             middle = winner >> 16
-            below, above = (
-                np.float32((keys[best - 1] >> 16) - middle),
-                np.float32((keys[best + 1] >> 16) - middle),
-            )
+            below = np.float32(np.int32(downs[here - one]) + np.int32(ups[here - one]) - middle)
+            above = np.float32(np.int32(downs[here + one]) + np.int32(ups[here + one]) - middle)
             steeper = max(below, above)
             if steeper > 0:
                 fraction = np.float32(0.5) * (below - above) / steeper
         left_px[x] = np.float32(best + lowest) + fraction
-        base = width - 1 - x + lowest
-        first, end = max(0, -base), min(count, width - base)
-        at_right, at_key = np.uint64(base + first), np.uint64(first)
-        for candidate in range(end - first):
-            k = np.uint64(candidate)
-            least[at_right + k] = min(least[at_right + k], keys[at_key + k])
     for x in range(width):
-        found = least[width - 1 - x]
+        found = least[margin + width - 1 - x]
         right_px[x] = np.float32((found & 0xFFFF) + lowest) if found < _WORST else _FAR
 
 
@@ -145,7 +177,8 @@ def _match_stripe(
     jumps = jump_costs(large, least_jump)
     paths = fresh_paths(width, places, small)
     leasts = np.empty((2, width, 3), dtype=np.uint8)
-    up, least = np.empty((width, places), dtype=np.uint16), np.empty(width, dtype=np.int32)
+    up = np.empty((width, places), dtype=np.uint16)
+    least = np.empty(width + 2 * (abs(lowest) + places), dtype=np.int32)
     above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
     for y in range(above, below):
         here = cost[y - above]

@@ -15,7 +15,7 @@ from numba.core import cgutils
 
 LANES = 32
 HALF_LANES = LANES // 2
-BYTE, SHORT, FLOAT = ir.IntType(8), ir.IntType(16), ir.FloatType()
+BYTE, SHORT, NUMBER, FLOAT = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.FloatType()
 FLOAT_LANES = 16
 _FAST = ("fast",)
 
@@ -122,7 +122,10 @@ class Vectors:
 
     def alike(self, gap: Any, nearness: Any) -> Any:
         """Tukey's biweight of a gap, whose reach is 1 / nearness."""
-        scaled = self.product(gap, nearness)
+        return self.biweight(self.product(gap, nearness))
+
+    def biweight(self, scaled: Any) -> Any:
+        """Tukey's biweight, whose reach is 1."""
         same = self.not_negative(self.difference(self.all(1.0, self.floats), self.product(scaled, scaled)))
         return self.product(same, same)
 
@@ -153,6 +156,10 @@ class Vectors:
     def least_of(self, vector: Any) -> Any:
         """The least byte of a vector."""
         return self._call(f"llvm.vector.reduce.umin.v{vector.type.count}i8", BYTE, vector)
+
+    def least_number(self, vector: Any) -> Any:
+        """The least of a vector's signed 32 bit numbers."""
+        return self._call(f"llvm.vector.reduce.smin.v{vector.type.count}i32", NUMBER, vector)
 
     def _call(self, name: str, result: Any, *values: Any) -> Any:
         kind = ir.FunctionType(result, [value.type for value in values])
