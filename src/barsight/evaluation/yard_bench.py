@@ -93,7 +93,8 @@ def yard_table(bench: YardBench) -> Table:
     smooth places.
     """
     title = f"{bench.what}; mm against truth on smooth places, commit {bench.provenance.commit}"
-    table = Table("method", title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("method", no_wrap=True)
     heads = ("bias", "MAE", "P95", "max", "seen %", "in 95 %", "all", "cells", "laser", "s", "MiB")
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
