@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -17,16 +17,18 @@ from barsight.calibration.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.core.arrays import UInt8
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, OutputError
-from barsight.core.types import Disparity, DisparityRange, RectifiedCamera, RectifiedPair, StereoFrame
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
+from barsight.evaluation.stereo_scenes import pair_from_images
 from barsight.mapping.view import disparity_range
 from barsight.measurement import Preview
-from barsight.recording.images import TornImageError, decode_colour, decode_gray
+from barsight.recording.images import TornImageError, decode_with_colour
 from barsight.report.files import write_preview
 from barsight.stereo.disparity_files import write_disparity
 from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
-from barsight.stereo.settings import StereoSettings, make_method
+from barsight.stereo.settings import MethodName, StereoSettings, make_method
 
-_Picture = TypeVar("_Picture", UInt8, UInt8 | None)
+_IN_COLOUR: tuple[MethodName, ...] = ("csca",)
+"""Methods that look at colours."""
 SUFFIXES = (".pfm", ".png", ".tif", ".tiff")
 
 
@@ -60,7 +62,7 @@ def run(arguments: Sequence[str]) -> None:
         if range is not None:
             low, high = _parsed_range(range)
             settings = replace(settings, lowest_disparity_px=low, highest_disparity_px=high)
-        pair = _pair(left, right, rig)
+        pair = _pair(left, right, rig, settings.method)
         candidates = disparity_range(pair, settings)
         if isinstance(candidates, Failed) and candidates.code != "no-texture":
             raise InputError(left, candidates.reason, "exchange the two pictures or give --range A:B")
@@ -89,11 +91,13 @@ def _summary(out: Path, disparity: Disparity) -> str:
     )
 
 
-def _pair(left: Path, right: Path, rig: Path | None) -> RectifiedPair:
+def _pair(left: Path, right: Path, rig: Path | None, method: MethodName) -> RectifiedPair:
     """The rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
-    frame = StereoFrame(0, _read(left, decode_gray), _read(right, decode_gray))
-    left_colour, right_colour = _read(left, decode_colour), _read(right, decode_colour)
-    colours = None if left_colour is None or right_colour is None else (left_colour, right_colour)
+    (left_grey, left_colour), (right_grey, right_colour) = _read(left), _read(right)
+    frame = StereoFrame(0, left_grey, right_grey)
+    colours = None
+    if method in _IN_COLOUR and left_colour is not None and right_colour is not None:
+        colours = left_colour, right_colour
     if rig is not None:
         rectifier = Rectifier(read_rig_file(rig))
         pair = rectifier(frame)
@@ -105,10 +109,7 @@ def _pair(left: Path, right: Path, rig: Path | None) -> RectifiedPair:
         if frame.left.shape != frame.right.shape:
             sizes = " and ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (frame.left, frame.right))
             raise InputError(right, f"the pictures' sizes differ ({sizes})", "give two pictures of one pair")
-        height, width = frame.left.shape
-        whole = np.ones((height, width), np.bool_)
-        camera = RectifiedCamera(float(width), (width - 1) / 2, (height - 1) / 2, 1.0, 0.0, width, height)
-        pair = RectifiedPair(0, frame.left, frame.right, whole, whole, camera, *(colours or ()))
+        pair = pair_from_images(frame.left, frame.right, *(colours or ()))
     offset = vertical_offset(pair.left, pair.right)
     if not isinstance(offset, Failed) and offset > MOST_OFFSET_PX:
         remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their --rig"
@@ -125,9 +126,9 @@ def _with_colours(pair: RectifiedPair, rectifier: Rectifier, left: UInt8, right:
     return replace(pair, left_colour=left, right_colour=right)
 
 
-def _read(path: Path, decode: Callable[[bytes], _Picture]) -> _Picture:
+def _read(path: Path) -> tuple[UInt8, UInt8 | None]:
     try:
-        return decode(path.read_bytes())
+        return decode_with_colour(path.read_bytes())
     except OSError as error:
         raise InputError(path, f"can't be read ({error.strerror})", "check the name") from error
     except TornImageError as error:

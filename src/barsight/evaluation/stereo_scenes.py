@@ -11,7 +11,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import InputError
 from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
-from barsight.recording.images import TornImageError, decode_colour
+from barsight.recording.images import TornImageError, decode_with_colour
 from barsight.stereo.disparity_files import read_disparity
 
 _BRIGHTEST_16_BIT = 257
@@ -97,7 +97,7 @@ def pair_from_images(
 
 def _read_colour(path: Path) -> UInt8 | None:
     try:
-        return decode_colour(path.read_bytes())
+        return decode_with_colour(path.read_bytes())[1]
     except TornImageError as error:
         raise InputError(path, str(error), "fetch it again") from error
 

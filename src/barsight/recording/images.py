@@ -34,13 +34,13 @@ def decode_gray(data: bytes) -> UInt8:
     return to_gray(_decoded(data))
 
 
-def decode_colour(data: bytes) -> UInt8 | None:
-    """(H, W, 3) uint8 BGR, or None where the picture holds gray values only. Raises as `decode_gray` does."""
+def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
+    """What `decode_gray` gives, and (H, W, 3) uint8 BGR, None where the picture holds gray values only."""
     image = _eight_bits(_decoded(data))
     if image.ndim != 3 or image.shape[2] not in (3, 4):
-        return None
+        return to_gray(image), None
     colour = np.ascontiguousarray(image[:, :, :3])
-    return colour if (colour != colour[:, :, :1]).any() else None
+    return to_gray(image), colour if (colour != colour[:, :, :1]).any() else None
 
 
 def _decoded(data: bytes) -> NDArray[Any]:
