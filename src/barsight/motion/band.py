@@ -172,3 +172,13 @@ def add_dense(matrix: Float64, count: int, rows: Float64) -> None:
     for i in range(count):
         for j in range(i + 1):
             rows[i, j - i + width - 1] += matrix[i, j]
+
+
+@kernel()
+def whole(rows: Float64, result: Float64) -> None:
+    """The matrix (n, n), both halves, zero beyond the band."""
+    n, width = rows.shape
+    result[:] = 0
+    for i in range(n):
+        for j in range(max(0, i - width + 1), i + 1):
+            result[i, j] = result[j, i] = rows[i, j - i + width - 1]

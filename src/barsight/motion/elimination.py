@@ -1,8 +1,9 @@
 """Points taken out of the normal equations: what is left binds poses and what is shared only.
 
-A point is seen from a few nodes and binds only these, so its four unknowns are eliminated where it stands
-(Schur's complement). With L L^T its own matrix, what it binds loses U^T U, U being L's inverse times what
-it shares with each: products along rows as long as its track, which the processor takes four at a time.
+A point is seen from a few nodes and binds only these, so its unknowns (three where nothing may slide, else
+four) are eliminated where it stands (Schur's complement). With L L^T its own matrix, what it binds loses
+U^T U, U being L's inverse times what it shares with each: products along rows as long as its track, which
+the processor takes four at a time.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ class Reduced(NamedTuple):
 
 
 @kernel(fastmath=True)
-def _factorise(m: Float64) -> None:
-    """Replaces the lower half of a symmetric (4, 4) by its Cholesky factor, the diagonal by its inverse."""
-    for i in range(4):
+def _factorise(m: Float64, size: int) -> None:
+    """Replaces a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse."""
+    for i in range(size):
         for j in range(i):
             total = m[i, j]
             for k in range(j):
@@ -43,9 +44,9 @@ def _factorise(m: Float64) -> None:
 
 
 @kernel(fastmath=True)
-def _add_point(error: Float64, by_point: Float64, normal: Float64, gradient: Float64) -> None:
+def _add_point(error: Float64, by_point: Float64, size: int, normal: Float64, gradient: Float64) -> None:
     """A sighting's share of its point's own equations; of the matrix the lower half."""
-    for a in range(4):
+    for a in range(size):
         gradient[a] += by_point[0, a] * error[0] + by_point[1, a] * error[1] + by_point[2, a] * error[2]
         for b in range(a + 1):
             normal[a, b] += (
@@ -57,7 +58,7 @@ def _add_point(error: Float64, by_point: Float64, normal: Float64, gradient: Flo
 @kernel(fastmath=True)
 def _add_pose(
     error: Float64, by_pose: Float64, by_point: Float64, by_drift: Float64, node: int, at: int, band: Float64,
-    gradient: Float64, side: Float64, bound: Float64,
+    gradient: Float64, side: Float64, size: int, bound: Float64,
 ) -> None:  # fmt: skip
     """A sighting's share of its pose's own equations and of those with the drift; bound (4, 6 R) from column
     `at` on with its point.
@@ -70,20 +71,20 @@ def _add_pose(
         gradient[6 * node + a] += x * error[0] + y * error[1] + z * error[2]
         side[drift, 6 * node + a] += by_drift[0] * z
         side[drift + 1, 6 * node + a] += by_drift[1] * z
-        for b in range(4):
+        for b in range(size):
             bound[b, at + a] = x * by_point[0, b] + y * by_point[1, b] + z * by_point[2, b]
 
 
 @kernel(fastmath=True)
 def _take_out(
-    bound: Float64, width: int, first: int, factor: Float64, rest: Float64, at: Int64, begin: int,
+    bound: Float64, width: int, first: int, factor: Float64, size: int, rest: Float64, at: Int64, begin: int,
     band: Float64, gradient: Float64, side: Float64, corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
     """Takes U^T U off, U being the factor's inverse times what the point shares: bound (4, width) with the
     poses of nodes from `first` on, rest (4, 4) with piece, drift and gradient. at: (3,) where the shared ones
     stand, those from `begin` on count.
     """
-    for i in range(4):
+    for i in range(size):
         mine = bound[i, :width]
         for j in range(i):
             share, other = factor[i, j], bound[j, :width]
@@ -101,8 +102,12 @@ def _take_out(
         for a in range(6):
             x, y, z, w = b0[6 * i + a], b1[6 * i + a], b2[6 * i + a], b3[6 * i + a]
             line = band[first + i, a, band.shape[2] - 6 * (i + 1) :]
-            for b in range(len(line)):
-                line[b] -= x * b0[b] + y * b1[b] + z * b2[b] + w * b3[b]
+            if size == 3:
+                for b in range(len(line)):
+                    line[b] -= x * b0[b] + y * b1[b] + z * b2[b]
+            else:
+                for b in range(len(line)):
+                    line[b] -= x * b0[b] + y * b1[b] + z * b2[b] + w * b3[b]
     for c in range(begin, 4):
         x, y, z, w = rest[0, c], rest[1, c], rest[2, c], rest[3, c]
         whole = gradient if c == 3 else side[at[c]]
@@ -128,7 +133,7 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
     )  # fmt: skip
     normal, gradient, rest, last = np.empty((4, 4)), np.empty(4), np.empty((4, 4)), len(shared) - 1
     bound, at = np.empty((4, band.shape[2])), np.array([0, last - 1, last])
-    begin = 0 if last > 1 else 1
+    begin, size = (0, 4) if last > 1 else (1, 3)
     for t in range(len(first) - 1):
         normal[:], gradient[:], rest[:] = 0.0, 0.0, 0.0
         begun = end = -1
@@ -144,30 +149,30 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
                 lens, mount, huber, camera, points, shared, scale, stereo, weight, n, k, t, error, q, by_pose,
                 by_point, by_drift,
             )  # fmt: skip
-            _add_point(error, by_point, normal, gradient)
-            _add_pose(error, by_pose, by_point, by_drift, n, 6 * (n - begun), band, slope, side, bound)
+            _add_point(error, by_point, size, normal, gradient)
+            _add_pose(error, by_pose, by_point, by_drift, n, 6 * (n - begun), band, slope, side, size, bound)
             for c in range(2):
                 corner_slope[last - 1 + c] += by_drift[c] * error[2]
                 for d in range(2):
                     corner[last - 1 + c, last - 1 + d] += by_drift[c] * by_drift[d]
-                for a in range(4):
+                for a in range(size):
                     rest[a, 1 + c] += by_drift[c] * by_point[2, a]
         if begun < 0 or normal[0, 0] == 0:
             continue
-        held = tight[t] ** 2
-        pull = held * slide_off(points, shared, piece, t)
-        normal[3, 3] += held
-        gradient[3] += pull
         if begin == 0:
+            held = tight[t] ** 2
+            pull = held * slide_off(points, shared, piece, t)
+            normal[3, 3] += held
+            gradient[3] += pull
             at[0] = piece[t]
             rest[3, 0] = -held
             corner[at[0], at[0]] += held
             corner_slope[at[0]] -= pull
-        for a in range(4):
+        for a in range(size):
             rest[a, 3] = gradient[a]
-        _factorise(normal)
+        _factorise(normal, size)
         width = 6 * (end - begun)
-        _take_out(bound, width, begun, normal, rest, at, begin, band, slope, side, corner, corner_slope)
+        _take_out(bound, width, begun, normal, size, rest, at, begin, band, slope, side, corner, corner_slope)
 
 
 @kernel(fastmath=True)
@@ -185,6 +190,7 @@ def substitute(
         np.empty(3), np.empty(3), np.empty(2), np.empty((3, 6)), np.empty((3, 4)),
     )  # fmt: skip
     normal, gradient, last = np.empty((4, 4)), np.empty(4), len(shared_step) - 1
+    size = 4 if last > 1 else 3
     for t in range(len(first) - 1):
         normal[:], gradient[:] = 0.0, 0.0
         for k in range(first[t], first[t + 1]):
@@ -199,22 +205,21 @@ def substitute(
             for i in range(3):
                 for a in range(6):
                     error[i] += by_pose[i, a] * pose_step[n, a]
-            _add_point(error, by_point, normal, gradient)
+            _add_point(error, by_point, size, normal, gradient)
         if normal[0, 0] == 0:
             continue
-        held, off = tight[t] ** 2, slide_off(points, shared, piece, t)
-        if last > 1:
-            off -= shared_step[piece[t]]
-        normal[3, 3] += held
-        gradient[3] += held * off
-        _factorise(normal)
-        variance[t] = normal[3, 3] ** 2
-        for i in range(4):
+        if size == 4:
+            held, off = tight[t] ** 2, slide_off(points, shared, piece, t) - shared_step[piece[t]]
+            normal[3, 3] += held
+            gradient[3] += held * off
+        _factorise(normal, size)
+        variance[t] = normal[size - 1, size - 1] ** 2
+        for i in range(size):
             for j in range(i):
                 gradient[i] -= normal[i, j] * gradient[j]
             gradient[i] *= normal[i, i]
-        for i in range(3, -1, -1):
-            for j in range(i + 1, 4):
+        for i in range(size - 1, -1, -1):
+            for j in range(i + 1, size):
                 gradient[i] -= normal[j, i] * gradient[j]
             gradient[i] *= normal[i, i]
             moved[t, i] -= gradient[i]

@@ -26,8 +26,6 @@ from barsight.motion.rig_drift import HUBER_SIGMAS
 from barsight.motion.system import System
 
 MOST_ITERATIONS = 25
-TIGHT = 1e6
-"""1 / rad: what holds points that don't slide."""
 RELATIVE_GAIN = 1e-5
 
 
@@ -64,7 +62,7 @@ def sights_of(problem: Problem, used: Bool) -> Sights:
     assert seen is not None
     scale = 1.0 if problem.sees_scale else 0.0
     points, pieces = len(seen.first) - 1, problem.pieces
-    piece, tight = np.zeros(points, np.int64), np.full(points, TIGHT)
+    piece, tight = np.zeros(points, np.int64), np.zeros(points)
     if pieces is not None:
         piece, tight = pieces.piece, 1 / pieces.own_sigma_rad[pieces.piece]
     return Sights(

@@ -17,6 +17,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.inertial.model import BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated
+from barsight.motion import band
 from barsight.motion.batch import FARTHEST_OUTLIER_SIGMAS, LEAST_AGREEING, LEAST_FACTOR
 from barsight.motion.drift_search import drifted
 from barsight.motion.encoders import agreeing
@@ -216,12 +217,10 @@ def without_first(window: Window, problem: Problem, used: Bool, count: int) -> W
 
 def _without(system: System, count: int) -> tuple[Float64, Float64]:
     """Matrix and gradient of all unknowns but the first `count`, which are taken out."""
-    n, width = system.rows.shape
+    n = len(system.rows)
     border = len(system.corner)
-    whole = np.zeros((n + border, n + border))
-    apart = np.subtract.outer(np.arange(n), np.arange(n))
-    row, column = np.nonzero((apart >= 0) & (apart < width))
-    whole[row, column] = whole[column, row] = system.rows[row, width - 1 - apart[row, column]]
+    whole = np.empty((n + border, n + border))
+    band.whole(system.rows, whole[:n, :n])
     whole[n:, :n], whole[:n, n:] = system.side, system.side.T
     whole[n:, n:] = system.corner
     slope = np.concatenate([system.gradient, system.corner_gradient])
