@@ -10,6 +10,7 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
@@ -21,7 +22,7 @@ import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.parallel import begun_map, beside, ordered_map
+from barsight.core.parallel import begun_map, beside
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
@@ -57,7 +58,7 @@ Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
 _FAST_SHIFT = 0.1
-_MATCHED_AHEAD = 12
+_MATCHED_AHEAD = 16
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,8 @@ def measure(
     match = _match(matcher, kept)
     # Pictures are matched on the core that the trajectory leaves idle.
     begun = islice((frame for frame in source.frames() if frame.stamp_ns in early), len(early))
-    with begun_map(match, begun, _MATCHED_AHEAD) as ahead:
+    with ExitStack() as pools:
+        ahead = pools.enter_context(begun_map(match, begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = _counter("trajectory", total, advance)
@@ -149,7 +151,8 @@ def measure(
         matched: Iterator[Matched | Refusal] = ahead
         if late is not None:
             rest = (f for f in source.frames() if f.stamp_ns in poses and f.stamp_ns >= late)
-            after = ordered_map(_match(replace(matcher, rectifier=rectifier), kept), rest)
+            match = _match(replace(matcher, rectifier=rectifier), kept)
+            after = pools.enter_context(begun_map(match, rest, _MATCHED_AHEAD))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
 
         refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
