@@ -105,10 +105,13 @@ def finish(
     _read_first.cache_clear()
     keys = store.keys()
     known = frozenset(keys)
-    for key in keys:
-        np.save(
-            _tile_file(folder, key, "first"), first_heights(store.take(key), min_views, settings.top_share)
-        )
+
+    def tiles() -> Iterator[tuple[TileKey, Float32]]:
+        return ((key, store.take(key)) for key in keys)
+
+    def look(item: tuple[TileKey, Float32]) -> None:
+        key, tile = item
+        np.save(_tile_file(folder, key, "first"), first_heights(tile, min_views, settings.top_share))
 
     def elect_tile(item: tuple[TileKey, Float32]) -> tuple[TileKey, int]:
         key, tile = item
@@ -123,8 +126,10 @@ def finish(
         _write_tile(folder, key, layers, "surface")
         return key, layers
 
+    for _ in ordered_map(look, tiles()):
+        pass
     seen = 0
-    for key, count in ordered_map(elect_tile, ((key, store.take(key)) for key in keys)):
+    for key, count in ordered_map(elect_tile, tiles()):
         seen += count
         store.drop(key)
     filled, sigmas = 0, []
