@@ -98,7 +98,8 @@ class BarsightStereo:
         matched = np.isfinite(start.left_px)
         refinement = settings.refinement
         if settings.preset == "fast":
-            refinement = replace(refinement, steps=min(refinement.steps, _FAST_STEPS), short_px=0.0)
+            steps = min(refinement.steps, _FAST_STEPS)
+            refinement = replace(refinement, steps=steps, short_px=0.0, first_at_half_size=True)
         refined = refine(pair.left, pair.right, with_row_holes_filled(start.left_px), matched, refinement)
         sigma = self._sigma(pair, refined, start.left_px)
         kept = matched & (np.abs(refined.disparity_px - start.left_px) < _FURTHEST_FROM_START_PX)

@@ -59,6 +59,8 @@ class RefinementSettings:
 
     steps: int = 3
     """Gauss-Newton steps."""
+    first_at_half_size: bool = False
+    """Whether the first step goes at half the size: a quarter of its work, errors a little larger."""
     along_px: float = 16.0
     """The long support along the axis, one sigma."""
     across_px: float = 1.5
@@ -103,7 +105,7 @@ class Refined:
 
 def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
-    at_half_size = settings.steps > 1 and min(left.shape) >= _LEAST_HALVED_PX
+    at_half_size = settings.first_at_half_size and min(left.shape) >= _LEAST_HALVED_PX and settings.steps > 1
     if at_half_size:
         start = _after_half_size_step(left, right, start, matched, settings)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
