@@ -110,11 +110,12 @@ def read_ahead(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
 
 
 @contextmanager
-def beside(work: Callable[[], None]) -> Iterator[None]:
-    """Do `work` in a thread of its own while the block under it runs; what it raises comes out at the end."""
+def beside(work: Callable[[], Result]) -> Iterator[Future[Result]]:
+    """Do `work` in a thread of its own while the block under it runs; what it raises comes out where its
+    result is asked for, at the latest at the block's end."""
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
-        yield
+        yield working
         working.result()
 
 

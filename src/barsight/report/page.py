@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -15,6 +14,7 @@ import jinja2
 from plotly.offline import get_plotlyjs
 
 from barsight.core.files import atomic_path
+from barsight.core.parallel import beside
 from barsight.report.match_pictures import Picture
 from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_path import path_plots
@@ -78,10 +78,8 @@ def render_page(out_dir: Path) -> str:
     path = read_path(out_dir)
     height = out_dir / "height.tif"
     raster = read_raster(height) if height.is_file() else None
-    with ThreadPoolExecutor(1) as beside:
-        drawn = beside.submit(yard_part, out_dir, raster)
+    with beside(lambda: yard_part(out_dir, raster)) as drawn:
         maps: tuple[MapFigure, ...] = map_figures(raster, laser) if raster else ()
-        yard = drawn.result()
     contours = [contour_plot(item) for item in compared]
     agreement = [
         found
@@ -94,7 +92,7 @@ def render_page(out_dir: Path) -> str:
         result=result,
         figures=key_figures(result),
         maps=maps,
-        yard=yard,
+        yard=drawn.result(),
         contours=contours,
         agreement_plots=agreement,
         ways=ways,

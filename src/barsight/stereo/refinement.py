@@ -2,10 +2,10 @@
 
 Each step warps the right image with the current disparity and asks every pixel how far it should move
 (Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
-offset of the images are taken off in a window. The first step sees the images at half the size. All but the
-last see them softer and use the mean gradient of both [Malis 2004], which carries them further; the last one
-uses the left gradient alone: an interpolated image's noise falls with the fraction of the disparity, and its
-own gradient turns that into pixel locking.
+offset of the images are taken off in a window. The first step may see the images at half the size. All but
+the last see them softer and use the mean gradient of both [Malis 2004], which carries them further; the last
+one uses the left gradient alone: an interpolated image's noise falls with the fraction of the disparity, and
+its own gradient turns that into pixel locking.
 
 Gloss: a highlight is constant along a bar but lies behind its surface, so what is constant along the axis
 bends the match. Residual and gradient are therefore split into their mean along the axis and the detail; the
