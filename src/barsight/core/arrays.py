@@ -27,7 +27,7 @@ _ALL_CORES = threading.Lock()
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
-def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[F], F]:
+def kernel(*, parallel: bool = False, fastmath: bool = False, inline: bool = False) -> Callable[[F], F]:
     """Compile a function with Numba, cached on disk so that a second run starts at once.
 
     Where no folder may be written (a read-only installation and home), every run compiles anew.
@@ -36,8 +36,13 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[F], F
     takes all cores, and calls from several threads take turns (Numba's plainest threading layer aborts when
     two enter it); other kernels can't call it. It compiles several times as long as a plain one, which
     `core.parallel.in_bands` spreads over the cores as well.
+    `inline` copies a short function into the kernels that call it: a call hands over each array as nine
+    numbers and hides from the compiler which of them overlap, which can cost more than the sums inside.
     """
-    options = {"parallel": parallel, "fastmath": fastmath, "nogil": True, "error_model": "numpy"}
+    options = {
+        "parallel": parallel, "fastmath": fastmath, "nogil": True, "error_model": "numpy",
+        "inline": "always" if inline else "never",
+    }  # fmt: skip
 
     def decorate(function: F) -> F:
         compiled: Any

@@ -28,7 +28,7 @@ class Reduced(NamedTuple):
     corner_gradient: Float64
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def _factorise(m: Float64, size: int) -> None:
     """Replaces a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse."""
     for i in range(size):
@@ -43,7 +43,7 @@ def _factorise(m: Float64, size: int) -> None:
         m[i, i] = 1 / np.sqrt(own)
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def _add_point(error: Float64, by_point: Float64, size: int, normal: Float64, gradient: Float64) -> None:
     """A sighting's share of its point's own equations; of the matrix the lower half."""
     for a in range(size):
@@ -55,7 +55,7 @@ def _add_point(error: Float64, by_point: Float64, size: int, normal: Float64, gr
             )  # fmt: skip
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def _add_pose(
     error: Float64, by_pose: Float64, by_point: Float64, by_drift: Float64, node: int, at: int, band: Float64,
     gradient: Float64, side: Float64, size: int, bound: Float64,

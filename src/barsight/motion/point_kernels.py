@@ -54,7 +54,7 @@ class Guess(NamedTuple):
     shared: Float64
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def _error(
     lens: Float64, camera: Float64, points: Float64, shared: Float64, scale: float, stereo: Float64,
     node: int, k: int, t: int, error: Float64, q: Float64, by_drift: Float64,
@@ -82,7 +82,7 @@ def _error(
     return True
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def slide_off(points: Float64, shared: Float64, piece: Int64, t: int) -> float:
     """How much further a point slides than its piece, rad."""
     off: float = points[t, 3]
@@ -117,7 +117,7 @@ def residuals(rig: Rig, sights: Sights, guess: Guess, result: Float64) -> float:
     return cost
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def rows(
     lens: Float64, mount: Float64, huber: float, camera: Float64, points: Float64, shared: Float64,
     scale: float, stereo: Float64, weights: Float64, node: int, k: int, t: int, error: Float64, q: Float64,
