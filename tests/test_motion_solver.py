@@ -1,11 +1,13 @@
 """The solver: band matrices against dense ones, points taken out against GTSAM's own factor per sighting."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import E, L, X
 from scipy.spatial.transform import Rotation
 
 from barsight.core.pose import Pose
@@ -118,6 +120,7 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
     placed, attitudes = (), ()
     if with_crane:
         v, a = np.array([0.8, 0, 0]), np.array([0.3, 0.1, 0])
+        places[2] += 0.01 * (wrong_px > 0)  # beyond Huber's length
         placed = tuple(Placed(k, place, v * (k % 3 - 1), a, 0.002) for k, place in enumerate(places))
         attitudes = tuple(Attitude(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
     problem = Problem(
@@ -127,8 +130,22 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
     return problem, often(seen, np.ones(len(seen.node), np.bool_))
 
 
+def encoder_error(place: Placed) -> Callable[[Any, gtsam.Values, list[np.ndarray] | None], np.ndarray]:
+    """The body's place minus the encoders' reading `latency` later, and its derivatives."""
+
+    def error(factor: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        pose, latency = values.atPose3(factor.keys()[0]), values.atVector(factor.keys()[1])[0]
+        if jacobians is not None:
+            jacobians[0] = np.hstack([np.zeros((3, 3)), pose.rotation().matrix()])
+            jacobians[1] = -(place.velocity_mps + place.acceleration_mps2 * latency)[:, None]
+        way = place.velocity_mps * latency + place.acceleration_mps2 * latency**2 / 2
+        return pose.translation() - place.position_m - way
+
+    return error
+
+
 def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Marginals]:
-    """The slow way: a factor and its objects for every sighting."""
+    """The slow way: a factor and its objects for every sighting and every place of the encoders."""
     seen, graph, values = problem.sightings, factors(problem), start_values(problem)
     assert seen is not None
     lens = gtsam.Cal3_S2Stereo(
@@ -137,12 +154,15 @@ def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Ma
     mounted = gtsam.Pose3(gtsam.Rot3(MOUNT.rotation), MOUNT.translation)
     huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS)
     points = start_points(problem)
+    for place in problem.placed:
+        model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, place.sigma_m))
+        graph.add(gtsam.CustomFactor(model, [X(place.node), E(0)], encoder_error(place)))
     for k in np.flatnonzero(used):
         model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, seen.sigma_px[k]))
         u, v, right = seen.stereo[k]
-        place = gtsam.StereoPoint2(u, right - CAMERA.doffs_px, v)
+        pixel = gtsam.StereoPoint2(u, right - CAMERA.doffs_px, v)
         node, track = X(int(seen.node[k])), L(int(seen.track[k]))
-        graph.add(gtsam.GenericStereoFactor3D(place, model, node, track, lens, mounted))
+        graph.add(gtsam.GenericStereoFactor3D(pixel, model, node, track, lens, mounted))
         if not values.exists(track):
             values.insert(track, points[seen.track[k], :3])
     parameters = gtsam.LevenbergMarquardtParams()

@@ -1,4 +1,4 @@
-"""The encoders in the graph: their latency is estimated, and what contradicts the rest leaves.
+"""The encoders in the estimate: their latency is estimated, and what contradicts the rest leaves.
 
 A reading stamped t says where the crane was at t minus the latency. That shows wherever the speed changes,
 since pictures and IMU know the way by themselves. Their scale against the baseline is the rig's drift; a
@@ -7,17 +7,16 @@ constant offset is seen by nothing in the recording: it stays what the yard's or
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import E, X
+from gtsam.symbol_shorthand import E
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.stamps import NS_PER_S
-from barsight.motion.problem import Placed, Problem
+from barsight.motion.gaps import Chain
+from barsight.motion.problem import Placed, Problem, latency_of, poses_of
 from barsight.motion.rig_drift import HUBER_SIGMAS
 
 FARTHEST_SIGMAS = 5.0
@@ -36,32 +35,46 @@ class EncoderState:
     latency_sigma_s: float
 
 
-def add_encoders(graph: Any, problem: Problem) -> None:
-    """Factors for the problem's places, Huber, and the prior of the latency."""
-    if problem.prior is None and problem.has_latency:
-        prior = gtsam.noiseModel.Isotropic.Sigma(1, problem.encoder_latency_sigma_s)
-        graph.add(gtsam.PriorFactorVector(E(0), np.zeros(1), prior))
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS)
-    for place in problem.placed:
-        sigma = max(place.sigma_m, LEAST_SIGMA_M)
-        model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, sigma))
-        graph.add(gtsam.CustomFactor(model, [X(place.node), E(0)], _error(place)))
+def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Float64) -> None:
+    """Adds what the problem's places, Huber, say of the chain's nodes and of the latency. poses: (M, 4, 4);
+    latency_s: (1,).
+    """
+    if not problem.placed:
+        return
+    node = _nodes(problem.placed)
+    reading, velocity = _readings(problem.placed, float(latency_s[0]))
+    turn, error = poses[node, :3, :3], poses[node, :3, 3] - reading
+    sigma = _sigmas(problem.placed, LEAST_SIGMA_M)
+    distance = np.linalg.norm(error, axis=1) / sigma
+    weight = HUBER_SIGMAS / np.maximum(distance, HUBER_SIGMAS) / sigma**2
+    at = node[:, None] * chain.size + np.arange(3, 6)  # GTSAM's shift, in body axes
+    chain.rows[at, -1] += weight[:, None]
+    chain.gradient[at] += np.einsum("p,pij,pi->pj", weight, turn, error)
+    chain.side[at] -= np.einsum("p,pij,pi->pj", weight, turn, velocity)
+    chain.corner += float(np.einsum("p,pi,pi", weight, velocity, velocity))
+    chain.corner_gradient -= float(np.einsum("p,pi,pi", weight, velocity, error))
+
+
+def encoders_cost(values: Any, problem: Problem) -> float:
+    """Of the places, Huber's."""
+    sigma = _sigmas(problem.placed, LEAST_SIGMA_M)
+    distance = np.linalg.norm(disagreement(values, problem), axis=1) / sigma
+    near = np.minimum(distance, HUBER_SIGMAS)
+    return float((near * (distance - near / 2)).sum())
 
 
 def disagreement(values: Any, problem: Problem) -> Float64:
     """(P, 3) m by which the encoders' places are off the poses."""
     if not problem.placed:
         return np.empty((0, 3))
-    latency = float(values.atVector(E(0))[0])
-    bodies = [np.asarray(values.atPose3(X(place.node)).translation()) for place in problem.placed]
-    readings = [_reading(place, latency)[0] for place in problem.placed]
-    off: Float64 = np.array(readings) - np.array(bodies)
+    reading, _ = _readings(problem.placed, float(latency_of(values)[0]))
+    off: Float64 = reading - poses_of(values)[_nodes(problem.placed), :3, 3]
     return off
 
 
 def agreeing(values: Any, problem: Problem) -> Bool:
     """(P,) places within 5 sigma of the poses."""
-    sigma = np.array([max(place.sigma_m, LEAST_AGREEING_SIGMA_M) for place in problem.placed])
+    sigma = _sigmas(problem.placed, LEAST_AGREEING_SIGMA_M)
     kept: Bool = np.linalg.norm(disagreement(values, problem), axis=1) < FARTHEST_SIGMAS * sigma
     return kept
 
@@ -101,22 +114,17 @@ def encoder_warnings(
     return tuple(sentences)
 
 
-def _reading(place: Placed, latency_s: float) -> tuple[Float64, Float64]:
-    """The encoders' place `latency_s` later and its speed, by their parabola."""
-    velocity = place.velocity_mps + place.acceleration_mps2 * latency_s
-    return place.position_m + (place.velocity_mps + velocity) / 2 * latency_s, velocity
+def _readings(placed: tuple[Placed, ...], latency_s: float) -> tuple[Float64, Float64]:
+    """(P, 3) the encoders' places `latency_s` later and (P, 3) their speeds, by their parabolas."""
+    place = np.array([p.position_m for p in placed])
+    velocity = np.array([p.velocity_mps for p in placed])
+    later = velocity + np.array([p.acceleration_mps2 for p in placed]) * latency_s
+    return place + (velocity + later) / 2 * latency_s, later
 
 
-def _error(place: Placed) -> Callable[[Any, Any, list[Float64] | None], Float64]:
-    """The body's place minus the encoders' reading `latency` later, and its derivatives."""
+def _nodes(placed: tuple[Placed, ...]) -> Int64:
+    return np.array([p.node for p in placed], np.int64)
 
-    def error(factor: Any, values: Any, jacobians: list[Float64] | None) -> Float64:
-        pose = values.atPose3(factor.keys()[0])
-        reading, velocity = _reading(place, float(values.atVector(factor.keys()[1])[0]))
-        if jacobians is not None:
-            jacobians[0] = np.hstack([np.zeros((3, 3)), pose.rotation().matrix()])
-            jacobians[1] = -velocity[:, None]
-        result: Float64 = np.asarray(pose.translation()) - reading
-        return result
 
-    return error
+def _sigmas(placed: tuple[Placed, ...], least_m: float) -> Float64:
+    return np.array([max(p.sigma_m, least_m) for p in placed], np.float64)

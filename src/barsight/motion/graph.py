@@ -1,5 +1,5 @@
-"""GTSAM's factors of all but the sightings: preintegrated IMU between neighbouring nodes, the encoders'
-places (Huber), priors on attitude, biases and, where the body stands still, velocity; and these linearised.
+"""GTSAM's factors of all but sightings and encoders: preintegrated IMU between neighbouring nodes, priors on
+attitude, biases, latency and, where the body stands still, velocity; and these linearised.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from gtsam.symbol_shorthand import B, E, V, X
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
 from barsight.motion import band
-from barsight.motion.encoders import add_encoders
 from barsight.motion.gaps import Chain
 from barsight.motion.problem import Problem
 
@@ -23,10 +22,11 @@ OFFSETS = {"x": 0, "v": 6, "b": 9}
 
 
 def factors(problem: Problem, before: int | None = None) -> Any:
-    """The graph of a problem without its sightings; of the IMU only what touches nodes `before` the given."""
+    """The graph of a problem without sightings and encoders; of the IMU only what touches nodes `before` the
+    given.
+    """
     graph = gtsam.NonlinearFactorGraph()
     _add_priors(graph, problem)
-    add_encoders(graph, problem)
     if problem.has_imu:
         _add_imu(graph, problem, len(problem.start) if before is None else before)
     return graph
@@ -92,6 +92,8 @@ def _add_priors(graph: Any, problem: Problem) -> None:
             whole[:3, :3] = spread
             sigmas = gtsam.noiseModel.Gaussian.Covariance(whole)
         graph.add(gtsam.PriorFactorPose3(X(0), _gtsam_pose(problem.start[0]), sigmas))
+    if problem.has_latency and problem.prior is None:
+        graph.add(gtsam.PriorFactorVector(E(0), np.zeros(1), _sigmas(problem.encoder_latency_sigma_s)))
     for attitude in problem.attitudes:
         rotation = gtsam.Rot3(attitude.rotation)
         graph.add(gtsam.PoseRotationPrior3D(X(attitude.node), rotation, _sigmas(*attitude.sigma_rad)))

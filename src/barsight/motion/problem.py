@@ -144,6 +144,14 @@ class Prior:
         return latency_of(self.at)
 
 
+def poses_of(values: Any) -> Float64:
+    """(M, 4, 4) reference_from_body of GTSAM's values, which hold nodes 0...M - 1."""
+    flat = gtsam.utilities.extractPose3(values)
+    poses = np.zeros((len(flat), 4, 4))
+    poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:], 1.0
+    return poses
+
+
 def inertial_of(values: Any, count: int) -> Float64:
     """(count, 9) of the first nodes' velocities and biases in GTSAM's values; (count, 0) without an IMU."""
     if not values.exists(V(0)):

@@ -18,10 +18,11 @@ from gtsam.symbol_shorthand import B, E, V, X
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
 from barsight.motion.elimination import Reduced, eliminate, substitute
+from barsight.motion.encoders import add_encoders, encoders_cost
 from barsight.motion.gaps import without_gaps
 from barsight.motion.graph import chain_of
 from barsight.motion.point_kernels import Guess, Rig, Sights, residuals
-from barsight.motion.problem import Prior, Problem, StereoSightings, inertial_of, latency_of
+from barsight.motion.problem import Prior, Problem, StereoSightings, inertial_of, latency_of, poses_of
 from barsight.motion.rig_drift import HUBER_SIGMAS
 from barsight.motion.system import System
 
@@ -42,10 +43,7 @@ class State:
     @cached_property
     def poses(self) -> Float64:
         """(M, 4, 4) reference_from_body."""
-        flat = gtsam.utilities.extractPose3(self.values)
-        result = np.tile(np.eye(4), (len(flat), 1, 1))
-        result[:, :3, :3], result[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
-        return result
+        return poses_of(self.values)
 
 
 def rig_of(seen: StereoSightings) -> Rig:
@@ -104,9 +102,9 @@ def optimise(
 ) -> tuple[State, System]:
     """The state that fits best and its system. [Levenberg 1944, Marquardt 1963]
 
-    graph: GTSAM's factors of all but the sightings. The rig's drift stays. least_gain: the share of the cost
-    that a step must save for another to follow. Raises LinAlgError where the measurements leave an unknown
-    undetermined.
+    graph: GTSAM's factors of all but sightings and encoders. The rig's drift stays. least_gain: the share of
+    the cost that a step must save for another to follow. Raises LinAlgError where the measurements leave an
+    unknown undetermined.
     """
     free = problem.free
     cost, damping = _cost(problem, graph, state, used), 0.0
@@ -146,7 +144,9 @@ def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
     size = nodes * width
     rows = np.zeros((size, span * width))
     side, corner, corner_gradient = np.zeros((border, size)), np.zeros((border, border)), np.zeros(border)
-    chain, gaps = without_gaps(chain_of(graph, state.values, width, len(problem.start)), problem.kept)
+    whole = chain_of(graph, state.values, width, len(problem.start))
+    add_encoders(whole, problem, state.poses, latency_of(state.values))
+    chain, gaps = without_gaps(whole, problem.kept)
     near = min(rows.shape[1], 2 * width)
     rows[:, -near:] = chain.rows[:, -near:]
     gradient = chain.gradient
@@ -224,7 +224,7 @@ def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Flo
 
 
 def _cost(problem: Problem, graph: Any, state: State, used: Bool) -> float:
-    cost = float(graph.error(state.values))
+    cost = float(graph.error(state.values)) + encoders_cost(state.values, problem)
     if problem.prior is not None:
         since = _since(problem.prior, state)
         cost += float(since @ (problem.prior.gradient + problem.prior.matrix @ since / 2))
