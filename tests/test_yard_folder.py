@@ -58,8 +58,14 @@ def test_heights_come_back_as_they_were(tmp_path: Path) -> None:
     folder, heights = write_folder(tmp_path / "out"), map_of(STOCK)
     back = read_heights(folder)
     assert (back.x0_m, back.y0_m) == pytest.approx((heights.x0_m, heights.y0_m))
-    np.testing.assert_array_equal(back.z_m, heights.z_m)
-    np.testing.assert_array_equal(back.source, heights.source)
+    assert back.shape == heights.shape
+    for rows, columns in (
+        (slice(0, back.shape[0]), slice(0, back.shape[1])), (slice(37, 300), slice(250, 260)),
+    ):  # fmt: skip
+        part, true = back.part(rows, columns), heights.part(rows, columns)
+        assert (part.x0_m, part.y0_m) == pytest.approx((true.x0_m, true.y0_m))
+        for name in ("z_m", "sigma_m", "views", "source"):
+            np.testing.assert_array_equal(getattr(part, name), getattr(true, name))
 
 
 def test_lifts_are_chosen_shown_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -149,4 +155,4 @@ def test_the_orthophoto_lies_on_the_height_maps_grid(tmp_path: Path) -> None:
         assert tie[3:5] == pytest.approx((-0.075, 0.345))
         assert (page.asarray() == 100).all()
     picture = cv2.imread(str(tmp_path / "ortho.png"), cv2.IMREAD_GRAYSCALE)
-    np.testing.assert_array_equal(picture, orthophoto(surface))
+    np.testing.assert_array_equal(picture, np.concatenate(list(orthophoto(surface))))

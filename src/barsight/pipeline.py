@@ -51,14 +51,15 @@ from barsight.yard.lift import map_vetoes, plan_lifts
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet, load_magnet
 from barsight.yard.stock_list import match_stock, read_stock, stock_warnings
+from barsight.yard.stretches import surface_map
 from barsight.yard.travel import Travel
-from barsight.yard.types import HeightMap
 
 Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
 _FAST_SHIFT = 0.1
-_MATCHED_AHEAD = 16
+_MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
+"""Pairs that may wait, matched, beside the trajectory and after it: 13 MB each at 1280x1024."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def measure(
         if late is not None:
             rest = (f for f in source.frames() if f.stamp_ns in poses and f.stamp_ns >= late)
             match = _match(replace(matcher, rectifier=rectifier), kept)
-            after = pools.enter_context(begun_map(match, rest, _MATCHED_AHEAD))
+            after = pools.enter_context(begun_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
 
         refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
@@ -196,7 +197,7 @@ def measure(
         agreed = [agree(by_number[p.profile], p, speed_mps) for p in laser if p.profile in by_number]
 
     with watch("bundles"), beside(lambda: write(surface)):
-        heights = HeightMap.of(surface)
+        heights = surface_map(surface)
         bundles = find_bundles(heights, settings.bundles)
         stock = (
             match_stock(expected, bundles)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,15 +14,29 @@ from typing import Any
 
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
-from barsight.core.arrays import Float32, Float64, Int64, UInt8
+from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
+from barsight.yard.stretches import PartedMap
 from barsight.yard.types import HeightMap
 
 PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")
+_BANDS = 4
+TORN_TIFF = (
+    tifffile.TiffFileError,
+    zlib.error,
+    struct.error,
+    OSError,
+    ValueError,
+    KeyError,
+    IndexError,
+    RuntimeError,
+)
+"""What tifffile raises on a file that is cut short or is something else."""
 _REMEDY = "measure the recording again"
 
 
@@ -71,35 +88,75 @@ def age_s(summary: dict[str, Any]) -> float | None:
     return (datetime.now(UTC) - measured).total_seconds()
 
 
-def read_heights(folder: Path) -> HeightMap:
-    """height.tif, whole, and ortho.tif where there is one. Raises InputError where one is missing or torn."""
-    path = folder / "height.tif"
+def read_heights(folder: Path) -> PartedMap:
+    """height.tif, and ortho.tif where there is one, read as parts of them are wanted.
+
+    Raises InputError, then or later, where one is missing or torn.
+    """
+    path, photo = folder / "height.tif", folder / "ortho.tif"
     if not path.is_file():
         raise InputError(folder, "has no height.tif", _REMEDY)
+    with _first_page(path) as page:
+        size = page.shape[-2:]
+        cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
+        tie = page.tags["ModelTiepointTag"].value
+        if page.planarconfig != 2 or not page.is_tiled or page.shape[0] < _BANDS:
+            raise InputError(path, f"is not {_BANDS} planar bands in tiles", _REMEDY)
+    x0_m, y0_m = float(tie[3]) + cell_m / 2, float(tie[4]) - (size[0] - 0.5) * cell_m
+    has_photo = photo.is_file()
+    if has_photo:
+        with _first_page(photo) as page:
+            if page.shape != size or page.dtype != np.uint8 or not page.is_tiled:
+                raise InputError(photo, "doesn't fit height.tif", _REMEDY)
+
+    def read(rows: slice, columns: slice) -> HeightMap:
+        with _first_page(path) as page:
+            z, sigma, views, source = _rectangle(page, _BANDS, rows, columns)
+        grey = None
+        if has_photo:
+            with _first_page(photo) as page:
+                grey = _rectangle(page, 1, rows, columns)[0]
+        x, y = x0_m + cell_m * columns.start, y0_m + cell_m * rows.start
+        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), grey)
+
+    return PartedMap(x0_m, y0_m, cell_m, (size[0], size[1]), read)
+
+
+@contextmanager
+def _first_page(path: Path) -> Iterator[tifffile.TiffPage]:
+    """The picture in a TIFF; what goes wrong while it is open says that the file is torn."""
     try:
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
-            bands = page.asarray()
-            cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
-            tie = page.tags["ModelTiepointTag"].value
-            z, sigma, views, source = np.ascontiguousarray(bands[:4, ::-1])
-    except (tifffile.TiffFileError, zlib.error, OSError, ValueError, KeyError, IndexError) as error:
+            assert isinstance(page, tifffile.TiffPage)
+            yield page
+    except TORN_TIFF as error:
         raise InputError(path, f"is torn ({error})", _REMEDY) from error
-    x0_m, y0_m = float(tie[3]) + cell_m / 2, float(tie[4]) - (z.shape[0] - 0.5) * cell_m
-    grey = _read_orthophoto(folder / "ortho.tif", z.shape)
-    return HeightMap(x0_m, y0_m, cell_m, z, sigma, views, source.astype(np.uint8), grey)
 
 
-def _read_orthophoto(path: Path, shape: tuple[int, ...]) -> UInt8 | None:
-    if not path.is_file():
-        return None
-    try:
-        picture = tifffile.imread(path)
-    except (tifffile.TiffFileError, zlib.error, OSError, ValueError) as error:
-        raise InputError(path, f"is torn ({error})", _REMEDY) from error
-    if picture.shape != shape or picture.dtype != np.uint8:
-        raise InputError(path, "doesn't fit height.tif", _REMEDY)
-    return np.ascontiguousarray(picture[::-1])
+def _rectangle(page: tifffile.TiffPage, bands: int, rows: slice, columns: slice) -> NDArray[Any]:
+    """(bands, R, C) of a tiled picture whose first row lies at the highest y; rows count from the lowest."""
+    height = page.shape[-2]
+    top, left = height - rows.stop, columns.start
+    out = np.empty((bands, rows.stop - rows.start, columns.stop - left), page.dtype)
+    down, across = -(-height // page.tilelength), -(-page.shape[-1] // page.tilewidth)
+    wanted = [
+        (band * down + i) * across + j
+        for band in range(bands)
+        for i in range(top // page.tilelength, -(-(height - rows.start) // page.tilelength))
+        for j in range(left // page.tilewidth, -(-columns.stop // page.tilewidth))
+    ]
+    file = page.parent.filehandle
+    for number in wanted:
+        file.seek(page.dataoffsets[number])
+        data, index, _ = page.decode(file.read(page.databytecounts[number]), number)
+        if data is None:
+            raise ValueError(f"tile {number} is empty")
+        i, j = index[2] - top, index[3] - left
+        target = out[index[0], max(i, 0) : i + page.tilelength, max(j, 0) : j + page.tilewidth]
+        shown = data[0, max(-i, 0) :, max(-j, 0) :, 0]
+        target[:] = shown[: target.shape[0], : target.shape[1]]
+    return np.ascontiguousarray(out[:, ::-1])
 
 
 def read_path(folder: Path) -> CameraPath | None:

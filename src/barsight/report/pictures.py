@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,19 +14,9 @@ from numpy.typing import NDArray
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.types import Source
+from barsight.result_folder import TORN_TIFF
 
 BANDS = 4
-_TORN = (
-    tifffile.TiffFileError,
-    zlib.error,
-    struct.error,
-    OSError,
-    ValueError,
-    KeyError,
-    IndexError,
-    RuntimeError,
-)
-"""What tifffile raises on a file that is cut short or is something else."""
 LONGEST_PX = 2400
 MOST_PIXELS = 3_000_000
 MOST_STRIPS = 12
@@ -89,7 +77,7 @@ def read_raster(path: Path) -> Raster:
             return _reduce(path, file.pages.first)
     except InputError:
         raise
-    except _TORN as error:
+    except TORN_TIFF as error:
         raise InputError(path, f"is torn ({error})", "measure the recording again") from error
 
 

@@ -10,13 +10,17 @@ import numpy as np
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import Source
 from barsight.result_folder import Cloud
-from barsight.yard.types import HeightMap
+from barsight.yard.stretches import patches
+from barsight.yard.types import YardMap
 
 SOURCE_RGB = {
     Source.VISION: ("vision", (46, 125, 190)),
     Source.LASER: ("laser", (90, 170, 60)),
     Source.FILLED: ("filled", (230, 120, 30)),
 }
+
+
+_PATCH_CELLS = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +54,27 @@ def seen_layer(cloud: Cloud) -> Layer:
     return Layer(cloud.xyz_m, values, cloud.total)
 
 
-def surface_layer(heights: HeightMap, most_points: int) -> Layer:
+def surface_layer(yard: YardMap, most_points: int) -> Layer:
     """The known cells of the map, filled ones too, at most `most_points` of them, evenly drawn."""
-    known = np.flatnonzero(heights.source.ravel() != Source.UNKNOWN)
-    count = min(known.size, most_points)
-    drawn = known[np.arange(count) * known.size // max(count, 1)]
-    row, column = np.divmod(drawn, heights.z_m.shape[1])
-    z, sigma, views, source = (
-        np.asarray(band.ravel()[drawn], np.float32)
-        for band in (heights.z_m, heights.sigma_m, heights.views, heights.source)
-    )
-    x, y = heights.x0_m + column * heights.cell_m, heights.y0_m + row * heights.cell_m
-    xyz = np.column_stack([x, y, z]).astype(np.float32)
-    return Layer(xyz, {"height": z * 1e3, "source": source, "sigma": sigma * 1e3, "views": views}, known.size)
+    cuts = list(patches(yard, _PATCH_CELLS))
+    known = np.cumsum([0, *((yard.part(*cut).source != Source.UNKNOWN).sum() for cut in cuts)])
+    total = int(known[-1])
+    count = min(total, most_points)
+    drawn = np.arange(count) * total // max(count, 1)
+    parts = [np.empty((6, 0), np.float32)]
+    for cut, first, last in zip(cuts, known, known[1:], strict=False):
+        if first == last:
+            continue
+        part = yard.part(*cut)
+        row, column = np.nonzero(part.source != Source.UNKNOWN)
+        own = drawn[(drawn >= first) & (drawn < last)] - first
+        cells = row[own], column[own]
+        x, y = part.x0_m + part.cell_m * column[own], part.y0_m + part.cell_m * row[own]
+        figures = (band[cells] for band in (part.z_m, part.sigma_m, part.views, part.source))
+        parts.append(np.stack([x, y, *figures]).astype(np.float32))
+    x, y, z, sigma, views, source = np.concatenate(parts, axis=1)
+    values = {"height": z * 1e3, "source": source, "sigma": sigma * 1e3, "views": views}
+    return Layer(np.column_stack([x, y, z]), values, total)
 
 
 def colour(layer: Layer, by: str) -> Colouring:

@@ -14,6 +14,7 @@ from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.layers import find_layers, neighbours_of, on_top_of
 from barsight.yard.outline import BARS_OF_RINGS, LOOSENESS, make_outline
 from barsight.yard.sheet import Sheet
+from barsight.yard.stretches import Stretch
 from barsight.yard.types import Bundle, BundleSigma
 
 _NARROW_M = 0.3
@@ -34,22 +35,25 @@ class Reading:
     other_packing: int | None
 
 
-def describe(readings: list[Reading], floor_m: float | None, settings: BundleSettings) -> tuple[Bundle, ...]:
-    """The chosen readings as bundles, numbered by rising x of their centres."""
-    bundles = sorted((_bundle(r, settings) for r in readings), key=lambda b: tuple(b.centre_m))
-    bundles = [replace(bundle, id=k) for k, bundle in enumerate(bundles)]
-    layers = find_layers(bundles, floor_m)
-    described = []
-    for bundle, layer in zip(bundles, layers, strict=True):
-        on_top, why = on_top_of(bundle, bundles)
-        touching = neighbours_of(bundle, bundles)
-        described.append(
-            replace(bundle, layer=layer, on_top=on_top, neighbours=touching, reasons=bundle.reasons + why)
-        )
-    return tuple(described)
+def described(bundles: list[Bundle], floor_m: float | None, parts: list[Stretch]) -> tuple[Bundle, ...]:
+    """The bundles, numbered by rising x of their centres, and what each of them is to its neighbours."""
+    ordered = sorted(bundles, key=lambda b: tuple(b.centre_m))
+    ordered = [replace(bundle, id=k) for k, bundle in enumerate(ordered)]
+    out = list(ordered)
+    for part in parts:
+        near = [bundle for bundle in ordered if part.reaches(bundle.centre_m)]
+        for bundle, layer in zip(near, find_layers(near, floor_m), strict=True):
+            if part.owns(bundle.centre_m):
+                on_top, why = on_top_of(bundle, near)
+                out[bundle.id] = replace(
+                    bundle, layer=layer, on_top=on_top, neighbours=neighbours_of(bundle, near),
+                    reasons=bundle.reasons + why,
+                )  # fmt: skip
+    return tuple(out)
 
 
-def _bundle(reading: Reading, settings: BundleSettings) -> Bundle:
+def record(reading: Reading, settings: BundleSettings) -> Bundle:
+    """The chosen reading as a bundle, without its number and what follows from its neighbours."""
     sheet, fit = reading.found.sheet, reading.found.fit
     ends = [find_end(sheet, fit, step, settings) for step in (-1, 1)]
     outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), 0.0)

@@ -11,18 +11,20 @@ from barsight.core.parallel import ordered_map
 from barsight.core.types import Source
 from barsight.yard.bundle_fit import AGREES, Fit, Found, U, Z, refine, widened
 from barsight.yard.bundle_growth import grow
-from barsight.yard.bundle_record import Reading, describe
+from barsight.yard.bundle_record import Reading, described, record
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.crossings import OVER_M, crossing_pieces, is_beam, rise_over
 from barsight.yard.floor import find_floor
 from barsight.yard.gullies import as_pictured, seen_smoothing
 from barsight.yard.headings import find_headings
 from barsight.yard.kinds import common_diameter, other_packings, with_company
+from barsight.yard.layers import same_place
 from barsight.yard.matching import Guess, Templates, guess, make_templates
 from barsight.yard.outline import bundle_width
 from barsight.yard.selection import choose, overlaps, strongest_rivals, without_slivers
 from barsight.yard.sheet import Sheet, turn
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.stretches import stretches
+from barsight.yard.types import Bundle, HeightMap, YardMap
 
 _EDGE_CELLS = 3.0
 """What a bundle costs per row: its edges explain nothing."""
@@ -34,20 +36,38 @@ _RESOLVED_CELLS = 4.0
 _SLIVER_SHARE = 0.03
 _CROSSING_STEP_M = 0.4
 """What lies across may be short: cross-sections this far apart meet it."""
+_SEAM_M = 0.1
+"""Two stretches of a yard put a bundle's middle no further apart than this."""
 
 
-def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundle, ...]:
+def find_bundles(yard: YardMap, settings: BundleSettings) -> tuple[Bundle, ...]:
     """All bundles that the map shows, in the map's frame, from low to high x; empty where there are none.
 
     A bundle is an outline of round bars in hexagonal packing (or one bar) that the measured heights follow.
     Outlines are guessed in cross-sections, grown along the bars by least squares, and of those that want the
-    same place the set is kept that explains most heights.
+    same place the set is kept that explains most heights. A long yard is searched stretch by stretch; where
+    two stretches read a place differently the first one holds.
     """
-    if not (height_map.source == Source.VISION).any() or height_map.cell_m > settings.coarsest_cell_m:
+    if yard.cell_m > settings.coarsest_cell_m:
         return ()
-    floor = find_floor(height_map)
+    floor = find_floor(yard)
+    templates = make_templates(settings, yard.cell_m)
+    parts, found = stretches(yard), list[Bundle]()
+    for part in parts:
+        read = _search(yard.part(part.rows, part.columns), floor, templates, settings)
+        own = [bundle for bundle in read if part.owns(bundle.centre_m, _SEAM_M)]
+        before = [bundle for bundle in found if part.reaches(bundle.centre_m)]
+        found += [bundle for bundle in own if not any(same_place(bundle, one) for one in before)]
+    return described(found, floor, parts)
+
+
+def _search(
+    height_map: HeightMap, floor: float | None, templates: Templates, settings: BundleSettings
+) -> list[Bundle]:
+    """What a map shows that is short enough to be held."""
+    if not (height_map.source == Source.VISION).any():
+        return []
     found: list[Found] = []
-    templates = make_templates(settings, height_map.cell_m)
     headings = find_headings(height_map, settings.max_skew_deg)
     for heading in headings:
         found += _found(height_map, heading, floor, templates, settings)
@@ -60,7 +80,7 @@ def find_bundles(height_map: HeightMap, settings: BundleSettings) -> tuple[Bundl
         found += [one for one in across if not is_beam(one.sheet, one.fit, settings)]
     places += [_claims(one, settings) for one in found[len(places) :]]
     readings = _settled(found, without_slivers(places, _SLIVER_SHARE), height_map, settings)
-    return describe(readings, floor, settings)
+    return [record(reading, settings) for reading in readings]
 
 
 def _found(

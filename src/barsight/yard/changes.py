@@ -12,7 +12,8 @@ from scipy.optimize import linear_sum_assignment
 from barsight.core.arrays import Float64
 from barsight.yard.load import Mass, mass_of
 from barsight.yard.stability import look_up
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.stretches import part_about
+from barsight.yard.types import Bundle, YardMap
 
 Kind = Literal["same", "moved", "settled", "taken", "added", "not-seen"]
 MOST_MOVE_M = 0.5
@@ -51,7 +52,7 @@ class Change:
 
 
 def compare_yards(
-    old: tuple[Bundle, ...], old_heights: HeightMap, new: tuple[Bundle, ...], new_heights: HeightMap
+    old: tuple[Bundle, ...], old_heights: YardMap, new: tuple[Bundle, ...], new_heights: YardMap
 ) -> tuple[Change, ...]:
     """Match the bundles of two maps of one yard and say what changed, in the old ones' order, then the added.
 
@@ -136,7 +137,7 @@ def _alone(kind: Kind, old: int | None, new: int | None, mass: Mass, sign: int) 
     return Change(kind, old, new, nan, nan, nan, nan, (nan,) * 4, nan, sign * mass.kg, mass.sigma_kg)
 
 
-def _seen(bundle: Bundle, heights: HeightMap) -> bool:
+def _seen(bundle: Bundle, heights: YardMap) -> bool:
     """Whether a map saw the place where a bundle lies in the other."""
     u = np.linspace(-0.4, 0.4, 5) * bundle.width_m
     v = np.linspace(-0.45, 0.45, 40) * bundle.length_m
@@ -144,4 +145,4 @@ def _seen(bundle: Bundle, heights: HeightMap) -> bool:
     cos, sin = math.cos(bundle.yaw_rad), math.sin(bundle.yaw_rad)
     x: Float64 = bundle.centre_m[0] + uu * cos - vv * sin
     y: Float64 = bundle.centre_m[1] + uu * sin + vv * cos
-    return bool(np.isfinite(look_up(heights, x, y)).mean() >= LEAST_KNOWN)
+    return bool(np.isfinite(look_up(part_about(heights, x, y), x, y)).mean() >= LEAST_KNOWN)

@@ -185,8 +185,4 @@ def _is_near(heading: float, headings: tuple[float, ...], apart_deg: float) -> b
 def _around(height_map: HeightMap, row: Int64, column: Int64) -> HeightMap:
     margin = round(_MARGIN_M / height_map.cell_m)
     j, i = max(int(row.min()) - margin, 0), max(int(column.min()) - margin, 0)
-    part = np.s_[j : int(row.max()) + margin + 1, i : int(column.max()) + margin + 1]
-    return HeightMap(
-        height_map.x0_m + i * height_map.cell_m, height_map.y0_m + j * height_map.cell_m, height_map.cell_m,
-        height_map.z_m[part], height_map.sigma_m[part], height_map.views[part], height_map.source[part],
-    )  # fmt: skip
+    return height_map.part(slice(j, int(row.max()) + margin + 1), slice(i, int(column.max()) + margin + 1))

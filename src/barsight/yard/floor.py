@@ -6,40 +6,36 @@ import numpy as np
 
 from barsight.core.arrays import Float32
 from barsight.core.types import Source
-from barsight.yard.types import HeightMap
+from barsight.yard.stretches import patches
+from barsight.yard.types import HeightMap, YardMap
 
 _BLOCK_M = 0.3
 _FLAT_M = 0.012
 _LEVEL_M = 0.03
 _KNOWN_SHARE = 0.6
-_STRIP_BLOCKS = 64
+_PATCH_BLOCKS = 64
 
 
-def find_floor(height_map: HeightMap) -> float | None:
+def find_floor(yard: YardMap) -> float | None:
     """Height (m) of the lowest level ground in the map; None where no block of 0.3 m is level.
 
     No bundle has a level top of 0.3 m, so level blocks are floor (or a platform: the lowest counts).
     """
-    block = max(round(_BLOCK_M / height_map.cell_m), 2)
-    rows, columns = (n // block for n in height_map.z_m.shape)
-    if rows == 0 or columns == 0:
-        return None
-    strips = [
-        _levels(height_map, block, rows, first, min(first + _STRIP_BLOCKS, columns))
-        for first in range(0, columns, _STRIP_BLOCKS)
-    ]
-    level = np.sort(np.concatenate(strips))
+    block = max(round(_BLOCK_M / yard.cell_m), 2)
+    found = [_levels(yard.part(*patch), block) for patch in patches(yard, _PATCH_BLOCKS * block)]
+    level = np.sort(np.concatenate([*found, np.empty(0, np.float32)]))
     if level.size == 0:
         return None
     return float(np.median(level[level < level[max(level.size // 50, 0)] + _LEVEL_M]))
 
 
-def _levels(height_map: HeightMap, block: int, rows: int, first: int, last: int) -> Float32:
-    """The heights of those blocks, between the columns of blocks first and last, that are level."""
-    part = np.s_[: rows * block, first * block : last * block]
+def _levels(height_map: HeightMap, block: int) -> Float32:
+    """The heights of those blocks that are level."""
+    rows, columns = (n // block for n in height_map.shape)
+    part = np.s_[: rows * block, : columns * block]
     z = np.where(height_map.source[part] == Source.VISION, height_map.z_m[part], np.nan)
-    cut = z.reshape(rows, block, last - first, block)
-    blocks = cut.transpose(0, 2, 1, 3).reshape(rows * (last - first), -1)
+    cut = z.reshape(rows, block, columns, block)
+    blocks = cut.transpose(0, 2, 1, 3).reshape(rows * columns, block * block)
     known = np.isfinite(blocks).sum(axis=1)
     enough = known >= _KNOWN_SHARE * blocks.shape[1]
     ordered, at = np.sort(blocks[enough], axis=1), known[enough] - 1  # NaN last

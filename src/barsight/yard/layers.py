@@ -12,6 +12,8 @@ _TOUCH_M = 0.03
 _DUNNAGE_M = 0.1
 _HIGHER_SHARE = 0.4
 _PARALLEL = 0.08
+_INSIDE = 0.35
+"""Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
 
 
 def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
@@ -71,6 +73,17 @@ def neighbours_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
         and abs(other.centre_m[2] - bundle.centre_m[2]) < 0.7 * (other.width_m + bundle.width_m) / 2
         and _common_length(bundle, other, _TOUCH_M) > _OVERLAP_M
     )
+
+
+def same_place(one: Bundle, other: Bundle) -> bool:
+    """Whether both claim to fill one place: the middle of either lies well inside the other."""
+    near = abs(one.centre_m[2] - other.centre_m[2]) < _INSIDE * min(one.width_m, other.width_m)
+    return bool(near) and (_holds(one, other.centre_m) or _holds(other, one.centre_m))
+
+
+def _holds(bundle: Bundle, place: Float64) -> bool:
+    to_side, to_end = _beside(place[:2], bundle)
+    return bool(to_side < _INSIDE * bundle.width_m and to_end < bundle.length_m / 2)
 
 
 def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:

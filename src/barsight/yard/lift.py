@@ -14,8 +14,9 @@ from barsight.yard.magnet import Magnet
 from barsight.yard.pile_sides import PileSide, pile_sides
 from barsight.yard.set_down import FreePlace, free_places
 from barsight.yard.stability import Footing, footings
+from barsight.yard.stretches import stretches
 from barsight.yard.travel import Travel
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
@@ -74,15 +75,25 @@ def map_vetoes(
 
 
 def plan_lifts(
-    heights: HeightMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
+    yard: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
     vetoes: tuple[Veto, ...], travel: Travel | None = None,
 ) -> LiftPlan:  # fmt: skip
     """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames."""
-    standing = footings(heights, bundles, settings)
-    yard = Yard(heights, BundleTable.of(bundles), standing, (), travel)
+    parts, stands = stretches(yard), dict[int, Footing]()
+    for part in parts:
+        own = tuple(bundle for bundle in bundles if part.owns(bundle.centre_m))
+        stands |= {one.bundle: one for one in footings(yard.part(part.rows, part.columns), own, settings)}
+    groups = list(_groups(bundles, settings.bundles))
+    lifts = dict[int, Lift]()
+    for part in parts:
+        near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
+        heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
+        here = Yard(heights, BundleTable.of(near), standing, (), travel)
+        for number, group in enumerate(groups):
+            if part.owns(group[0].centre_m):
+                lifts[number] = _best(group, here, magnet, settings)
     offered, refused = [], []
-    for group in _groups(bundles, settings.bundles):
-        lift = _best(group, yard, magnet, settings)
+    for _, lift in sorted(lifts.items()):
         if lift.vetoes or vetoes:
             refused.append(_with(lift, vetoes))
         else:
@@ -91,7 +102,8 @@ def plan_lifts(
     offered.sort(key=lambda lift: (-round(lift.safety, 2), -max(top[i] for i in lift.bundles)))
     wide = max((b.width_m for b in bundles), default=settings.set_down_width_m)
     long = max((b.length_m for b in bundles), default=settings.set_down_length_m)
-    free = free_places(heights, wide, long)
+    free = free_places(yard, wide, long)
+    standing = tuple(stands[bundle.id] for bundle in bundles)
     return LiftPlan(
         magnet,
         settings,

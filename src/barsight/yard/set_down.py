@@ -9,7 +9,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.types import Source
-from barsight.yard.types import HeightMap
+from barsight.yard.stretches import patches
+from barsight.yard.types import HeightMap, YardMap
 
 COARSE_M = 0.05
 LEVEL_M = 0.04
@@ -18,6 +19,7 @@ LEAST_KNOWN = 0.9
 GULLY_M = 0.4
 """Gullies narrower than this between tops don't make a layer uneven: dunnage bridges them."""
 MOST = 20
+_PATCH_CELLS = 256
 RULE = (
     "The lowest first, then the most level; at least 90 % seen, level within 40 mm, 100 mm clear all round."
 )
@@ -34,14 +36,17 @@ class FreePlace:
     known_share: float
 
 
-def free_places(heights: HeightMap, width_m: float, length_m: float) -> tuple[FreePlace, ...]:
+def free_places(yard: YardMap, width_m: float, length_m: float) -> tuple[FreePlace, ...]:
     """Places along Y for a bundle of this size, in `RULE`'s order; at most 20, none over another.
 
     On the floor or on a layer of bundles: what counts is the upper envelope, closed over gullies.
     """
-    step = max(round(COARSE_M / heights.cell_m), 1)
-    top, known = _coarse(heights, step)
-    cell = heights.cell_m * step
+    step = max(round(COARSE_M / yard.cell_m), 1)
+    top, known = np.empty((2, *(n // step for n in yard.shape)), np.float32)
+    for patch in patches(yard, _PATCH_CELLS * step):
+        blocks = tuple(slice(cut.start // step, cut.stop // step) for cut in patch)
+        top[blocks], known[blocks] = _coarse(yard.part(*patch), step)
+    cell = yard.cell_m * step
     wide = round((width_m + 2 * CLEARANCE_M) / cell) | 1
     long = round((length_m + 2 * CLEARANCE_M) / cell) | 1
     if wide > top.shape[1] or long > top.shape[0]:
@@ -56,7 +61,7 @@ def free_places(heights: HeightMap, width_m: float, length_m: float) -> tuple[Fr
     rows, columns = long // 2, wide // 2
     inner = np.zeros_like(fits)
     inner[rows : fits.shape[0] - rows, columns : fits.shape[1] - columns] = True
-    return _ranked(fits & inner, highest, level, share, heights, cell, (wide, long))
+    return _ranked(fits & inner, highest, level, share, yard, cell, (wide, long))
 
 
 def _coarse(heights: HeightMap, step: int) -> tuple[Float32, Float32]:
@@ -70,7 +75,7 @@ def _coarse(heights: HeightMap, step: int) -> tuple[Float32, Float32]:
 
 
 def _ranked(
-    fits: Bool, z: Float32, level: Float32, share: Float32, heights: HeightMap, cell: float,
+    fits: Bool, z: Float32, level: Float32, share: Float32, yard: YardMap, cell: float,
     size: tuple[int, int],
 ) -> tuple[FreePlace, ...]:  # fmt: skip
     found: list[FreePlace] = []
@@ -78,7 +83,7 @@ def _ranked(
     order = np.lexsort((level[row, column], np.round(z[row, column], 1)))
     taken = np.zeros(fits.shape, np.bool_)
     wide, long = size
-    offset: Float64 = np.array([heights.x0_m, heights.y0_m]) + (cell - heights.cell_m) / 2
+    offset: Float64 = np.array([yard.x0_m, yard.y0_m]) + (cell - yard.cell_m) / 2
     for k in order:
         i, j = int(row[k]), int(column[k])
         if taken[i, j]:

@@ -7,11 +7,11 @@ All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, count
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
-from barsight.mapping.surface import Surface, grey_levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +32,40 @@ class HeightMap:
     source: UInt8
     grey: UInt8 | None = None
 
-    @classmethod
-    def of(cls, surface: Surface) -> HeightMap:
-        """All that a surface knows."""
-        rows, columns = surface.shape
-        layers = surface.window(surface.columns[0], surface.rows[0], columns, rows)
-        x0_m, y0_m = surface.columns[0] * surface.cell_m, surface.rows[0] * surface.cell_m
-        grey = grey_levels(layers.intensity)
-        return cls(x0_m, y0_m, surface.cell_m, layers.z_m, layers.sigma_m, layers.views, layers.source, grey)
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        rows, columns = self.z_m.shape
+        return rows, columns
+
+    def part(self, rows: slice, columns: slice) -> HeightMap:
+        """A rectangle of the map, by cells from start to stop; the arrays are shared."""
+        x0_m, y0_m = (
+            first + self.cell_m * part.start for first, part in ((self.x0_m, columns), (self.y0_m, rows))
+        )
+        cut = rows, columns
+        return HeightMap(
+            x0_m, y0_m, self.cell_m, self.z_m[cut], self.sigma_m[cut], self.views[cut], self.source[cut],
+            None if self.grey is None else self.grey[cut],
+        )  # fmt: skip
+
+
+class YardMap(Protocol):
+    """A height map that may be too large to be held: `part` reads what is needed of it. See `HeightMap`."""
+
+    @property
+    def x0_m(self) -> float: ...
+
+    @property
+    def y0_m(self) -> float: ...
+
+    @property
+    def cell_m(self) -> float: ...
+
+    @property
+    def shape(self) -> tuple[int, int]: ...
+
+    def part(self, rows: slice, columns: slice) -> HeightMap: ...
 
 
 @dataclass(frozen=True, eq=False)
