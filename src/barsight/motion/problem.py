@@ -47,12 +47,9 @@ class StereoSightings:
         nodes = np.concatenate([np.full(len(s.track), k) for s, k in zip(sightings, node, strict=True)])
         track = np.concatenate([s.track for s in sightings])
         order = np.lexsort((nodes, track))
-        _, begin, count = np.unique(track[order], return_index=True, return_counts=True)
-        place = np.arange(len(order)) - np.repeat(begin, count)
-        _, named = np.unique(
-            track[order] * (len(sightings) // MOST_SIGHTINGS + 1) + place // MOST_SIGHTINGS,
-            return_inverse=True,
-        )
+        begin = np.flatnonzero(np.diff(track[order], prepend=-1))
+        place = np.arange(len(order)) - np.repeat(begin, np.diff(begin, append=len(order)))
+        named = np.cumsum(place % MOST_SIGHTINGS == 0) - 1
         stereo = np.vstack([s.stereo for s in sightings])[order]
         sigma = np.hypot(np.concatenate([s.sigma_px for s in sightings])[order], LEAST_SIGMA_PX)
         return cls(nodes[order], named, stereo, sigma, camera, body_from_rect0)

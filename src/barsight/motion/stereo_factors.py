@@ -55,10 +55,14 @@ def nearness(residual: Float64, seen: StereoSightings, used: Bool) -> float:
     cell, an eighth of the picture wide, don't add up like independent ones: the sums' squares over the
     single ones' is the variance that counts.
     """
+    if not used.any():
+        return 1.0
     scaled = np.clip(residual[used] / seen.sigma_px[used, None], -MOST_WHITENED, MOST_WHITENED)
     cell = (seen.stereo[used, :2] * CELLS // seen.camera.width).astype(np.int64)
-    _, name = np.unique(np.column_stack([seen.node[used], cell]), axis=0, return_inverse=True)
-    sums = np.array([np.bincount(name.ravel(), axis) for axis in scaled.T])
+    cell -= cell.min(axis=0)
+    across, down = cell.max(axis=0) + 1
+    name = (seen.node[used] * across + cell[:, 0]) * down + cell[:, 1]
+    sums = np.array([np.bincount(name, axis) for axis in scaled.T])
     return float(max(1.0, (sums**2).sum() / max(float((scaled**2).sum()), 1e-12)) ** 0.5)
 
 

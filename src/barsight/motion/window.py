@@ -26,7 +26,7 @@ from barsight.motion.marginals import Newest, newest
 from barsight.motion.problem import Prior, Problem, StereoSightings
 from barsight.motion.sightings import Sighting
 from barsight.motion.solver import State, linearise, moved, sighting_residuals
-from barsight.motion.stereo_factors import often, persistence, start_points
+from barsight.motion.stereo_factors import nearness, often, persistence, start_points, taken_up
 from barsight.motion.system import System
 
 NOISE_SHARE = 0.2
@@ -143,9 +143,10 @@ def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window
     if seen is not None and used.any():
         residual = sighting_residuals(problem, state, used)
         share = np.abs(residual) / stated[:, None]
-        factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])))
+        factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])) * taken_up(seen, used))
         used = often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
-        now = factor * persistence(residual, seen, used)
+        shown = replace(seen, sigma_px=factor * stated)
+        now = factor * persistence(residual, shown, used) * nearness(residual, shown, used)
         noise = now if noise is None else (1 - NOISE_SHARE) * noise + NOISE_SHARE * now
         problem = replace(problem, sightings=replace(seen, sigma_px=noise * stated))
         system = linearise(problem, graph, state, used)
