@@ -95,7 +95,7 @@ class LiveEstimator:
         if isinstance(window, Failed):
             return RefusedFrame(seen.stamp_ns, window.reason)
         window = with_frame(window, sighting, self._held)
-        window = self._bound(window, now, stamp)
+        window = self._bound(window, sighting, now, stamp)
         rectifier = self._rectifier
         try:
             window, problem, used = solved(window, rectifier.camera, rectifier.body_from_rect0)
@@ -213,21 +213,26 @@ class LiveEstimator:
             added.append(Attitude(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
         return replace(window, problem=replace(problem, attitudes=problem.attitudes + tuple(added)))
 
-    def _bound(self, window: Window, now: Readings, stamp: int) -> Window:
-        """With the encoders' places of nodes whose fit has come to be complete, 0.4 s apart."""
+    def _bound(self, window: Window, sighting: Sighting | None, now: Readings, stamp: int) -> Window:
+        """With the encoders' places of nodes whose fit has come to be complete, 0.4 s apart; at once where
+        nothing else ties the last node to the one before.
+        """
         if now.crane is None:
             return window
-        crane, placed = with_seen_noise(now.crane), list(window.problem.placed)
-        complete = stamp + seconds_to_ns(SENSOR_DELAY_S - FIT_S)
-        for k, node_ns in enumerate(window.problem.stamp_ns.tolist()):
+        crane, placed, problem = with_seen_noise(now.crane), list(window.problem.placed), window.problem
+        complete, last = stamp + seconds_to_ns(SENSOR_DELAY_S - FIT_S), len(problem.start) - 1
+        by_imu = last > 0 and problem.preintegrated[-1] is not None
+        loose = not by_imu and (sighting is None or sighting.motion is None)
+        for k, node_ns in enumerate(problem.stamp_ns.tolist()):
+            at_once = loose and k == last
             near = node_ns - self._last_placed_ns < 0.97 * seconds_to_ns(PLACE_SPACING_S)
-            if near or node_ns > complete:
+            if not at_once and (near or node_ns > complete):
                 continue
-            fit = fit_position(crane, node_ns, seconds_to_ns(FIT_S))
+            fit = fit_position(crane, node_ns, seconds_to_ns(self._crane.window_s if at_once else FIT_S))
             if isinstance(fit, Failed):
                 continue
             place = fit.position_m + crane.crane_to_body_m
             sigma = float(np.sqrt(fit.covariance[0, 0]))
             placed.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
             self._last_placed_ns = node_ns
-        return replace(window, problem=replace(window.problem, placed=tuple(placed)))
+        return replace(window, problem=replace(problem, placed=tuple(placed)))
