@@ -44,7 +44,8 @@ def taken_up(seen: StereoSightings, used: Bool) -> float:
     leaves of them; at most sqrt(3).
     """
     rows = 3 * int(used.sum())
-    unknowns = 3 * len(np.unique(seen.track[used])) + 6 * len(np.unique(seen.node[used]))
+    points, frames = np.bincount(seen.track[used]) > 0, np.bincount(seen.node[used]) > 0
+    unknowns = 3 * int(points.sum()) + 6 * int(frames.sum())
     return float((rows / max(rows - unknowns, rows / 3, 1)) ** 0.5)
 
 

@@ -7,6 +7,7 @@ every point that was seen at a frame which leaves has ended and is taken out who
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -130,7 +131,8 @@ def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window
             [s for _, s in window.sightings], [node for node, _ in window.sightings], camera, mount
         )
         stated = seen.sigma_px
-        names = np.unique(np.concatenate([s.track for _, s in window.sightings]))
+        names = np.sort(np.concatenate([s.track for _, s in window.sightings]))
+        names = names[np.diff(names, prepend=-1) > 0]
         problem = replace(problem, sightings=replace(seen, sigma_px=(window.noise or 1.0) * stated))
         points = _points(window, problem, names)
         used = often(seen, np.ones(len(seen.node), np.bool_))
@@ -231,14 +233,28 @@ def _without(system: System, count: int) -> tuple[Float64, Float64]:
 
 
 def _renumbered(state: State, problem: Problem, count: int) -> gtsam.Values:
+    nodes = range(count, len(problem.start))
     values = gtsam.Values()
-    for k in range(count, len(problem.start)):
+    if problem.has_imu:
+        biases = gtsam.VectorValues()
+        for k in nodes:
+            biases.insert(B(k - count), state.values.atConstantBias(B(k)).vector())
+        values = _no_biases(len(nodes)).retract(biases)
+    for k in nodes:
         values.insert(X(k - count), state.values.atPose3(X(k)))
         if problem.has_imu:
             values.insert(V(k - count), state.values.atVector(V(k)))
-            values.insert(B(k - count), state.values.atConstantBias(B(k)))
     if problem.has_latency:
         values.insert(E(0), state.values.atVector(E(0)))
+    return values
+
+
+@cache
+def _no_biases(count: int) -> gtsam.Values:
+    """To add vectors to: to insert a bias itself takes thirty times as long."""
+    values = gtsam.Values()
+    for k in range(count):
+        values.insert(B(k), gtsam.imuBias.ConstantBias())
     return values
 
 
