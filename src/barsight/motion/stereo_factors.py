@@ -59,7 +59,7 @@ def nearness(residual: Float64, seen: StereoSightings, used: Bool) -> float:
     if not used.any():
         return 1.0
     scaled = np.clip(residual[used] / seen.sigma_px[used, None], -MOST_WHITENED, MOST_WHITENED)
-    cell = (seen.stereo[used, :2] * CELLS // seen.camera.width).astype(np.int64)
+    cell = (seen.stereo[used, :2] * (CELLS / seen.camera.width)).astype(np.int64)
     cell -= cell.min(axis=0)
     across, down = cell.max(axis=0) + 1
     name = (seen.node[used] * across + cell[:, 0]) * down + cell[:, 1]
