@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from barsight.mapping.lengthways import lengthways, sharpened
+from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened
 
 CELL_M, GATE_M, REACH = 0.01, 0.015, 12
+BLUR_CELLS = 0.7
 
 
 def bars(turn_deg: float, diameter_m: float = 0.09, cells: int = 120) -> np.ndarray:
@@ -66,10 +67,10 @@ def test_a_step_stays_a_step() -> None:
     z = np.zeros((40, 40), np.float32)
     z[:, 20:] = 0.05
     averaged, direction = lengthways(z, np.ones_like(z), GATE_M, REACH)
-    np.testing.assert_allclose(sharpened(averaged, direction, 0.5), z, atol=1e-7)
+    np.testing.assert_allclose(sharpened(averaged, direction, BLUR_CELLS + 0 * z), z, atol=1e-7)
 
 
-def sharpened_slowly(z: np.ndarray, direction: np.ndarray, share: float) -> np.ndarray:
+def sharpened_slowly(z: np.ndarray, direction: np.ndarray, blur_cells: np.ndarray) -> np.ndarray:
     out = z.copy()
     for i in range(1, z.shape[0] - 1):
         for j in range(1, z.shape[1] - 1):
@@ -78,6 +79,7 @@ def sharpened_slowly(z: np.ndarray, direction: np.ndarray, share: float) -> np.n
                 di, dj = round(np.sin(turn)), round(np.cos(turn))
                 beside = np.array([z[i - di, j - dj], z[i + di, j + dj]])
                 if np.all(np.abs(beside - z[i, j]) <= 0.03):
+                    share = min(blur_cells[i, j], 1.5) ** 2
                     out[i, j] += share * (z[i, j] - beside.mean()) / (di**2 + dj**2)
     return out
 
@@ -87,17 +89,34 @@ def test_sharpening_agrees_with_the_slow_reference() -> None:
     z = (bars(20.0, cells=40) + rng.normal(0, 0.01, (40, 40))).astype(np.float32)
     z[rng.random(z.shape) < 0.1] = np.nan
     direction = np.where(np.isfinite(z), rng.integers(0, 16, z.shape), -1).astype(np.int8)
-    np.testing.assert_allclose(sharpened(z, direction, 0.5), sharpened_slowly(z, direction, 0.5), atol=1e-6)
+    blur = rng.uniform(0, 2, z.shape).astype(np.float32)
+    np.testing.assert_allclose(sharpened(z, direction, blur), sharpened_slowly(z, direction, blur), atol=1e-6)
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 30.0, 90.0])
 @pytest.mark.parametrize("diameter_m", [0.04, 0.09])
 def test_sharpening_undoes_part_of_a_windows_blur(turn_deg: float, diameter_m: float) -> None:
     truth = bars(turn_deg, diameter_m)
-    blurred = gaussian_filter(truth, 0.7).astype(np.float32)
+    blurred = gaussian_filter(truth, BLUR_CELLS).astype(np.float32)
     averaged, direction = lengthways(blurred, np.ones_like(blurred), GATE_M, REACH)
     inner = (slice(15, -15),) * 2
-    before, after = averaged - truth, sharpened(averaged, direction, 0.5) - truth
+    sharp = sharpened(averaged, direction, BLUR_CELLS + 0 * blurred)
+    before, after = averaged - truth, sharp - truth
     left = 0.8 if turn_deg % 90 == 0 else 0.9
     assert np.std(after[inner]) < left * np.std(before[inner])
     assert abs(np.mean(after[inner])) < 0.0005
+    assert np.mean((np.abs(after) <= 1.96 * blur_sigma(sharp - averaged))[inner]) > 0.8
+
+
+def test_what_blur_leaves_is_twice_and_three_quarters_the_rms_moved() -> None:
+    """Against a plain loop; cells that couldn't be moved don't count, and far from bars nothing is left."""
+    rng = np.random.default_rng(7)
+    moved = rng.normal(0, 0.002, (40, 60)).astype(np.float32)
+    moved[:, 40:] = 0
+    moved[rng.random(moved.shape) < 0.2] = np.nan
+    found = blur_sigma(moved)
+    for i, j in ((20, 20), (6, 30), (30, 41), (20, 50)):
+        near = moved[i - 5 : i + 6, j - 5 : j + 6]
+        near = near[np.isfinite(near) & (near != 0)]
+        expected = 2.75 * np.sqrt(np.mean(near**2)) if near.size else 0.0
+        assert found[i, j] == pytest.approx(expected, rel=1e-4, abs=1e-9)

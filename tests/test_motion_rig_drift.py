@@ -13,7 +13,7 @@ from barsight.motion import fusion
 from barsight.motion.crane import CraneSettings
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
 from barsight.motion.rig_drift import MATCHING_BIAS_PX
-from barsight.motion.self_calibration import is_drifted, self_calibrated, turned_right
+from barsight.motion.self_calibration import is_drifted, left_open_px, self_calibrated, turned_right
 from barsight.motion.sightings import Sighting
 from motion_recordings import MemoryRecording, ideal_rig
 
@@ -97,11 +97,12 @@ def test_without_encoders_nothing_is_corrected(monkeypatch: pytest.MonkeyPatch) 
     drift = drift_of(*travel(3, np.deg2rad(0.05), 0.0, 0.0), monkeypatch)
     rectifier = Rectifier(RIG)
     blind = replace(drift, by_encoders=False)
-    assert self_calibrated(RIG, rectifier, blind, correct=False).warnings == ()
-    refused = self_calibrated(RIG, rectifier, blind, correct=True)
+    believed = self_calibrated(RIG, rectifier, blind, 0.05, correct=False)
+    assert (believed.warnings, believed.sigma_px) == ((), 0.05)
+    refused = self_calibrated(RIG, rectifier, blind, 0.05, correct=True)
     assert refused.rectifier is rectifier
     assert "only with encoders" in refused.warnings[0]
-    warned = self_calibrated(RIG, rectifier, drift, correct=False)
+    warned = self_calibrated(RIG, rectifier, drift, 0.05, correct=False)
     assert warned.rectifier is rectifier
     assert "calibrate anew" in warned.warnings[0]
 
@@ -111,9 +112,42 @@ def test_the_turned_rig_takes_the_yaw_off() -> None:
     yaw = np.deg2rad(0.2)
     true = turned_right(RIG, np.array([0.0, yaw, 0.0]))
     drift = RigDrift(yaw, 0.0, np.eye(2) * 1e-12, np.ones(2), 0.4, 7.0, True)
-    corrected = self_calibrated(RIG, Rectifier(RIG), drift, correct=True).rectifier
+    corrected = self_calibrated(RIG, Rectifier(RIG), drift, 0.05, correct=True).rectifier
     assert corrected.camera == Rectifier(true).camera
     point = np.array([[0.3, -0.4, 7.0]])
     cam1_from_cam0 = true.cam0_from_cam1.inverse()
     raw = RIG.cam1.project(cam1_from_cam0.apply(point))[0, 0] - RIG.cam0.project(point)[0, 0]
     assert abs(raw + 1250 * 0.4 / 7 + 1250 * yaw) < 0.05
+
+
+def shown(yaw_px: float, yaw_sigma_px: float, scale_sigma: float = 1e-9) -> RigDrift:
+    """A yaw (px straight ahead) seen at 7 m by a rig of f 1250 px."""
+    covariance = np.diag([(yaw_sigma_px / 1250) ** 2, scale_sigma**2])
+    return RigDrift(yaw_px / 1250, 0.0, covariance, np.ones(2), 0.4, 7.0, True)
+
+
+def test_what_the_rig_leaves_open() -> None:
+    """Travel and calibration believed together where they agree; what contradicts counts as error until it is
+    taken off; a baseline counts by the disparity."""
+    left = left_open_px(shown(0.02, 0.03), 1250, 0.04, False)
+    assert left == pytest.approx(1 / np.hypot(1 / 0.03, 1 / 0.04), rel=1e-4)
+    assert left_open_px(shown(0.2, 50.0), 1250, 0.05, False) == pytest.approx(0.05, rel=1e-4)
+    assert left_open_px(shown(0.02, 0.03), 1250, 0.0, False) == pytest.approx(0, abs=1e-4)
+    assert left_open_px(shown(0.2, 0.02), 1250, 0.05, False) == pytest.approx(np.hypot(0.2, 0.02), rel=1e-4)
+    assert left_open_px(shown(0.2, 0.02), 1250, 0.05, True) == pytest.approx(0.02, rel=1e-4)
+    baseline_px = 1e-3 * 1250 * 0.4 / 7
+    wide = left_open_px(shown(0.0, 1e-9, 1e-3), 1250, 0.05, False)
+    assert wide == pytest.approx(baseline_px, rel=1e-4)
+
+
+@pytest.mark.parametrize("rig_px", [0.02, 0.05])
+def test_intervals_hold_over_rigs(rig_px: float) -> None:
+    """Rigs as far off as their calibration admits or less, travel that shows it to 0.018 px, and 0.026 px
+    (2 mm at 7 m) of other errors: 95 % of the errors lie inside. Far beyond what is admitted, all do."""
+    rng = np.random.default_rng(2)
+    off = rng.normal(0, rig_px, 3000)
+    seen = off + rng.normal(0, 0.018, off.size)
+    stated = np.array([left_open_px(shown(yaw, 0.018), 1250, 0.05, False) for yaw in seen])
+    error = off + rng.normal(0, 0.026, off.size)
+    assert 0.94 < np.mean(np.abs(error) <= 1.96 * np.hypot(stated, 0.026)) < 0.97
+    assert left_open_px(shown(0.22, 0.018), 1250, 0.05, False) > 0.22

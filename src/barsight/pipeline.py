@@ -123,15 +123,15 @@ def measure(
         imu = source.imu()
         hints = imu_hints(imu) if imu is not None else ()
         cell_m = settings.map.cell_m or choose_cell(first, has_crane=source.crane() is not None)
-    shared_px = disparity_sigma_px(settings.recording.rig, first.range_m)
-    stereo = settings.stereo.with_calibration(shared_px)
+    known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
+    calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
     total = len(source.index.stamps_ns)
     configuration, inputs = plain(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
         kept = keeping_folder(resume, digest([barsight.__version__, configuration, inputs]))
 
-    matcher = Matcher(stereo, make_method(settings.stereo.for_map()), rectifier, watch)
+    matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), rectifier, watch)
     early = _known_early(source, settings, rectifier, first.range_m)
     match = _match(matcher, kept)
     # Pictures are matched on the core that the trajectory leaves idle.
@@ -143,9 +143,11 @@ def measure(
             count = _counter("trajectory", total, advance)
             trajectory = once(kept, "trajectory", lambda: estimate(source, rectifier, count))
             calibrated = self_calibrated(
-                source.rig, rectifier, trajectory.drift, correct=settings.self_calibrate == "yaw"
-            )
+                source.rig, rectifier, trajectory.drift, calibration_px,
+                correct=settings.self_calibrate == "yaw",
+            )  # fmt: skip
             rectifier = calibrated.rectifier
+            stereo = settings.stereo.with_calibration(calibrated.sigma_px)
         taken = apart(trajectory.frames, rectifier, first.range_m, settings.map.least_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
         late = min((stamp for stamp in poses if stamp not in early), default=None)

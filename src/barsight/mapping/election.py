@@ -54,6 +54,11 @@ class Sights:
             np.array([pose.apply(both) for pose in poses]).reshape(-1, 2, 3),
         )
 
+    def pixel_m(self, z_m: Float32) -> Float32:
+        """How wide a pixel is on the ground at heights z_m, seen from the views' median height."""
+        above = np.abs(np.float32(np.median(self.eyes[..., 2])) - z_m)
+        return np.asarray(above / np.float32(self.camera.focal_px), np.float32)
+
     def near(self, low_m: Float64, high_m: Float64) -> Sights:
         """Those views alone whose left picture may hold something of the box from low_m to high_m (3,)."""
         corners = np.array(list(product(*zip(low_m, high_m, strict=True))))

@@ -31,9 +31,9 @@ class MapSettings:
     along_m: float = 0.12
     """Heights are averaged so far to either side, along the direction in which they are most alike (a bar's
     own); 0 leaves each cell as it is."""
-    sharpen: float = 0.5
-    """Matching's window lowers crests and lifts valleys: heights averaged along a bar are moved back by this
-    share of their distance from the mean of both neighbours across it; 0 leaves them."""
+    sharpen_px: float = 1.25
+    """Matching's window lowers crests and lifts valleys across the bars as a blur of so many pixels (sigma)
+    does: heights averaged along a bar are moved back by as much, and sigma grows with it; 0 leaves both."""
     fill_m: float = 0.03
     """Unknown cells no further than this from seen ones on opposite sides are filled, and flagged so."""
     max_sigma_m: float = 0.5
@@ -53,8 +53,8 @@ class MapSettings:
             raise ConfigError("min_views must be at least 1 and resident_tiles at least 16")
         if not 0 <= self.least_shift <= 0.5:
             raise ConfigError(f"least_shift must lie in 0...0.5, not {self.least_shift}")
-        if not 0 <= self.sharpen <= 1:
-            raise ConfigError(f"sharpen must lie in 0...1, not {self.sharpen}")
+        if not 0 <= self.sharpen_px <= 5:
+            raise ConfigError(f"sharpen_px must lie in 0...5, not {self.sharpen_px}")
         for name in ("top_share", "own_share", "along_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must lie in 0...1, not {getattr(self, name)}")

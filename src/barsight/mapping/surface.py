@@ -15,11 +15,11 @@ from barsight.core.types import Source
 from barsight.mapping.election import Sights, elect, first_heights
 from barsight.mapping.filling import bridge
 from barsight.mapping.fusion import height_sigma
-from barsight.mapping.lengthways import lengthways, sharpened
+from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
 
-_HALO = 16
+_HALO = 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def finish(
         return key, int((elected.source == Source.VISION).sum())
 
     def finish_tile(key: TileKey) -> tuple[TileKey, Layers]:
-        layers = _filled(folder, key, known, cell_m, settings)
+        layers = _filled(folder, key, known, cell_m, settings, sights)
         _write_tile(folder, key, layers, "surface")
         return key, layers
 
@@ -188,7 +188,7 @@ def _layers(tile: Float32, winner: Int8) -> Layers:
 
 
 def _filled(
-    folder: Path, key: TileKey, keys: frozenset[TileKey], cell_m: float, settings: MapSettings
+    folder: Path, key: TileKey, keys: frozenset[TileKey], cell_m: float, settings: MapSettings, sights: Sights
 ) -> Layers:
     """The tile averaged lengthways, sharpened, its narrow gaps filled, looking at most the halo around it."""
     along, reach = (min(round(way_m / cell_m), _HALO) for way_m in (settings.along_m, settings.fill_m))
@@ -203,7 +203,8 @@ def _filled(
     if along > 0:
         weight = np.nan_to_num(around.sigma_m**-2)
         z, direction = lengthways(around.z_m, weight, settings.least_gate_m, along)
-        around = replace(around, z_m=sharpened(z, direction, settings.sharpen))
+        sharp = sharpened(z, direction, settings.sharpen_px * sights.pixel_m(z) / cell_m)
+        around = replace(around, z_m=sharp, sigma_m=np.hypot(around.sigma_m, blur_sigma(sharp - z)))
     if reach > 0:
         fill_gaps(around, reach)
     inner = slice(_HALO, _HALO + TILE_CELLS)

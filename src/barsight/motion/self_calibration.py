@@ -1,4 +1,6 @@
-"""What follows from a rig's drift: a warning where it matters, and a rig turned back where that is asked."""
+"""What follows from a rig's drift: a warning where it matters, a rig turned back where that is asked, and how
+far disparities may still be off.
+"""
 
 from __future__ import annotations
 
@@ -14,28 +16,54 @@ from barsight.core.types import RigDrift
 
 SIGNIFICANT_SIGMAS = 3.0
 WORTH_MM = 3.0
+AGREEING_SIGMAS = 1.96
+"""Travel that shows yaw and scale within this agrees with the calibration. Over rigs that are off as far as
+they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py)."""
 
 
 @dataclass(frozen=True)
 class SelfCalibrated:
-    """The rectifier to measure with, and sentences where the drift needs any."""
+    """The rectifier to measure with, sentences where the drift needs any, and the disparity error (px, one
+    sigma) that the rig may still cause everywhere alike."""
 
     rectifier: Rectifier
     warnings: tuple[str, ...]
+    sigma_px: float
 
 
 def self_calibrated(
-    rig: StereoRig, rectifier: Rectifier, drift: RigDrift | None, *, correct: bool
+    rig: StereoRig, rectifier: Rectifier, drift: RigDrift | None, calibration_px: float, *, correct: bool
 ) -> SelfCalibrated:
-    """The rig turned by the drift's yaw if `correct`, else as it is; encoders must have shown the drift."""
+    """The rig turned by the drift's yaw if `correct`, else as it is; encoders must have shown the drift.
+
+    calibration_px: the disparity error (1 sigma) that the calibration itself admits.
+    """
     if drift is None or not drift.by_encoders:
         reason = "nothing is self-calibrated: the yaw shows only with encoders in the fused estimate"
-        return SelfCalibrated(rectifier, (reason,) if correct else ())
-    seen = describe(drift)
+        return SelfCalibrated(rectifier, (reason,) if correct else (), calibration_px)
+    seen, sigma_px = describe(drift), left_open_px(drift, rectifier.camera.focal_px, calibration_px, correct)
     if correct:
         turned = turned_right(rig, np.array([0.0, drift.yaw_rad, 0.0]))
-        return SelfCalibrated(Rectifier(turned), (f"the rig is self-calibrated: {seen}",))
-    return SelfCalibrated(rectifier, (f"{seen}; calibrate anew",) if is_drifted(drift) else ())
+        return SelfCalibrated(Rectifier(turned), (f"the rig is self-calibrated: {seen}",), sigma_px)
+    warnings = (f"{seen}; calibrate anew",) if is_drifted(drift) else ()
+    return SelfCalibrated(rectifier, warnings, sigma_px)
+
+
+def left_open_px(drift: RigDrift, focal_px: float, calibration_px: float, corrected: bool) -> float:
+    """The disparity error (1 sigma) that yaw and scale may cause straight ahead at the points' median depth.
+
+    Where the travel agrees with the calibration, both are believed, the calibration for the yaw. Where it
+    contradicts, the travel alone is, and what it found counts as error unless it is `corrected`.
+    """
+    found, covariance = np.array([drift.yaw_rad, drift.scale]), drift.covariance
+    by = np.array([focal_px, focal_px * drift.baseline_m / drift.range_m])
+    off = 0.0
+    if found @ np.linalg.solve(covariance, found) > AGREEING_SIGMAS**2:
+        off = float(by @ (found * [not corrected, True]))
+    elif not corrected:
+        gain = covariance[0] / (covariance[0, 0] + (calibration_px / focal_px) ** 2)
+        covariance = covariance - np.outer(gain, covariance[0])
+    return float(np.sqrt(by @ covariance @ by + off**2))
 
 
 def is_drifted(drift: RigDrift) -> bool:

@@ -30,7 +30,7 @@ class StereoSettings:
     """End of the candidates; found from the images when not given."""
     calibration_sigma_px: float = 0.05
     """Disparity error that the calibration may cause everywhere alike (1 sigma), where no rig file's
-    covariance says it."""
+    covariance says it. A known travel that agrees with the calibration narrows it."""
     max_depth_m: float = 40.0
     """Points further away are left out."""
     max_sigma_px: float = 0.99
@@ -56,9 +56,9 @@ class StereoSettings:
         if not 0 <= self.gap_darkness < 1:
             raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
 
-    def with_calibration(self, sigma_px: float | None) -> StereoSettings:
-        """The same with the calibration's own sigma, where it is known."""
-        return self if sigma_px is None else replace(self, calibration_sigma_px=sigma_px)
+    def with_calibration(self, sigma_px: float) -> StereoSettings:
+        """The same with another sigma of the calibration."""
+        return replace(self, calibration_sigma_px=sigma_px)
 
     def for_map(self) -> StereoSettings:
         """The same without guesses, which no map takes, and as sure of a pixel's side as if there were no
