@@ -22,6 +22,7 @@ import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.memory import give_back
 from barsight.core.parallel import begun_map, beside
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
@@ -178,6 +179,7 @@ def measure(
                 placed.append(posed.reference_from_body @ body_from_rect0)
                 if preview is None or abs(done - len(poses) / 2) < 1:
                     preview = Preview(view.left, view.disparity_px)
+            give_back()
             advance("map", done, len(poses))
     used = len(placed)
     if used == 0:
@@ -187,6 +189,7 @@ def measure(
         min_views = settings.map.min_views if used > 1 else 1
         sights = Sights.of(placed, rectifier.camera, per_pixel)
         surface = finish(store, scratch, cell_m, min_views, settings.map, sights)
+        give_back()
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")
     with watch("contours"):

@@ -107,7 +107,7 @@ def finish(
     known = frozenset(keys)
 
     def tiles() -> Iterator[tuple[TileKey, Float32]]:
-        return ((key, store.take(key)) for key in keys)
+        return ((key, store.read(key)) for key in keys)
 
     def look(item: tuple[TileKey, Float32]) -> None:
         key, tile = item

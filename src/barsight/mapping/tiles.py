@@ -41,9 +41,7 @@ class TileStore:
         """The tile to read and write; a fresh one where there is none yet."""
         tile = self._held.pop(key, None)
         if tile is None:
-            while len(self._held) >= self._resident:
-                oldest, evicted = self._held.popitem(last=False)
-                np.save(self._file(oldest), evicted)
+            self.hold(self._resident - 1)
             if key in self._known:
                 tile = np.load(self._file(key))
             else:
@@ -51,6 +49,17 @@ class TileStore:
                 self._known.add(key)
         self._held[key] = tile
         return tile
+
+    def hold(self, most: int) -> None:
+        """Write those that are untouched for longest to disk until so many are held."""
+        while len(self._held) > most:
+            oldest, evicted = self._held.popitem(last=False)
+            np.save(self._file(oldest), evicted)
+
+    def read(self, key: TileKey) -> Float32:
+        """A tile that holds something, not to be written to: it isn't kept if it lay on disk."""
+        tile = self._held.get(key)
+        return np.load(self._file(key)) if tile is None else tile
 
     def drop(self, key: TileKey) -> None:
         """Forget a tile."""
