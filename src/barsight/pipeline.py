@@ -61,6 +61,8 @@ Advance = Callable[[str, int, int], None]
 _FAST_SHIFT = 0.1
 _MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
 """Pairs that may wait, matched, beside the trajectory and after it: 13 MB each at 1280x1024."""
+_TIDIED_EVERY = 8
+"""Frames between which freed memory may pile up."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,8 @@ def measure(
                 placed.append(posed.reference_from_body @ body_from_rect0)
                 if preview is None or abs(done - len(poses) / 2) < 1:
                     preview = Preview(view.left, view.disparity_px)
-            give_back()
+            if done % _TIDIED_EVERY == 1:
+                give_back()
             advance("map", done, len(poses))
     used = len(placed)
     if used == 0:
