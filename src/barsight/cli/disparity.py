@@ -16,7 +16,14 @@ from barsight.calibration.any_rig_file import read_rig_file
 from barsight.calibration.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.core.arrays import UInt8
-from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, OutputError
+from barsight.core.errors import (
+    CalibrationError,
+    ConfigError,
+    Failed,
+    InputError,
+    MeasurementError,
+    OutputError,
+)
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
 from barsight.evaluation.stereo_scenes import pair_from_images
 from barsight.mapping.view import disparity_range
@@ -24,11 +31,18 @@ from barsight.measurement import Preview
 from barsight.recording.images import TornImageError, decode_with_colour
 from barsight.report.files import write_preview
 from barsight.stereo.disparity_files import write_disparity
+from barsight.stereo.disparity_range import nothing_to_match
 from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
 from barsight.stereo.settings import MethodName, StereoSettings, make_method
 
 _IN_COLOUR: tuple[MethodName, ...] = ("csca",)
 """Methods that look at colours."""
+_REMEDIES = {
+    "swapped": "exchange the two pictures or give --range A:B",
+    "same-image": "give two pictures of one pair",
+}
+_LEAST_SIZE = (3, 16)
+"""Rows and columns below which nothing is matched."""
 SUFFIXES = (".pfm", ".png", ".tif", ".tiff")
 
 
@@ -64,15 +78,15 @@ def run(arguments: Sequence[str]) -> None:
             settings = replace(settings, lowest_disparity_px=low, highest_disparity_px=high)
         pair = _pair(left, right, rig, settings.method)
         candidates = disparity_range(pair, settings)
-        if isinstance(candidates, Failed) and candidates.code != "no-texture":
-            raise InputError(left, candidates.reason, "exchange the two pictures or give --range A:B")
         if isinstance(candidates, Failed):
-            console.print(f"[yellow]{candidates.reason}[/yellow]", soft_wrap=True)
-            unknown = np.full(pair.left.shape, np.nan, np.float32)
-            disparity = Disparity(unknown, unknown.copy())
-        else:
-            _expect_inside(candidates, pair)
-            disparity = make_method(settings)(pair, candidates)
+            if candidates.code not in _REMEDIES:
+                raise MeasurementError(f"{left}: {candidates.reason}")
+            raise InputError(left, candidates.reason, _REMEDIES[candidates.code])
+        _expect_inside(candidates, pair)
+        disparity = make_method(settings)(pair, candidates)
+        if disparity.coverage == 0:
+            span = f"no pixel has a match from {candidates.lowest_px} to {candidates.highest_px} px"
+            raise MeasurementError(f"{left}: {nothing_to_match(pair) or span}")
         write_disparity(out, disparity)
         if preview is not None:
             write_preview(Preview(pair.left, disparity.disparity_px), preview)
@@ -83,8 +97,6 @@ def run(arguments: Sequence[str]) -> None:
 
 def _summary(out: Path, disparity: Disparity) -> str:
     found = disparity.disparity_px[np.isfinite(disparity.disparity_px)]
-    if found.size == 0:
-        return f"[yellow]{escape(str(out))}: no pixel has a match[/yellow]"
     return (
         f"{escape(str(out))}: {100 * disparity.coverage:.1f} % of the pixels, {found.min():.2f} to "
         f"{found.max():.2f} px, median sigma {np.nanmedian(disparity.sigma_px):.3f} px"
@@ -110,6 +122,10 @@ def _pair(left: Path, right: Path, rig: Path | None, method: MethodName) -> Rect
             sizes = " and ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (frame.left, frame.right))
             raise InputError(right, f"the pictures' sizes differ ({sizes})", "give two pictures of one pair")
         pair = pair_from_images(frame.left, frame.right, *(colours or ()))
+    if any(side < least for side, least in zip(pair.left.shape, _LEAST_SIZE, strict=True)):
+        rows, columns = _LEAST_SIZE
+        size = f"{pair.camera.width}x{pair.camera.height}"
+        raise InputError(left, f"is {size}: {columns}x{rows} at least can be matched", "give whole pictures")
     offset = vertical_offset(pair.left, pair.right)
     if not isinstance(offset, Failed) and offset > MOST_OFFSET_PX:
         remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their --rig"

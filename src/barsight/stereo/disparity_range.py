@@ -27,8 +27,12 @@ _LEAST_CONSISTENT = 0.03
 def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
     """The range of disparities that a pair shows, widened by a margin.
 
-    Failed `no-texture` where too little matches either way, `swapped` where left and right are exchanged.
+    Failed `no-texture` where too little matches either way, `swapped` where left and right are exchanged; see
+    also `nothing_to_match`.
     """
+    nothing = nothing_to_match(pair)
+    if nothing is not None:
+        return nothing
     doffs = pair.camera.doffs_px
     disparity = coarse_disparity(pair.left, pair.right, doffs)
     share = _finite_share(disparity)
@@ -49,13 +53,25 @@ def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
                 f"when they are exchanged, {100 * share:.0f} % as given",
             )
     if share < _LEAST_CONSISTENT:
-        return Failed("no-texture", f"only {100 * share:.1f} % of the pixels match between the images")
+        return Failed("no-texture", f"too little can be matched: {100 * share:.1f} % of the pixels")
     low, high = np.nanpercentile(disparity, (0.1, 99.9))
     margin = _MARGIN_PX + _MARGIN_SHARE * (high - low)
     ceiling = int(pair.camera.width * 0.9)
     lowest = int(np.floor(min(max(low - margin, -doffs), ceiling - 16)))
     highest = int(np.ceil(min(high + margin, ceiling)))
     return DisparityRange(lowest, lowest + max(16, -(-(highest - lowest) // 16) * 16))
+
+
+def nothing_to_match(pair: RectifiedPair) -> Failed | None:
+    """Failed `no-texture` where an image is one grey all over, `same-image` where both are the same one."""
+    for name, image in (("left", pair.left), ("right", pair.right)):
+        grey = int(image[0, 0])
+        if (image == grey).all():
+            shade = {0: "black", 255: "white"}.get(grey, f"grey {grey}")
+            return Failed("no-texture", f"nothing can be matched: the {name} image is {shade} all over")
+    if np.array_equal(pair.left, pair.right):
+        return Failed("same-image", "nothing has a depth: left and right are the same image")
+    return None
 
 
 def coarse_disparity(
