@@ -11,7 +11,6 @@ from barsight.calibration.rig import StereoRig
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import StereoFrame
-from barsight.features.guided import project_stereo
 
 RADTAN = (-0.28, 0.07, 0.0002, 1.8e-05)
 EQUIDISTANT = (-0.013, 0.021, -0.011, 0.002)
@@ -63,7 +62,7 @@ def test_points_land_where_the_maps_look(name: str, side: str) -> None:
     """
     rig, rectifier = RIGS[name], Rectifier(RIGS[name])
     camera = rectifier.camera
-    u, v = (a.ravel() for a in np.meshgrid(*(np.arange(0, n, 7) for n in (camera.width, camera.height))))
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(0, 640, 7), np.arange(0, 480, 7)))
     z = np.random.default_rng(1).uniform(2, 20, u.size)
     shift = camera.focal_px * camera.baseline_m / z - camera.doffs_px if side == "right" else 0
     x, y = ((u + shift - camera.cx_px) * z / camera.focal_px, (v - camera.cy_px) * z / camera.focal_px)
@@ -77,64 +76,6 @@ def test_points_land_where_the_maps_look(name: str, side: str) -> None:
     np.testing.assert_allclose(np.column_stack([warp.map_x[v, u], warp.map_y[v, u]]), expected, atol=2e-4)
     inside = ((expected >= 0) & (expected <= (639, 479))).all(axis=1)
     assert (warp.valid[v, u] == inside).mean() > 0.999
-
-
-MILD = (-0.06, 0.02, 0.0003, -0.0002)
-
-
-def both_see(rig: StereoRig, in_body: np.ndarray) -> np.ndarray:
-    """(N,) whether the raw pictures of both cameras show the points."""
-    seen = np.ones(len(in_body), np.bool_)
-    for lens, body_from_cam in ((rig.cam0, rig.body_from_cam0), (rig.cam1, rig.body_from_cam1)):
-        pixels = lens.project(body_from_cam.inverse().apply(in_body))
-        seen &= ((pixels >= 0) & (pixels <= (639, 479))).all(axis=1)
-    return seen
-
-
-@pytest.mark.parametrize(
-    ("turn", "model", "coefficients"),
-    [
-        ((0.005, -0.004, 0.003), Distortion.RADTAN, MILD),
-        ((-0.01, 0.05, -0.006), Distortion.RADTAN, MILD),
-        ((0.02, -0.06, 0.015), Distortion.NONE, ()),
-    ],
-)
-def test_nothing_that_both_cameras_see_is_lost(
-    turn: tuple[float, float, float], model: Distortion, coefficients: tuple[float, ...]
-) -> None:
-    """Points at 3 to 30 m lie on valid pixels of both rectified pictures, which hardly grow."""
-    one = rig(model, coefficients, turn)
-    rectifier = Rectifier(one)
-    camera = rectifier.camera
-    assert camera.width * camera.height < 1.08 * 640 * 480
-    rng = np.random.default_rng(4)
-    z = rng.uniform(3, 30, 40_000)
-    points = np.column_stack([rng.uniform(-1, 1, (2, z.size)).T * z[:, None], z])
-    points = points[both_see(one, rectifier.body_from_rect0.apply(points))]
-    assert len(points) > 5000
-    place = project_stereo(points, camera)
-    row = np.rint(place[:, 1]).astype(int)
-    for column, valid in zip((place[:, 0], place[:, 2]), rectifier.valid, strict=True):
-        # A point between the outermost valid pixel and the raw border is half a pixel off at most.
-        inner = np.rint(column).astype(int).clip(0, camera.width - 1)
-        assert column.min() > -0.01 and column.max() < camera.width - 0.99
-        assert valid[row, inner].mean() > 0.998
-    assert place[:, 1].min() > -0.01 and place[:, 1].max() < camera.height - 0.99
-
-
-@pytest.mark.parametrize(
-    ("model", "coefficients", "focal"),
-    [(Distortion.RADTAN, (-0.45, 0.2, 0, 0), 400.0), (Distortion.EQUIDISTANT, (0.0,) * 4, 190.0)],
-)
-def test_a_strong_lens_makes_no_huge_picture(
-    model: Distortion, coefficients: tuple[float, ...], focal: float
-) -> None:
-    """Its corners would take several times the pixels; the equidistant one sees 190 degrees across."""
-    lens = Camera(640, 480, focal, focal, 319.5, 239.5, model, coefficients)
-    place = Pose("cam0", "cam1", np.eye(3), np.array([0.5, 0, 0]))
-    camera = Rectifier(StereoRig(lens, lens, BODY_FROM_CAM0, BODY_FROM_CAM0 @ place)).camera
-    assert (camera.width, camera.height) == (706, 530)
-    assert (camera.cx_px, camera.cy_px) == pytest.approx((352.5, 264.5))
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -219,9 +160,8 @@ def test_an_equidistant_lens_of_zeros_is_rectified() -> None:
     lens = Camera(64, 48, 70, 70, 31.5, 23.5, Distortion.EQUIDISTANT, (0.0,) * 4)
     place = Pose("cam0", "cam1", np.eye(3), np.array([0.5, 0, 0]))
     rectifier = Rectifier(StereoRig(lens, lens, BODY_FROM_CAM0, BODY_FROM_CAM0 @ place))
-    camera = rectifier.camera
     np.testing.assert_allclose(
-        raw_places(rectifier, "left", np.array([[camera.cx_px + 31.5, camera.cy_px]]))[0],
+        raw_places(rectifier, "left", np.array([[63, 23.5]]))[0],
         [31.5 + 70 * np.arctan(31.5 / 70), 23.5],
         atol=0.03,
     )

@@ -1,20 +1,11 @@
 """Guided matching: found in the ellipse, refused outside it, ambiguous where the bars repeat within it."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
-import pytest
 
 from barsight.core.types import RectifiedCamera, RectifiedPair
-from barsight.features.guided import (
-    PredictedMotion,
-    match_across,
-    match_guided,
-    predict_places,
-    project_stereo,
-)
-from barsight.features.patches import MARGIN_PX, PatchPair, patch_pair
+from barsight.features.guided import PredictedMotion, match_guided, predict_places, project_stereo
+from barsight.features.patches import PatchPair, patch_pair
 
 CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 0.4, 0.0, 320, 240)
 DEPTH_M = 6.0
@@ -55,20 +46,3 @@ def test_found_refused_and_ambiguous() -> None:
     repeat = match_guided(source, places, depth, wall(7.3), right, 0.2, np.full(len(points), 1.0))
     assert repeat.ambiguous.all()
     assert not repeat.found.any()
-
-
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_patches_beside_invalid_pixels_are_not_found(side: str) -> None:
-    """There the picture goes on with its border's pixels, which look like nothing in the other one."""
-    pair = wall(0)
-    valid = np.ones((240, 320), np.bool_)
-    valid[:100], valid[:, 200:] = False, False
-    masked = replace(pair, pair=replace(pair.pair, **{f"{side}_valid": valid}))
-    u, v = (a.ravel() for a in np.meshgrid(np.arange(40.0, 300, 4), np.arange(20.0, 220, 4)))
-    places = np.column_stack([u, v])
-    whole, part = (match_across(one, places, np.full(u.size, 20.0)).found for one in (pair, masked))
-    there = places if side == "left" else places - (20, 0)
-    shown = (there[:, 1] >= 100 + MARGIN_PX) & (there[:, 0] < 200 - MARGIN_PX)
-    near = np.abs(there[:, 0] - (200 - MARGIN_PX)) < 1
-    assert whole[shown].mean() > 0.9
-    np.testing.assert_array_equal(part[~near], (whole & shown)[~near])

@@ -16,7 +16,6 @@ from barsight.mapping.carried import carried_along
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.5, 0.0, 640, 480)
 DEPTH_M, WAY_M = 7.5, 0.5
 WAY_PX = round(600.0 * WAY_M / DEPTH_M)
-WHOLE = np.ones((480, 640), np.bool_)
 PLATE = np.s_[150:310, 240:440]
 
 
@@ -40,7 +39,7 @@ def views(ground: np.ndarray, swing: tuple[int, int]) -> tuple[np.ndarray, np.nd
 def test_a_plate_is_found_and_nothing_else(swing: tuple[int, int]) -> None:
     left, neighbour, disparity = views(noise(1, (480, 700)), swing)
     moved = Pose("rect0", "rect0", np.eye(3), np.array([-WAY_M, 0.0, 0.0]))
-    found = carried_along(left, WHOLE, disparity, CAMERA, neighbour, moved)
+    found = carried_along(left, disparity, CAMERA, neighbour, moved)
     assert found[PLATE].mean() > 0.9
     inside = np.zeros(left.shape, np.bool_)
     inside[130:330, 220:460] = True
@@ -53,13 +52,13 @@ def test_bars_alike_are_the_yards() -> None:
     left, neighbour = bars[:, :640], bars[:, WAY_PX : 640 + WAY_PX]
     disparity = np.full((480, 640), 600.0 * 0.5 / DEPTH_M, np.float32)
     moved = Pose("rect0", "rect0", np.eye(3), np.array([-WAY_M, 0.0, 0.0]))
-    assert not carried_along(left, WHOLE, disparity, CAMERA, neighbour, moved).any()
+    assert not carried_along(left, disparity, CAMERA, neighbour, moved).any()
 
 
 def test_a_crane_at_rest_carries_nothing() -> None:
     left, _, disparity = views(noise(1, (480, 700)), (0, 0))
     still = Pose.identity("rect0", "rect0")
-    assert not carried_along(left, WHOLE, disparity, CAMERA, left, still).any()
+    assert not carried_along(left, disparity, CAMERA, left, still).any()
 
 
 @pytest.mark.slow

@@ -1,13 +1,10 @@
 """Rectification: raw pairs to pairs whose matches lie on the same row.
 
 Both cameras are turned about their centres so that their x axes run along the baseline and their rows agree
-[Fusiello 2000]; the lens distortion is taken off in the same interpolation. The rectified pictures hold all
-that both cameras can see, and neither rows nor columns that no match can be in.
+[Fusiello 2000]; the lens distortion is taken off in the same interpolation.
 """
 
 from __future__ import annotations
-
-from math import ceil, floor
 
 import cv2
 import numpy as np
@@ -15,21 +12,16 @@ import numpy as np
 from barsight.calibration.camera import Camera, Distortion
 from barsight.calibration.rig import StereoRig
 from barsight.calibration.warp import Warp
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera, RectifiedPair, StereoFrame
-
-_MOST_GROWTH = 1.1
-"""A rectified side over the raw one, at most: a strong lens's corners show little for their cost."""
-_GRID = 65
 
 
 class Rectifier:
     """Rectifies a rig's pairs. Maps are made once; a pair that is rectified already passes untouched.
 
     camera: geometry of the rectified pair. body_from_rect0: where the rectified left camera sits.
-    valid: (H, W) bool of left and right, see `RectifiedPair`.
     """
 
     def __init__(self, rig: StereoRig) -> None:
@@ -45,27 +37,20 @@ class Rectifier:
                 rig.cam0.fx_px, rig.cam0.cx_px, rig.cam0.cy_px, rig.baseline_m,
                 rig.cam1.cx_px - rig.cam0.cx_px, rig.cam0.width, rig.cam0.height,
             )  # fmt: skip
-            everywhere = np.ones(self._size, dtype=np.bool_)
-            self.valid: tuple[Bool, Bool] = everywhere, everywhere
+            self._left_valid = self._right_valid = np.ones(self._size, dtype=np.bool_)
             return
         focal = (rig.cam0.fx_px + rig.cam0.fy_px + rig.cam1.fx_px + rig.cam1.fy_px) / 4
-        low, high, centre = _extent(rig.cam0, rotation, focal)
-        right_low, right_high, right_centre = _extent(rig.cam1, right_rotation, focal)
-        # What is far lies alike in both pictures, what is near further left in the right one.
-        first, last = max(low[0], right_low[0]), min(high[0], right_high[0])
-        top, bottom = max(low[1], right_low[1]), min(high[1], right_high[1])
-        # Whole pixels: in the middle the pictures' own pixels are read, hardly any between them.
-        cx, right_cx = centre[0] - floor(centre[0] + first), right_centre[0]
-        right_cx -= floor(right_cx + right_low[0])
-        cy = (centre[1] + right_centre[1]) / 2
-        cy -= floor(cy + top)
-        columns, rows = max(cx + high[0], right_cx + last, rig.cam0.width / 2), cy + bottom
-        width, height = ceil(columns) + 1, ceil(max(rows, rig.cam0.height / 2)) + 1
-        self.camera = RectifiedCamera(focal, cx, cy, rig.baseline_m, right_cx - cx, width, height)
-        left = _warp(rig.cam0, rotation, (focal, cx, cy), (height, width))
-        right = _warp(rig.cam1, right_rotation, (focal, right_cx, cy), (height, width))
+        left_centre = _principal_point(rig.cam0, rotation, focal)
+        right_centre = _principal_point(rig.cam1, right_rotation, focal)
+        cy = (left_centre[1] + right_centre[1]) / 2
+        self.camera = RectifiedCamera(
+            focal, left_centre[0], cy, rig.baseline_m,
+            right_centre[0] - left_centre[0], rig.cam0.width, rig.cam0.height,
+        )  # fmt: skip
+        left = _warp(rig.cam0, rotation, (focal, left_centre[0], cy), self._size)
+        right = _warp(rig.cam1, right_rotation, (focal, right_centre[0], cy), self._size)
         self._warps = (left, right)
-        self.valid = left.valid, right.valid
+        self._left_valid, self._right_valid = left.valid, right.valid
 
     def __call__(self, frame: StereoFrame) -> RectifiedPair | Failed:
         """The rectified pair; Failed `wrong-size` where the images don't have the calibration's size."""
@@ -79,10 +64,13 @@ class Rectifier:
                     f"the {name} image is {image.shape[1]}x{image.shape[0]}, "
                     f"the calibration is for {size[1]}x{size[0]}",
                 )
-        left, right = frame.left, frame.right
-        if self._warps is not None:
-            left, right = self._warps[0](left), self._warps[1](right)
-        return RectifiedPair(frame.stamp_ns, left, right, *self.valid, self.camera)
+        right = frame.right if self._warps is None else self._warps[1](frame.right)
+        left = self.left(frame.left)
+        return RectifiedPair(frame.stamp_ns, left, right, self._left_valid, self._right_valid, self.camera)
+
+    def left(self, image: UInt8) -> UInt8:
+        """The left image alone, of the calibration's size."""
+        return image if self._warps is None else self._warps[0](image)
 
     def places(self, left: Float64, right: Float64) -> tuple[Float64, Float64]:
         """Where raw pixels (N, 2) of cam0 and cam1 come to lie in the rectified pair, (N, 2) each."""
@@ -130,17 +118,12 @@ def _is_rectified(rig: StereoRig) -> bool:
     return bool(same_rows and aligned and along_x and square and same_size and ideal)
 
 
-def _extent(camera: Camera, rotation: Float64, focal: float) -> tuple[list[float], list[float], list[float]]:
-    """Lowest and highest x, y that the raw picture's pixels get, px from the rectified principal point, and
-    where that point lies if the raw picture's middle stays where it is.
-    """
-    size = np.array([camera.width, camera.height])
-    pixels = np.stack(np.meshgrid(*(np.linspace(0, side - 1, _GRID) for side in size)), axis=-1)
-    ray = camera.rays(pixels.reshape(-1, 2)) @ rotation
-    places = focal * ray[:, :2] / ray[:, 2:]
-    middle, reach = places[len(places) // 2], _MOST_GROWTH * size / 2
-    low, high = (np.clip(end, middle - reach, middle + reach) for end in (places.min(0), places.max(0)))
-    return low.tolist(), high.tolist(), ((size - 1) / 2 - middle).tolist()
+def _principal_point(camera: Camera, rotation: Float64, focal: float) -> tuple[float, float]:
+    """Keeps the middle of the raw image in the middle of the rectified one."""
+    middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
+    ray = camera.rays(middle)[0] @ rotation
+    x, y = middle[0] - focal * ray[:2] / ray[2]
+    return float(x), float(y)
 
 
 def _warp(

@@ -13,10 +13,12 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64
 from barsight.core.pose import skew
 from barsight.core.types import RectifiedCamera
-from barsight.features.patches import MARGIN_PX, Located, PatchImage, PatchPair, locate, shown_whole
+from barsight.features.patches import Located, PatchImage, PatchPair, locate
 
 GATE_SIGMAS = 4.0
 MOST_OFF_ROW_PX = 1.0
+MARGIN_PX = 8.0
+"""Nearer to its border a picture doesn't show a patch whole with what its spline needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,18 +180,14 @@ def match_left(
     spread = predicted.covariance[tried, :2, :2] + sigma_px**2 * np.eye(2)
     distance2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
     pixels[tried], found[tried] = left.pixels, left.found & (distance2 < GATE_SIGMAS**2)
-    found &= shown_whole(pair.pair.left_valid, pixels)
     return pixels, found
 
 
 def match_across(pair: PatchPair, left: Float64, disparity: Float64, sure: bool = False) -> Located:
-    """Left places (N, 2), whose disparity (N,) is about known, in the right picture; found only on their row
-    and where both pictures show the patch whole.
+    """Left places (N, 2), whose disparity (N,) is about known, in the right picture; found only on their row.
 
     sure: the disparities are good to a pixel or two.
     """
     guess = np.column_stack([left[:, 0] - disparity, left[:, 1]])
     right = locate(pair.left, pair.right, left, guess, sure)
-    found = right.found & (np.abs(right.pixels[:, 1] - left[:, 1]) < MOST_OFF_ROW_PX)
-    found &= shown_whole(pair.pair.left_valid, left) & shown_whole(pair.pair.right_valid, right.pixels)
-    return replace(right, found=found)
+    return replace(right, found=right.found & (np.abs(right.pixels[:, 1] - left[:, 1]) < MOST_OFF_ROW_PX))

@@ -9,7 +9,6 @@ any fraction of a pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import cv2
@@ -20,8 +19,6 @@ from barsight.core.types import RectifiedPair
 
 HALF_PX = 5
 """A patch is 2 * HALF_PX + 1 wide."""
-MARGIN_PX = 8
-"""Nearer to its border a picture doesn't show a patch whole with what its spline needs."""
 MOST_ROWS = 64
 """A patch that covers more rows of its source isn't looked for."""
 MOST_STEPS = 15
@@ -78,20 +75,6 @@ def patch_image(image: UInt8) -> PatchImage:
 def patch_pair(pair: RectifiedPair) -> PatchPair:
     """Both pictures of a pair made ready."""
     return PatchPair(pair, patch_image(pair.left), patch_image(pair.right))
-
-
-def shown_whole(valid: Bool, pixels: Float64) -> Bool:
-    """(N,) whether the picture whose pixels are `valid` (H, W) shows the patch around each place (N, 2) with
-    what its spline needs: the corners say so, since a lens bends the border but little.
-    """
-    x, y = np.nan_to_num(np.rint(pixels), nan=-1e6).astype(np.int64).T
-    height, width = valid.shape
-    m = MARGIN_PX
-    whole: Bool = (x >= m) & (x < width - m) & (y >= m) & (y < height - m)
-    x, y = x.clip(m, width - 1 - m), y.clip(m, height - 1 - m)
-    for dx, dy in product((-m, m), repeat=2):
-        whole &= valid[y + dy, x + dx]
-    return whole
 
 
 def locate(

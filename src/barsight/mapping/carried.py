@@ -24,14 +24,12 @@ _LEAST_DIFFERENCE = 2.0
 
 
 def carried_along(
-    left: UInt8, valid: Bool, disparity_px: Float32, camera: RectifiedCamera, neighbour: UInt8,
-    neighbour_from_here: Pose,
-) -> Bool:  # fmt: skip
+    left: UInt8, disparity_px: Float32, camera: RectifiedCamera, neighbour: UInt8, neighbour_from_here: Pose
+) -> Bool:
     """(H, W) what stands still in the rectified left pictures `left` and `neighbour`, both (H, W).
 
-    valid: which pixels the raw picture has. neighbour_from_here: between the two views' rect0.
-    Nothing is found where the yard itself moves by less than `_LEAST_WAY_PX`, nor where the picture shows too
-    little to tell.
+    neighbour_from_here: between the two views' rect0. Nothing is found where the yard itself moves by less
+    than `_LEAST_WAY_PX`, nor where the picture shows too little to tell.
     """
     here, there = _shrunk(left), _shrunk(neighbour)
     first = _SHRINK // 2
@@ -52,10 +50,8 @@ def carried_along(
     way = np.hypot(at_x - u[None], at_y - v[:, None])
     place_x, place_y = (((at + 0.5) / _SHRINK - 0.5).astype(np.float32) for at in (at_x, at_y))
     # Near the border the wide mean is another picture's.
-    seen = cv2.resize(valid.view(np.uint8), here.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    around = np.ones((_SMOOTH, _SMOOTH), np.uint8)
-    inner = cv2.erode(seen, around, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    known = np.where(inner > 0, np.float32(0), np.float32(np.nan))
+    known = np.full(here.shape, np.nan, np.float32)
+    known[_SMOOTH // 2 : -(_SMOOTH // 2), _SMOOTH // 2 : -(_SMOOTH // 2)] = 0.0
     moved = cv2.remap(there + known, place_x, place_y, cv2.INTER_LINEAR, borderValue=float("nan"))
     by_motion = _difference(here, np.asarray(np.where(np.isnan(moved + known), here, moved), np.float32))
     still = np.full(here.shape, np.inf, np.float32)

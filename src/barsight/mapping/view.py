@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float32, UInt8
@@ -73,37 +71,8 @@ class Matcher:
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.watch("stereo", 1):
-            found = _matched_where_both_see(self.method, pair, candidates)
-            sure = surer_than(found, self.stereo.max_sigma_px)
+            sure = surer_than(self.method(pair, candidates), self.stereo.max_sigma_px)
             return without_gaps(sure, pair.left, self.stereo.gap_darkness)
-
-
-def _matched_where_both_see(
-    method: StereoMethod, pair: RectifiedPair, candidates: DisparityRange
-) -> Disparity:
-    """The method's match, without the columns of each picture that no candidate leads to in the other one."""
-    cut = min(max(candidates.lowest_px, 0), pair.camera.width // 2)
-    if cut == 0:
-        return method(pair, candidates)
-    camera = pair.camera
-    camera = replace(
-        camera, cx_px=camera.cx_px - cut, doffs_px=camera.doffs_px + cut, width=camera.width - cut
-    )
-    narrow = RectifiedPair(
-        pair.stamp_ns,
-        np.ascontiguousarray(pair.left[:, cut:]),
-        np.ascontiguousarray(pair.right[:, :-cut]),
-        np.ascontiguousarray(pair.left_valid[:, cut:]),
-        np.ascontiguousarray(pair.right_valid[:, :-cut]),
-        camera,
-    )
-    found = method(narrow, DisparityRange(candidates.lowest_px - cut, candidates.highest_px - cut))
-    beside = np.full((camera.height, cut), np.nan, np.float32)
-    return replace(
-        found,
-        disparity_px=np.hstack([beside, found.disparity_px + np.float32(cut)]),
-        sigma_px=np.hstack([beside, found.sigma_px]),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +103,7 @@ class Placer:
             for other, pose in beside:
                 there_from_here = (pose.reference_from_body @ self.body_from_rect0).inverse()
                 still = carried_along(
-                    pair.left, pair.left_valid, disparity.disparity_px, pair.camera, other.pair.left,
+                    pair.left, disparity.disparity_px, pair.camera, other.pair.left,
                     there_from_here @ reference_from_rect0,
                 )  # fmt: skip
                 disparity = keep(disparity, ~still)

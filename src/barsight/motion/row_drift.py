@@ -15,7 +15,7 @@ from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
-from barsight.features.patches import locate, patch_image, shown_whole
+from barsight.features.patches import locate, patch_image
 from barsight.features.tracks import TrackSettings, detect_corners
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import coarse_disparity
@@ -82,8 +82,7 @@ def match_freely(pair: RectifiedPair) -> Float64:
     start = places - np.column_stack([guess, np.zeros_like(guess)])
     right = locate(patch_image(pair.left), patch_image(pair.right), places, start)
     off = right.pixels[:, 1] - places[:, 1]
-    found = right.found & shown_whole(pair.left_valid, places) & shown_whole(pair.right_valid, right.pixels)
-    matches: Float64 = np.column_stack([right.pixels, off])[found]
+    matches: Float64 = np.column_stack([right.pixels, off])[right.found]
     return matches
 
 
