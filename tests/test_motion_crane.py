@@ -56,6 +56,22 @@ def test_the_covariance_is_right(count: int) -> None:
     assert 0.8 < np.mean(nees) < (1.5 if count == 5 else 1.2)
 
 
+def test_a_known_acceleration_leaves_less_to_find() -> None:
+    """A line's middle has 4/9 of a parabola's variance, and scatters so."""
+    rng, count = np.random.default_rng(1), 14
+    stamp, truth = START_NS + 350_000_000, place(np.array(0.35))
+    bend = 2 * np.array([-0.2, 0.1, 0.05])
+    off, stated = [], []
+    for _ in range(400):
+        fits = [fit_position(readings(count, STD_M, rng), stamp, WINDOW_NS, known) for known in (None, bend)]
+        off.append([fit.position_m - truth for fit in fits])
+        stated.append([fit.covariance[0, 0] for fit in fits])
+        np.testing.assert_array_equal(fits[1].acceleration_mps2, bend)
+    seen, stated = np.square(off).mean(axis=(0, 2)), np.mean(stated, axis=0)
+    np.testing.assert_allclose(seen / stated, 1, atol=0.15)
+    assert abs(seen[1] / seen[0] - 4 / 9) < 0.08
+
+
 @pytest.mark.parametrize("size_m", [0.05, 1.0, 100.0])
 @pytest.mark.parametrize("wild", [[5], [4, 9]])
 def test_wild_readings_dont_pull(size_m: float, wild: list[int]) -> None:
@@ -190,4 +206,5 @@ def test_the_kernels_parabola_is_the_slow_one(degree: int) -> None:
         weights = 1 / np.sqrt(1 + (np.linalg.norm(values - design @ expected, axis=1) / 0.02) ** 2)
     np.testing.assert_allclose(fitted[:, :3], expected, atol=1e-10)
     inverse = np.linalg.inv((design * used[:, None] ** 2).T @ design)
-    np.testing.assert_allclose(fitted[:, 3], inverse[:, 0], atol=1e-10)
+    less = (weights**4).sum() / (weights**2).sum()
+    np.testing.assert_allclose(fitted[:, 3], less * inverse[:, 0], atol=1e-10)

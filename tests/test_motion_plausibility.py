@@ -62,6 +62,8 @@ def test_the_noise_is_what_the_readings_show() -> None:
         seen = with_seen_noise(replace(travelling(), position_std_m=stated))
         assert seen.position_std_m == pytest.approx(0.00153, rel=0.1)
     assert with_seen_noise(replace(travelling(), position_std_m=0.02)).position_std_m == 0.01
+    wild = with_seen_noise(with_outliers(travelling(), 0.05, 0.05))
+    assert wild.position_std_m == pytest.approx(0.00153, rel=0.15)
 
 
 def test_saturated_samples_leave() -> None:

@@ -18,10 +18,10 @@ from barsight.motion import band
 from barsight.motion.gaps import Chain, with_gaps, without_gaps
 from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import marginals
-from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
+from barsight.motion.problem import Attitude, Pieces, Placed, Problem, StereoSightings
 from barsight.motion.rig_drift import HUBER_SIGMAS
 from barsight.motion.sightings import Sighting
-from barsight.motion.solver import State, optimise
+from barsight.motion.solver import State, cost_of, moved, optimise
 from barsight.motion.stereo_factors import often, start_points
 
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.3, 4.0, 640, 480)
@@ -185,6 +185,34 @@ def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
         sigma = np.sqrt(np.diag(covariance.marginalCovariance(X(k))))
         assert (np.abs(off) < 0.01 * sigma + 1e-9).all()
         np.testing.assert_allclose(np.sqrt(np.diag(found.poses[k])), sigma, rtol=0.01)
+
+
+def test_what_is_shared_costs_what_the_system_says() -> None:
+    """Slides, disparities and the drift moved a little, all else following: the cost rises as the border's
+    own matrix has it."""
+    problem, used = seen_from(6, 3, True, 0.0)
+    assert problem.sightings is not None
+    rng = np.random.default_rng(3)
+    wide = replace(problem.sightings, sigma_px=6 * problem.sightings.sigma_px)  # none beyond Huber's length
+    pieces = Pieces(rng.integers(0, 3, len(wide.first) - 1), np.array([2e-3, 3e-3, 4e-3]), 0.7, 0.2)
+    problem = replace(problem, sightings=wide, pieces=pieces)
+    graph = factors(problem)
+    state = State(start_values(problem), start_points(problem), np.zeros(2), np.zeros(6))
+    for _ in range(6):
+        state, system = optimise(problem, graph, state, used)
+    own, _ = system.schur(system.forward)
+    for axis in range(1, len(own)):
+        by = np.zeros(len(own))
+        by[axis] = 0.3 / np.sqrt(own[axis, axis])
+        held = np.zeros(len(own), np.bool_)
+        held[0] = axis > 6  # the latency may follow the drift
+        costs = [
+            cost_of(problem, graph, moved(problem, state, used, *system.step(held, fixed=side * by)), used)
+            for side in (0.0, 1.0, -1.0)
+        ]
+        left = own[axis, axis] - (own[axis, 0] ** 2 / own[0, 0] if held[0] else 0.0)
+        rise = (costs[1] + costs[2] - 2 * costs[0]) / by[axis] ** 2
+        np.testing.assert_allclose(rise, left, rtol=0.02)
 
 
 def test_the_drifts_share_is_right() -> None:

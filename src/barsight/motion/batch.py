@@ -15,10 +15,10 @@ from barsight.core.types import RigDrift
 from barsight.inertial.model import ImuBias
 from barsight.motion.detail import imu_in_sigmas, inertial, pictures_in_sigmas
 from barsight.motion.drift_search import sought
-from barsight.motion.encoders import EncoderState, agreeing, disagreement, encoder_state
+from barsight.motion.encoders import EncoderState, agreeing, disagreement, encoder_state, with_known_bends
 from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import Marginals, marginals
-from barsight.motion.problem import Problem, StereoSightings
+from barsight.motion.problem import Placed, Problem, StereoSightings
 from barsight.motion.slides import with_slides
 from barsight.motion.solver import State, optimise, sighting_residuals
 from barsight.motion.stereo_factors import nearness, often, persistence, start_points, taken_up
@@ -39,7 +39,7 @@ class Estimate:
     (F - 1, 6, 6) of a frame's pose in the frame before, in its own axes. velocity_mps: (M, 3) or
     None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
     drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
-    without. encoder_off_m: (P, 3) of each place, encoder_used: (P,) those that agree. inertial, pictures,
+    without. placed: P of them; encoder_off_m: (P, 3) of each, encoder_used: (P,) those that agree. inertial, pictures,
     imu: of the nodes, their stamps by the nodes' clock; points: (M,) sightings used at each.
     """
 
@@ -52,6 +52,7 @@ class Estimate:
     drift: RigDrift | None
     used: Bool
     encoders: EncoderState | None
+    placed: tuple[Placed, ...]
     encoder_off_m: Float64
     encoder_used: Bool
     inertial: Inertial | None
@@ -63,8 +64,8 @@ class Estimate:
 def solve(problem: Problem, frames: Int64) -> Estimate:
     """frames: (F,) the nodes whose covariance is wanted, also relative, each with the next.
 
-    After a first solution, drift of the rig included, sightings beyond 3.5 sigma leave and all sigmas
-    grow or shrink to what was seen; then the drift is sought on and weighed against its prior, and encoder
+    After a first solution, drift of the rig included, encoders' places are taken anew with the accelerations
+    it shows, sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was seen; then the drift is sought on and weighed against its prior, and encoder
     places beyond 5 sigma leave. (A cut before the drift is known would take the very sightings that show it
     best.) Raises LinAlgError where the measurements leave an unknown undetermined.
     """
@@ -78,7 +79,8 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     if problem.sightings is not None and used.any():
         if problem.has_latency and seeks_drift:
             state, system, _ = sought(problem, state, system, used, START_GAIN)
-        problem, state, system, used = _with_seen_noise(problem, problem.sightings, state, used)
+        seen, problem = problem.sightings, with_known_bends(problem, state.values)
+        problem, state, system, used = _with_seen_noise(problem, seen, state, used)
     drift: RigDrift | None = None
     everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)
     for _ in range(MOST_ROUNDS):
@@ -103,7 +105,7 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
         poses, covariances(found, shown, drift), relative(found, shown, drift, pairs), velocity, biases,
         sigma, drift, used,
         encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
-        disagreement(state.values, everywhere), agreeing(state.values, everywhere),
+        everywhere.placed, disagreement(state.values, everywhere), agreeing(state.values, everywhere),
         inertial(problem, state, everything), pictures, imu_in_sigmas(problem, state), points,
     )  # fmt: skip
 

@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
-from barsight.motion.point_kernels import Guess, Rig, Sights, rows, slide_off
+from barsight.motion.point_kernels import Guess, Rig, Sights, disparity_off, rows, slide_off
 
 
 class Reduced(NamedTuple):
     """Normal equations of poses and what is shared. band: (M, 6, 6 R) as `band.add_blocks` takes it; gradient
-    (6 M,); side (S + 2, 6 M) with what is shared; corner (S + 2, S + 2), corner_gradient (S + 2,) of itself.
+    (6 M,); side (2 S + 2, 6 M) with what is shared; corner (2 S + 2, 2 S + 2), corner_gradient (2 S + 2,) of
+    itself.
     """
 
     band: Float64
@@ -57,22 +58,22 @@ def _add_point(error: Float64, by_point: Float64, size: int, normal: Float64, gr
 
 @kernel(fastmath=True, inline=True)
 def _add_pose(
-    error: Float64, by_pose: Float64, by_point: Float64, by_drift: Float64, node: int, at: int, band: Float64,
-    gradient: Float64, side: Float64, size: int, bound: Float64,
+    error: Float64, by_pose: Float64, by_point: Float64, by_shared: Float64, node: int, first: int, at: Int64,
+    begin: int, band: Float64, gradient: Float64, side: Float64, size: int, bound: Float64,
 ) -> None:  # fmt: skip
-    """A sighting's share of its pose's own equations and of those with the drift; bound (4, 6 R) from column
-    `at` on with its point.
+    """A sighting's share of its pose's own equations and of those with what is shared (at, begin: as
+    `_take_out` has them); bound (4, 6 R) from column `first` on with its point.
     """
-    drift, own = len(side) - 2, band.shape[2] - 6
+    own = band.shape[2] - 6
     for a in range(6):
         x, y, z = by_pose[0, a], by_pose[1, a], by_pose[2, a]
         for b in range(a + 1):
             band[node, a, own + b] += x * by_pose[0, b] + y * by_pose[1, b] + z * by_pose[2, b]
         gradient[6 * node + a] += x * error[0] + y * error[1] + z * error[2]
-        side[drift, 6 * node + a] += by_drift[0] * z
-        side[drift + 1, 6 * node + a] += by_drift[1] * z
+        for c in range(max(begin, 1), 4):
+            side[at[c], 6 * node + a] += by_shared[c - 1] * z
         for b in range(size):
-            bound[b, at + a] = x * by_point[0, b] + y * by_point[1, b] + z * by_point[2, b]
+            bound[b, first + a] = x * by_point[0, b] + y * by_point[1, b] + z * by_point[2, b]
 
 
 @kernel(fastmath=True)
@@ -81,8 +82,8 @@ def _take_out(
     band: Float64, gradient: Float64, side: Float64, corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
     """Takes U^T U off, U being the factor's inverse times what the point shares: bound (4, width) with the
-    poses of nodes from `first` on, rest (4, 4) with piece, drift and gradient. at: (3,) where the shared ones
-    stand, those from `begin` on count.
+    poses of nodes from `first` on, rest (4, 5) with the piece's slide and disparity, drift and gradient. at:
+    (4,) where the shared ones stand, those from `begin` on count.
     """
     for i in range(size):
         mine = bound[i, :width]
@@ -90,12 +91,12 @@ def _take_out(
             share, other = factor[i, j], bound[j, :width]
             for a in range(width):
                 mine[a] -= share * other[a]
-            for b in range(4):
+            for b in range(5):
                 rest[i, b] -= share * rest[j, b]
         share = factor[i, i]
         for a in range(width):
             mine[a] *= share
-        for b in range(4):
+        for b in range(5):
             rest[i, b] *= share
     b0, b1, b2, b3 = bound[0, :width], bound[1, :width], bound[2, :width], bound[3, :width]
     for i in range(width // 6):
@@ -108,16 +109,16 @@ def _take_out(
             else:
                 for b in range(len(line)):
                     line[b] -= x * b0[b] + y * b1[b] + z * b2[b] + w * b3[b]
-    for c in range(begin, 4):
+    for c in range(begin, 5):
         x, y, z, w = rest[0, c], rest[1, c], rest[2, c], rest[3, c]
-        whole = gradient if c == 3 else side[at[c]]
+        whole = gradient if c == 4 else side[at[c]]
         line = whole[6 * first : 6 * first + width]
         for a in range(len(line)):
             line[a] -= x * b0[a] + y * b1[a] + z * b2[a] + w * b3[a]
-    for c in range(begin, 3):
+    for c in range(begin, 4):
         for k in range(4):
-            corner_gradient[at[c]] -= rest[k, c] * rest[k, 3]
-            for d in range(begin, 3):
+            corner_gradient[at[c]] -= rest[k, c] * rest[k, 4]
+            for d in range(begin, 4):
                 corner[at[c], at[d]] -= rest[k, c] * rest[k, d]
 
 
@@ -128,15 +129,17 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
     camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
     band, slope, side, corner, corner_slope = result
-    error, q, by_drift, by_pose, by_point = (
-        np.empty(3), np.empty(3), np.empty(2), np.empty((3, 6)), np.empty((3, 4)),
+    error, q, by_shared, by_pose, by_point = (
+        np.empty(3), np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 4)),
     )  # fmt: skip
-    normal, gradient, rest, last = np.empty((4, 4)), np.empty(4), np.empty((4, 4)), len(shared) - 1
-    bound, at = np.empty((4, band.shape[2])), np.array([0, last - 1, last])
-    begin, size = (0, 4) if last > 1 else (1, 3)
+    normal, gradient, rest, last = np.empty((4, 4)), np.empty(4), np.empty((4, 5)), len(shared) - 1
+    bound, at = np.empty((4, band.shape[2])), np.array([0, 0, last - 1, last])
+    begin, size = (0, 4) if last > 1 else (2, 3)
     for t in range(len(first) - 1):
         normal[:], gradient[:], rest[:] = 0.0, 0.0, 0.0
-        begun = end = -1
+        begun, end, off_px = -1, -1, disparity_off(shared, piece, t)
+        if begin == 0:
+            at[0], at[1] = piece[t], piece[t] + (last - 1) // 2
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
@@ -146,17 +149,20 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
                 bound[:] = 0.0
             end = n + 1
             rows(
-                lens, mount, huber, camera, points, shared, scale, stereo, weight, n, k, t, error, q, by_pose,
-                by_point, by_drift,
+                lens, mount, huber, camera, points, shared, off_px, scale, stereo, weight, n, k, t, error, q,
+                by_pose, by_point, by_shared,
             )  # fmt: skip
             _add_point(error, by_point, size, normal, gradient)
-            _add_pose(error, by_pose, by_point, by_drift, n, 6 * (n - begun), band, slope, side, size, bound)
-            for c in range(2):
-                corner_slope[last - 1 + c] += by_drift[c] * error[2]
-                for d in range(2):
-                    corner[last - 1 + c, last - 1 + d] += by_drift[c] * by_drift[d]
+            _add_pose(
+                error, by_pose, by_point, by_shared, n, 6 * (n - begun), at, begin, band, slope, side, size,
+                bound,
+            )  # fmt: skip
+            for c in range(max(begin, 1), 4):
+                corner_slope[at[c]] += by_shared[c - 1] * error[2]
+                for d in range(max(begin, 1), 4):
+                    corner[at[c], at[d]] += by_shared[c - 1] * by_shared[d - 1]
                 for a in range(size):
-                    rest[a, 1 + c] += by_drift[c] * by_point[2, a]
+                    rest[a, c] += by_shared[c - 1] * by_point[2, a]
         if begun < 0 or normal[0, 0] == 0:
             continue
         if begin == 0:
@@ -164,12 +170,11 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
             pull = held * slide_off(points, shared, piece, t)
             normal[3, 3] += held
             gradient[3] += pull
-            at[0] = piece[t]
             rest[3, 0] = -held
             corner[at[0], at[0]] += held
             corner_slope[at[0]] -= pull
         for a in range(size):
-            rest[a, 3] = gradient[a]
+            rest[a, 4] = gradient[a]
         _factorise(normal, size)
         width = 6 * (end - begun)
         _take_out(bound, width, begun, normal, size, rest, at, begin, band, slope, side, corner, corner_slope)
@@ -180,28 +185,30 @@ def substitute(
     rig: Rig, sights: Sights, guess: Guess, pose_step: Float64, shared_step: Float64, moved: Float64,
     variance: Float64,
 ) -> None:  # fmt: skip
-    """The points `moved` (T, 4) after steps (M, 6) of the poses and (S + 2,) of what is shared; variance (T,)
-    of each point's slide, all else taken as known.
+    """The points `moved` (T, 4) after steps (M, 6) of the poses and (2 S + 2,) of what is shared; variance
+    (T,) of each point's slide, all else taken as known.
     """
     lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
     camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
-    error, q, by_drift, by_pose, by_point = (
-        np.empty(3), np.empty(3), np.empty(2), np.empty((3, 6)), np.empty((3, 4)),
+    error, q, by_shared, by_pose, by_point = (
+        np.empty(3), np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 4)),
     )  # fmt: skip
     normal, gradient, last = np.empty((4, 4)), np.empty(4), len(shared_step) - 1
     size = 4 if last > 1 else 3
     for t in range(len(first) - 1):
-        normal[:], gradient[:] = 0.0, 0.0
+        normal[:], gradient[:], off_px = 0.0, 0.0, disparity_off(shared, piece, t)
+        step = disparity_off(shared_step, piece, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
             n = node[k]
             rows(
-                lens, mount, huber, camera, points, shared, scale, stereo, weight, n, k, t, error, q, by_pose,
-                by_point, by_drift,
+                lens, mount, huber, camera, points, shared, off_px, scale, stereo, weight, n, k, t, error, q,
+                by_pose, by_point, by_shared,
             )  # fmt: skip
-            error[2] += by_drift[0] * shared_step[last - 1] + by_drift[1] * shared_step[last]
+            error[2] += by_shared[0] * step + by_shared[1] * shared_step[last - 1]
+            error[2] += by_shared[2] * shared_step[last]
             for i in range(3):
                 for a in range(6):
                     error[i] += by_pose[i, a] * pose_step[n, a]

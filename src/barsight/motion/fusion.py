@@ -180,7 +180,7 @@ class FusedTrajectory:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
         from barsight.motion.batch import solve
         from barsight.motion.detail import encoders_in_sigmas
-        from barsight.motion.encoders import encoder_warnings
+        from barsight.motion.encoders import encoder_warnings, places
         from barsight.motion.problem import Attitude, Placed, Problem, StereoSightings
 
         start = start_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
@@ -190,18 +190,11 @@ class FusedTrajectory:
         else:
             known = inputs.sightings[0].stamp_ns + shift, inputs.sightings[-1].stamp_ns + shift
         ties = tied_by_imu(nodes, start, known, inputs.imu, noise)
-        placed: list[Placed] = []
+        placed: tuple[Placed, ...] = ()
         attitudes: list[Attitude] = []
         if inputs.crane is not None:
             chosen = _apart(nodes.stamp_ns, seconds_to_ns(PLACE_SPACING_S))
-            for k in chosen:
-                fit = fit_position(
-                    inputs.crane, int(nodes.stamp_ns[k]), seconds_to_ns(PLACE_SPACING_S / 2 + 0.01)
-                )
-                if not isinstance(fit, Failed):
-                    place = fit.position_m + inputs.crane.crane_to_body_m
-                    sigma = float(np.sqrt(fit.covariance[0, 0]))
-                    placed.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
+            placed = places(inputs.crane, nodes.stamp_ns, chosen)
             nominal = inputs.crane.yard_from_body_nominal
             still = [k for k in chosen if k in ties.still]
             for k in chosen:
@@ -218,16 +211,17 @@ class FusedTrajectory:
                 rectifier.body_from_rect0,
             )  # fmt: skip
         problem = Problem(
-            start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, tuple(placed),
+            start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, placed,
             tuple(attitudes), ties.still, ties.bias,
             offset_prior_px=self.settings.calibration_sigma_px, scale_prior=self.settings.scale_sigma,
-            has_latency=bool(placed), has_imu=any(part is not None for part in ties.preintegrated),
+            crane=inputs.crane, has_latency=bool(placed),
+            has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
         estimate = solve(problem, nodes.frame)
         warnings = encoder_warnings(
-            estimate.encoders, nodes.stamp_ns, problem.placed, estimate.encoder_off_m, estimate.encoder_used
+            estimate.encoders, nodes.stamp_ns, estimate.placed, estimate.encoder_off_m, estimate.encoder_used
         )
-        encoders = encoders_in_sigmas(nodes.stamp_ns, problem.placed, estimate.encoder_off_m)
+        encoders = encoders_in_sigmas(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
         return estimate, warnings, encoders
 
 

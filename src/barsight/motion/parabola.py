@@ -14,7 +14,7 @@ def fit_parabola(time: Float64, values: Float64, length: float, result: Float64)
     """By least squares with Cauchy's weights, which fall from residuals of `length` on.
 
     time: (N,), about -1...1; values (N, 3). result: (P, 4) the P coefficients, lowest power first, and the
-    inverse normal matrix's first column.
+    first column of their covariance where a reading's variance is 1.
     """
     size = len(result)
     weight, normal, power = np.ones(len(time)), np.empty((size, size)), np.empty(size)
@@ -49,3 +49,4 @@ def fit_parabola(time: Float64, values: Float64, length: float, result: Float64)
                     off = off * time[n] + result[a, c]
                 square += (values[n, c] - off) ** 2
             weight[n] = 1 / (1 + square / length**2)
+    result[:, 3] *= (weight**2).sum() / weight.sum()

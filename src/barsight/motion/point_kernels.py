@@ -46,7 +46,8 @@ class Sights(NamedTuple):
 
 class Guess(NamedTuple):
     """Where the unknowns are. camera: (M, 3, 4) left camera from reference, turn and shift; points (T, 4);
-    shared (S + 2,): the slides of S pieces of the yard, then the rig's drift.
+    shared (2 S + 2,): the slides of S pieces of the yard, what their disparity is too large by (px), then the
+    rig's drift.
     """
 
     camera: Float64
@@ -56,11 +57,12 @@ class Guess(NamedTuple):
 
 @kernel(fastmath=True, inline=True)
 def _error(
-    lens: Float64, camera: Float64, points: Float64, shared: Float64, scale: float, stereo: Float64,
-    node: int, k: int, t: int, error: Float64, q: Float64, by_drift: Float64,
+    lens: Float64, camera: Float64, points: Float64, shared: Float64, off_px: float, scale: float,
+    stereo: Float64, node: int, k: int, t: int, error: Float64, q: Float64, by_shared: Float64,
 ) -> bool:  # fmt: skip
-    """error (3,) px predicted minus seen; q (3,) the point in the left camera; by_drift (2,) px of the right
-    column. False behind the camera.
+    """error (3,) px predicted minus seen; q (3,) the point in the left camera; by_shared (3,) how the right
+    column goes with the piece's disparity, which is off_px too large, and the rig's drift. False behind the
+    camera.
     """
     x, y, z = points[t, 0], points[t, 1], points[t, 2]
     for i in range(3):
@@ -73,9 +75,10 @@ def _error(
     u = lens[0] * x + lens[1]
     # By the predicted place: by the seen one, a scale would shrink the right picture's noise and be liked.
     across = x - lens[3] / lens[0] * z
-    by_drift[0] = -lens[0] * (1 + across**2)
-    by_drift[1] = -scale * lens[3] * z
-    shift = by_drift[0] * shared[last - 1] + by_drift[1] * shared[last]
+    by_shared[0] = -1.0
+    by_shared[1] = -lens[0] * (1 + across**2)
+    by_shared[2] = -scale * lens[3] * z
+    shift = by_shared[1] * shared[last - 1] + by_shared[2] * shared[last] - off_px
     error[0] = u - slide * y - stereo[k, 0]
     error[1] = lens[0] * y + lens[2] + slide * x - stereo[k, 1]
     error[2] = u - slide * y - lens[3] * z + lens[4] + shift - stereo[k, 2]
@@ -91,20 +94,30 @@ def slide_off(points: Float64, shared: Float64, piece: Int64, t: int) -> float:
     return off
 
 
+@kernel(fastmath=True, inline=True)
+def disparity_off(shared: Float64, piece: Int64, t: int) -> float:
+    """What a point's disparity is too large by with all of its piece, px."""
+    pieces = (len(shared) - 2) // 2
+    off: float = shared[pieces + piece[t]] if pieces > 0 else 0.0
+    return off
+
+
 @kernel(fastmath=True)
 def residuals(rig: Rig, sights: Sights, guess: Guess, result: Float64) -> float:
     """Seen minus predicted (N, 3) px of the used sightings; returns their robust cost."""
     lens, huber, scale = rig.lens, rig.huber, sights.scale
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
     camera, points, shared = guess.camera, guess.points, guess.shared
-    error, q, by_drift, cost = np.empty(3), np.empty(3), np.empty(2), 0.0
+    error, q, by_shared, cost = np.empty(3), np.empty(3), np.empty(3), 0.0
     for t in range(len(first) - 1):
-        seen = False
+        seen, off_px = False, disparity_off(shared, sights.piece, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
             seen = True
-            if not _error(lens, camera, points, shared, scale, stereo, node[k], k, t, error, q, by_drift):
+            if not _error(
+                lens, camera, points, shared, off_px, scale, stereo, node[k], k, t, error, q, by_shared
+            ):
                 error[:] = BEHIND_SIGMAS / weight[k]
             total = 0.0
             for i in range(3):
@@ -120,17 +133,17 @@ def residuals(rig: Rig, sights: Sights, guess: Guess, result: Float64) -> float:
 @kernel(fastmath=True, inline=True)
 def rows(
     lens: Float64, mount: Float64, huber: float, camera: Float64, points: Float64, shared: Float64,
-    scale: float, stereo: Float64, weights: Float64, node: int, k: int, t: int, error: Float64, q: Float64,
-    by_pose: Float64, by_point: Float64, by_drift: Float64,
+    off_px: float, scale: float, stereo: Float64, weights: Float64, node: int, k: int, t: int, error: Float64,
+    q: Float64, by_pose: Float64, by_point: Float64, by_shared: Float64,
 ) -> None:  # fmt: skip
-    """The whitened error (3,) of a sighting and its derivatives: by_pose (3, 6), by_point (3, 4), by_drift
-    (2,) of its third row. q: (3,) scratch.
+    """The whitened error (3,) of a sighting and its derivatives: by_pose (3, 6), by_point (3, 4), by_shared
+    (3,) of its third row. q: (3,) scratch.
     """
-    if not _error(lens, camera, points, shared, scale, stereo, node, k, t, error, q, by_drift):
+    if not _error(lens, camera, points, shared, off_px, scale, stereo, node, k, t, error, q, by_shared):
         error[:] = 0
         by_pose[:] = 0
         by_point[:] = 0
-        by_drift[:] = 0
+        by_shared[:] = 0
         return
     weight = weights[k]
     square = (error[0] ** 2 + error[1] ** 2 + error[2] ** 2) * weight**2
@@ -155,5 +168,5 @@ def rows(
             by_point[i, j] = along * camera[node, axis, j] + deep * camera[node, 2, j]
         by_point[i, 3] = along * q[0] if i == 1 else -along * q[1]
         error[i] *= weight
-    by_drift[0] *= weight
-    by_drift[1] *= weight
+    for c in range(3):
+        by_shared[c] *= weight

@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.types import CraneSamples, RectifiedCamera
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.sightings import Sighting
@@ -88,14 +88,16 @@ class Attitude:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """What slides (`slides`). piece: (T,) 0...S-1, which piece of the yard a point is of. own_sigma_rad: (S,)
-    by how much a piece's points slide apart; share: a piece as a whole slides by this times that (1 sigma),
-    half of the variance in common with all pieces.
+    """Pieces of the yard, and what their points have in common (`slides`). piece: (T,) 0...S-1, which one a
+    point is of. own_sigma_rad: (S,) by how much a piece's points slide apart; share: a piece as a whole
+    slides by this times that (1 sigma), half of the variance in common with all pieces. disparity_sigma_px:
+    how far off its disparity may be.
     """
 
     piece: Int64
     own_sigma_rad: Float64
     share: float
+    disparity_sigma_px: float
 
     @property
     def count(self) -> int:
@@ -104,10 +106,11 @@ class Pieces:
 
     @cached_property
     def information(self) -> Float64:
-        """(S, S) the inverse of the slides' covariance."""
+        """(2 S, 2 S) the inverse of the covariance of slides and disparities."""
         alike = (np.eye(self.count) + 1) / 2
         scale = self.share * self.own_sigma_rad
-        result: Float64 = np.linalg.inv(alike) / np.outer(scale, scale)
+        result = np.eye(2 * self.count) / self.disparity_sigma_px**2
+        result[: self.count, : self.count] = np.linalg.inv(alike) / np.outer(scale, scale)
         return result
 
 
@@ -188,6 +191,8 @@ class Problem:
     """By which share baseline and encoders may disagree (1 sigma)."""
     prior: Prior | None = None
     """Takes the place of what fixes the first node, the biases and the latency."""
+    crane: CraneSamples | None = None
+    """The readings that `placed` are of."""
     pieces: Pieces | None = None
     """What slides together; None where nothing is held to slide."""
     asked: Int64 | None = None
@@ -205,8 +210,9 @@ class Problem:
 
     @property
     def border(self) -> int:
-        """Unknowns that all nodes share: the encoders' latency, the pieces' slides, the rig's drift."""
-        return int(self.has_latency) + (self.pieces.count if self.pieces else 0) + 2
+        """Unknowns that all nodes share: the encoders' latency, the pieces' slides and disparities, the
+        rig's drift."""
+        return int(self.has_latency) + (2 * self.pieces.count if self.pieces else 0) + 2
 
     @property
     def free(self) -> Bool:

@@ -21,6 +21,8 @@ SERVICE_RAD = float(np.deg2rad(0.2))
 """How far a camera may turn in service (1 sigma), where encoders are there to see it."""
 MATCHING_BIAS_PX = 0.015
 """Disparity error that matching leaves everywhere alike, whatever the calibration."""
+COMMON_BIAS_PX = 0.01
+"""What of it all pieces of the yard share, where each one's own is an unknown."""
 
 
 def columns(seen: StereoSightings) -> Float64:
@@ -35,8 +37,9 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     """The drift seen, weighed against what the calibration may be off by.
 
     Matching has a bias of its own, and another one for what lies nearer, glossy bars say: both pass for
-    drift (`_floor`). Without encoders a yaw as large as the calibration's own does too, since what
-    rectification leaves differs from place to place, and near points lie low and far ones high.
+    drift (`_floor`). Where pieces' disparities are unknowns (`slides`), only what they share does. Without
+    encoders a yaw as large as the calibration's own does too, since what rectification leaves differs from
+    place to place, and near points lie low and far ones high.
     """
     seen = problem.sightings
     assert seen is not None
@@ -44,7 +47,10 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
     yaw_prior = SERVICE_RAD if problem.has_latency else problem.offset_prior_px / focal
     prior = np.array([yaw_prior, problem.scale_prior]) ** 2
-    floor = _floor(disparity, focal)
+    everywhere_px, near_px = MATCHING_BIAS_PX, MATCHING_BIAS_PX
+    if problem.pieces is not None:
+        everywhere_px, near_px = COMMON_BIAS_PX, 0.0
+    floor = _floor(disparity, focal, everywhere_px, near_px)
     if not problem.has_latency:
         floor[0, 0] += prior[0]
     information = np.linalg.inv(covariance + floor)
@@ -56,10 +62,9 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     )
 
 
-def _floor(disparity: Float64, focal_px: float) -> Float64:
+def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:
     """(2, 2) of yaw and scale: a matching bias at the mean disparity and another over its spread."""
-    everywhere = MATCHING_BIAS_PX
-    per_px = MATCHING_BIAS_PX / max(float(disparity.std()), 1e-3)
+    per_px = near_px / max(float(disparity.std()), 1e-3)
     by = np.array([[-1 / focal_px, float(disparity.mean()) / focal_px], [0.0, -1.0]])
-    floor: Float64 = by @ np.diag([everywhere**2, per_px**2]) @ by.T
+    floor: Float64 = by @ np.diag([everywhere_px**2, per_px**2]) @ by.T
     return floor

@@ -1,8 +1,8 @@
 """Gauss-Newton over all unknowns: points taken out by kernels, the rest linearised by GTSAM.
 
 Unknowns are ordered node by node (pose, with an IMU velocity and biases), so the matrix is a band as wide as
-the longest track; the encoders' latency, the pieces' slides and the rig's drift touch many nodes and stand at
-its border.
+the longest track; the encoders' latency, what pieces of the yard share and the rig's drift touch many nodes
+and stand at its border.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ RELATIVE_GAIN = 1e-5
 @dataclass(frozen=True, eq=False)
 class State:
     """values: GTSAM's, of all but the points (T, 4; the fourth is a point's slide, rad), the rig's
-    drift (2,) and the pieces' slides (S,), rad."""
+    drift (2,) and of the pieces (2 S,) the slides, rad, and what their disparities are too large by, px."""
 
     values: Any
     points: Float64
     drift: Float64
-    slides: Float64 = field(default_factory=lambda: np.zeros(0))
+    pieces: Float64 = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def poses(self) -> Float64:
@@ -81,7 +81,7 @@ def guess_of(problem: Problem, state: State) -> Guess:
     left = state.poses[problem.kept] @ problem.sightings.body_from_rect0.matrix
     turn = left[:, :3, :3].transpose(0, 2, 1)
     camera = np.concatenate([turn, -turn @ left[:, :3, 3:]], axis=2)
-    return Guess(camera, state.points, np.concatenate([state.slides, state.drift]))
+    return Guess(camera, state.points, np.concatenate([state.pieces, state.drift]))
 
 
 def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
@@ -107,12 +107,12 @@ def optimise(
     unknown undetermined.
     """
     free = problem.free
-    cost, damping = _cost(problem, graph, state, used), 0.0
+    cost, damping = cost_of(problem, graph, state, used), 0.0
     system = linearise(problem, graph, state, used)
     for _ in range(most):
         try:
             trial = moved(problem, state, used, *system.step(free, damping))
-            lower = _cost(problem, graph, trial, used)
+            lower = cost_of(problem, graph, trial, used)
         except np.linalg.LinAlgError:
             if damping > 1:
                 raise
@@ -165,9 +165,9 @@ def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
         corner[-shared:, -shared:] += reduced.corner
         corner_gradient[-shared:] += reduced.corner_gradient
     if problem.pieces is not None:
-        slide, information = slice(border - shared, border - 2), problem.pieces.information
-        corner[slide, slide] += information
-        corner_gradient[slide] += information @ state.slides
+        own, information = slice(border - shared, border - 2), problem.pieces.information
+        corner[own, own] += information
+        corner_gradient[own] += information @ state.pieces
     if problem.prior is not None:
         _add_prior(problem.prior, state, rows, gradient, side, corner, corner_gradient)
     return System(
@@ -219,17 +219,17 @@ def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Flo
         substitute(rig, sights, guess_of(problem, state), poses, shared, points, np.empty(len(points)))
     return replace(
         state, values=state.values.retract(vectors), points=points, drift=state.drift + shared[-2:],
-        slides=state.slides + shared[:-2],
+        pieces=state.pieces + shared[:-2],
     )  # fmt: skip
 
 
-def _cost(problem: Problem, graph: Any, state: State, used: Bool) -> float:
+def cost_of(problem: Problem, graph: Any, state: State, used: Bool) -> float:
     cost = float(graph.error(state.values)) + encoders_cost(state.values, problem)
     if problem.prior is not None:
         since = _since(problem.prior, state)
         cost += float(since @ (problem.prior.gradient + problem.prior.matrix @ since / 2))
     if problem.pieces is not None:
-        cost += float(state.slides @ problem.pieces.information @ state.slides) / 2
+        cost += float(state.pieces @ problem.pieces.information @ state.pieces) / 2
     if problem.sightings is None:
         return cost
     seen, guess = problem.sightings, guess_of(problem, state)

@@ -17,8 +17,8 @@ from barsight.motion.rig_drift import LOOSE
 class System:
     """Normal equations at a state. rows: (n, w), a band as `band` has it; gradient (n,). side: (b, n) with
     the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one, the
-    pieces' slides, then the rig's drift. size: unknowns a node. kept: (K,) the nodes that the band is of;
-    gaps: those between. nodes: how many in all.
+    pieces' slides and disparities, then the rig's drift. size: unknowns a node. kept: (K,) the nodes that
+    the band is of; gaps: those between. nodes: how many in all.
     """
 
     rows: Float64
