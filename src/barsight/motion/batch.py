@@ -39,8 +39,9 @@ class Estimate:
     (F - 1, 6, 6) of a frame's pose in the frame before, in its own axes. velocity_mps: (M, 3) or
     None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
     drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
-    without. placed: P of them; encoder_off_m: (P, 3) of each, encoder_used: (P,) those that agree. inertial, pictures,
-    imu: of the nodes, their stamps by the nodes' clock; points: (M,) sightings used at each.
+    without. placed: P of them; encoder_off_m: (P, 3) of each, encoder_used: (P,) those that agree.
+    inertial, pictures, imu: of the nodes, their stamps by the nodes' clock; points: (M,) sightings used at
+    each.
     """
 
     poses: tuple[Pose, ...]
@@ -65,9 +66,10 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     """frames: (F,) the nodes whose covariance is wanted, also relative, each with the next.
 
     After a first solution, drift of the rig included, encoders' places are taken anew with the accelerations
-    it shows, sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was seen; then the drift is sought on and weighed against its prior, and encoder
-    places beyond 5 sigma leave. (A cut before the drift is known would take the very sightings that show it
-    best.) Raises LinAlgError where the measurements leave an unknown undetermined.
+    it shows, sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was seen; then the drift
+    is sought on and weighed against its prior, and encoder places beyond 5 sigma leave. (A cut before the
+    drift is known would take the very sightings that show it best.) Raises LinAlgError where the
+    measurements leave an unknown undetermined.
     """
     problem = replace(problem, asked=frames)
     used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
