@@ -19,6 +19,7 @@ from barsight.motion.encoders import EncoderState, agreeing, disagreement, encod
 from barsight.motion.graph import factors, start_values
 from barsight.motion.marginals import Marginals, marginals
 from barsight.motion.problem import Placed, Problem, StereoSightings
+from barsight.motion.rig_drift import with_own_bias
 from barsight.motion.slides import with_slides
 from barsight.motion.solver import State, optimise, sighting_residuals
 from barsight.motion.stereo_factors import nearness, often, persistence, start_points, taken_up
@@ -105,7 +106,7 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     pictures, points = pictures_in_sigmas(problem, state, used)
     return Estimate(
         poses, covariances(found, shown, drift), relative(found, shown, drift, pairs), velocity, biases,
-        sigma, drift, used,
+        sigma, drift and with_own_bias(drift, problem), used,
         encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
         everywhere.placed, disagreement(state.values, everywhere), agreeing(state.values, everywhere),
         inertial(problem, state, everything), pictures, imu_in_sigmas(problem, state), points,

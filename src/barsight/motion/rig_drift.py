@@ -7,6 +7,8 @@ proportion to the disparity).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from barsight.core.arrays import Float64
@@ -60,6 +62,19 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     return RigDrift(
         float(yaw), float(scale), combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency)
     )
+
+
+def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
+    """The drift as it is told: by it people judge heights, which what single pieces' disparities are off by
+    falsifies too.
+    """
+    seen = problem.sightings
+    if problem.pieces is None or seen is None:
+        return drift
+    disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
+    own_px = float(np.sqrt(MATCHING_BIAS_PX**2 - COMMON_BIAS_PX**2))
+    floor = _floor(disparity, seen.camera.focal_px, own_px, MATCHING_BIAS_PX)
+    return replace(drift, covariance=drift.covariance + floor)
 
 
 def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:
