@@ -74,7 +74,9 @@ def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
     own_px = float(np.sqrt(MATCHING_BIAS_PX**2 - COMMON_BIAS_PX**2))
     floor = _floor(disparity, seen.camera.focal_px, own_px, MATCHING_BIAS_PX)
-    return replace(drift, covariance=drift.covariance + floor)
+    prior = np.diag(drift.prior_sigma**-2)
+    shown = np.linalg.inv(np.linalg.inv(drift.covariance) - prior) + floor
+    return replace(drift, covariance=np.linalg.inv(np.linalg.inv(shown) + prior).astype(np.float64))
 
 
 def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:
