@@ -1,6 +1,8 @@
 """Yaw and scale of the rig from known travel: errors as large as stated, and what follows from them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ from barsight.features.guided import project_stereo
 from barsight.motion import fusion
 from barsight.motion.crane import CraneSettings
 from barsight.motion.fusion import FusedTrajectory, FusionSettings
-from barsight.motion.rig_drift import MATCHING_BIAS_PX
+from barsight.motion.problem import Problem
+from barsight.motion.rig_drift import MATCHING_BIAS_PX, weigh, with_own_bias
 from barsight.motion.self_calibration import is_drifted, left_open_px, self_calibrated, turned_right
 from barsight.motion.sightings import Sighting
 from motion_recordings import MemoryRecording, ideal_rig
@@ -118,6 +121,21 @@ def test_the_turned_rig_takes_the_yaw_off() -> None:
     cam1_from_cam0 = true.cam0_from_cam1.inverse()
     raw = RIG.cam1.project(cam1_from_cam0.apply(point))[0, 0] - RIG.cam0.project(point)[0, 0]
     assert abs(raw + 1250 * 0.4 / 7 + 1250 * yaw) < 0.05
+
+
+def test_the_drift_is_told_as_if_pieces_were_not_unknowns() -> None:
+    """What single pieces' disparities are off by falsifies heights whether or not the estimate knows it."""
+    disparity = np.random.default_rng(4).uniform(60, 100, 500)
+    stereo = np.column_stack([disparity, np.zeros(500), np.zeros(500)])
+    seen = SimpleNamespace(stereo=stereo, camera=Rectifier(RIG).camera)
+    without = SimpleNamespace(sightings=seen, has_latency=True, scale_prior=5e-4, pieces=None)
+    with_pieces = SimpleNamespace(**{**vars(without), "pieces": ()})
+    theta, covariance = np.array([1e-4, 2e-4]), np.array([[4e-10, 1e-9], [1e-9, 9e-8]])
+    inside = weigh(theta, covariance, cast(Problem, with_pieces))
+    told = with_own_bias(inside, cast(Problem, with_pieces))
+    expected = weigh(theta, covariance, cast(Problem, without))
+    assert told.yaw_sigma_rad > 1.2 * inside.yaw_sigma_rad
+    np.testing.assert_allclose(told.covariance, expected.covariance, rtol=1e-6)
 
 
 def shown(yaw_px: float, yaw_sigma_px: float, scale_sigma: float = 1e-9) -> RigDrift:
