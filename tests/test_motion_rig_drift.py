@@ -136,6 +136,7 @@ def test_the_drift_is_told_as_if_pieces_were_not_unknowns() -> None:
     expected = weigh(theta, covariance, cast(Problem, without))
     assert told.yaw_sigma_rad > 1.2 * inside.yaw_sigma_rad
     np.testing.assert_allclose(told.covariance, expected.covariance, rtol=1e-6)
+    np.testing.assert_allclose([told.yaw_rad, told.scale], [expected.yaw_rad, expected.scale], rtol=1e-6)
 
 
 def shown(yaw_px: float, yaw_sigma_px: float, scale_sigma: float = 1e-9) -> RigDrift:

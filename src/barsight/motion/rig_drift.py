@@ -74,9 +74,13 @@ def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
     own_px = float(np.sqrt(MATCHING_BIAS_PX**2 - COMMON_BIAS_PX**2))
     floor = _floor(disparity, seen.camera.focal_px, own_px, MATCHING_BIAS_PX)
-    prior = np.diag(drift.prior_sigma**-2)
-    shown = np.linalg.inv(np.linalg.inv(drift.covariance) - prior) + floor
-    return replace(drift, covariance=np.linalg.inv(np.linalg.inv(shown) + prior).astype(np.float64))
+    known, prior = np.linalg.inv(drift.covariance), np.diag(drift.prior_sigma**-2)
+    seen_alone = np.linalg.inv(known - prior)
+    theta = seen_alone @ known @ np.array([drift.yaw_rad, drift.scale])
+    information = np.linalg.inv(seen_alone + floor)
+    combined = np.linalg.inv(information + prior).astype(np.float64)
+    yaw, scale = combined @ information @ theta
+    return replace(drift, yaw_rad=float(yaw), scale=float(scale), covariance=combined)
 
 
 def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:
