@@ -150,7 +150,7 @@ def measure(
                 correct=settings.self_calibrate == "yaw",
             )  # fmt: skip
             rectifier = calibrated.rectifier
-            stereo = settings.stereo.with_calibration(calibrated.sigma_px)
+            stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
         taken = apart(trajectory.frames, rectifier, first.range_m, settings.map.least_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
         late = min((stamp for stamp in poses if stamp not in early), default=None)

@@ -55,13 +55,9 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     floor = _floor(disparity, focal, everywhere_px, near_px)
     if not problem.has_latency:
         floor[0, 0] += prior[0]
-    information = np.linalg.inv(covariance + floor)
-    combined = np.linalg.inv(information + np.diag(1 / prior))
-    yaw, scale = combined @ information @ theta
+    yaw, scale, combined = _weighed(theta, covariance + floor, np.diag(1 / prior))
     range_m = focal * baseline / float(np.median(disparity))
-    return RigDrift(
-        float(yaw), float(scale), combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency)
-    )
+    return RigDrift(yaw, scale, combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency))
 
 
 def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
@@ -77,10 +73,16 @@ def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
     known, prior = np.linalg.inv(drift.covariance), np.diag(drift.prior_sigma**-2)
     seen_alone = np.linalg.inv(known - prior)
     theta = seen_alone @ known @ np.array([drift.yaw_rad, drift.scale])
-    information = np.linalg.inv(seen_alone + floor)
+    yaw, scale, combined = _weighed(theta, seen_alone + floor, prior)
+    return replace(drift, yaw_rad=yaw, scale=scale, covariance=combined)
+
+
+def _weighed(theta: Float64, covariance: Float64, prior: Float64) -> tuple[float, float, Float64]:
+    """Yaw, scale and their covariance (2, 2), from those seen, their covariance and the prior information."""
+    information = np.linalg.inv(covariance)
     combined = np.linalg.inv(information + prior).astype(np.float64)
     yaw, scale = combined @ information @ theta
-    return replace(drift, yaw_rad=float(yaw), scale=float(scale), covariance=combined)
+    return float(yaw), float(scale), combined
 
 
 def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:

@@ -56,10 +56,6 @@ class StereoSettings:
         if not 0 <= self.gap_darkness < 1:
             raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
 
-    def with_calibration(self, sigma_px: float) -> StereoSettings:
-        """The same with another sigma of the calibration."""
-        return replace(self, calibration_sigma_px=sigma_px)
-
     def for_map(self) -> StereoSettings:
         """The same without guesses, which no map takes, and as sure of a pixel's side as if there were no
         edge: a map holds the views' sides against each other.
