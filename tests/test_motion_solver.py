@@ -17,7 +17,7 @@ from barsight.inertial.model import ImuBias
 from barsight.motion import band
 from barsight.motion.gaps import Chain, with_gaps, without_gaps
 from barsight.motion.graph import factors, start_values
-from barsight.motion.marginals import marginals
+from barsight.motion.marginals import marginals, piece_variances
 from barsight.motion.problem import Attitude, Pieces, Placed, Problem, StereoSightings
 from barsight.motion.rig_drift import HUBER_SIGMAS
 from barsight.motion.sightings import Sighting
@@ -46,17 +46,19 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
     matrix, rows = banded(rng, n, width)
     right = rng.normal(size=(2, n))
     expected = np.linalg.solve(matrix, right.T).T
-    assert band.factorise(rows)
+    factor = band.even(rows)
+    assert band.factorise(factor)
     beside = right.T.copy()
-    band.solve_forward(rows, beside)
-    band.solve_back(rows, beside)
+    band.solve_forward(factor, beside)
+    band.solve_back(factor, beside)
     right = beside.T
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     blocks = np.empty((n // 3, 3, 3))
     pairs = np.array([[k, k + 1] for k in range(n // 3 - 1)], np.int64).reshape(-1, 2)
-    cross = np.empty((len(pairs), 3, 3))
-    band.inverse_blocks(rows, 3, blocks, pairs, cross)
+    cross, diagonal = np.empty((len(pairs), 3, 3)), np.empty(n)
+    band.inverse_blocks(factor, np.arange(0, n, 3), diagonal, blocks, pairs, cross)
     inverse = np.linalg.inv(matrix)
+    np.testing.assert_allclose(diagonal, np.diag(inverse), rtol=1e-8)
     for k, block in enumerate(cross):
         whole = inverse[3 * k : 3 * k + 3, 3 * k + 3 : 3 * k + 6]
         near = np.subtract.outer(np.arange(3), np.arange(3, 6)) > -width
@@ -70,7 +72,32 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
 
 def test_an_undetermined_band_is_told() -> None:
     rows = np.array([[0.0, 1.0], [1.0, 1.0]])
-    assert not band.factorise(rows)
+    assert not band.factorise(band.even(rows))
+
+
+def test_rows_that_begin_late_are_solved_like_a_dense_matrix() -> None:
+    """Rows of all lengths; the inverse's diagonal too."""
+    rng, n = np.random.default_rng(5), 40
+    first = np.array([rng.integers(max(0, i - 17), i + 1) for i in range(n)])
+    held = np.arange(n) >= first[:, None]
+    matrix = np.where(held, np.tril(rng.normal(size=(n, n)), -1), 0)
+    matrix = matrix + matrix.T
+    matrix += np.diag(np.abs(matrix).sum(axis=1) + 0.5)
+    factor = band.empty(first)
+    for i in range(n):
+        factor.values[factor.offset[i] + np.arange(first[i], i + 1)] = matrix[i, first[i] : i + 1]
+    again = np.empty((n, n))
+    band.whole(factor, again)
+    np.testing.assert_array_equal(again, matrix)
+    right = rng.normal(size=(n, 2))
+    expected = np.linalg.solve(matrix, right)
+    assert band.factorise(factor)
+    band.solve_forward(factor, right)
+    band.solve_back(factor, right)
+    np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
+    diagonal, none = np.empty(n), np.empty((0, 1, 1))
+    band.inverse_blocks(factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none)
+    np.testing.assert_allclose(diagonal, np.diag(np.linalg.inv(matrix)), rtol=1e-9)
 
 
 def test_nodes_between_frames_are_taken_out() -> None:
@@ -188,8 +215,8 @@ def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
 
 
 def test_what_is_shared_costs_what_the_system_says() -> None:
-    """Slides, disparities and the drift moved a little, all else following: the cost rises as the border's
-    own matrix has it."""
+    """Slides, disparities and the drift pulled at a little, all else but the drift following: they move, and
+    the cost rises, as their variances have it."""
     problem, used = seen_from(6, 3, True, 0.0)
     assert problem.sightings is not None
     rng = np.random.default_rng(3)
@@ -200,17 +227,35 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
     state = State(start_values(problem), start_points(problem), np.zeros(2), np.zeros(6))
     for _ in range(6):
         state, system = optimise(problem, graph, state, used)
+    at, weights = system.layout.pieces, np.array([1 / 2e-3, 1 / 3e-3, 1 / 4e-3, 0.5, -1.0, 2.0])
+    variances, of_sum = piece_variances(system, weights)
+
+    def check(pulls: np.ndarray, variance: float) -> None:
+        gradient = np.zeros_like(system.gradient)
+        gradient[at] = pulls / np.sqrt(variance)
+        pulled = replace(system, gradient=gradient, corner_gradient=np.zeros(4))
+        step = pulled.step(problem.free)
+        np.testing.assert_allclose(step[1] @ pulls, -np.sqrt(variance), rtol=1e-6)
+        costs = []
+        for side in (0.0, 0.3, -0.3):
+            there = moved(problem, state, used, *(side * part for part in step))
+            costs.append(cost_of(problem, graph, there, used))
+        np.testing.assert_allclose((costs[1] + costs[2] - 2 * costs[0]) / 0.3**2, 1.0, rtol=0.02)
+
+    for axis in range(6):
+        check(np.eye(6)[axis], variances[axis])
+    check(weights, of_sum)
     own, _ = system.schur(system.forward)
-    for axis in range(1, len(own)):
-        by = np.zeros(len(own))
+    for axis in (2, 3):
+        by = np.zeros(4)
         by[axis] = 0.3 / np.sqrt(own[axis, axis])
-        held = np.zeros(len(own), np.bool_)
-        held[0] = axis > 6  # the latency may follow the drift
         costs = [
-            cost_of(problem, graph, moved(problem, state, used, *system.step(held, fixed=side * by)), used)
-            for side in (0.0, 1.0, -1.0)
+            cost_of(
+                problem, graph, moved(problem, state, used, *system.step(problem.free, fixed=s * by)), used
+            )
+            for s in (0.0, 1.0, -1.0)
         ]
-        left = own[axis, axis] - (own[axis, 0] ** 2 / own[0, 0] if held[0] else 0.0)
+        left = own[axis, axis] - own[axis, :2] @ np.linalg.solve(own[:2, :2], own[:2, axis])
         rise = (costs[1] + costs[2] - 2 * costs[0]) / by[axis] ** 2
         np.testing.assert_allclose(rise, left, rtol=0.02)
 

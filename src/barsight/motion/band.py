@@ -1,75 +1,105 @@
-"""Symmetric band matrices: Cholesky's factor, its solutions, and the inverse within the band.
+"""Symmetric matrices of which each row begins late: Cholesky's factor, its solutions, and the inverse within.
 
-A matrix (n, n) of half-width w lies in rows (n, w): `rows[i, w - 1 - (i - j)]` is its element (i, j), j <= i.
-Plain loops: the bands are a few hundred wide, where BLAS's threads cost more than they bring.
+A factor's rows begin where the matrix's do [Jennings 1966], so nothing before is stored or worked on. Plain
+loops: rows are a few hundred long, where BLAS's threads cost more than they bring.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
 
 
+class Band(NamedTuple):
+    """The lower half of a symmetric matrix (n, n). first: (n,) each row's first column that may be filled;
+    element (i, j), first[i] <= j <= i, is `values[offset[i] + j]`.
+    """
+
+    values: Float64
+    first: Int64
+    offset: Int64
+
+
+def empty(first: Int64) -> Band:
+    """Zeros."""
+    index = np.arange(len(first))
+    end = np.cumsum(index - first + 1)
+    return Band(np.zeros(end[-1] if len(end) else 0), first, end - index - 1)
+
+
+def even(rows: Float64) -> Band:
+    """A matrix of one half-width w as a band, the same memory: rows (n, w), `rows[i, w - 1 - (i - j)]` is
+    its element (i, j).
+    """
+    return Band(rows.reshape(-1), *_even(*rows.shape))
+
+
+@lru_cache(maxsize=256)
+def _even(n: int, width: int) -> tuple[Int64, Int64]:
+    index = np.arange(n)
+    return np.maximum(index - width + 1, 0), (index + 1) * (width - 1)
+
+
 @kernel(fastmath=True)
-def factorise(rows: Float64) -> bool:
+def factorise(band: Band) -> bool:
     """Replaces the matrix by its lower factor; false where it isn't positive definite."""
-    n, width = rows.shape
-    for i in range(n):
-        first = max(0, i - width + 1)
-        for j in range(first, i + 1):
-            begin = max(first, j - width + 1)
-            mine = rows[i, begin - i + width - 1 : j - i + width - 1]
-            other = rows[j, begin - j + width - 1 : width - 1]
+    values, first, offset = band
+    for i in range(len(first)):
+        for j in range(first[i], i + 1):
+            begin = max(first[i], first[j])
+            mine = values[offset[i] + begin : offset[i] + j]
+            other = values[offset[j] + begin : offset[j] + j]
             total = 0.0
             for k in range(len(mine)):
                 total += mine[k] * other[k]
-            left = rows[i, j - i + width - 1] - total
+            left = values[offset[i] + j] - total
             if j < i:
-                rows[i, j - i + width - 1] = left / rows[j, width - 1]
+                values[offset[i] + j] = left / values[offset[j] + j]
             elif left <= 0:
                 return False
             else:
-                rows[i, width - 1] = np.sqrt(left)
+                values[offset[i] + i] = np.sqrt(left)
     return True
 
 
 @kernel(fastmath=True)
-def solve_forward(factor: Float64, x: Float64) -> None:
+def solve_forward(factor: Band, x: Float64) -> None:
     """Replaces x (n, m), right sides beside each other so that the factor is read once for all of them, by
     the factor's inverse times these. Four rows at a time, so that the sums stay in the registers.
     """
-    n, width = factor.shape
+    values, first, offset = factor
     sides = x.shape[1]
-    for i in range(n):
-        first = max(0, i - width + 1)
-        own = i - width + 1
-        fours = first + (i - first) // 4 * 4
-        for k in range(first, fours, 4):
-            p, q = factor[i, k - own], factor[i, k + 1 - own]
-            r, s = factor[i, k + 2 - own], factor[i, k + 3 - own]
+    for i in range(len(first)):
+        own, begin = offset[i], first[i]
+        fours = begin + (i - begin) // 4 * 4
+        for k in range(begin, fours, 4):
+            p, q, r, s = values[own + k], values[own + k + 1], values[own + k + 2], values[own + k + 3]
             for c in range(sides):
                 x[i, c] -= p * x[k, c] + q * x[k + 1, c] + r * x[k + 2, c] + s * x[k + 3, c]
         for k in range(fours, i):
-            p = factor[i, k - own]
+            p = values[own + k]
             for c in range(sides):
                 x[i, c] -= p * x[k, c]
-        p = 1 / factor[i, width - 1]
+        p = 1 / values[own + i]
         for c in range(sides):
             x[i, c] *= p
 
 
 @kernel(fastmath=True)
-def solve_back(factor: Float64, x: Float64) -> None:
+def solve_back(factor: Band, x: Float64) -> None:
     """Replaces x (n, m) by the inverse of the factor's transpose times it."""
-    n, width = factor.shape
+    values, first, offset = factor
     sides = x.shape[1]
-    for i in range(n - 1, -1, -1):
-        p = 1 / factor[i, width - 1]
+    for i in range(len(first) - 1, -1, -1):
+        p = 1 / values[offset[i] + i]
         for c in range(sides):
             x[i, c] *= p
-        for k in range(max(0, i - width + 1), i):
-            share = factor[i, k - i + width - 1]
+        for k in range(first[i], i):
+            share = values[offset[i] + k]
             for c in range(sides):
                 x[k, c] -= share * x[i, c]
 
@@ -86,41 +116,54 @@ def products(x: Float64, result: Float64) -> None:
 
 
 @kernel(fastmath=True)
-def inverse_blocks(factor: Float64, size: int, blocks: Float64, pairs: Int64, cross: Float64) -> None:
-    """blocks: (n / size, size, size) those on the inverse's diagonal, from the last column back [Takahashi
-    1973]: only the inverse's elements within the band are needed. cross: (P, size, size) those in the rows of
-    block pairs[:, 0] and the columns of the later pairs[:, 1]; NaN beyond the band.
+def inverse_blocks(
+    factor: Band, at: Int64, diagonal: Float64, blocks: Float64, pairs: Int64, cross: Float64
+) -> None:
+    """Parts of the inverse, from the last column back [Takahashi 1973]: only its elements within the band
+    are needed, and of these only those of the rows that a column reaches. diagonal: (n,). blocks: (K, b, b)
+    of the unknowns from at[k] on, at ascending; cross: (P, b, b) those in the rows of block pairs[:, 0],
+    ascending, and the columns of the later pairs[:, 1]; NaN beyond the band.
     """
-    n, width = factor.shape
-    inverse = np.zeros((n, 2 * width - 1))  # element (i, j) at [i, j - i + width - 1], both halves
-    column, sums = np.empty(width), np.empty(width)
+    values, first, offset = factor
+    n, size = len(first), blocks.shape[1]
+    reach = 1
+    for i in range(n):
+        reach = max(reach, i - first[i] + 1)
+    held = reach + size
+    near = np.zeros((held, held))  # element (i, j) at [i % held, j % held]
+    column, below, sums = np.zeros(held), np.empty(held, np.int64), np.empty(held)
+    block, pair = len(blocks) - 1, len(pairs) - 1
     for j in range(n - 1, -1, -1):
-        own = factor[j, width - 1]
-        count = min(width - 1, n - 1 - j)
-        for k in range(count):
-            column[k] = factor[j + 1 + k, width - 2 - k] / own
-        for i in range(count):
-            row = inverse[j + 1 + i, width - 1 - i : width - 1 - i + count]
-            total = 0.0
-            for k in range(count):
+        own, count = values[offset[j] + j], 0
+        column[:] = 0.0
+        for i in range(j + 1, min(n, j + reach)):
+            if first[i] <= j:
+                below[count] = i % held
+                column[below[count]] = values[offset[i] + j] / own
+                count += 1
+        here, spread = j % held, 1 / own**2
+        for a in range(count):
+            row, total = near[below[a]], 0.0
+            for k in range(held):
                 total += column[k] * row[k]
-            sums[i] = -total
-        diagonal = 1 / own**2
-        for i in range(count):
-            inverse[j + 1 + i, width - 2 - i] = inverse[j, width + i] = sums[i]
-            diagonal -= column[i] * sums[i]
-        inverse[j, width - 1] = diagonal
-    for b in range(len(blocks)):
+            sums[a] = total
+        for a in range(count):
+            near[below[a], here] = near[here, below[a]] = -sums[a]
+            spread += column[below[a]] * sums[a]
+        near[here, here] = diagonal[j] = spread
+        if block < 0 or at[block] != j:
+            continue
         for i in range(size):
-            for j in range(size):
-                blocks[b, i, j] = inverse[b * size + i, j - i + width - 1]
-    for p in range(len(pairs)):
-        apart = (pairs[p, 1] - pairs[p, 0]) * size
-        for i in range(size):
-            for j in range(size):
-                within = apart + j - i < width
-                row = pairs[p, 0] * size + i
-                cross[p, i, j] = inverse[row, apart + j - i + width - 1] if within else np.nan
+            for k in range(size):
+                blocks[block, i, k] = near[(j + i) % held, (j + k) % held]
+        while pair >= 0 and pairs[pair, 0] == block:
+            for k in range(size):
+                later = at[pairs[pair, 1]] + k
+                for i in range(size):
+                    within = first[later] <= j + i
+                    cross[pair, i, k] = near[(j + i) % held, later % held] if within else np.nan
+            pair -= 1
+        block -= 1
 
 
 @kernel(fastmath=True)
@@ -128,8 +171,8 @@ def add_products(
     first: Int64, at: Int64, values: Float64, right: Float64, rows: Float64, gradient: Float64,
     side: Float64, corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
-    """Adds the normal equations of sparse rows: row r has values[k] at unknown at[k], first[r] <= k <
-    first[r + 1], and `right`. Unknown n, one after the band's, is the border's first.
+    """Adds the normal equations of sparse rows to those of one half-width (`even`): row r has values[k] at
+    unknown at[k], first[r] <= k < first[r + 1], and `right`. Unknown n, after the band's, is the border's.
     """
     n, width = rows.shape
     for r in range(len(right)):
@@ -150,35 +193,31 @@ def add_products(
 
 
 @kernel(fastmath=True)
-def add_blocks(blocks: Float64, size: int, rows: Float64) -> None:
-    """Adds blocks (M, b, R b): of node k's first b unknowns with those of the nodes k - R + 1...k; a node has
-    `size` unknowns. Of its own block the lower half counts.
-    """
-    width, own = rows.shape[1], blocks.shape[1]
-    reach = blocks.shape[2] // own
-    for k in range(blocks.shape[0]):
-        for s in range(min(reach, k + 1)):
-            for i in range(own):
-                row, begin = k * size + i, (reach - 1 - s) * own
-                column = row - i - s * size
-                for j in range(i + 1 if s == 0 else own):
-                    rows[row, column + j - row + width - 1] += blocks[k, i, begin + j]
+def add_chain(rows: Float64, at: Int64, band: Band) -> None:
+    """Adds a chain (M n, 2 n) of nodes that bind their neighbours, each node's unknowns from at[k] on."""
+    size = rows.shape[1] // 2
+    for k in range(len(at)):
+        for i in range(size):
+            row, line = at[k] + i, rows[k * size + i]
+            for j in range(i + 1):
+                band.values[band.offset[row] + at[k] + j] += line[2 * size - 1 - i + j]
+            if k > 0:
+                for j in range(size):
+                    band.values[band.offset[row] + at[k - 1] + j] += line[size - 1 - i + j]
 
 
 @kernel(fastmath=True)
-def add_dense(matrix: Float64, count: int, rows: Float64) -> None:
+def add_dense(matrix: Float64, count: int, band: Band) -> None:
     """Adds a symmetric matrix's first `count` unknowns to the band's first ones."""
-    width = rows.shape[1]
     for i in range(count):
         for j in range(i + 1):
-            rows[i, j - i + width - 1] += matrix[i, j]
+            band.values[band.offset[i] + j] += matrix[i, j]
 
 
 @kernel()
-def whole(rows: Float64, result: Float64) -> None:
+def whole(band: Band, result: Float64) -> None:
     """The matrix (n, n), both halves, zero beyond the band."""
-    n, width = rows.shape
     result[:] = 0
-    for i in range(n):
-        for j in range(max(0, i - width + 1), i + 1):
-            result[i, j] = result[j, i] = rows[i, j - i + width - 1]
+    for i in range(len(band.first)):
+        for j in range(band.first[i], i + 1):
+            result[i, j] = result[j, i] = band.values[band.offset[i] + j]

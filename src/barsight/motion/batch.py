@@ -99,7 +99,7 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     pairs = np.column_stack([np.arange(len(frames) - 1), np.arange(1, len(frames))])
     poses, found = _poses(state, problem), marginals(system, pairs)
     shown = tuple(poses[k] for k in frames)
-    everything = np.full((len(poses), system.size, system.size), np.nan)
+    everything = np.full((len(poses), system.layout.size, system.layout.size), np.nan)
     everything[frames] = found.nodes
     velocity, biases = _inertial(state, problem)
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0

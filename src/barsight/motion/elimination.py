@@ -13,20 +13,36 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
+from barsight.motion.band import Band
+from barsight.motion.layout import Layout
 from barsight.motion.point_kernels import Guess, Rig, Sights, disparity_off, rows, slide_off
 
 
 class Reduced(NamedTuple):
-    """Normal equations of poses and what is shared. band: (M, 6, 6 R) as `band.add_blocks` takes it; gradient
-    (6 M,); side (2 S + 2, 6 M) with what is shared; corner (2 S + 2, 2 S + 2), corner_gradient (2 S + 2,) of
-    itself.
+    """Normal equations of poses and what is shared. band: (M, 6, 6 R) of each pose with those of the nodes
+    k - R + 1...k, of its own block the lower half; gradient (6 M,). What points of S pieces (one where there
+    are none) say of their piece's slide and disparity and of the rig's drift: side (S, 4, 6 Q) with the Q
+    poses from node `first` (S,) on; corner (S, 4, 4), corner_gradient (S, 4) of itself.
     """
 
     band: Float64
     gradient: Float64
+    first: Int64
     side: Float64
     corner: Float64
     corner_gradient: Float64
+
+    @classmethod
+    def empty(cls, layout: Layout) -> Reduced:
+        """Zeros."""
+        nodes = len(layout.node)
+        first, longest = np.zeros(1, np.int64), nodes
+        if len(layout.seen):
+            first, longest = layout.seen[:, 0].copy(), int((layout.seen[:, 1] - layout.seen[:, 0]).max()) + 1
+        return cls(
+            np.zeros((nodes, 6, 6 * layout.reach)), np.zeros(6 * nodes), first,
+            np.zeros((len(first), 4, 6 * longest)), np.zeros((len(first), 4, 4)), np.zeros((len(first), 4)),
+        )  # fmt: skip
 
 
 @kernel(fastmath=True, inline=True)
@@ -58,10 +74,11 @@ def _add_point(error: Float64, by_point: Float64, size: int, normal: Float64, gr
 
 @kernel(fastmath=True, inline=True)
 def _add_pose(
-    error: Float64, by_pose: Float64, by_point: Float64, by_shared: Float64, node: int, first: int, at: Int64,
-    begin: int, band: Float64, gradient: Float64, side: Float64, size: int, bound: Float64,
+    error: Float64, by_pose: Float64, by_point: Float64, by_shared: Float64, node: int, first: int,
+    piece: int, since: int, begin: int, band: Float64, gradient: Float64, side: Float64, size: int,
+    bound: Float64,
 ) -> None:  # fmt: skip
-    """A sighting's share of its pose's own equations and of those with what is shared (at, begin: as
+    """A sighting's share of its pose's own equations and of those with what is shared (since, begin: as
     `_take_out` has them); bound (4, 6 R) from column `first` on with its point.
     """
     own = band.shape[2] - 6
@@ -71,19 +88,20 @@ def _add_pose(
             band[node, a, own + b] += x * by_pose[0, b] + y * by_pose[1, b] + z * by_pose[2, b]
         gradient[6 * node + a] += x * error[0] + y * error[1] + z * error[2]
         for c in range(max(begin, 1), 4):
-            side[at[c], 6 * node + a] += by_shared[c - 1] * z
+            side[piece, c, 6 * (node - since) + a] += by_shared[c - 1] * z
         for b in range(size):
             bound[b, first + a] = x * by_point[0, b] + y * by_point[1, b] + z * by_point[2, b]
 
 
 @kernel(fastmath=True)
 def _take_out(
-    bound: Float64, width: int, first: int, factor: Float64, size: int, rest: Float64, at: Int64, begin: int,
+    bound: Float64, width: int, first: int, factor: Float64, size: int, rest: Float64, since: int, begin: int,
     band: Float64, gradient: Float64, side: Float64, corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
     """Takes U^T U off, U being the factor's inverse times what the point shares: bound (4, width) with the
-    poses of nodes from `first` on, rest (4, 5) with the piece's slide and disparity, drift and gradient. at:
-    (4,) where the shared ones stand, those from `begin` on count.
+    poses of nodes from `first` on, rest (4, 5) with the piece's slide and disparity, drift and gradient; of
+    the shared ones those from `begin` on count. side (its first node is `since`), corner, corner_gradient:
+    the piece's.
     """
     for i in range(size):
         mine = bound[i, :width]
@@ -111,15 +129,15 @@ def _take_out(
                     line[b] -= x * b0[b] + y * b1[b] + z * b2[b] + w * b3[b]
     for c in range(begin, 5):
         x, y, z, w = rest[0, c], rest[1, c], rest[2, c], rest[3, c]
-        whole = gradient if c == 4 else side[at[c]]
-        line = whole[6 * first : 6 * first + width]
+        whole, left = (gradient, first) if c == 4 else (side[c], first - since)
+        line = whole[6 * left : 6 * left + width]
         for a in range(len(line)):
             line[a] -= x * b0[a] + y * b1[a] + z * b2[a] + w * b3[a]
     for c in range(begin, 4):
         for k in range(4):
-            corner_gradient[at[c]] -= rest[k, c] * rest[k, 4]
+            corner_gradient[c] -= rest[k, c] * rest[k, 4]
             for d in range(begin, 4):
-                corner[at[c], at[d]] -= rest[k, c] * rest[k, d]
+                corner[c, d] -= rest[k, c] * rest[k, d]
 
 
 @kernel(fastmath=True)
@@ -128,18 +146,18 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
     lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
     camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
-    band, slope, side, corner, corner_slope = result
+    band, slope, begun_at, sides, corners, corner_slopes = result
     error, q, by_shared, by_pose, by_point = (
         np.empty(3), np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 4)),
     )  # fmt: skip
     normal, gradient, rest, last = np.empty((4, 4)), np.empty(4), np.empty((4, 5)), len(shared) - 1
-    bound, at = np.empty((4, band.shape[2])), np.array([0, 0, last - 1, last])
+    bound = np.empty((4, band.shape[2]))
     begin, size = (0, 4) if last > 1 else (2, 3)
     for t in range(len(first) - 1):
         normal[:], gradient[:], rest[:] = 0.0, 0.0, 0.0
         begun, end, off_px = -1, -1, disparity_off(shared, piece, t)
-        if begin == 0:
-            at[0], at[1] = piece[t], piece[t] + (last - 1) // 2
+        own = piece[t]
+        since, corner, corner_slope = begun_at[own], corners[own], corner_slopes[own]
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
@@ -154,13 +172,13 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
             )  # fmt: skip
             _add_point(error, by_point, size, normal, gradient)
             _add_pose(
-                error, by_pose, by_point, by_shared, n, 6 * (n - begun), at, begin, band, slope, side, size,
-                bound,
+                error, by_pose, by_point, by_shared, n, 6 * (n - begun), own, since, begin, band, slope,
+                sides, size, bound,
             )  # fmt: skip
             for c in range(max(begin, 1), 4):
-                corner_slope[at[c]] += by_shared[c - 1] * error[2]
+                corner_slope[c] += by_shared[c - 1] * error[2]
                 for d in range(max(begin, 1), 4):
-                    corner[at[c], at[d]] += by_shared[c - 1] * by_shared[d - 1]
+                    corner[c, d] += by_shared[c - 1] * by_shared[d - 1]
                 for a in range(size):
                     rest[a, c] += by_shared[c - 1] * by_point[2, a]
         if begun < 0 or normal[0, 0] == 0:
@@ -171,13 +189,59 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
             normal[3, 3] += held
             gradient[3] += pull
             rest[3, 0] = -held
-            corner[at[0], at[0]] += held
-            corner_slope[at[0]] -= pull
+            corner[0, 0] += held
+            corner_slope[0] -= pull
         for a in range(size):
             rest[a, 4] = gradient[a]
         _factorise(normal, size)
         width = 6 * (end - begun)
-        _take_out(bound, width, begun, normal, size, rest, at, begin, band, slope, side, corner, corner_slope)
+        side = sides[own]
+        _take_out(
+            bound, width, begun, normal, size, rest, since, begin, band, slope, side, corner, corner_slope
+        )
+
+
+@kernel(fastmath=True)
+def spread(
+    reduced: Reduced, node: Int64, piece: Int64, rows: Band, gradient: Float64, side: Float64,
+    corner: Float64, corner_gradient: Float64,
+) -> None:  # fmt: skip
+    """Adds `reduced` to the equations of all unknowns, which stand as `Layout` has them; the rig's drift is
+    the border's last.
+    """
+    band, slope, first, sides, corners, corner_slopes = reduced
+    values, offset = rows.values, rows.offset
+    nodes, reach, last = len(node), band.shape[2] // 6, len(corner) - 2
+    for k in range(nodes):
+        for a in range(6):
+            row = node[k] + a
+            gradient[row] += slope[6 * k + a]
+            for n in range(max(0, k - reach + 1), k + 1):
+                if node[n] < rows.first[row]:
+                    continue
+                column, begin = offset[row] + node[n], 6 * (reach - 1 - k + n)
+                for b in range(a + 1 if n == k else 6):
+                    values[column + b] += band[k, a, begin + b]
+    for p in range(len(first)):
+        for n in range(min(sides.shape[2] // 6, nodes - first[p])):
+            at = node[first[p] + n]
+            for a in range(6):
+                for c in range(2):
+                    side[last + c, at + a] += sides[p, 2 + c, 6 * n + a]
+                    if len(piece) and at < piece[p]:
+                        values[offset[piece[p] + c] + at + a] += sides[p, c, 6 * n + a]
+        for c in range(2):
+            corner_gradient[last + c] += corner_slopes[p, 2 + c]
+            for d in range(2):
+                corner[last + c, last + d] += corners[p, 2 + c, 2 + d]
+        if len(piece):
+            for c in range(2):
+                row = piece[p] + c
+                gradient[row] += corner_slopes[p, c]
+                for d in range(2):
+                    side[last + d, row] += corners[p, c, 2 + d]
+                    if d <= c:
+                        values[offset[row] + piece[p] + d] += corners[p, c, d]
 
 
 @kernel(fastmath=True)

@@ -71,7 +71,7 @@ def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Gap:
     if end * size < len(chain.rows):
         right[-size:, size:-2] = _link(chain.rows, end).T
     right[:, -2], right[:, -1] = chain.side[here], chain.gradient[here]
-    factor = chain.rows[here].copy()
+    factor = band.even(chain.rows[here].copy())
     if not band.factorise(factor):
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
     band.solve_forward(factor, right)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.motion.band import inverse_blocks, solve_back
+from barsight.motion.band import inverse_blocks, solve_back, solve_forward
 from barsight.motion.system import System
 
 NO_PAIRS = np.empty((0, 2), np.int64)
@@ -17,8 +17,8 @@ NO_PAIRS = np.empty((0, 2), np.int64)
 class Marginals:
     """Of the system's K nodes. poses: (K, 6, 6) in GTSAM's order and body axes, the rig's drift taken as
     known. latency_sigma_s: nan without encoders. swing: (K, 6, 2) how the poses move with the drift. nodes:
-    (K, n, n) of all that a node has, the latency taken as known too. cross: (P, 6, 6) of pairs of poses, as
-    `poses`; NaN for those too far apart for the band.
+    (K, n, n) of all that a node has, what the border shares taken as known too. cross: (P, 6, 6) of pairs of
+    poses, as `poses`; NaN for those too far apart for the band.
     """
 
     poses: Float64
@@ -30,17 +30,15 @@ class Marginals:
 
 def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
     """Of a system at its best state. pairs: (P, 2) of these nodes, the earlier first."""
-    factor, size = system.factor, system.size
+    layout = system.layout
     own, _ = system.schur(system.forward)
-    count = len(factor) // size
+    count, size = len(layout.node), layout.size
     nodes = np.empty((count, size, size))
     cross = np.empty((len(pairs), size, size))
-    inverse_blocks(factor, size, nodes, pairs, cross)
+    inverse_blocks(system.factor, layout.node, np.empty(len(layout.first)), nodes, pairs, cross)
     cross = cross[:, :6, :6]
     poses = nodes[:, :6, :6]
-    to_border = system.forward[:, 1:].copy()
-    solve_back(factor, to_border)
-    by_border = -to_border.reshape(count, size, -1)[:, :6]
+    by_border = -_to_border(system)[layout.poses].reshape(count, 6, -1)
     swing, latency = by_border[:, :, -2:], float("nan")
     if len(own) > 2:
         variance = np.linalg.inv(own[:-2, :-2])
@@ -50,6 +48,31 @@ def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
         swing = swing - to_border @ variance @ own[:-2, -2:]
         cross = cross + to_border[pairs[:, 0]] @ variance @ to_border[pairs[:, 1]].transpose(0, 2, 1)
     return Marginals(poses, latency, swing, nodes, cross)
+
+
+def piece_variances(system: System, weights: Float64) -> tuple[Float64, float]:
+    """(2 S,) of the pieces' slides and disparities, and that of their sum with `weights` (2 S,), the rig's
+    drift taken as known.
+    """
+    at, count = system.layout.pieces, len(system.layout.first)
+    diagonal, none = np.empty(count), np.empty((0, 1, 1))
+    inverse_blocks(system.factor, NO_PAIRS[:, 0], diagonal, none, NO_PAIRS, none)
+    own, _ = system.schur(system.forward)
+    variance = np.linalg.inv(own[:-2, :-2])
+    to_border = _to_border(system)[at, :-2]
+    each = diagonal[at] + np.einsum("sb,bc,sc->s", to_border, variance, to_border)
+    whole = np.zeros((count, 1))
+    whole[at, 0] = weights
+    solve_forward(system.factor, whole)
+    of_sum = weights @ to_border
+    return each, float(whole[:, 0] @ whole[:, 0] + of_sum @ variance @ of_sum)
+
+
+def _to_border(system: System) -> Float64:
+    """(n, b) the matrix's inverse times what binds its unknowns to the border."""
+    result = system.forward[:, 1:].copy()
+    solve_back(system.factor, result)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +87,12 @@ class Newest:
 
 def newest(system: System) -> Newest:
     """Of a system at its best state, without the work for all the other nodes."""
-    factor, size = system.factor, system.size
+    factor, size = system.factor, system.layout.size
     own, _ = system.schur(system.forward)
-    last = len(factor) - size
+    last = len(factor.first) - size
     row, column = np.nonzero(np.tri(size))
     lower = np.zeros((size, size))
-    lower[row, column] = factor[last + row, column - row + factor.shape[1] - 1]
+    lower[row, column] = factor.values[factor.offset[last + row] + last + column]
     inverse = np.linalg.inv(lower)
     covariance = inverse.T @ inverse
     by_border = -inverse.T @ system.forward[last:, 1:]

@@ -16,6 +16,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, RectifiedCamera
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.layout import Layout, layout
 from barsight.motion.sightings import Sighting
 
 MOST_SIGHTINGS = 40
@@ -92,6 +93,9 @@ class Pieces:
     point is of. own_sigma_rad: (S,) by how much a piece's points slide apart; share: a piece as a whole
     slides by this times that (1 sigma), half of the variance in common with all pieces. disparity_sigma_px:
     how far off its disparity may be.
+
+    What slides have in common is an unknown itself (in terms of each piece's sigma), so that pieces are bound
+    to it and not to each other.
     """
 
     piece: Int64
@@ -104,14 +108,21 @@ class Pieces:
         """How many."""
         return len(self.own_sigma_rad)
 
-    @cached_property
-    def information(self) -> Float64:
-        """(2 S, 2 S) the inverse of the covariance of slides and disparities."""
-        alike = (np.eye(self.count) + 1) / 2
-        scale = self.share * self.own_sigma_rad
-        result = np.eye(2 * self.count) / self.disparity_sigma_px**2
-        result[: self.count, : self.count] = np.linalg.inv(alike) / np.outer(scale, scale)
-        return result
+    @property
+    def slide_sigma_rad(self) -> Float64:
+        """(S,) of a piece as a whole."""
+        return self.share * self.own_sigma_rad
+
+    def common(self, unknowns: Float64) -> float:
+        """What slides have in common, as `unknowns` (2 S,) show it: slides, then disparities."""
+        return float((unknowns[: self.count] / self.slide_sigma_rad).sum()) / (self.count + 1)
+
+    def cost(self, unknowns: Float64) -> float:
+        """Half the square of these in sigma."""
+        slides, disparities = np.split(unknowns, 2)
+        common = self.common(unknowns)
+        own = slides / self.slide_sigma_rad - common
+        return float(own @ own + common**2 + (disparities @ disparities) / self.disparity_sigma_px**2 / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +219,28 @@ class Problem:
         """(K,) the nodes of the system."""
         return np.arange(len(self.start)) if self.asked is None else self.asked
 
+    @cached_property
+    def places(self) -> Int64:
+        """(M,) where the system has each node; those taken out beforehand: nowhere."""
+        places = np.full(len(self.start), -1)
+        places[self.kept] = np.arange(len(self.kept))
+        return places
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the system has each unknown."""
+        begin = end = np.empty(0, np.int64)
+        if self.sightings is not None and len(self.sightings.node):
+            node, first = self.places[self.sightings.node], self.sightings.first
+            begin, end = node[first[:-1]], node[first[1:] - 1]
+        piece = None if self.pieces is None else self.pieces.piece
+        return layout(15 if self.has_imu else 6, len(self.kept), begin, end, piece, self.prior is not None)
+
     @property
     def border(self) -> int:
-        """Unknowns that all nodes share: the encoders' latency, the pieces' slides and disparities, the
-        rig's drift."""
-        return int(self.has_latency) + (2 * self.pieces.count if self.pieces else 0) + 2
+        """Unknowns that all nodes share: the encoders' latency, what pieces' slides have in common, the rig's
+        drift."""
+        return int(self.has_latency) + int(self.pieces is not None) + 2
 
     @property
     def free(self) -> Bool:

@@ -17,9 +17,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Bool
 from barsight.motion.elimination import substitute
 from barsight.motion.graph import factors
+from barsight.motion.marginals import piece_variances
 from barsight.motion.problem import Pieces, Problem
 from barsight.motion.solver import State, guess_of, optimise, rig_of, sights_of
 from barsight.motion.system import System
@@ -96,19 +97,12 @@ def _learnt(problem: Problem, state: State, system: System, pieces: Pieces, used
     total = np.bincount(pieces.piece[good], square[good], pieces.count) + PRIOR_POINTS * everywhere
     own = np.sqrt(total / (np.bincount(pieces.piece[good], minlength=pieces.count) + PRIOR_POINTS))
     own = np.maximum(own, LEAST_SIGMA_RAD)
-    covariance = _covariance(system, 2 * pieces.count)
-    whole = np.outer(slides, slides) + covariance[: pieces.count, : pieces.count]
+    spread, in_all = piece_variances(system, np.concatenate([1 / own, np.zeros(pieces.count)]))
     unit = replace(pieces, own_sigma_rad=own, share=1.0)
-    slid = unit.information[: pieces.count, : pieces.count]
-    share = float(np.sqrt((slid * whole).sum() / pieces.count))
-    known = np.diag(covariance)[pieces.count :] / pieces.disparity_sigma_px**2
+    scatter = (spread[: pieces.count] / own**2).sum() - in_all / (pieces.count + 1)
+    slid = unit.cost(np.concatenate([slides, np.zeros(pieces.count)])) + scatter
+    share = float(np.sqrt(2 * slid / pieces.count))
+    known = spread[pieces.count :] / pieces.disparity_sigma_px**2
     square = disparities @ disparities + PRIOR_PIECES * FIRST_SIGMA_PX**2
     sigma = float(np.sqrt(square / ((1 - known).sum() + PRIOR_PIECES)))
     return Pieces(pieces.piece, own, share, sigma)
-
-
-def _covariance(system: System, count: int) -> Float64:
-    """(n, n) of the last ones of the border but the drift, which is taken as known."""
-    own, _ = system.schur(system.forward)
-    first = len(own) - 2 - count
-    return np.asarray(np.linalg.inv(own[:-2, :-2])[first:, first:], np.float64)

@@ -1,8 +1,7 @@
 """Gauss-Newton over all unknowns: points taken out by kernels, the rest linearised by GTSAM.
 
-Unknowns are ordered node by node (pose, with an IMU velocity and biases), so the matrix is a band as wide as
-the longest track; the encoders' latency, what pieces of the yard share and the rig's drift touch many nodes
-and stand at its border.
+Unknowns stand as `layout` has them, so the matrix is a band as wide as the longest track; the encoders'
+latency, what all pieces of the yard share and the rig's drift touch many nodes and stand at its border.
 """
 
 from __future__ import annotations
@@ -15,14 +14,16 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, E, V, X
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float64
 from barsight.motion import band
-from barsight.motion.elimination import Reduced, eliminate, substitute
+from barsight.motion.band import Band
+from barsight.motion.elimination import Reduced, eliminate, spread, substitute
 from barsight.motion.encoders import add_encoders, encoders_cost
 from barsight.motion.gaps import without_gaps
 from barsight.motion.graph import chain_of
+from barsight.motion.layout import Layout
 from barsight.motion.point_kernels import Guess, Rig, Sights, residuals
-from barsight.motion.problem import Prior, Problem, StereoSightings, inertial_of, latency_of, poses_of
+from barsight.motion.problem import Pieces, Prior, Problem, StereoSightings, inertial_of, latency_of, poses_of
 from barsight.motion.rig_drift import HUBER_SIGMAS
 from barsight.motion.system import System
 
@@ -64,15 +65,8 @@ def sights_of(problem: Problem, used: Bool) -> Sights:
     if pieces is not None:
         piece, tight = pieces.piece, 1 / pieces.own_sigma_rad[pieces.piece]
     return Sights(
-        seen.first, _places(problem)[seen.node], used, seen.stereo, 1 / seen.sigma_px, piece, tight, scale
+        seen.first, problem.places[seen.node], used, seen.stereo, 1 / seen.sigma_px, piece, tight, scale
     )
-
-
-def _places(problem: Problem) -> Int64:
-    """(M,) where the system has each node; those taken out beforehand: nowhere."""
-    places = np.full(len(problem.start), -1)
-    places[problem.kept] = np.arange(len(problem.kept))
-    return places
 
 
 def guess_of(problem: Problem, state: State) -> Guess:
@@ -131,53 +125,50 @@ def optimise(
 
 def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
     """The system at a state."""
-    width, nodes = 15 if problem.has_imu else 6, len(problem.kept)
-    border, shared = problem.border, problem.border - int(problem.has_latency)
-    span = 2
-    seen = problem.sightings
-    if seen is not None and len(seen.node):
-        place = _places(problem)[seen.node]
-        span = max(span, 1 + int((place[seen.first[1:] - 1] - place[seen.first[:-1]]).max()))
-    if problem.prior is not None:
-        span = nodes
-    span = min(span, nodes)
-    size = nodes * width
-    rows = np.zeros((size, span * width))
-    side, corner, corner_gradient = np.zeros((border, size)), np.zeros((border, border)), np.zeros(border)
-    whole = chain_of(graph, state.values, width, len(problem.start))
+    layout, border, seen = problem.layout, problem.border, problem.sightings
+    rows, size = layout.zeros(), len(layout.first)
+    gradient, side = np.zeros(size), np.zeros((border, size))
+    corner, corner_gradient = np.zeros((border, border)), np.zeros(border)
+    whole = chain_of(graph, state.values, layout.size, len(problem.start))
     add_encoders(whole, problem, state.poses, latency_of(state.values))
     chain, gaps = without_gaps(whole, problem.kept)
-    near = min(rows.shape[1], 2 * width)
-    rows[:, -near:] = chain.rows[:, -near:]
-    gradient = chain.gradient
+    band.add_chain(chain.rows, layout.node, rows)
+    gradient[layout.nodes] = chain.gradient
     if problem.has_latency:
-        side[0], corner[0, 0], corner_gradient[0] = chain.side, chain.corner, chain.corner_gradient
+        side[0, layout.nodes] = chain.side
+        corner[0, 0], corner_gradient[0] = chain.corner, chain.corner_gradient
     if seen is not None and used.any():
-        reduced = Reduced(
-            np.zeros((nodes, 6, 6 * span)), np.zeros(6 * nodes), np.zeros((shared, 6 * nodes)),
-            np.zeros((shared, shared)), np.zeros(shared),
-        )  # fmt: skip
+        reduced = Reduced.empty(layout)
         eliminate(rig_of(seen), sights_of(problem, used), guess_of(problem, state), reduced)
-        band.add_blocks(reduced.band, width, rows)
-        at = (np.arange(nodes)[:, None] * width + np.arange(6)).ravel()
-        gradient[at] += reduced.gradient
-        side[-shared:, at] += reduced.side
-        corner[-shared:, -shared:] += reduced.corner
-        corner_gradient[-shared:] += reduced.corner_gradient
+        spread(reduced, layout.node, layout.piece, rows, gradient, side, corner, corner_gradient)
     if problem.pieces is not None:
-        own, information = slice(border - shared, border - 2), problem.pieces.information
-        corner[own, own] += information
-        corner_gradient[own] += information @ state.pieces
+        _hold_pieces(problem.pieces, state.pieces, layout, rows, gradient, side, corner)
     if problem.prior is not None:
         _add_prior(problem.prior, state, rows, gradient, side, corner, corner_gradient)
     return System(
-        rows, gradient, side, corner, corner_gradient, width, problem.kept, gaps, len(problem.start),
+        rows, gradient, side, corner, corner_gradient, layout, problem.kept, gaps, len(problem.start),
         problem.has_latency,
     )  # fmt: skip
 
 
+def _hold_pieces(
+    pieces: Pieces, unknowns: Float64, layout: Layout, rows: Band, gradient: Float64, side: Float64,
+    corner: Float64,
+) -> None:  # fmt: skip
+    """Adds what `Pieces.cost` says. What slides have in common, the border's last but the drift, is where it
+    costs least."""
+    sigma, (slides, disparities) = pieces.slide_sigma_rad, np.split(unknowns, 2)
+    slide, disparity = layout.piece, layout.piece + 1
+    rows.values[rows.offset[slide] + slide] += 2 / sigma**2
+    rows.values[rows.offset[disparity] + disparity] += 1 / pieces.disparity_sigma_px**2
+    gradient[slide] += 2 * (slides / sigma - pieces.common(unknowns)) / sigma
+    gradient[disparity] += disparities / pieces.disparity_sigma_px**2
+    side[-3, slide] -= 2 / sigma
+    corner[-3, -3] += 2 * (pieces.count + 1)
+
+
 def _add_prior(
-    prior: Prior, state: State, rows: Float64, gradient: Float64, side: Float64, corner: Float64,
+    prior: Prior, state: State, rows: Band, gradient: Float64, side: Float64, corner: Float64,
     corner_gradient: Float64,
 ) -> None:  # fmt: skip
     border = len(corner)
@@ -200,8 +191,10 @@ def _since(prior: Prior, state: State) -> Float64:
     )
 
 
-def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Float64) -> State:
-    """The state after a step of the band's and the border's unknowns; the points follow."""
+def moved(
+    problem: Problem, state: State, used: Bool, step: Float64, pieces: Float64, border: Float64
+) -> State:
+    """The state after a step of the nodes', the pieces' and the border's unknowns; the points follow."""
     by_node = step.reshape(len(problem.start), -1)
     vectors = gtsam.VectorValues()
     for k, part in enumerate(by_node):
@@ -211,15 +204,15 @@ def moved(problem: Problem, state: State, used: Bool, step: Float64, border: Flo
             vectors.insert(B(k), part[9:])
     if problem.has_latency:
         vectors.insert(E(0), border[:1])
-    points, shared = state.points, np.ascontiguousarray(border[int(problem.has_latency) :])
+    points, shared = state.points, np.concatenate([pieces, border[-2:]])
     if problem.sightings is not None:
         points = points.copy()
         poses = np.ascontiguousarray(by_node[problem.kept, :6])
         rig, sights = rig_of(problem.sightings), sights_of(problem, used)
         substitute(rig, sights, guess_of(problem, state), poses, shared, points, np.empty(len(points)))
     return replace(
-        state, values=state.values.retract(vectors), points=points, drift=state.drift + shared[-2:],
-        pieces=state.pieces + shared[:-2],
+        state, values=state.values.retract(vectors), points=points, drift=state.drift + border[-2:],
+        pieces=state.pieces + pieces,
     )  # fmt: skip
 
 
@@ -229,7 +222,7 @@ def cost_of(problem: Problem, graph: Any, state: State, used: Bool) -> float:
         since = _since(problem.prior, state)
         cost += float(since @ (problem.prior.gradient + problem.prior.matrix @ since / 2))
     if problem.pieces is not None:
-        cost += float(state.pieces @ problem.pieces.information @ state.pieces) / 2
+        cost += problem.pieces.cost(state.pieces)
     if problem.sightings is None:
         return cost
     seen, guess = problem.sightings, guess_of(problem, state)

@@ -9,37 +9,39 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.motion import band
+from barsight.motion.band import Band
 from barsight.motion.gaps import Gap, with_gaps
+from barsight.motion.layout import Layout
 from barsight.motion.rig_drift import LOOSE
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Normal equations at a state. rows: (n, w), a band as `band` has it; gradient (n,). side: (b, n) with
-    the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one, the
-    pieces' slides and disparities, then the rig's drift. size: unknowns a node. kept: (K,) the nodes that
-    the band is of; gaps: those between. nodes: how many in all.
+    """Normal equations at a state. rows: n unknowns, which stand as `layout` has them; gradient (n,). side:
+    (b, n) with the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one,
+    what pieces' slides have in common if there are any, then the rig's drift. kept: (K,) the nodes that the
+    band is of; gaps: those between. nodes: how many in all.
     """
 
-    rows: Float64
+    rows: Band
     gradient: Float64
     side: Float64
     corner: Float64
     corner_gradient: Float64
-    size: int
+    layout: Layout
     kept: Int64
     gaps: tuple[Gap, ...]
     nodes: int
     has_latency: bool
 
     @cached_property
-    def factor(self) -> Float64:
+    def factor(self) -> Band:
         """The band's factor. Raises LinAlgError where the measurements leave it undetermined."""
         return self._factor(0.0)
 
-    def _factor(self, damping: float) -> Float64:
-        factor = self.rows.copy()
-        factor[:, -1] *= 1 + damping
+    def _factor(self, damping: float) -> Band:
+        factor = self.rows._replace(values=self.rows.values.copy())
+        factor.values[factor.offset + np.arange(len(factor.offset))] *= 1 + damping
         if not band.factorise(factor):
             raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
         return factor
@@ -49,7 +51,7 @@ class System:
         """(n, 1 + b) the factor's inverse times gradient and side."""
         return self._forward(self.factor)
 
-    def _forward(self, factor: Float64) -> Float64:
+    def _forward(self, factor: Band) -> Float64:
         result = np.column_stack([self.gradient, self.side.T])
         band.solve_forward(factor, result)
         return result
@@ -62,9 +64,11 @@ class System:
         loose[-2:] = 1 / np.array(LOOSE) ** 2
         return self.corner - taken[1:, 1:] + np.diag(loose), self.corner_gradient - taken[1:, 0]
 
-    def step(self, free: Bool, damping: float = 0.0, fixed: Float64 | None = None) -> tuple[Float64, Float64]:
-        """(M n,) of all nodes and (b,): the border's `free` (b,) unknowns step too, the others as `fixed`
-        (b,) says.
+    def step(
+        self, free: Bool, damping: float = 0.0, fixed: Float64 | None = None
+    ) -> tuple[Float64, Float64, Float64]:
+        """(M n,) of all nodes, (2 S,) of the pieces' slides and disparities, and (b,): the border's `free`
+        (b,) unknowns step too, the others as `fixed` (b,) says.
         """
         factor = self._factor(damping) if damping else self.factor
         forward = self._forward(factor) if damping else self.forward
@@ -77,6 +81,6 @@ class System:
         step = -(forward[:, :1] + forward[:, 1:] @ border[:, None])
         band.solve_back(factor, step)
         latency = float(border[0]) if self.has_latency else 0.0
-        return with_gaps(
-            step.reshape(-1, self.size), latency, self.kept, self.gaps, self.nodes
-        ).ravel(), border
+        by_node = step[self.layout.nodes].reshape(-1, self.layout.size)
+        by_node = with_gaps(by_node, latency, self.kept, self.gaps, self.nodes)
+        return by_node.ravel(), step[self.layout.pieces, 0], border

@@ -193,7 +193,7 @@ def without_first(window: Window, problem: Problem, used: Bool, count: int) -> W
         attitudes=tuple(a for a in problem.attitudes if a.node < count),
     )  # fmt: skip
     system = linearise(part, factors(part, count), state, leaving)
-    matrix, gradient = _without(system, count * system.size)
+    matrix, gradient = _without(system, count * system.layout.size)
     values = _renumbered(state, problem, count)
     prior = Prior(values, state.drift, matrix, gradient)
     stays = ~ended if seen is not None else np.ones(0, np.bool_)
@@ -220,7 +220,7 @@ def without_first(window: Window, problem: Problem, used: Bool, count: int) -> W
 
 def _without(system: System, count: int) -> tuple[Float64, Float64]:
     """Matrix and gradient of all unknowns but the first `count`, which are taken out."""
-    n = len(system.rows)
+    n = len(system.gradient)
     border = len(system.corner)
     whole = np.empty((n + border, n + border))
     band.whole(system.rows, whole[:n, :n])
