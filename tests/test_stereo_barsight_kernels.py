@@ -90,7 +90,7 @@ def test_axis_means_are_weighted_means_along_the_axis(direction: tuple[float, fl
     first, second, weight, alike = _noise(3), _noise(4), np.abs(_noise(5)), _noise(15, 0.5)
     found = np.empty_like(first), np.empty_like(first)
     frames = [_frame(image) for image in (first, second, weight, alike)]
-    axis_means(*frames, 1.0, _axes(*direction), 3.0, found)
+    axis_means(*frames, _axes(*direction), 3.0, found)
     for y, x in ((0, 0), (13, 31), (39, 69), (20, 40)):
         total = sums = 0.0
         for step in range(-7, 8):

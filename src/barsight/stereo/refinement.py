@@ -218,9 +218,10 @@ class _Work:
         settings, shape = self.settings, grey.shape
         means = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         if settings.gloss_px > 0:
-            inside(self.alike, shape)[:] = cv2.GaussianBlur(grey, (0, 0), _ALIKE_BLUR_PX)
+            blurred = cv2.GaussianBlur(grey, (0, 0), _ALIKE_BLUR_PX)
+            np.multiply(blurred, np.float32(1 / settings.alike_grey), out=inside(self.alike, shape))
             images = self.residual, self.slope, self.trust, self.alike
-            axis_means(*images, settings.alike_grey, self.axes, settings.gloss_px, means)
+            axis_means(*images, self.axes, settings.gloss_px, means)
         return means
 
     def _fit(self, power: Float32) -> tuple[Float32, Float32]:

@@ -57,12 +57,15 @@ def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
 def empty_frame(shape: tuple[int, ...]) -> Float32:
     """Room for an image, with a margin of zeros that every support offset stays within.
 
-    An odd number of cache lines per row: with most even ones a column's rows compete for a few of the nearest
-    cache's places.
+    Rows begin with a cache line and take an odd number of them: with most even ones a column's rows compete
+    for a few of the nearest cache's places.
     """
     height, width = shape
     lines = -(-(width + 2 * MARGIN + TILE_COLUMNS) // _LINE_FLOATS) | 1
-    return np.zeros((height + 2 * MARGIN + TILE_ROWS, lines * _LINE_FLOATS), dtype=np.float32)
+    rows, columns = height + 2 * MARGIN + TILE_ROWS, lines * _LINE_FLOATS
+    room = np.zeros(rows * columns + _LINE_FLOATS, dtype=np.float32)
+    first = -room.ctypes.data // room.itemsize % _LINE_FLOATS
+    return room[first : first + rows * columns].reshape(rows, columns)
 
 
 def inside(frame: Float32, shape: tuple[int, ...]) -> Float32:
@@ -71,66 +74,81 @@ def inside(frame: Float32, shape: tuple[int, ...]) -> Float32:
 
 
 def axis_means(
-    first: Float32, second: Float32, weight: Float32, alike: Float32, alike_px: float, axes: Float32,
-    sigma_px: float, means: tuple[Float32, Float32],
+    first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, sigma_px: float,
+    means: tuple[Float32, Float32],
 ) -> None:  # fmt: skip
     """Weighted Gaussian means of two images along each tile's axis. Frames in, no NaN; (H, W) each out.
 
-    alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at alike_px),
-    so that a strap or a shadow across the bars has a mean of its own.
+    alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at 1), so that
+    a strap or a shadow across the bars has a mean of its own.
     """
-    steps = np.arange(-min(int(2.5 * sigma_px), MARGIN - 1), min(int(2.5 * sigma_px), MARGIN - 1) + 1)
+    steps = np.arange(1, min(int(2.5 * sigma_px), MARGIN - 1) + 1)
     shares = np.exp(-0.5 * (steps / sigma_px) ** 2).astype(np.float32)
-    nearness = np.float32(1 / alike_px)
 
     def work(first_tile: int, end_tile: int) -> None:
-        _axis_means(first, second, weight, alike, nearness, axes, steps, shares, *means, first_tile, end_tile)
+        _axis_means(first, second, weight, alike, axes, steps, shares, *means, first_tile, end_tile)
 
     in_bands(work, len(axes), BAND_TILES)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def _add_means(
+def _take_means(
     _: Any, theres: Any, firsts: Any, seconds: Any, weights: Any, middle: Any, offsets: Any, shares: Any,
-    nearness: Any, sums: Any, at: Any, stride: Any,
+    first_mean: Any, second_mean: Any, at: Any,
 ) -> Any:  # fmt: skip
-    """The sums of weights, of the first and of the second image for 16 pixels from `middle` on. They lie
-    `stride` apart; offsets: flat, from a pixel to its support's points. All arrays are flat."""
+    """The means of the first and of the second image for 16 pixels from `middle` on, written from `at` on.
+    offsets: from a pixel to its support's points on one side; the other side's are mirror images. All arrays
+    are flat."""
     signature = types.void(
-        theres, firsts, seconds, weights, middle, offsets, shares, nearness, sums, at, stride
+        theres, firsts, seconds, weights, middle, offsets, shares, first_mean, second_mean, at
     )
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
-        centre, nearness = v.load(v.data(0), arguments[4], v.floats), v.all(arguments[7], v.floats)
+        middle = arguments[4]
+        centre, own = v.load(v.data(0), middle, v.floats), v.load(v.data(3), middle, v.floats)
         totals = v.zeros(3)
+        builder.store(own, totals[0])
+        for total, image in zip(totals[1:], (1, 2), strict=True):
+            builder.store(v.product(own, v.load(v.data(image), middle, v.floats)), total)
         with cgutils.for_range(builder, v.length(5)) as loop:
-            there = builder.add(arguments[4], builder.load(builder.gep(v.data(5), [loop.index])))
-            alike = v.alike(v.difference(v.load(v.data(0), there, v.floats), centre), nearness)
-            weight = v.product(v.number(6, loop.index, v.floats), alike, v.load(v.data(3), there, v.floats))
-            v.add_to(totals[0], weight)
+            offset = builder.load(builder.gep(v.data(5), [loop.index]))
+            sides = builder.add(middle, offset), builder.sub(middle, offset)
+            both = [
+                v.product(
+                    v.biweight(v.difference(v.load(v.data(0), there, v.floats), centre)),
+                    v.load(v.data(3), there, v.floats),
+                )
+                for there in sides
+            ]
+            share = v.number(6, loop.index, v.floats)
+            v.add_to(totals[0], v.product(share, v.sum(*both)))
             for total, image in zip(totals[1:], (1, 2), strict=True):
-                v.add_to(total, v.product(weight, v.load(v.data(image), there, v.floats)))
-        for one, place in enumerate(totals):
-            target = builder.add(arguments[9], builder.mul(arguments[10], arguments[10].type(one)))
-            v.store(builder.load(place), v.data(8), target)
+                one, other = (
+                    v.product(weight, v.load(v.data(image), there, v.floats))
+                    for weight, there in zip(both, sides, strict=True)
+                )
+                v.add_to(total, v.product(share, v.sum(one, other)))
+        whole = v.sum(builder.load(totals[0]), v.all(1e-6, v.floats))
+        for total, place in zip(totals[1:], (7, 8), strict=True):
+            v.store(v.quotient(builder.load(total), whole), v.data(place), arguments[9])
         return context.get_dummy_value()
 
     return signature, generate
 
 
-@kernel(fastmath=True)
+@kernel()
 def _axis_means(
-    first: Float32, second: Float32, weight: Float32, alike: Float32, nearness: np.float32, axes: Float32,
-    steps: Int64, shares: Float32, first_mean: Float32, second_mean: Float32, first_tile: int, end_tile: int,
+    first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, steps: Int64,
+    shares: Float32, first_mean: Float32, second_mean: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
     height, width = first_mean.shape
     framed_width = first.shape[1]
     firsts, seconds, weights, theres = (
         first.reshape(-1), second.reshape(-1), weight.reshape(-1), alike.reshape(-1),
     )  # fmt: skip
-    sums = np.empty((3, TILE_COLUMNS), dtype=np.float32)
-    flat = sums.reshape(-1)
+    found = np.empty((2, TILE_COLUMNS), dtype=np.float32)
+    one, two = found[0], found[1]
     offsets = np.empty(len(steps), dtype=np.int64)
     for tile_x in range(axes.shape[1]):
         for tile_y in range(first_tile, end_tile):
@@ -142,12 +160,10 @@ def _axis_means(
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
                 for part in range(0, count, FLOAT_LANES):
-                    _add_means(
-                        theres, firsts, seconds, weights, middle + part, offsets, shares, nearness, flat,
-                        part, TILE_COLUMNS,
-                    )  # fmt: skip
-                one, two = first_mean[y, x0 : x0 + count], second_mean[y, x0 : x0 + count]
+                    _take_means(
+                        theres, firsts, seconds, weights, middle + part, offsets, shares, one, two, part
+                    )
                 for i in range(count):
-                    one[i] = sums[1, i] / (sums[0, i] + np.float32(1e-6))
+                    first_mean[y, x0 + i] = one[i]
                 for i in range(count):
-                    two[i] = sums[2, i] / (sums[0, i] + np.float32(1e-6))
+                    second_mean[y, x0 + i] = two[i]

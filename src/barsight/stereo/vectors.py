@@ -120,10 +120,6 @@ class Vectors:
         """Pointers to float vectors of zeros: registers, where there are enough."""
         return [cgutils.alloca_once_value(self.builder, self.all(0.0, self.floats)) for _ in range(count)]
 
-    def alike(self, gap: Any, nearness: Any) -> Any:
-        """Tukey's biweight of a gap, whose reach is 1 / nearness."""
-        return self.biweight(self.product(gap, nearness))
-
     def biweight(self, scaled: Any) -> Any:
         """Tukey's biweight, whose reach is 1."""
         same = self.not_negative(self.difference(self.all(1.0, self.floats), self.product(scaled, scaled)))
@@ -133,13 +129,21 @@ class Vectors:
         """Of floats."""
         return self.builder.fsub(one, other, flags=_FAST)
 
+    def quotient(self, one: Any, other: Any) -> Any:
+        """Of floats."""
+        return self.builder.fdiv(one, other, flags=_FAST)
+
     def not_negative(self, vector: Any) -> Any:
         """Floats, zero in place of what is less."""
+        return self.at_least(vector, 0.0)
+
+    def at_least(self, vector: Any, least: float) -> Any:
+        """Floats, `least` in place of what is less."""
         kind = ir.FunctionType(self.floats, [self.floats, self.floats])
         function = cgutils.get_or_insert_function(
             self.builder.module, kind, f"llvm.maxnum.v{self.floats.count}f32"
         )
-        return self.builder.call(function, [vector, self.all(0.0, self.floats)], fastmath=_FAST)
+        return self.builder.call(function, [vector, self.all(least, self.floats)], fastmath=_FAST)
 
     def sum_of(self, vector: Any) -> Any:
         """The sum of a vector's floats."""
