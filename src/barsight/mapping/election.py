@@ -27,6 +27,7 @@ from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
 
 _ALONG = 30
 _ALIKE_CELLS = 3.0
+_BORDER_PX = 3.0
 _NOTHING = np.float32(-1e6)
 
 
@@ -58,6 +59,20 @@ class Sights:
         """How wide a pixel is on the ground at heights z_m, seen from the views' median height."""
         above = np.abs(np.float32(np.median(self.eyes[..., 2])) - z_m)
         return np.asarray(above / np.float32(self.camera.focal_px), np.float32)
+
+    def planes(self) -> Float64:
+        """(6, 4, K) a x + b y + c z + d of the planes that bound what both pictures of a view hold, less
+        `_BORDER_PX` all around: 0 or more on their inner side."""
+        camera = self.camera
+        rays = np.concatenate([self.rotation, self.translation[:, :, None]], axis=2)
+        x, y, depth = np.moveaxis(rays, 1, 0)
+        left = camera.focal_px * x + camera.cx_px * depth
+        right = left + camera.doffs_px * depth - camera.focal_px * camera.baseline_m * np.eye(4)[3]
+        row = camera.focal_px * y + camera.cy_px * depth
+        sides = ((left, camera.width), (right, camera.width), (row, camera.height))
+        low = [place - _BORDER_PX * depth for place, _ in sides]
+        high = [(size - 1 - _BORDER_PX) * depth - place for place, size in sides]
+        return np.ascontiguousarray(np.moveaxis(np.array(low + high), 1, 2))
 
     def near(self, low_m: Float64, high_m: Float64) -> Sights:
         """Those views alone whose left picture may hold something of the box from low_m to high_m (3,)."""
@@ -98,9 +113,6 @@ def elect(
 
     around: (3 * TILE_CELLS, 3 * TILE_CELLS) `first_heights` of the tile and its eight neighbours.
     """
-    camera = sights.camera
-    lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m, camera.doffs_px])
-    size = np.array([camera.width, camera.height], np.float64)
     known = np.isfinite(around)
     ceiling = float(around[known].max()) if known.any() else 0.0
     held = tile[..., Z][tile[..., VIEWS] >= min_views]
@@ -112,8 +124,8 @@ def elect(
     around = np.where(known, around, _NOTHING)
     roof = np.asarray(cv2.dilate(around, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)), np.float32)
     share, expected = _supported(
-        tile, corner, around, roof, ceiling, lens, size, sights.rotation, sights.translation, sights.eyes,
-        cell_m, float(min_views), cell_m / sights.spacing_rad,
+        tile, corner, around, roof, ceiling, sights.planes(), sights.eyes, cell_m, float(min_views),
+        cell_m / sights.spacing_rad,
     )  # fmt: skip
     return _elected(tile, share, expected, cell_m, float(min_views), settings.own_share, settings.along_share)
 
@@ -125,10 +137,7 @@ def _supported(
     around: Float32,
     roof: Float32,
     ceiling: float,
-    lens: Float64,
-    size: Float64,
-    rotation: Float64,
-    translation: Float64,
+    planes: Float64,
     eyes: Float64,
     cell_m: float,
     min_views: float,
@@ -143,7 +152,7 @@ def _supported(
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
-    point = np.empty(3)
+    point, margin = np.empty(3), np.empty(eyes.shape[0])
     for i in range(rows):
         for j in range(columns):
             for s in range(SLOTS):
@@ -152,14 +161,15 @@ def _supported(
                 z = float(tile[i, j, s, Z])
                 point[0], point[1], point[2] = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z
                 able, votes = 0, 0.0
-                for k in range(rotation.shape[0]):
-                    if inside(point[0], point[1], z, lens, size, rotation, translation, k):
+                inside(point[0], point[1], z, planes, margin)
+                for k in range(margin.size):
+                    if margin[k] >= 0:
                         seen = free(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
                         if seen and free(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
                             able += 1
                             votes += density(point, eyes[k, 0], one_point_m)
                 covered = able >= min_views and may_be_covered(
-                    point, i, j, around, ceiling, lens, size, rotation, translation, cell_m, min_views
+                    point, i, j, around, ceiling, planes, margin, cell_m, min_views
                 )
                 if able >= min_views and not covered:
                     share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)

@@ -7,7 +7,6 @@ import numpy as np
 from barsight.core.arrays import Float32, Float64, kernel
 from barsight.mapping.tiles import TILE_CELLS
 
-_BORDER_PX = 3.0
 _CUT_CELLS = 30
 _CUT_MARGIN_CELLS = 3
 _OVERHANG_CELLS = 10.0
@@ -24,22 +23,16 @@ def density(point: Float64, eye: Float64, one_point_m: float) -> float:
 
 
 @kernel()
-def inside(
-    x_m: float, y_m: float, z_m: float, lens: Float64, size: Float64, rotation: Float64, translation: Float64,
-    k: int,
-) -> bool:  # fmt: skip
-    """Whether both cameras of view k have the point in their pictures."""
-    depth = translation[k, 2] + rotation[k, 2, 0] * x_m + rotation[k, 2, 1] * y_m + rotation[k, 2, 2] * z_m
-    if depth <= 0:
-        return False
-    y = translation[k, 1] + rotation[k, 1, 0] * x_m + rotation[k, 1, 1] * y_m + rotation[k, 1, 2] * z_m
-    v = lens[0] * y / depth + lens[2]
-    if not _BORDER_PX <= v <= size[1] - 1 - _BORDER_PX:
-        return False
-    x = translation[k, 0] + rotation[k, 0, 0] * x_m + rotation[k, 0, 1] * y_m + rotation[k, 0, 2] * z_m
-    u = lens[0] * x / depth + lens[1]
-    right = u - (lens[0] * lens[3] / depth - lens[4])
-    return bool(min(u, right) >= _BORDER_PX and max(u, right) <= size[0] - 1 - _BORDER_PX)
+def inside(x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64) -> None:
+    """How far the point lies inside of both pictures of each view: margin (K,), not below 0 where it does.
+
+    planes: (6, 4, K), see `Sights.planes`.
+    """
+    margin[:] = np.inf
+    for p in range(planes.shape[0]):
+        for k in range(margin.size):
+            over = planes[p, 0, k] * x_m + planes[p, 1, k] * y_m + planes[p, 2, k] * z_m + planes[p, 3, k]
+            margin[k] = min(margin[k], over)
 
 
 @kernel()
@@ -49,18 +42,16 @@ def may_be_covered(
     column: int,
     around: Float32,
     ceiling: float,
-    lens: Float64,
-    size: Float64,
-    rotation: Float64,
-    translation: Float64,
+    planes: Float64,
+    margin: Float64,
     cell_m: float,
     min_views: float,
 ) -> bool:
     """Whether, within `_CUT_CELLS` along x or y, a much higher surface ends where fewer than min_views views
-    could see it go on towards the point: their pictures end there.
+    could see it go on towards the point: their pictures end there. margin: (K,) is written to.
     """
     x_m, y_m = point[0], point[1]
-    if enough_views(x_m, y_m, ceiling, lens, size, rotation, translation, min_views):
+    if enough_views(x_m, y_m, ceiling, planes, margin, min_views):
         return False
     for direction in range(4):
         di, dj = (0, 0, 1, -1)[direction], (1, -1, 0, 0)[direction]
@@ -69,7 +60,7 @@ def may_be_covered(
             if height > point[2] + _OVERHANG_CELLS * cell_m:
                 outward = max(n - _CUT_MARGIN_CELLS, 0) * cell_m
                 x_there, y_there = x_m + dj * outward, y_m + di * outward
-                if not enough_views(x_there, y_there, height, lens, size, rotation, translation, min_views):
+                if not enough_views(x_there, y_there, height, planes, margin, min_views):
                     return True
                 break
     return False
@@ -77,16 +68,11 @@ def may_be_covered(
 
 @kernel()
 def enough_views(
-    x_m: float, y_m: float, z_m: float, lens: Float64, size: Float64, rotation: Float64, translation: Float64,
-    least: float,
-) -> bool:  # fmt: skip
+    x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64, least: float
+) -> bool:
     """Whether at least so many views have the point in both pictures."""
-    count = 0
-    for k in range(rotation.shape[0]):
-        count += inside(x_m, y_m, z_m, lens, size, rotation, translation, k)
-        if count >= least:
-            return True
-    return False
+    inside(x_m, y_m, z_m, planes, margin)
+    return bool((margin >= 0).sum() >= least)
 
 
 @kernel()
