@@ -8,12 +8,12 @@ import pytest
 
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera, Source
-from barsight.mapping.election import Sights
+from barsight.mapping.election import Sights, first_heights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import Layers, finish
-from barsight.mapping.tiles import TileStore
+from barsight.mapping.tiles import FIELDS, SLOTS, VIEWS, TileStore, Z
 from mapping_views import FAR_CAMERA, block, high_above, view
 
 CELL_M = 0.01
@@ -153,3 +153,15 @@ def test_beneath_a_surface_that_the_border_cuts_off_nothing_is_known(
     assert known[38:42, 30:].any() == known_beneath
     assert known[10:25, 30:].all()
     assert known[38:42, :15].all()
+
+
+def test_first_heights_are_the_highest_with_enough_votes() -> None:
+    rng = np.random.default_rng(2)
+    tile = np.zeros((6, 7, SLOTS, FIELDS), np.float32)
+    tile[..., VIEWS], tile[..., Z] = rng.integers(0, 9, tile.shape[:3]), rng.normal(size=tile.shape[:3])
+    tile[0] = 0
+    found = first_heights(tile, 3, 0.35)
+    for i, j in np.ndindex(found.shape):
+        needed = max(3, 0.35 * tile[i, j, :, VIEWS].max())
+        enough = [z for z, views in tile[i, j][:, [Z, VIEWS]] if views >= needed]
+        np.testing.assert_equal(found[i, j], max(enough, default=np.float32(np.nan)))

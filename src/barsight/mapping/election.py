@@ -91,13 +91,22 @@ class Sights:
         )
 
 
+@kernel()
 def first_heights(tile: Float32, min_views: int, top_share: float) -> Float32:
     """(rows, columns) what votes alone elect: the highest with top_share of the best-seen one's views; NaN
     where none has enough views."""
-    views, z = tile[..., VIEWS], tile[..., Z]
-    needed = np.maximum(min_views, top_share * views.max(axis=-1, keepdims=True))
-    highest: Float32 = np.where(views >= needed, z, _NOTHING).max(axis=-1)
-    return np.where(highest > _NOTHING, highest, np.float32(np.nan))
+    rows, columns = tile.shape[:2]
+    highest = np.full((rows, columns), np.nan, np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            most = np.float32(0)
+            for s in range(SLOTS):
+                most = max(most, tile[i, j, s, VIEWS])
+            needed = max(np.float32(min_views), np.float32(top_share) * most)
+            for s in range(SLOTS):
+                if tile[i, j, s, VIEWS] >= needed and not highest[i, j] >= tile[i, j, s, Z]:
+                    highest[i, j] = tile[i, j, s, Z]
+    return highest
 
 
 def elect(

@@ -4,28 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32
+from barsight.core.arrays import Bool, Float32, kernel
 
 
-def bridge(z: Float32, sigma: Float32, seen: Bool, reach: int) -> tuple[Float32, Float32, Float32]:
-    """Along each row: height, sigma and gap (cells, inf if too wide) between the seen cells on both sides."""
-    width = z.shape[1]
-    index = np.arange(width)[None, :]
-    before = np.maximum.accumulate(np.where(seen, index, -(10**6)), axis=1)
-    after = np.minimum.accumulate(np.where(seen, index, 10**6)[:, ::-1], axis=1)[:, ::-1]
-    to_before, to_after = index - before, after - index
-    bridged = (to_before <= reach) & (to_after <= reach)
-    left = np.take_along_axis(z, before.clip(0, width - 1), axis=1)
-    right = np.take_along_axis(z, after.clip(0, width - 1), axis=1)
-    gap = np.maximum(to_before + to_after, 1)
-    share = (to_before / gap).astype(np.float32)
-    worst = np.maximum(
-        np.take_along_axis(sigma, before.clip(0, width - 1), axis=1),
-        np.take_along_axis(sigma, after.clip(0, width - 1), axis=1),
-    )
-    height = left * (1 - share) + right * share
-    return (
-        height.astype(np.float32),
-        np.hypot(worst, np.abs(right - left) / 2).astype(np.float32),
-        np.where(bridged, gap, np.inf).astype(np.float32),
-    )
+@kernel()
+def bridged(z: Float32, sigma: Float32, seen: Bool, reach: int) -> Bool:
+    """Write height and sigma into the cells that aren't seen but have seen ones within `reach` on opposite
+    sides, along x or along y (the nearer pair wins); (H, W) which those are.
+    """
+    filled = np.zeros(seen.shape, np.bool_)
+    for i in range(seen.shape[0]):
+        for j in range(seen.shape[1]):
+            if seen[i, j]:
+                continue
+            least = 2 * reach + 1
+            for di, dj in ((0, 1), (1, 0)):
+                before, after = _steps(seen, i, j, -di, -dj, reach), _steps(seen, i, j, di, dj, reach)
+                if before == 0 or after == 0 or before + after >= least:
+                    continue
+                least = before + after
+                one, other = (i - before * di, j - before * dj), (i + after * di, j + after * dj)
+                share = np.float32(before / least)
+                z[i, j] = z[one] * (1 - share) + z[other] * share
+                sigma[i, j] = np.hypot(max(sigma[one], sigma[other]), abs(z[other] - z[one]) / 2)
+                filled[i, j] = True
+    return filled
+
+
+@kernel()
+def _steps(seen: Bool, i: int, j: int, di: int, dj: int, reach: int) -> int:
+    """Steps to the first seen cell that way, 0 where there is none within `reach`."""
+    for n in range(1, reach + 1):
+        a, b = i + n * di, j + n * dj
+        if a < 0 or b < 0 or a >= seen.shape[0] or b >= seen.shape[1]:
+            return 0
+        if seen[a, b]:
+            return n
+    return 0

@@ -28,36 +28,44 @@ def lengthways(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[
     onward = np.arange(_SAMPLE_CELLS, reach + 1, _SAMPLE_CELLS)
     along = np.r_[-onward[::-1], 0, onward]
     rows, columns = (np.rint(f(turn) * along).astype(np.int64) for f in (np.sin, np.cos))
-    return _lengthways(z, weight, gate_m, rows, columns)
+    z, weight = np.pad(z, reach, constant_values=np.nan), np.pad(weight, reach)
+    return _lengthways(z, weight, gate_m, rows, columns, reach)
 
 
 @kernel()
 def _lengthways(
-    z: Float32, weight: Float32, gate_m: float, rows: Int64, columns: Int64
+    z: Float32, weight: Float32, gate_m: float, rows: Int64, columns: Int64, reach: int
 ) -> tuple[Float32, Int8]:
-    height, width = z.shape
-    out, chosen = z.copy(), np.full(z.shape, -1, np.int8)
+    """z, weight: with `reach` cells more on each side. What the neighbour chose is tried first: it is mostly
+    right, and so the others are given up early."""
+    height, width = z.shape[0] - 2 * reach, z.shape[1] - 2 * reach
+    out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)
+    likely = 0
     for i in range(height):
         for j in range(width):
-            if not weight[i, j] > 0:
+            own = z[i + reach, j + reach]
+            out[i, j] = own
+            if not weight[i + reach, j + reach] > 0:
                 continue
-            least = np.inf
-            for d in range(rows.shape[0]):
+            least, best = np.inf, rows.shape[0]
+            for turn in range(rows.shape[0]):
+                d = likely if turn == 0 else turn - (turn <= likely)
                 off, total, squares = 0.0, 0.0, 0.0
                 for k in range(rows.shape[1]):
-                    a, b = i + rows[d, k], j + columns[d, k]
-                    gap = gate_m
-                    if 0 <= a < height and 0 <= b < width and abs(z[a, b] - z[i, j]) <= gate_m:
-                        gap = z[a, b] - z[i, j]
+                    a, b = i + reach + rows[d, k], j + reach + columns[d, k]
+                    gap = z[a, b] - own
+                    if abs(gap) <= gate_m:
                         off += weight[a, b] * gap
                         total += weight[a, b]
+                    else:
+                        gap = gate_m
                     squares += gap * gap
-                    if squares >= least:
+                    if squares > least:
                         break
-                if squares < least:
-                    least = squares
-                    out[i, j] = z[i, j] + off / total
-                    chosen[i, j] = d
+                if squares < least or (squares == least and d < best):
+                    least, best = squares, d
+                    out[i, j] = own + off / total
+            chosen[i, j] = likely = best
     return out, chosen
 
 

@@ -67,9 +67,7 @@ def may_be_covered(
 
 
 @kernel()
-def enough_views(
-    x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64, least: float
-) -> bool:
+def enough_views(x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64, least: float) -> bool:
     """Whether at least so many views have the point in both pictures."""
     inside(x_m, y_m, z_m, planes, margin)
     return bool((margin >= 0).sum() >= least)

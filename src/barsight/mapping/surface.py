@@ -13,7 +13,7 @@ from barsight.core.arrays import Bool, Float32, Int8, UInt8
 from barsight.core.parallel import ordered_map
 from barsight.core.types import Source
 from barsight.mapping.election import Sights, elect, first_heights
-from barsight.mapping.filling import bridge
+from barsight.mapping.filling import bridged
 from barsight.mapping.fusion import height_sigma
 from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened
 from barsight.mapping.settings import MapSettings
@@ -217,18 +217,8 @@ def fill_gaps(layers: Layers, reach: int) -> None:
     The height is interpolated between the two (the nearer pair wins), its sigma is half their difference at
     the least, and its source says FILLED.
     """
-    seen = layers.source == Source.VISION
-    unknown = ~seen
-    if not unknown.any() or not seen.any():
-        return
-    across_x = bridge(layers.z_m, layers.sigma_m, seen, reach)
-    across_y = tuple(a.T for a in bridge(layers.z_m.T, layers.sigma_m.T, seen.T, reach))
-    take_x = across_x[2] <= across_y[2]
-    gap = np.where(take_x, across_x[2], across_y[2])
-    fill = unknown & np.isfinite(gap)
-    layers.z_m[fill] = np.where(take_x, across_x[0], across_y[0])[fill]
-    layers.sigma_m[fill] = np.where(take_x, across_x[1], across_y[1])[fill]
-    layers.source[fill] = Source.FILLED
+    filled = bridged(layers.z_m, layers.sigma_m, layers.source == Source.VISION, reach)
+    layers.source[filled] = Source.FILLED
 
 
 def _write_cloud(folder: Path, key: TileKey, tile: Float32, cell_m: float, min_views: int) -> None:
