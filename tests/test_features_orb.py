@@ -4,7 +4,7 @@ import numpy as np
 
 from barsight.core.arrays import UInt8
 from barsight.features.matching import match_mutual
-from barsight.features.orb import Features, detect_orb
+from barsight.features.orb import Features, describe_upright, detect_orb
 from synthetic_scenes import Texture, quantised
 
 
@@ -41,6 +41,19 @@ def test_matches_are_mutual() -> None:
     assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
     moved = second.pixels[pairs[:, 1]] - first.pixels[pairs[:, 0]]
     assert (np.linalg.norm(moved - (7, -4), axis=1) < 3).mean() > 0.95
+
+
+def test_places_described_upright_are_told_apart() -> None:
+    """Each is its own nearest in the moved picture, to a pixel at half size; those at the border leave."""
+    places = np.stack(np.meshgrid(np.arange(70.0, 250, 14), np.arange(70.0, 170, 14)), -1).reshape(-1, 2)
+    places = np.vstack([places, [[5.0, 120.0]]]).astype(np.float32)
+    first = describe_upright(shifted(0, 0), places)
+    second = describe_upright(shifted(7, -4, noise=2.0), places + np.array([8, -4], np.float32))
+    np.testing.assert_array_equal(first.pixels, places[:-1])
+    pairs = match_mutual(first, second)
+    assert (pairs[:, 0] == pairs[:, 1]).all()
+    assert len(pairs) > 0.95 * len(first)
+    assert len(describe_upright(shifted(0, 0), places[-1:])) == 0
 
 
 def test_mutual_matching_is_brute_force() -> None:

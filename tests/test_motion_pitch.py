@@ -1,4 +1,4 @@
-"""Predictions that are bars off, on pictures of bars of 20, 40 and 90 mm: refused, never followed."""
+"""Bars of 20, 40 and 90 mm: predictions that are bars off are refused, and pictures alone don't take them."""
 
 from functools import lru_cache
 
@@ -10,7 +10,9 @@ from barsight.core.errors import Failed
 from barsight.features.guided import GuidedMatches, PredictedMotion
 from barsight.features.patches import PatchPair
 from barsight.features.tracks import Tracks, TrackSettings, carry_on
-from barsight.motion.sightings import FrontEndSettings, consensus
+from barsight.motion.sightings import FrontEndSettings, consensus, look_at_corners
+from barsight.motion.step import move
+from barsight.motion.views import View
 from barsight.stereo.disparity_range import coarse_disparity
 
 WAY_M = 0.5
@@ -57,3 +59,20 @@ def test_a_prediction_as_coarse_as_the_bars_is_refused(pitch_m: float) -> None:
         refused = moved(pitch_m, 12.0, bars_off, pitch_m / 3)
         assert isinstance(refused, Failed)
         assert "can't be told from the next bar's" in refused.reason
+
+
+@pytest.mark.parametrize("contrast", [12.0, 6.0])
+@pytest.mark.parametrize("pitch_m", [0.02, 0.04, 0.09])
+def test_pictures_alone_find_the_right_bar(pitch_m: float, contrast: float) -> None:
+    """Standing still, there and back, far; bars of three pixels may be refused."""
+    settings = FrontEndSettings()
+    old = look_at_corners(bar_view(pitch_m, 0.0, contrast), settings)
+    for way in (0.0, WAY_M, -WAY_M, 1.0):
+        new = look_at_corners(bar_view(pitch_m, way, contrast, seed=9), settings)
+        assert isinstance(old, View)
+        assert isinstance(new, View)
+        step = move(old, new, settings.rough)
+        if isinstance(step, Failed):
+            assert pitch_m == 0.02
+        else:
+            assert abs(step.translation[0] + way) < pitch_m / 8

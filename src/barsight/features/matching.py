@@ -59,9 +59,10 @@ def match_mutual(first: Features, second: Features, ratio: float = 0.9) -> Int64
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), dtype=np.int64)
     forward = nearest(first.descriptors, second.descriptors)
-    backward = nearest(second.descriptors, first.descriptors)
-    kept = passes_ratio(forward, ratio) & is_mutual(forward, backward)
-    return np.column_stack([np.flatnonzero(kept), forward.index[kept]])
+    clear = np.flatnonzero(passes_ratio(forward, ratio))
+    backward = nearest(second.descriptors[forward.index[clear]], first.descriptors)
+    kept = clear[backward.index == clear]
+    return np.column_stack([kept, forward.index[kept]])
 
 
 def match_rows(

@@ -58,5 +58,18 @@ def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Fea
     )
 
 
+def describe_upright(image: UInt8, places: Float32) -> Features:
+    """ORB's bits at given places (N, 2), but upright and all of the picture at half size.
+
+    For pictures that hardly turn or grow from one to the next. Places too near the border are left out.
+    """
+    keypoints = [cv2.KeyPoint(float(x), float(y), _PATCH_PX, 0.0) for x, y in places / 2]
+    described, descriptors = cv2.ORB.create(nlevels=1).compute(cv2.pyrDown(image), keypoints)
+    if not described:
+        return _no_features()
+    pixels = np.array([k.pt for k in described], dtype=np.float32)
+    return Features(2 * pixels, descriptors, np.full(len(described), 2, dtype=np.float32))
+
+
 def _no_features() -> Features:
     return Features(np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty(0, np.float32))

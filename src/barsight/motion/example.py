@@ -16,9 +16,8 @@ from barsight.features.matching import is_mutual, nearest, on_one_plane
 from barsight.features.patches import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, carry_on
 from barsight.motion.prediction import CranePredictor
-from barsight.motion.sightings import FrontEndSettings, consensus
+from barsight.motion.sightings import FrontEndSettings, consensus, look_at_corners
 from barsight.motion.step import move
-from barsight.motion.views import look
 from barsight.recording.base import Recording
 from barsight.stereo.disparity_range import coarse_disparity
 
@@ -32,7 +31,7 @@ class MatchingExample:
     raw: (R, 4) old and new place of each feature's nearest in descriptors; filtered: (R,) mutual ones on
     one homography. followed: (P, 2) corners followed, predicted (P, 2) where they must be in the new picture,
     covariance (P, 2, 2) px^2 of that; found (P, 2); agreed, ambiguous (P,). by_sensors: whether encoders and
-    gyro predicted, rather than ORB's features.
+    gyro predicted, rather than the pictures themselves.
     """
 
     stamps_ns: tuple[int, int]
@@ -113,7 +112,7 @@ def _predicted(
         prediction = predictor(old.pair.stamp_ns, new.pair.stamp_ns)
         if prediction is not None:
             return prediction, True
-    views = [look(pair, settings.rough) for pair in (old, new)]
+    views = [look_at_corners(pair, settings) for pair in (old, new)]
     for view in views:
         if isinstance(view, Failed):
             return view, False

@@ -15,9 +15,10 @@ from barsight.core.motion_detail import InSigmas
 from barsight.core.parallel import ordered_map, read_ahead
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame
 from barsight.features.guided import GuidedMatches, PredictedMotion, predict_places, triangulate
+from barsight.features.orb import describe_upright
 from barsight.features.patches import PatchPair, patch_pair
 from barsight.features.repeat import repeat_px
-from barsight.features.tracks import Tracks, TrackSettings, carry_on, find_again
+from barsight.features.tracks import Tracks, TrackSettings, carry_on, detect_corners, find_again
 from barsight.motion.step import Step, move, ransac, refine
 from barsight.motion.views import OdometrySettings, View, look
 from barsight.recording.base import Recording
@@ -60,8 +61,8 @@ class FrontEndSettings:
     """How points are followed."""
 
     tracks: TrackSettings = field(default_factory=TrackSettings)
-    rough: OdometrySettings = field(default_factory=lambda: OdometrySettings(features=1200))
-    """The motion from ORB features where no other sensor predicts it."""
+    rough: OdometrySettings = field(default_factory=lambda: OdometrySettings(features=900))
+    """The motion from corners' descriptors where no other sensor predicts it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,17 +191,26 @@ def _span(known: Float64, camera: RectifiedCamera) -> tuple[float, float] | None
 def _rough(
     state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
 ) -> tuple[Step, View] | Failed:
-    """The motion by ORB features of both pairs, without any prediction."""
+    """The motion by both pairs' corners, without any prediction."""
     assert tracks.last is not None
     span = _span(tracks.stereo, pair.pair.camera)
-    old = state.view or look(patch_pair(tracks.last), settings.rough, span)
-    new = look(pair, settings.rough, span)
+    old = state.view or look_at_corners(patch_pair(tracks.last), settings, span)
+    new = look_at_corners(pair, settings, span)
     if isinstance(old, Failed):
         return old
     if isinstance(new, Failed):
         return new
     step = move(old, new, settings.rough)
     return step if isinstance(step, Failed) else (step, new)
+
+
+def look_at_corners(
+    pair: PatchPair, settings: FrontEndSettings, span: tuple[float, float] | None = None
+) -> View | Failed:
+    """The corners of a pair, described; `look` says the rest."""
+    chosen, image = replace(settings.tracks, points=settings.rough.features), pair.pair.left
+    corners = detect_corners(image, chosen, np.empty((0, 2)))
+    return look(pair, describe_upright(image, corners), settings.rough, span)
 
 
 def consensus(

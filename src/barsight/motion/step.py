@@ -40,15 +40,19 @@ def move(old: View, new: View, settings: OdometrySettings) -> Step | Failed:
     pairs = match_mutual(old.features, new.features)
     if len(pairs) < settings.least_inliers:
         return Failed("no-matches", f"only {len(pairs)} features match the frame before")
+    points = old.points(pairs[:, 0], settings)
+    known = np.isfinite(points[:, 2])
+    pairs, points = pairs[known], points[known]
     places = old.features.pixels[pairs[:, 0]].astype(np.float64)
     guesses = new.features.pixels[pairs[:, 1]].astype(np.float64)
-    again = locate(old.pair.left, new.pair.left, places, guesses)
-    right = match_across(new.pair, again.pixels, new.disparity[pairs[:, 1]], sure=True)
+    about = new.about_px[pairs[:, 1]].astype(np.float64)
+    grown = points[:, 2] * (about + camera.doffs_px) / (camera.focal_px * camera.baseline_m)
+    again = locate(old.pair.left, new.pair.left, places, guesses, grown=grown)
+    right = match_across(new.pair, again.pixels, about)
     kept = again.found & right.found
-    pairs, target = pairs[kept], np.column_stack([again.pixels, right.pixels[:, 0]])[kept]
-    if len(pairs) < settings.least_inliers:
-        return Failed("no-matches", f"only {len(pairs)} features can be followed from the frame before")
-    points = old.points[pairs[:, 0]]
+    points, target = points[kept], np.column_stack([again.pixels, right.pixels[:, 0]])[kept]
+    if len(points) < settings.least_inliers:
+        return Failed("no-matches", f"only {len(points)} features can be followed from the frame before")
     start = ransac(points, target[:, :2], camera, settings)
     if isinstance(start, Failed):
         return start

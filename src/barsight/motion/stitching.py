@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.arrays import Bool, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
@@ -99,12 +99,14 @@ class PaperStitching:
 
     def _step(self, old: View, new: View, camera: RectifiedCamera, trend: Pose | None) -> Alignment | Failed:
         pairs = match_mutual(old.features, new.features)
-        if len(pairs) >= self.settings.least_matches:
-            kept = self._on_plane(old, new, pairs) & self._on_trend(old, new, pairs, camera, trend)
-            pairs = pairs[kept]
-        if len(pairs) < self.settings.least_matches:
-            return Failed("no-matches", f"only {len(pairs)} matches with the frame before agree")
-        return align(new.points[pairs[:, 1]], old.points[pairs[:, 0]], ("rect0", "rect0"))
+        first, second = old.points(pairs[:, 0], self.features), new.points(pairs[:, 1], self.features)
+        kept = np.isfinite(first[:, 2]) & np.isfinite(second[:, 2])
+        if kept.sum() >= self.settings.least_matches:
+            kept[kept] = self._on_plane(old, new, pairs[kept])
+            kept &= self._on_trend(first, new.features.pixels[pairs[:, 1]], camera, trend)
+        if kept.sum() < self.settings.least_matches:
+            return Failed("no-matches", f"only {int(kept.sum())} matches with the frame before agree")
+        return align(second[kept], first[kept], ("rect0", "rect0"))
 
     def _on_plane(self, old: View, new: View, pairs: Int64) -> Bool:
         cv2.setRNGSeed(1)
@@ -117,14 +119,12 @@ class PaperStitching:
         agreeing: Bool = inliers.ravel().astype(np.bool_)
         return agreeing
 
-    def _on_trend(
-        self, old: View, new: View, pairs: Int64, camera: RectifiedCamera, trend: Pose | None
-    ) -> Bool:
+    def _on_trend(self, points: Float64, seen: Float32, camera: RectifiedCamera, trend: Pose | None) -> Bool:
         if trend is None:
-            return np.ones(len(pairs), np.bool_)
-        expected = project_stereo(trend.apply(old.points[pairs[:, 0]]), camera)[:, :2]
-        off = np.linalg.norm(expected - new.features.pixels[pairs[:, 1]], axis=1)
-        near: Bool = off <= self.settings.trend_px
+            return np.ones(len(points), np.bool_)
+        with np.errstate(invalid="ignore"):
+            off = np.linalg.norm(project_stereo(trend.apply(points), camera)[:, :2] - seen, axis=1)
+            near: Bool = off <= self.settings.trend_px
         return near
 
 

@@ -1,4 +1,4 @@
-"""Pictures one by one as stereo odometry looks at them: ORB features with a depth, or why there are none."""
+"""Pictures one by one as stereo odometry looks at them: features with a depth, or why there are none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.calibration.rectification import Rectifier
-from barsight.core.arrays import Float32, Float64
+from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.types import RefusedFrame
 from barsight.features.guided import match_across, triangulate
@@ -46,14 +46,13 @@ class OdometrySettings:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One frame's features with a stereo disparity. points: (N, 3) in `rect0`. coarse: (h, w) the pair's
-    coarse disparity, px of the full picture, NaN unknown.
+    """One frame's features. about_px: (N,) their coarse disparities; coarse: (h, w) the pair's, NaN unknown;
+    both in px of the full picture.
     """
 
     pair: PatchPair
     features: Features
-    disparity: Float64
-    points: Float64
+    about_px: Float32
     coarse: Float32
 
     @property
@@ -61,43 +60,51 @@ class View:
         """The frame's."""
         return self.pair.pair.stamp_ns
 
+    def points(self, index: Int64, settings: OdometrySettings) -> Float64:
+        """(M, 3) in `rect0` of the features of an index (M,), NaN where the right picture shows none at a
+        useful depth.
+        """
+        camera = self.pair.pair.camera
+        places = self.features.pixels[index].astype(np.float64)
+        right = match_across(self.pair, places, self.about_px[index].astype(np.float64))
+        points = triangulate(np.column_stack([places, right.pixels[:, 0]]), camera)
+        with np.errstate(invalid="ignore"):
+            kept = right.found & (points[:, 2] > settings.nearest_m)
+            kept &= points[:, 2] < settings.farthest_baselines * camera.baseline_m
+        return np.where(kept[:, None], points, np.nan)
+
 
 def views(
     recording: Recording, rectifier: Rectifier, settings: OdometrySettings, advance: Callable[[], None]
 ) -> Iterator[View | RefusedFrame]:
-    """Of each frame its features, or why it shows none. `advance` is called once a frame."""
+    """Of each frame its ORB features, or why it shows none. `advance` is called once a frame."""
     for frame in recording.frames():
         advance()
         if isinstance(frame, RefusedFrame):
             yield frame
             continue
         pair = rectifier(frame)
-        view = pair if isinstance(pair, Failed) else look(patch_pair(pair), settings)
+        if isinstance(pair, Failed):
+            yield RefusedFrame(frame.stamp_ns, pair.reason)
+            continue
+        view = look(patch_pair(pair), detect_orb(pair.left, settings.features), settings)
         yield RefusedFrame(frame.stamp_ns, view.reason) if isinstance(view, Failed) else view
 
 
 def look(
-    pair: PatchPair, settings: OdometrySettings, span: tuple[float, float] | None = None
-) -> View | Failed:
-    """The ORB features of a pair that have a depth; Failed `no-features` where too few do.
+    pair: PatchPair, features: Features, settings: OdometrySettings,
+    span: tuple[float, float] | None = None,
+) -> View | Failed:  # fmt: skip
+    """A pair's left features that have a coarse disparity; Failed `no-features` where too few do.
 
     span: the lowest and highest disparity to expect, px, where that is known.
     """
     camera = pair.pair.camera
-    features = detect_orb(pair.pair.left, settings.features)
     coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px, known=span, both_ways=False)
     row = (features.pixels[:, 1] * coarse.shape[0] / camera.height).astype(int)
     column = (features.pixels[:, 0] * coarse.shape[1] / camera.width).astype(int)
-    guess = coarse[row, column]
-    near = np.isfinite(guess)
-    features, guess = features.chosen(near), guess[near]
-    places = features.pixels.astype(np.float64)
-    right = match_across(pair, places, guess.astype(np.float64))
-    points = triangulate(np.column_stack([places, right.pixels[:, 0]]), camera)
-    with np.errstate(invalid="ignore"):
-        kept = right.found & (points[:, 2] > settings.nearest_m)
-        kept &= points[:, 2] < settings.farthest_baselines * camera.baseline_m
-    if kept.sum() < settings.least_inliers:
-        return Failed("no-features", f"only {int(kept.sum())} features have a depth")
-    disparity = places[kept, 0] - right.pixels[kept, 0]
-    return View(pair, features.chosen(kept), disparity, points[kept], coarse)
+    about = coarse[row, column]
+    known = np.isfinite(about)
+    if known.sum() < settings.least_inliers:
+        return Failed("no-features", f"only {int(known.sum())} features have a depth")
+    return View(pair, features.chosen(known), about[known], coarse)

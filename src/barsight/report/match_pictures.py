@@ -35,7 +35,7 @@ def match_pictures(example: MatchingExample) -> tuple[Picture, ...]:
     scale = min(1.0, LONGEST_PX / max(example.old.shape))
     wrong = ~example.filtered
     agreed, lost = example.agreed, ~example.agreed & np.isfinite(example.found).all(axis=1)
-    source = "encoders and gyro" if example.by_sensors else "ORB's features"
+    source = "encoders and gyro" if example.by_sensors else "the pictures themselves"
     return (
         Picture(
             "features", "Features",
