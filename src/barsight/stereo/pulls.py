@@ -12,7 +12,15 @@ import numpy as np
 from barsight.core.arrays import Float32, kernel
 from barsight.core.parallel import in_bands
 from barsight.stereo.supports import MARGIN
-from barsight.stereo.windows import BAND_ROWS, mirrored, roll_product, roll_square, roll_sum, slide
+from barsight.stereo.windows import (
+    BAND_ROWS,
+    fresh_columns,
+    mirrored,
+    roll_product,
+    roll_square,
+    roll_sum,
+    slide,
+)
 
 _CONTRAST_FLOOR = np.float32(4)
 _BLOCK_PX = 3
@@ -40,7 +48,7 @@ def _compare(
     trust: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = left.shape
-    columns = np.zeros((5, width + 2 * reach + 1))
+    columns = fresh_columns(5, width, reach)
     means = np.empty((5, width), dtype=np.float32)
     none = np.zeros(width, dtype=np.float32)
     one, zero, floor = np.float32(1), np.float32(0), _CONTRAST_FLOOR
@@ -100,7 +108,7 @@ def _weigh(
     end: int,
 ) -> None:  # fmt: skip
     height, width = residual_mean.shape
-    columns = np.zeros((2, width + 2 * reach + 1))
+    columns = fresh_columns(2, width, reach)
     powers = np.empty((2, width), dtype=np.float32)
     rows = np.zeros((4, width), dtype=np.float32)
     none, coming_detail, going_detail, share = rows[0], rows[1], rows[2], rows[3]
@@ -176,7 +184,7 @@ def _lengthen(
     mean_weight: Float32, short_of: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = mean_weight.shape
-    columns = np.zeros((2, width + 2 * reach + 1))
+    columns = fresh_columns(2, width, reach)
     rows = np.zeros((2, width), dtype=np.float32)
     none, spurious = rows[0], rows[1]
     inner, share = slice(MARGIN, MARGIN + width), np.float32(1) / _MOST_UNDAMPED
@@ -235,7 +243,7 @@ def _noise_power(
     power: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = usable.shape
-    column = np.zeros(width + 2 * reach + 1)
+    column = fresh_columns(1, width, reach)[0]
     rows = np.zeros((3, width), dtype=np.float32)
     none, ahead, behind = rows[0], rows[1], rows[2]
     line = np.empty(width + 2, dtype=np.float32)

@@ -8,7 +8,7 @@ from barsight.core.arrays import Float32, kernel
 from barsight.core.parallel import in_bands
 from barsight.stereo.curvature import curvature_row
 from barsight.stereo.supports import MARGIN
-from barsight.stereo.windows import BAND_ROWS, mirrored, roll_product, roll_sum, slide
+from barsight.stereo.windows import BAND_ROWS, fresh_columns, mirrored, roll_product, roll_sum, slide
 
 _SLACK = np.float32(0.5)
 _BLEND_REACH_PX = 4
@@ -57,7 +57,7 @@ def _blend(
     usable: Float32, reach: int, fitted: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = power.shape
-    columns = np.zeros((2, width + 2 * reach + 1))
+    columns = fresh_columns(2, width, reach)
     rows = np.zeros((5, width), dtype=np.float32)
     none, ahead, behind, mean, seen = rows[0], rows[1], rows[2], rows[3], rows[4]
     zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
@@ -110,7 +110,7 @@ def _settle(
     fitted: Float32, axes: Float32, reach: int, disparity: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = fitted.shape
-    column = np.zeros(width + 2 * reach + 1)
+    column = fresh_columns(1, width, reach)[0]
     rows = np.zeros((4, width), dtype=np.float32)
     none, ahead, behind, sag = rows[0], rows[1], rows[2], rows[3]
     half, quarter = np.float32(0.5) * _SPREAD_ACROSS_PX2, np.float32(0.25)

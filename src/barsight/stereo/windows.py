@@ -8,10 +8,17 @@ compiler makes vectors of no others.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Float64, kernel
 from barsight.core.parallel import in_bands
+from barsight.stereo.vectors import FLOAT_LANES, Vectors
 
 BAND_ROWS = 128
 
@@ -39,8 +46,14 @@ def mirrored(place: int, count: int) -> int:
 
 
 @kernel()
+def fresh_columns(count: int, width: int, reach: int) -> Float64:
+    """Columns' sums (count, ...) to begin with, one row for each of the roll_* below."""
+    return np.zeros((count, width + 2 * reach + 2 * FLOAT_LANES))
+
+
+@kernel()
 def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> None:
-    """column: (W + 2 reach + 1,) sums; a row ahead comes in, one behind goes."""
+    """column: see `fresh_columns`; a row ahead comes in, one behind goes."""
     for x in range(ahead.shape[0]):
         column[reach + x] += np.float64(ahead[x]) - np.float64(behind[x])
 
@@ -64,39 +77,56 @@ def roll_square(
         column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
 
 
+@intrinsic  # type: ignore[untyped-decorator]
+def _add_columns(_: Any, column: Any, threes: Any, side: Any, mean: Any, chunks: Any, scale: Any) -> Any:
+    """Sums of `side` columns, times `scale`, for so many chunks of 16 windows. threes: for use inside."""
+    signature = types.void(column, threes, side, mean, chunks, scale)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        side, chunks = arguments[2], arguments[4]
+        index, wide = side.type, ir.VectorType(ir.DoubleType(), FLOAT_LANES)
+        whole = builder.sdiv(side, index(3))
+
+        def columns(at: Any) -> Any:
+            return v.load(v.data(0), at, wide)
+
+        beyond = builder.add(builder.sdiv(side, index(FLOAT_LANES)), index(1))
+        with cgutils.for_range(builder, builder.add(chunks, beyond)) as loop:
+            at = builder.mul(loop.index, index(FLOAT_LANES))
+            one, two, three = (columns(builder.add(at, index(step))) for step in range(3))
+            v.store(builder.fptrunc(v.sum(v.sum(one, two), three), v.floats), v.data(1), at)
+        with cgutils.for_range(builder, chunks) as loop:
+            at = builder.mul(loop.index, index(FLOAT_LANES))
+            (total,) = v.zeros(1)
+            with cgutils.for_range(builder, whole) as inner:
+                v.add_to(
+                    total, v.load(v.data(1), builder.add(at, builder.mul(inner.index, index(3))), v.floats)
+                )
+            with cgutils.for_range(builder, builder.srem(side, index(3))) as inner:
+                last = builder.sub(builder.add(at, side), builder.add(inner.index, index(1)))
+                v.add_to(total, builder.fptrunc(columns(last), v.floats))
+            v.store(v.product(builder.load(total), v.all(arguments[5], v.floats)), v.data(3), at)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
 @kernel()
 def slide(column: Float64, reach: int, mean: Float32) -> None:
-    """The means (W,) over windows of 2 reach + 1 columns, whose sums are column[reach : reach + W].
-
-    Four quarters of the row go at once: one waits for the sum before.
-    """
+    """The means (W,) over windows of 2 reach + 1 columns, whose sums are column[reach : reach + W]."""
     width, side = mean.shape[0], 2 * reach + 1
     for step in range(1, reach + 1):
         column[reach - step] = column[reach + mirrored(-step, width)]
         column[reach + width - 1 + step] = column[reach + mirrored(width - 1 + step, width)]
-    scale = 1.0 / (side * side)
-    quarter = width // 4
-    a = b = c = d = 0.0
-    for step in range(side):
-        a += column[step]
-        b += column[quarter + step]
-        c += column[2 * quarter + step]
-        d += column[3 * quarter + step]
-    for x in range(quarter):
-        mean[x] = a * scale
-        a += column[x + side] - column[x]
-        y = quarter + x
-        mean[y] = b * scale
-        b += column[y + side] - column[y]
-        y += quarter
-        mean[y] = c * scale
-        c += column[y + side] - column[y]
-        y += quarter
-        mean[y] = d * scale
-        d += column[y + side] - column[y]
-    for x in range(4 * quarter, width):
-        mean[x] = d * scale
-        d += column[x + side] - column[x]
+    scale, chunks = 1.0 / (side * side), width // FLOAT_LANES
+    threes = np.empty(len(column), dtype=np.float32)
+    _add_columns(column, threes, side, mean, chunks, np.float32(scale))
+    for x in range(chunks * FLOAT_LANES, width):
+        total = 0.0
+        for step in range(side):
+            total += column[x + step]
+        mean[x] = total * scale
 
 
 @kernel(fastmath=True)
