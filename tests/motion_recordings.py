@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,8 +43,8 @@ class MemoryRecording:
     def index(self) -> FrameIndex:
         return FrameIndex(self.stamps_ns or tuple(p.stamp_ns for p in self.pictures), ())
 
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
-        yield from self.pictures
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
+        yield from (p for p in self.pictures if wanted is None or p.stamp_ns in wanted)
 
     def imu(self) -> ImuSamples | None:
         return self.imu_samples

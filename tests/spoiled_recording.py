@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -35,10 +35,11 @@ class SpoiledRecording:
     def index(self) -> FrameIndex:
         return FrameIndex(tuple(self._new.values()), ())
 
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
         for frame in self.recording.frames():
-            if frame.stamp_ns in self._new:
-                yield replace(frame, stamp_ns=self._new[frame.stamp_ns])
+            stamp = self._new.get(frame.stamp_ns)
+            if stamp is not None and (wanted is None or stamp in wanted):
+                yield replace(frame, stamp_ns=stamp)
 
     def imu(self) -> ImuSamples | None:
         imu = self.recording.imu()

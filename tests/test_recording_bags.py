@@ -225,6 +225,8 @@ def test_frames_on_one_side_and_messages_late(tmp_path: Path) -> None:
     frames = list(recording.frames())
     assert [frame.stamp_ns for frame in frames] == list(recording.index.stamps_ns)
     assert all(isinstance(f, StereoFrame) and np.array_equal(f.left, f.right) for f in frames)
+    chosen = list(recording.frames({stamps(9)[1], stamps(9)[7]}))
+    assert [frame.stamp_ns for frame in chosen] == [stamps(9)[1], stamps(9)[7]]
 
 
 def test_a_bag_out_of_time_does_not_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,6 +37,7 @@ def test_everything_is_read(tmp_path: Path) -> None:
         assert frame.stamp_ns == stamps(3)[k]
         np.testing.assert_array_equal(frame.left, picture(10 * k))
         np.testing.assert_array_equal(frame.right, picture(10 * k + 1))
+    assert [frame.stamp_ns for frame in recording.frames({stamps(3)[1]})] == [stamps(3)[1]]
     assert recording.rig.timeshift_cam_imu_ns == -3_500_000
     np.testing.assert_allclose(recording.rig.body_from_cam1.matrix, mounts()[1], atol=1e-12)
     imu, crane, laser = recording.imu(), recording.crane(), recording.laser()

@@ -138,7 +138,7 @@ def measure(
     early = _known_early(source, settings, rectifier, first.range_m)
     match = _match(matcher, kept)
     # Pictures are matched on the core that the trajectory leaves idle.
-    begun = islice((frame for frame in source.frames() if frame.stamp_ns in early), len(early))
+    begun = islice(source.frames(early), len(early))
     with ExitStack() as pools:
         ahead = pools.enter_context(begun_map(match, begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
@@ -156,7 +156,7 @@ def measure(
         late = min((stamp for stamp in poses if stamp not in early), default=None)
         matched: Iterator[Matched | Refusal] = ahead
         if late is not None:
-            rest = (f for f in source.frames() if f.stamp_ns in poses and f.stamp_ns >= late)
+            rest = source.frames({stamp for stamp in poses if stamp >= late})
             match = _match(replace(matcher, rectifier=rectifier), kept)
             after = pools.enter_context(begun_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)

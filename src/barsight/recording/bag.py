@@ -7,7 +7,7 @@ asked for, once for the pictures. Nothing but the pictures that wait for their p
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -117,7 +117,7 @@ class BagRecording:
         """See `Recording.index`."""
         return self.camera_stamps.index
 
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
         """See `Recording.frames`. The bag is read once; a picture waits undecoded for its partner."""
         pairs = self.camera_stamps
         turns = (
@@ -133,7 +133,9 @@ class BagRecording:
                 continue
             waiting.setdefault(turn, {})[camera] = message
             while len(waiting.get(due, ())) == 2:
-                yield self._pair(self.index.stamps_ns[due], waiting.pop(due))
+                stamp, pair = self.index.stamps_ns[due], waiting.pop(due)
+                if wanted is None or stamp in wanted:
+                    yield self._pair(stamp, pair)
                 due += 1
             if sum(map(len, waiting.values())) > WAITING_LIMIT:
                 raise InputError(

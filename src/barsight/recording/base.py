@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -84,8 +84,11 @@ class Recording(Protocol):
         """The frames that `frames` will yield, without reading any image."""
         ...
 
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
-        """The paired frames in time's order, decoded one at a time; a torn image yields a `RefusedFrame`."""
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
+        """The paired frames in time's order, decoded one at a time; a torn image yields a `RefusedFrame`.
+
+        wanted: the stamps of those to decode; all, if None.
+        """
         ...
 
     def imu(self) -> ImuSamples | None:

@@ -5,7 +5,7 @@ The corners are known one from another, so the motion can be estimated from them
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -76,10 +76,11 @@ class CornerRecording(PairedAtOpening):
             both, first, second = np.intersect1d(names, other_names, return_indices=True)
             yield NamedPoints(int(self._pairs.left_ns[left]), both, pixels[first], other_pixels[second])
 
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
         """All refused: there are no pictures."""
         for stamp in self.index.stamps_ns:
-            yield RefusedFrame(stamp, NO_PICTURES)
+            if wanted is None or stamp in wanted:
+                yield RefusedFrame(stamp, NO_PICTURES)
 
     def stored_images(self) -> Iterator[StoredImage]:
         """Raises InputError: there are no pictures."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,8 +42,8 @@ class Forwarded:
     def index(self) -> FrameIndex:
         return self.whole.index
 
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
-        return self.whole.frames()
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
+        return self.whole.frames(wanted)
 
     def imu(self) -> ImuSamples | None:
         return self.whole.imu()

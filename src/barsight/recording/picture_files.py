@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 
 from barsight.calibration.rig import StereoRig
@@ -23,11 +23,12 @@ class PictureFiles(PairedAtOpening):
     _left: Sequence[Path]
     _right: Sequence[Path]
 
-    def frames(self) -> Iterator[StereoFrame | RefusedFrame]:
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
         """See `Recording.frames`."""
         pairing = self._pairs.pairing
         for stamp, left, right in zip(self.index.stamps_ns, pairing.left, pairing.right, strict=True):
-            yield self._read_pair(stamp, self._left[left], self._right[right])
+            if wanted is None or stamp in wanted:
+                yield self._read_pair(stamp, self._left[left], self._right[right])
 
     def stored_images(self) -> Iterator[StoredImage]:
         """Every picture's bytes as stored, both cameras in time's order, missing files left out."""
