@@ -135,37 +135,30 @@ def _by_cell(
 
 
 @kernel()
-def _highest_first(said: Float32) -> None:
-    """Order the few points of a cell in place; many (a wall seen from the side) by a real sort."""
-    if said.shape[0] > 32:
-        said[:] = said[np.argsort(-said[:, _HEIGHT])]
-        return
-    for i in range(1, said.shape[0]):
-        j = i
-        while j > 0 and said[j - 1, _HEIGHT] < said[j, _HEIGHT]:
-            for k in range(_SAID):
-                said[j - 1, k], said[j, k] = said[j, k], said[j - 1, k]
-            j -= 1
-
-
-@kernel()
 def _gather(
     said: Float32, starts: Int64, cell_m: float
 ) -> tuple[Int64, Bool, Float32, Float32, Float32, Float32]:
-    """Within each cell, from the top: points no deeper than 4 sigma below the first are one surface."""
+    """Within each cell, from the top: points no deeper than 4 sigma below the highest are one surface; those
+    below wait at the cell's front."""
     count = said.shape[0]
     cell, middle = np.empty(count, np.int64), np.zeros(count, np.bool_)
     out = np.empty((4, count), np.float32)
     n = 0
     for k in range(starts.size - 1):
-        i, last = starts[k], starts[k + 1]
-        if last - i > 1:
-            _highest_first(said[i:last])
-        while i < last:
-            floor = said[i, _HEIGHT] - max(4 * np.sqrt(said[i, _NOISE]), 2 * cell_m)
+        first, last = starts[k], starts[k + 1]
+        while first < last:
+            top = first
+            for i in range(first + 1, last):
+                if said[i, _HEIGHT] > said[top, _HEIGHT]:
+                    top = i
+            floor = said[top, _HEIGHT] - max(4 * np.sqrt(said[top, _NOISE]), 2 * cell_m)
             weights = heights = variances = extra = grey = 0.0
-            held = 0
-            while i < last and said[i, _HEIGHT] >= floor:
+            left = first
+            for i in range(first, last):
+                if said[i, _HEIGHT] < floor:
+                    said[left] = said[i]
+                    left += 1
+                    continue
                 w = 1.0 / max(said[i, _NOISE], 1e-10)
                 weights += w
                 heights += w * said[i, _HEIGHT]
@@ -173,12 +166,12 @@ def _gather(
                 extra += said[i, _SHARED]
                 grey += said[i, _GREY]
                 middle[n] |= said[i, _MIDDLE] > 0
-                held += 1
-                i += 1
+            held = last - left
             cell[n] = k
             out[0, n] = heights / weights
             out[1, n] = variances / held
             out[2, n] = extra / held
             out[3, n] = grey / held
             n += 1
+            last = left
     return cell[:n], middle[:n], out[0, :n], out[1, :n], out[2, :n], out[3, :n]
