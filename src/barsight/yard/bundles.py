@@ -156,14 +156,17 @@ def _readings(sheet: Sheet, templates: Templates, settings: BundleSettings) -> l
     for row in range(int(known[0]) + min(step, known.size) // 2, int(known[-1]) + 1, step):
         v = sheet.v0_m + row * sheet.cell_m
         candidates = _worth_growing(guess(sheet, templates, v, settings))
-        fresh = [one for one in candidates if not any(_same(one, fit, row) for fit in fits)]
+        taken = _taken(fits, row, v)
+        fresh = [one for one in candidates if not _is_taken(one, taken)]
         seeds = (_seed(one, row, rows, sheet, settings) for one in fresh)
         grown = ordered_map(lambda seed: grow(sheet, seed, settings), seeds)
         for one, fit in zip(fresh, grown, strict=True):
-            if fit is None or any(_same(one, earlier, row) for earlier in fits):
+            if fit is None or _is_taken(one, taken):
                 continue
             if (fit.last - fit.first + 1) * sheet.cell_m >= settings.least_length_m:
                 fits.append(fit)
+                for rings, places in _taken([fit], row, v).items():
+                    taken.setdefault(rings, []).extend(places)
     return fits
 
 
@@ -181,18 +184,16 @@ def _worth_growing(guesses: list[Guess]) -> list[Guess]:
     """The best set of guesses that don't overlap, and other packings that do nearly as well there."""
     if not guesses:
         return []
-    low = np.array([g.u_m - 0.45 * bundle_width(g.rings, g.diameter_m) for g in guesses])
-    high = np.array([g.u_m + 0.45 * bundle_width(g.rings, g.diameter_m) for g in guesses])
-    weight = np.array([g.gain - _EDGE_CELLS for g in guesses])
-    best = _best_intervals(low, high, weight)
+    u, gain = np.array([(g.u_m, g.gain) for g in guesses]).T
+    reach = 0.45 * np.array([bundle_width(g.rings, g.diameter_m) for g in guesses])
+    best = _best_intervals(u - reach, u + reach, gain - _EDGE_CELLS)
     kept = [guesses[k] for k in best]
     for k in best:
         seen = {guesses[k].rings}
-        for other in guesses:
-            near = abs(other.u_m - guesses[k].u_m) < 0.5 * (high[k] - low[k])
-            if near and other.rings not in seen and other.gain > _RIVAL_SHARE * guesses[k].gain:
-                kept.append(other)
-                seen.add(other.rings)
+        for n in np.flatnonzero((np.abs(u - u[k]) < reach[k]) & (gain > _RIVAL_SHARE * gain[k])):
+            if guesses[n].rings not in seen:
+                kept.append(guesses[n])
+                seen.add(guesses[n].rings)
     return kept
 
 
@@ -214,11 +215,18 @@ def _best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
     return kept
 
 
-def _same(candidate: Guess, fit: Fit, row: int) -> bool:
-    if candidate.rings != fit.rings or not fit.first <= row <= fit.last:
-        return False
-    u, z = fit.at(candidate.v_m)
-    return abs(candidate.u_m - u) < 0.3 * fit.width_m and abs(candidate.z_m - z) < 0.3 * fit.width_m
+def _taken(fits: list[Fit], row: int, v_m: float) -> dict[int, list[tuple[float, float, float]]]:
+    """By rings: where the outlines that cross a row have their axes there, and how near one is the same."""
+    taken: dict[int, list[tuple[float, float, float]]] = {}
+    for fit in fits:
+        if fit.first <= row <= fit.last:
+            taken.setdefault(fit.rings, []).append((*fit.at(v_m), 0.3 * fit.width_m))
+    return taken
+
+
+def _is_taken(candidate: Guess, taken: dict[int, list[tuple[float, float, float]]]) -> bool:
+    places = taken.get(candidate.rings, ())
+    return any(abs(candidate.u_m - u) < near and abs(candidate.z_m - z) < near for u, z, near in places)
 
 
 def _weight(fit: Fit) -> float:
