@@ -13,7 +13,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64
 from barsight.core.pose import skew
 from barsight.core.types import RectifiedCamera
-from barsight.features.patches import Located, PatchImage, PatchPair, locate
+from barsight.features.patches import FINE_REACH_PX, Located, PatchImage, PatchPair, locate
 
 GATE_SIGMAS = 4.0
 MOST_OFF_ROW_PX = 1.0
@@ -130,7 +130,8 @@ def match_guided(
 ) -> GuidedMatches:  # fmt: skip
     """Looks for the patches of `source` at `places` (N, 2), `depth` (N,) m off, in both pictures of `pair`.
 
-    From the predicted place in the left picture, then across to the right one. repeat_px: (N,) how far off
+    From the predicted place in the left picture, by full-size pictures alone where that is near enough, then
+    across to the right one. repeat_px: (N,) how far off
     each patch's likeness is (the bars' pitch); an ellipse of 2 sigma that reaches a quarter of it is
     ambiguous.
     """
@@ -147,7 +148,8 @@ def match_guided(
     disparity = guess[:, 0] - guess[:, 2]
     camera = pair.pair.camera
     now = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
-    left = locate(source, pair.left, places[tried], guess[:, :2], grown=depth[tried] / now)
+    sure = bool(GATE_SIGMAS * np.quantile(predicted.reach_px[tried], 0.9) < FINE_REACH_PX)
+    left = locate(source, pair.left, places[tried], guess[:, :2], sure, grown=depth[tried] / now)
     right = match_across(pair, left.pixels, disparity, sure=True)
     stereo[tried] = np.column_stack([left.pixels, right.pixels[:, 0]])
     sigma[tried] = np.hypot(left.sigma_px, right.sigma_px) / 2**0.5
