@@ -1,5 +1,6 @@
 """Bars of 20, 40 and 90 mm: predictions that are bars off are refused, and pictures alone don't take them."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from bar_pictures import CAMERA, bar_view
 from barsight.core.errors import Failed
 from barsight.features.guided import GuidedMatches, PredictedMotion
-from barsight.features.patches import PatchPair
+from barsight.features.patches import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, TrackSettings, carry_on
 from barsight.motion.sightings import FrontEndSettings, consensus, look_at_corners
 from barsight.motion.step import move
@@ -20,11 +21,14 @@ WAY_M = 0.5
 
 @lru_cache
 def views(pitch_m: float, contrast: float) -> tuple[Tracks, PatchPair]:
-    old, new = bar_view(pitch_m, 0.0, contrast), bar_view(pitch_m, WAY_M, contrast, seed=9)
+    return followed(bar_view(pitch_m, 0.0, contrast)), bar_view(pitch_m, WAY_M, contrast, seed=9)
+
+
+def followed(old: PatchPair) -> Tracks:
     none = np.zeros(0, np.bool_)
     nothing = GuidedMatches(np.empty((0, 3)), np.empty(0), none, none)
     coarse = coarse_disparity(old.pair.left, old.pair.right, CAMERA.doffs_px)
-    return carry_on(Tracks(), old, nothing, none, coarse, TrackSettings()), new
+    return carry_on(Tracks(), old, nothing, none, coarse, TrackSettings())
 
 
 def moved(pitch_m: float, contrast: float, bars_off: float, sure_m: float) -> float | Failed:
@@ -59,6 +63,32 @@ def test_a_prediction_as_coarse_as_the_bars_is_refused(pitch_m: float) -> None:
         refused = moved(pitch_m, 12.0, bars_off, pitch_m / 3)
         assert isinstance(refused, Failed)
         assert "can't be told from the next bar's" in refused.reason
+
+
+def test_the_motion_that_thick_bars_show_tells_thin_ones_apart() -> None:
+    """The prediction is fine enough for 90 mm in the lower half only; points on 40 mm above are found too."""
+    old, new = (half_and_half(0.04, 0.09, x_m, seed) for x_m, seed in ((0.0, 0), (WAY_M, 9)))
+    tracks = followed(old)
+    covariance = np.diag([3e-4] * 3 + [0.007] * 3) ** 2
+    predicted = PredictedMotion(np.eye(3), np.array([-WAY_M - 0.003, 0, 0]), covariance)
+    found = consensus(tracks, new, predicted, FrontEndSettings())
+    assert not isinstance(found, Failed)
+    kept, matches, motion = found
+    assert abs(motion.translation[0] + WAY_M) < 1e-3
+    assert not matches.ambiguous.any()
+    above = tracks.stereo[:, 1] < CAMERA.height / 2 - 20
+    assert kept[above].sum() > 0.6 * (above & (tracks.stereo[:, 0] > WAY_M * 150 + 10)).sum() > 50
+    off = matches.stereo[kept, 0] - tracks.stereo[kept, 0]
+    depth = CAMERA.focal_px * CAMERA.baseline_m / (tracks.stereo[kept, 0] - tracks.stereo[kept, 2])
+    assert np.abs(off * depth / CAMERA.focal_px + WAY_M).max() < 0.01
+
+
+def half_and_half(above_m: float, below_m: float, x_m: float, seed: int) -> PatchPair:
+    above, below = bar_view(above_m, x_m, seed=seed).pair, bar_view(below_m, x_m, seed=seed).pair
+    middle = CAMERA.height // 2
+    left = np.vstack([above.left[:middle], below.left[middle:]])
+    right = np.vstack([above.right[:middle], below.right[middle:]])
+    return patch_pair(replace(above, left=left, right=right))
 
 
 @pytest.mark.parametrize("contrast", [12.0, 6.0])

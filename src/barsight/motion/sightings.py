@@ -245,4 +245,23 @@ def consensus(
             "ambiguous",
             f"only {100 * share:.0f} % of the points are found where they are expected: another bar may be",
         )
-    return kept, matches, PredictedMotion(step.rotation, step.translation, step.covariance)
+    motion = PredictedMotion(step.rotation, step.translation, step.covariance)
+    return *_with_ambiguous(tracks, pair, motion, matches, kept, repeats, settings), motion
+
+
+def _with_ambiguous(
+    tracks: Tracks, pair: PatchPair, motion: PredictedMotion, matches: GuidedMatches, kept: Bool,
+    repeats: Float64, settings: FrontEndSettings,
+) -> tuple[Bool, GuidedMatches]:  # fmt: skip
+    """Points too ambiguous for the prediction, looked for anew by the motion on which the others agree."""
+    left = np.flatnonzero(matches.ambiguous)
+    if left.size == 0:
+        return kept, matches
+    some, camera = tracks.chosen(matches.ambiguous), pair.pair.camera
+    places = predict_places(triangulate(some.stereo, camera), settings.tracks.sigma_px, motion, camera)
+    again = find_again(some, pair, places, settings.tracks, repeats[left])
+    stereo, sigma = matches.stereo.copy(), matches.sigma_px.copy()
+    kept, ambiguous = kept.copy(), matches.ambiguous.copy()
+    stereo[left], sigma[left], kept[left] = again.stereo, again.sigma_px, again.found
+    ambiguous[left] = again.ambiguous
+    return kept, GuidedMatches(stereo, sigma, matches.found | kept, ambiguous)
