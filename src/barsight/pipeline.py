@@ -145,6 +145,7 @@ def measure(
             estimate = make_estimator(settings.motion)
             count = _counter("trajectory", total, advance)
             trajectory = once(kept, "trajectory", lambda: estimate(source, rectifier, count))
+            give_back()
             calibrated = self_calibrated(
                 source.rig, rectifier, trajectory.drift, calibration_px,
                 correct=settings.self_calibrate == "yaw",

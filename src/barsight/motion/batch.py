@@ -82,6 +82,7 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     if problem.sightings is not None and used.any():
         if problem.has_latency and seeks_drift:
             state, system, _ = sought(problem, state, system, used, START_GAIN)
+        del system
         seen, problem = problem.sightings, with_known_bends(problem, state.values)
         problem, state, system, used = _with_seen_noise(problem, seen, state, used)
     drift: RigDrift | None = None
@@ -155,6 +156,7 @@ def _with_seen_noise(
     residual = sighting_residuals(problem, state, used)
     wider = persistence(residual, seen, used) * nearness(residual, seen, used)
     if wider > 1:
+        del system
         problem = replace(problem, sightings=replace(seen, sigma_px=wider * seen.sigma_px))
         problem, state, system = with_slides(problem, state, used, rounds=1)
     return problem, state, system, used

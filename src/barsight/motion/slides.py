@@ -75,10 +75,12 @@ def with_slides(
         return problem, *optimise(problem, graph, state, used)
     if not len(state.pieces):
         state = replace(state, pieces=np.zeros(2 * pieces.count))
-    for _ in range(rounds):
+    for left in reversed(range(rounds)):
         problem = replace(problem, pieces=pieces)
         state, system = optimise(problem, graph, state, used, most=STEPS)
         pieces = _learnt(problem, state, system, pieces, used)
+        if left:
+            del system
     return problem, state, system
 
 

@@ -117,6 +117,7 @@ def optimise(
             damping = max(1e-5, 10 * damping)
             continue
         gain, cost, state, damping = cost - lower, lower, trial, damping / 10 if damping > 1e-5 else 0.0
+        del system  # the largest thing here: never two of them
         system = linearise(problem, graph, state, used)
         if gain < least_gain * max(cost, 1e-9):
             break
