@@ -117,3 +117,18 @@ def test_what_is_refused(pair: tuple[Path, Path], tmp_path: Path, capsys: pytest
     refused([left, right, *out, "--range", "many"], capsys, "many")
     refused([left, right, "-o", str(tmp_path / "d.jpg")], capsys, "d.jpg", ".pfm")
     assert not any(tmp_path.glob("d.*"))
+
+
+def test_pictures_that_do_not_belong_together_are_told(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Noise matches itself somewhere; a wall has no such warning."""
+    noise = [
+        np.random.default_rng(k).normal(128, 60, (200, 300)).clip(0, 255).astype(np.uint8) for k in (1, 2)
+    ]
+    left, right = tmp_path / "noise.png", tmp_path / "other.png"
+    for path, picture in zip((left, right), noise, strict=True):
+        cv2.imwrite(str(path), cv2.GaussianBlur(picture, (0, 0), 1.2))
+    for pictures, told in (((left, right), True), (pair, False)):
+        assert run(["disparity", *map(str, pictures), "-o", str(tmp_path / "d.pfm")]) == 0
+        assert ("warning: hardly anything is matched well" in capsys.readouterr().err) == told

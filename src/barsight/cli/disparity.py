@@ -41,8 +41,12 @@ _REMEDIES = {
     "swapped": "exchange the two pictures or give --range A:B",
     "same-image": "give two pictures of one pair",
 }
+_POOR = "warning: hardly anything is matched well: two pictures of one pair, bright and sharp enough?"
 _LEAST_SIZE = (3, 16)
 """Rows and columns below which nothing is matched."""
+_POOR_SIGMA_PX = 0.7
+"""Lower quartile of our own sigma: sound pairs (Middlebury, EuRoC, KITTI, a yard) have 0.06 to 0.45, noise,
+pictures of different scenes and pictures drowned in noise 1.0 to 42."""
 SUFFIXES = (".pfm", ".png", ".tif", ".tiff")
 
 
@@ -91,6 +95,8 @@ def run(arguments: Sequence[str]) -> None:
         if preview is not None:
             write_preview(Preview(pair.left, disparity.disparity_px), preview)
         console.print(_summary(out, disparity), soft_wrap=True, highlight=False)
+        if settings.method == "barsight" and np.nanpercentile(disparity.sigma_px, 25) > _POOR_SIGMA_PX:
+            console.print(_POOR, soft_wrap=True, highlight=False)
 
     call(command, "disparity", arguments)
 
