@@ -149,12 +149,11 @@ def _solved(
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _add_near(
-    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, weight_sums: Any,
-    pull_sums: Any, at: Any,
-) -> Any:  # fmt: skip
-    """The sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written from
-    `at` on. All arrays are flat."""
-    signature = types.void(theres, weights, pulls, middle, offsets, weight_sums, pull_sums, at)
+    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, weight_sums: Any, pull_sums: Any
+) -> Any:
+    """The sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written to the
+    same places. All arrays are flat."""
+    signature = types.void(theres, weights, pulls, middle, offsets, weight_sums, pull_sums)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
@@ -170,7 +169,7 @@ def _add_near(
                 totals[1], v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, v.floats)))
             )
         for place, total in zip((5, 6), totals, strict=True):
-            v.store(builder.load(total), v.data(place), arguments[7])
+            v.store(builder.load(total), v.data(place), arguments[3])
         return context.get_dummy_value()
 
     return signature, generate
@@ -187,8 +186,7 @@ def _sum_near(
     framed_width = disparity.shape[1]
     theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
     offsets = np.empty(len(near), dtype=np.int64)
-    flat = np.empty((2, TILE_COLUMNS), dtype=np.float32)
-    weight_part, pull_part = flat[0], flat[1]
+    weight_sums, pull_sums = weight_sum.reshape(-1), pull_sum.reshape(-1)
     for tile_x in range(axes.shape[1]):
         for tile_y in range(first_tile, end_tile):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
@@ -199,11 +197,9 @@ def _sum_near(
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
                 for part in range(0, count, FLOAT_LANES):
-                    _add_near(theres, weights, pulls, middle + part, offsets, weight_part, pull_part, part)
-                for i in range(count):
-                    weight_sum[y + MARGIN, x0 + MARGIN + i] = weight_part[i]
-                for i in range(count):
-                    pull_sum[y + MARGIN, x0 + MARGIN + i] = pull_part[i]
+                    _add_near(theres, weights, pulls, middle + part, offsets, weight_sums, pull_sums)
+                for beyond in range(middle + count, middle + TILE_COLUMNS):
+                    weight_sums[beyond] = pull_sums[beyond] = 0
 
 
 @kernel()
