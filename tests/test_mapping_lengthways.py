@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened
+from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened, valleys
 
 CELL_M, GATE_M, REACH = 0.01, 0.015, 12
 BLUR_CELLS = 0.7
@@ -105,18 +105,58 @@ def test_sharpening_undoes_part_of_a_windows_blur(turn_deg: float, diameter_m: f
     left = 0.8 if turn_deg % 90 == 0 else 0.9
     assert np.std(after[inner]) < left * np.std(before[inner])
     assert abs(np.mean(after[inner])) < 0.0005
-    assert np.mean((np.abs(after) <= 1.96 * blur_sigma(sharp - averaged))[inner]) > 0.8
+    sigma = blur_sigma(sharp - averaged, valleys(sharp, direction))
+    assert np.mean((np.abs(after) <= 1.96 * sigma)[inner]) > 0.8
 
 
-def test_what_blur_leaves_is_twice_and_three_quarters_the_rms_moved() -> None:
+def valleys_slowly(z: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    out = np.zeros(z.shape, bool)
+    for i, j in zip(*np.nonzero(direction >= 0), strict=True):
+        turn = direction[i, j] * np.pi / 16
+        sides = []
+        for side in (-1, 1):
+            way = [
+                (i + side * round(n * np.cos(turn)), j - side * round(n * np.sin(turn))) for n in range(1, 7)
+            ]
+            off = [z[a, b] - z[i, j] if 0 <= a < z.shape[0] and 0 <= b < z.shape[1] else 1.0 for a, b in way]
+            step = next((n for n, o in enumerate(off) if abs(o) > 0.03), 6)
+            sides.append(any(o > 0 for o in off[:step]))
+        out[i, j] = all(sides)
+    return out
+
+
+def test_valleys_agree_with_the_slow_reference() -> None:
+    rng = np.random.default_rng(9)
+    z = (bars(20.0, cells=40) + rng.normal(0, 0.005, (40, 40))).astype(np.float32)
+    z[rng.random(z.shape) < 0.1] = np.nan
+    direction = np.where(np.isfinite(z), rng.integers(0, 16, z.shape), -1).astype(np.int8)
+    np.testing.assert_array_equal(valleys(z, direction), valleys_slowly(z, direction))
+
+
+@pytest.mark.parametrize("diameter_m", [0.04, 0.06])
+def test_valleys_lie_between_crests(diameter_m: float) -> None:
+    """Bars along one of the 16 directions: all but crests lie lower than something on either side of them; a
+    plane doesn't."""
+    z = bars(0.0, diameter_m).astype(np.float32)
+    direction = np.full(z.shape, 8, np.int8)
+    depth = z.max() - z
+    found = valleys(z, direction)[:, 15:-15]
+    assert not found[depth[:, 15:-15] < 1e-6].any()
+    assert found[(depth[:, 15:-15] > 0.004) & (depth[:, 15:-15] < 0.02)].all()
+    slope = np.broadcast_to(np.arange(40, dtype=np.float32) * 0.005, (40, 40))
+    assert not valleys(slope, np.full((40, 40), 8, np.int8)).any()
+
+
+def test_what_blur_leaves_is_twice_the_rms_moved_and_five_times_in_valleys() -> None:
     """Against a plain loop; cells that couldn't be moved don't count, and far from bars nothing is left."""
     rng = np.random.default_rng(7)
     moved = rng.normal(0, 0.002, (40, 60)).astype(np.float32)
     moved[:, 40:] = 0
     moved[rng.random(moved.shape) < 0.2] = np.nan
-    found = blur_sigma(moved)
-    for i, j in ((20, 20), (6, 30), (30, 41), (20, 50)):
+    valley = rng.random(moved.shape) < 0.5
+    found = blur_sigma(moved, valley)
+    for i, j in ((20, 20), (20, 21), (6, 30), (30, 41), (20, 50)):
         near = moved[i - 5 : i + 6, j - 5 : j + 6]
         near = near[np.isfinite(near) & (near != 0)]
-        expected = 2.75 * np.sqrt(np.mean(near**2)) if near.size else 0.0
+        expected = (5 if valley[i, j] else 2) * np.sqrt(np.mean(near**2)) if near.size else 0.0
         assert found[i, j] == pytest.approx(expected, rel=1e-4, abs=1e-9)

@@ -154,3 +154,27 @@ def test_the_cloud_holds_every_supported_height(tmp_path: Path) -> None:
     sigma = np.concatenate([part.sigma_z_m for part in parts])
     np.testing.assert_allclose(sigma, np.sqrt(0.01**2 / 2 * 4 / 5), rtol=1e-3)
     np.testing.assert_allclose(surface.window(-2, 255, 3, 2).z_m, 1)
+
+
+def test_the_cloud_agrees_with_the_surface_on_bars(tmp_path: Path) -> None:
+    """Bars over a floor, across a tile's border: the surface's points are the surface's cells, and what lies
+    beneath has the same part for blur."""
+    rng = np.random.default_rng(2)
+    x, y = block(60, 60, 230, 10)
+    bars = 0.5 + np.sqrt(0.03**2 - (0.01 * x % 0.06 - 0.03) ** 2)
+    noisy = (z + rng.normal(0, 0.0005, x.shape) for z in (0.0, bars) for _ in range(2))
+    views = [view(x, y, z, 0.0005) for z in noisy]
+    surface = fused(views, tmp_path, MapSettings(min_views=2, along_m=0.1))
+    layers = surface.window(230, 10, 60, 60)
+    xyz, sigma = (
+        np.concatenate([getattr(part, name) for part in surface.cloud()]) for name in ("xyz_m", "sigma_z_m")
+    )
+    column, row = np.rint(xyz[:, :2].T / 0.01).astype(int) - [[230], [10]]
+    top = xyz[:, 2] > 0.3
+    assert top.sum() == (~top).sum() == 3600
+    np.testing.assert_array_equal(xyz[top, 2], layers.z_m[row[top], column[top]])
+    np.testing.assert_array_equal(sigma[top], layers.sigma_m[row[top], column[top]])
+    assert np.median(sigma[top]) > 3 * 0.0005
+    beneath = np.full((60, 60), np.nan)
+    beneath[row[~top], column[~top]] = sigma[~top]
+    np.testing.assert_allclose(beneath, layers.sigma_m, rtol=0.1)

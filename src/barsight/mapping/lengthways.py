@@ -7,13 +7,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Float32, Int8, Int64, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int8, Int64, kernel
 
 _SAMPLE_CELLS = 2
 _DIRECTIONS = 16
 _STEP_M = 0.03
 _WIDEST_CELLS = np.float32(1.5)
-_BLUR_CELLS, _BLUR_SHARE = 11, 2.75
+_BLUR_CELLS, _BLUR_SHARE, _VALLEY_SHARE = 11, 2.0, 5.0
+_VALLEY_CELLS = 6
 
 
 def lengthways(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[Float32, Int8]:
@@ -77,24 +78,43 @@ def sharpened(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:
     neighbour is missing or over 30 mm higher or lower, which is a step and no bend. A wider blur than
     `_WIDEST_CELLS` is undone in part only, since noise would grow more than bars gain.
     """
-    turn = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
-    rows, columns = (np.rint(f).astype(np.int64) for f in (np.cos(turn), -np.sin(turn)))
+    rows, columns = np.rint(_across()).astype(np.int64)
     return _sharpened(z, direction, np.minimum(blur_cells, _WIDEST_CELLS) ** 2, rows, columns)
 
 
-def blur_sigma(moved: Float32) -> Float32:
+def valleys(z: Float32, direction: Int8) -> Bool:
+    """(H, W) whether a height lies below something on either side of it, across the bar and no further than
+    `_VALLEY_CELLS`: what a step of over 30 mm parts from it doesn't count.
+
+    z: (H, W) heights, NaN where there is none; direction: (H, W) the bar's own, of `lengthways`.
+    """
+    onward = np.arange(1, _VALLEY_CELLS + 1)[:, None]
+    rows, columns = (np.rint(onward * turn).astype(np.int64) for turn in _across())
+    return _valleys(z, direction, rows, columns)
+
+
+def blur_sigma(moved: Float32, valley: Bool) -> Float32:
     """(H, W) standard deviation of what blur and gloss leave on bars. moved: (H, W) by how much `sharpened`
-    has moved heights, NaN or 0 where it couldn't.
+    has moved heights, NaN or 0 where it couldn't; valley: (H, W), see `valleys`.
 
     The correction that is best differs from stack to stack by more than itself, and flanks are as unsure as
-    crests and valleys: `_BLUR_SHARE` times the RMS over about a bar's width, found on six yards.
+    crests: `_BLUR_SHARE` times the RMS over about a bar's width. Two bars of diameter D meet in a cusp: a
+    pixel's width p beside its bottom they lie sqrt(D p) higher, while a crest falls by p^2 / D. So valleys
+    have `_VALLEY_SHARE` times the RMS. Both shares were found on seven yards.
     """
     known = np.isfinite(moved) & (moved != 0)
     squares, count = (
         cv2.blur(a.astype(np.float32), (_BLUR_CELLS, _BLUR_CELLS))
         for a in (np.where(known, moved, 0) ** 2, known)
     )
-    return np.asarray(_BLUR_SHARE * np.sqrt(np.maximum(squares, 0) / np.maximum(count, 1e-6)), np.float32)
+    share = np.where(valley, np.float32(_VALLEY_SHARE), np.float32(_BLUR_SHARE))
+    return np.asarray(share * np.sqrt(np.maximum(squares, 0) / np.maximum(count, 1e-6)), np.float32)
+
+
+def _across() -> Float64:
+    """(2, 16) one cell across the bar of each direction, as a step in rows and in columns."""
+    turn = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+    return np.array([np.cos(turn), -np.sin(turn)])
 
 
 @kernel()
@@ -109,4 +129,26 @@ def _sharpened(z: Float32, direction: Int8, share: Float32, rows: Int64, columns
             before, after = z[i - di, j - dj] - z[i, j], z[i + di, j + dj] - z[i, j]
             if abs(before) <= _STEP_M and abs(after) <= _STEP_M:
                 out[i, j] = z[i, j] - share[i, j] * (before + after) / 2 / (di * di + dj * dj)
+    return out
+
+
+@kernel()
+def _valleys(z: Float32, direction: Int8, rows: Int64, columns: Int64) -> Bool:
+    height, width = z.shape
+    out = np.zeros(z.shape, np.bool_)
+    for i in range(height):
+        for j in range(width):
+            d = direction[i, j]
+            if d < 0:
+                continue
+            sides = 0
+            for side in (-1, 1):
+                for k in range(rows.shape[0]):
+                    a, b = i + side * rows[k, d], j + side * columns[k, d]
+                    if not (0 <= a < height and 0 <= b < width) or abs(z[a, b] - z[i, j]) > _STEP_M:
+                        break
+                    if z[a, b] > z[i, j]:
+                        sides += 1
+                        break
+            out[i, j] = sides == 2
     return out

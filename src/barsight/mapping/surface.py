@@ -12,14 +12,16 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Int8, UInt8
 from barsight.core.parallel import ordered_map
 from barsight.core.types import Source
+from barsight.mapping.cloud import CloudPart, read_part
 from barsight.mapping.election import Sights, elect, first_heights
 from barsight.mapping.filling import bridged
 from barsight.mapping.fusion import height_sigma
-from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened
+from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened, valleys
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, TileStore, Z
 
-_HALO = 18
+_HALO = 19
+"""Cells around a tile that it depends on: 12 along a bar, as far as six cells beside it, one for the bend."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +48,6 @@ class Layers:
 def grey_levels(intensity: Float32) -> UInt8:
     """Whole grey levels from 1, 0 where no view saw the cell."""
     return np.where(np.isfinite(intensity), np.rint(intensity).clip(1, 255), 0).astype(np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class CloudPart:
-    """A tile's points: xyz_m (N, 3) float32 in the reference frame, intensity, sigma_z_m, views (N,)."""
-
-    xyz_m: Float32
-    intensity: UInt8
-    sigma_z_m: Float32
-    views: Float32
 
 
 @dataclass(frozen=True)
@@ -91,10 +83,10 @@ class Surface:
         return layers
 
     def cloud(self) -> Iterator[CloudPart]:
-        """Every height that enough views support, sides and lower surfaces included, tile by tile."""
+        """Every height that enough views support, sides and lower surfaces included, tile by tile; those
+        that are the surface are as it has them."""
         for key in sorted(self.tiles):
-            with np.load(self.folder / f"cloud_{key[0]}_{key[1]}.npz") as part:
-                yield CloudPart(part["xyz"], part["intensity"], part["sigma"], part["views"])
+            yield read_part(self.folder, key)
 
 
 def finish(
@@ -116,14 +108,16 @@ def finish(
     def elect_tile(item: tuple[TileKey, Float32]) -> tuple[TileKey, int]:
         key, tile = item
         around = _first_around(folder, key, known)
-        elected = _layers(tile, elect(tile, key, around, sights, cell_m, min_views, settings))
+        winner = elect(tile, key, around, sights, cell_m, min_views, settings)
+        elected = _layers(tile, winner)
         _write_tile(folder, key, elected, "elected")
-        _write_cloud(folder, key, tile, cell_m, min_views)
+        CloudPart.of(tile, winner, key, cell_m, min_views).write(folder, key)
         return key, int((elected.source == Source.VISION).sum())
 
     def finish_tile(key: TileKey) -> tuple[TileKey, Layers]:
-        layers = _filled(folder, key, known, cell_m, settings, sights)
+        layers, blur = _filled(folder, key, known, cell_m, settings, sights)
         _write_tile(folder, key, layers, "surface")
+        read_part(folder, key).finished(layers.z_m, layers.sigma_m, blur).write(folder, key)
         return key, layers
 
     for _ in ordered_map(look, tiles()):
@@ -189,8 +183,9 @@ def _layers(tile: Float32, winner: Int8) -> Layers:
 
 def _filled(
     folder: Path, key: TileKey, keys: frozenset[TileKey], cell_m: float, settings: MapSettings, sights: Sights
-) -> Layers:
-    """The tile averaged lengthways, sharpened, its narrow gaps filled, looking at most the halo around it."""
+) -> tuple[Layers, Float32]:
+    """The tile averaged lengthways, sharpened, its narrow gaps filled, looking at most the halo around it;
+    and what blur and gloss leave on bars, 1 sigma."""
     along, reach = (min(round(way_m / cell_m), _HALO) for way_m in (settings.along_m, settings.fill_m))
     side = TILE_CELLS + 2 * _HALO
     around = Layers.unknown(side, side)
@@ -200,15 +195,18 @@ def _filled(
             neighbour = (key[0] + i, key[1] + j)
             if neighbour in keys:
                 _paste(_read_tile(folder, neighbour, "elected"), neighbour, around, column, row)
+    blur = np.zeros((side, side), np.float32)
     if along > 0:
         weight = np.nan_to_num(around.sigma_m**-2)
         z, direction = lengthways(around.z_m, weight, settings.least_gate_m, along)
         sharp = sharpened(z, direction, settings.sharpen_px * sights.pixel_m(z) / cell_m)
-        around = replace(around, z_m=sharp, sigma_m=np.hypot(around.sigma_m, blur_sigma(sharp - z)))
+        blur = blur_sigma(sharp - z, valleys(sharp, direction))
+        around = replace(around, z_m=sharp, sigma_m=np.hypot(around.sigma_m, blur))
     if reach > 0:
         fill_gaps(around, reach)
     inner = slice(_HALO, _HALO + TILE_CELLS)
-    return Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
+    layers = Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
+    return layers, blur[inner, inner]
 
 
 def fill_gaps(layers: Layers, reach: int) -> None:
@@ -219,25 +217,6 @@ def fill_gaps(layers: Layers, reach: int) -> None:
     """
     filled = bridged(layers.z_m, layers.sigma_m, layers.source == Source.VISION, reach)
     layers.source[filled] = Source.FILLED
-
-
-def _write_cloud(folder: Path, key: TileKey, tile: Float32, cell_m: float, min_views: int) -> None:
-    row, column, slot = np.nonzero(tile[..., VIEWS] >= min_views)
-    kept = tile[row, column, slot]
-    xyz = np.column_stack(
-        [
-            (column + key[0] * TILE_CELLS) * cell_m,
-            (row + key[1] * TILE_CELLS) * cell_m,
-            kept[:, Z],
-        ]
-    ).astype(np.float32)
-    np.savez(
-        folder / f"cloud_{key[0]}_{key[1]}.npz",
-        xyz=xyz,
-        intensity=kept[:, GREY].round().clip(0, 255).astype(np.uint8),
-        sigma=height_sigma(kept),
-        views=kept[:, VIEWS],
-    )
 
 
 def _span(occupied: Bool) -> tuple[int, int]:

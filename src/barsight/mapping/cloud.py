@@ -1,0 +1,66 @@
+"""The cloud: every height that enough views support, sides and lower surfaces included, a file per tile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Int8, Int32, UInt8
+from barsight.mapping.fusion import height_sigma
+from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, Z
+
+
+@dataclass(frozen=True, eq=False)
+class CloudPart:
+    """A tile's points: xyz_m (N, 3) float32 in the reference frame, intensity, sigma_z_m, views (N,).
+
+    cell: (N,) the point's cell, row by row; elected: (N,) whether it is its cell's surface.
+    """
+
+    xyz_m: Float32
+    intensity: UInt8
+    sigma_z_m: Float32
+    views: Float32
+    cell: Int32
+    elected: Bool
+
+    @classmethod
+    def of(cls, tile: Float32, winner: Int8, key: TileKey, cell_m: float, min_views: int) -> CloudPart:
+        """A tile's heights that min_views support; winner: (rows, columns), which of them is the surface."""
+        row, column, slot = np.nonzero(tile[..., VIEWS] >= min_views)
+        kept = tile[row, column, slot]
+        x, y = column + key[0] * TILE_CELLS, row + key[1] * TILE_CELLS
+        return cls(
+            np.column_stack([x * cell_m, y * cell_m, kept[:, Z]]).astype(np.float32),
+            kept[:, GREY].round().clip(0, 255).astype(np.uint8),
+            height_sigma(kept),
+            kept[:, VIEWS],
+            (row * TILE_CELLS + column).astype(np.int32),
+            slot == winner[row, column],
+        )
+
+    def finished(self, z_m: Float32, sigma_m: Float32, blur_m: Float32) -> CloudPart:
+        """The elected points as the finished surface has them; the others' sigma with the part for bars.
+
+        z_m, sigma_m, blur_m: (rows, columns) of the tile.
+        """
+        xyz = self.xyz_m.copy()
+        xyz[:, 2] = np.where(self.elected, z_m.ravel()[self.cell], xyz[:, 2])
+        beside = np.hypot(self.sigma_z_m, blur_m.ravel()[self.cell])
+        return replace(self, xyz_m=xyz, sigma_z_m=np.where(self.elected, sigma_m.ravel()[self.cell], beside))
+
+    def write(self, folder: Path, key: TileKey) -> None:
+        """Into the tile's file."""
+        np.savez(_file(folder, key), **{field.name: getattr(self, field.name) for field in fields(self)})
+
+
+def read_part(folder: Path, key: TileKey) -> CloudPart:
+    """The tile's points as they were written last."""
+    with np.load(_file(folder, key)) as part:
+        return CloudPart(**part)
+
+
+def _file(folder: Path, key: TileKey) -> Path:
+    return folder / f"cloud_{key[0]}_{key[1]}.npz"
