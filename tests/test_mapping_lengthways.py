@@ -147,7 +147,7 @@ def test_valleys_lie_between_crests(diameter_m: float) -> None:
     assert not valleys(slope, np.full((40, 40), 8, np.int8)).any()
 
 
-def test_what_blur_leaves_is_twice_the_rms_moved_and_five_times_in_valleys() -> None:
+def test_what_blur_leaves_is_twice_the_rms_moved_and_more_in_valleys() -> None:
     """Against a plain loop; cells that couldn't be moved don't count, and far from bars nothing is left."""
     rng = np.random.default_rng(7)
     moved = rng.normal(0, 0.002, (40, 60)).astype(np.float32)
@@ -158,5 +158,5 @@ def test_what_blur_leaves_is_twice_the_rms_moved_and_five_times_in_valleys() -> 
     for i, j in ((20, 20), (20, 21), (6, 30), (30, 41), (20, 50)):
         near = moved[i - 5 : i + 6, j - 5 : j + 6]
         near = near[np.isfinite(near) & (near != 0)]
-        expected = (5 if valley[i, j] else 2) * np.sqrt(np.mean(near**2)) if near.size else 0.0
+        expected = (4.5 if valley[i, j] else 2) * np.sqrt(np.mean(near**2)) if near.size else 0.0
         assert found[i, j] == pytest.approx(expected, rel=1e-4, abs=1e-9)
