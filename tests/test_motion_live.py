@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.rectification import Rectifier
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
-from barsight.core.types import RefusedFrame, StereoFrame, Trajectory
+from barsight.core.types import PosedFrame, RefusedFrame, StereoFrame, Trajectory
 from barsight.evaluation.drift import compare
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion import fusion, live
@@ -97,7 +97,8 @@ def test_what_is_held_doesnt_grow() -> None:
         estimator.take(sighting)
         window = estimator.window
         assert window is not None
-        held.append((len(window.problem.start), sum(len(s.track) for _, s in window.sightings)))
+        assert window.problem.sightings is not None
+        held.append((len(window.problem.start), len(window.problem.sightings.track)))
     assert max(nodes for nodes, _ in held[10:]) <= max(nodes for nodes, _ in held[:10]) <= 12
     most = max(len(s.track) for s in seen)
     assert max(count for _, count in held) <= 4 * most
@@ -168,6 +169,52 @@ def test_frames_that_show_nothing_are_bridged(monkeypatch: pytest.MonkeyPatch) -
     assert drift is not None
     assert drift.frames == len(seen)
     assert drift.reference_rmse_mm < 3
+
+
+def turned(seen: tuple, angle: float) -> tuple:
+    """Every picture turned about the camera's axis, as points that slide alike look."""
+    camera = Rectifier(ideal_rig(1280, 1024)).camera
+    told = []
+    for sighting in seen:
+        stereo = sighting.stereo.copy()
+        x, y = sighting.stereo[:, 0] - camera.cx_px, sighting.stereo[:, 1] - camera.cy_px
+        stereo -= angle * np.column_stack([y, -x, y])
+        told.append(replace(sighting, stereo=stereo))
+    return tuple(told)
+
+
+def test_what_slides_alike_is_in_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slides of the size that ribbed bars show pass for a heading that is off: sigma counts them."""
+    nees = []
+    for seed in range(8):
+        recording, seen, truth = simulated(seed)
+        angle = np.random.default_rng(100 + seed).normal(0, 2.5e-4)
+        found = estimated("live", "stereo,imu,crane", recording, turned(seen, angle), monkeypatch)
+        drift = compare(found, truth, 0)
+        assert drift is not None
+        nees.append([drift.nees_position, drift.nees_attitude])
+    assert (np.mean(nees, axis=0) < 1.4).all()
+    assert (np.mean(nees, axis=0) > 0.5).all()
+
+
+def test_a_spoiled_window_is_left() -> None:
+    """A frame that has no solution leaves nothing behind; after two the encoders say where to begin anew."""
+    recording, seen, truth = steady(0.4, 0, frames=16)
+    estimator = estimator_of(recording, "stereo,imu,crane", 4)
+    for sighting in seen[:8]:
+        estimator.take(sighting)
+    window = estimator.window
+    assert window is not None
+    assert window.problem.prior is not None
+    spoiled = replace(window.problem.prior, matrix=-1e12 * window.problem.prior.matrix)
+    estimator.window = replace(window, problem=replace(window.problem, prior=spoiled))
+    assert isinstance(estimator.take(seen[8]), RefusedFrame)
+    assert estimator.window.placed_ns == window.placed_ns
+    assert isinstance(estimator.take(seen[9]), RefusedFrame)
+    for sighting, true in zip(seen[10:], truth.poses[10:], strict=True):
+        frame = estimator.take(sighting)
+        assert isinstance(frame, PosedFrame)
+        assert np.linalg.norm(frame.reference_from_body.translation - true.translation) < 0.01
 
 
 def test_settings() -> None:

@@ -204,20 +204,3 @@ def add_chain(rows: Float64, at: Int64, band: Band) -> None:
             if k > 0:
                 for j in range(size):
                     band.values[band.offset[row] + at[k - 1] + j] += line[size - 1 - i + j]
-
-
-@kernel(fastmath=True)
-def add_dense(matrix: Float64, count: int, band: Band) -> None:
-    """Adds a symmetric matrix's first `count` unknowns to the band's first ones."""
-    for i in range(count):
-        for j in range(i + 1):
-            band.values[band.offset[i] + j] += matrix[i, j]
-
-
-@kernel()
-def whole(band: Band, result: Float64) -> None:
-    """The matrix (n, n), both halves, zero beyond the band."""
-    result[:] = 0
-    for i in range(len(band.first)):
-        for j in range(band.first[i], i + 1):
-            result[i, j] = result[j, i] = band.values[band.offset[i] + j]

@@ -21,14 +21,15 @@ OFFSETS = {"x": 0, "v": 6, "b": 9}
 """Where a node's unknowns stand: pose, with an IMU velocity and biases."""
 
 
-def factors(problem: Problem, before: int | None = None) -> Any:
-    """The graph of a problem without sightings and encoders; of the IMU only what touches nodes `before` the
-    given.
+def factors(problem: Problem, first: int = 0, end: int | None = None) -> Any:
+    """The graph of a problem without sightings and encoders: of what binds the nodes first...end - 1 (None:
+    all) and, by the IMU, each to the next.
     """
     graph = gtsam.NonlinearFactorGraph()
-    _add_priors(graph, problem)
+    nodes = range(first, len(problem.start) if end is None else end)
+    _add_priors(graph, problem, nodes)
     if problem.has_imu:
-        _add_imu(graph, problem, len(problem.start) if before is None else before)
+        _add_imu(graph, problem, nodes)
     return graph
 
 
@@ -81,8 +82,9 @@ def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64,
     return first, unknown[column[order]], np.ascontiguousarray(value[order]), right
 
 
-def _add_priors(graph: Any, problem: Problem) -> None:
-    if problem.first_fixed and problem.prior is None:
+def _add_priors(graph: Any, problem: Problem, nodes: range) -> None:
+    begins = problem.prior is None and 0 in nodes
+    if problem.first_fixed and begins:
         sigmas = _sigmas(1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6)
         if problem.has_imu:
             # Gravity turns the first attitude about level axes; its heading stays where it is.
@@ -92,24 +94,26 @@ def _add_priors(graph: Any, problem: Problem) -> None:
             whole[:3, :3] = spread
             sigmas = gtsam.noiseModel.Gaussian.Covariance(whole)
         graph.add(gtsam.PriorFactorPose3(X(0), _gtsam_pose(problem.start[0]), sigmas))
-    if problem.has_latency and problem.prior is None:
+    if problem.has_latency and begins:
         graph.add(gtsam.PriorFactorVector(E(0), np.zeros(1), _sigmas(problem.encoder_latency_sigma_s)))
     for attitude in problem.attitudes:
+        if attitude.node not in nodes:
+            continue
         rotation = gtsam.Rot3(attitude.rotation)
         graph.add(gtsam.PoseRotationPrior3D(X(attitude.node), rotation, _sigmas(*attitude.sigma_rad)))
 
 
-def _add_imu(graph: Any, problem: Problem, before: int) -> None:
+def _add_imu(graph: Any, problem: Problem, nodes: range) -> None:
     bias = gtsam.imuBias.ConstantBias(problem.bias.accel_mps2, problem.bias.gyro_radps)
     model = _sigmas(*[problem.accel_bias_sigma_mps2] * 3, *[problem.gyro_bias_sigma_radps] * 3)
-    if problem.prior is None:
+    if problem.prior is None and 0 in nodes:
         graph.add(gtsam.PriorFactorConstantBias(B(0), bias, model))
-    for k in range(before):
+    for k in nodes:
         sigma = 1e-3 if k in problem.still else 10.0
         model = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
         graph.add(gtsam.PriorFactorVector(V(k), np.zeros(3), model))
     gap = _sigmas(*[0.01] * 3, *[1e-3] * 3)
-    for k, part in enumerate(problem.preintegrated[:before]):
+    for k, part in zip(nodes, problem.preintegrated[nodes.start : nodes.stop], strict=False):
         if part is None:
             none = gtsam.imuBias.ConstantBias()
             graph.add(gtsam.BetweenFactorConstantBias(B(k), B(k + 1), none, gap))

@@ -52,10 +52,8 @@ class Layout:
         return band.empty(self.first)
 
 
-def layout(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None, dense: bool) -> Layout:
-    """begin, end: (T,) the nodes of each point's first and last sighting; piece: (T,) as `Pieces`. dense:
-    whether every node is bound to all before.
-    """
+def layout(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None) -> Layout:
+    """begin, end: (T,) the nodes of each point's first and last sighting; piece: (T,) as `Pieces`."""
     index = np.arange(nodes)
     seen = np.empty((0, 2), np.int64)
     if piece is not None:
@@ -67,7 +65,7 @@ def layout(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None,
     node = size * index + 2 * before
     own = np.empty(len(seen), np.int64)
     own[order] = size * (seen[order, 1] + 1) + 2 * np.arange(len(seen))
-    nearest = np.zeros(nodes, np.int64) if dense else np.maximum(index - 1, 0)
+    nearest = np.maximum(index - 1, 0)
     earliest = nearest.copy()
     np.minimum.at(earliest, end, begin)
     earliest = np.minimum.accumulate(earliest[::-1])[::-1]  # a track binds all nodes between its ends

@@ -36,7 +36,8 @@ from barsight.motion.problem import Attitude, Placed, Problem
 from barsight.motion.readings import Readings
 from barsight.motion.sightings import Sighting
 from barsight.motion.solver import State
-from barsight.motion.window import Window, grown, solved, with_frame, without_first
+from barsight.motion.window import Window, grown, with_frame
+from barsight.motion.window_step import solved, without
 
 SENSOR_DELAY_S = 0.06
 """A frame is computed once readings this much later are there."""
@@ -56,8 +57,7 @@ class LiveEstimator:
         self._rectifier, self._shift_ns = rectifier, shift_ns
         self._readings, self._level = readings, level
         self.window: Window | None = None
-        self._last_placed_ns = self._last_seen_ns = -(10**18)
-        self._stood = False
+        self._failed = False
 
     def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
         """A `Predictor`: by the IMU from the last estimate, else by encoders; None without either."""
@@ -94,19 +94,20 @@ class LiveEstimator:
         )
         if isinstance(window, Failed):
             return RefusedFrame(seen.stamp_ns, window.reason)
-        window = with_frame(window, sighting, self._held)
-        window = self._bound(window, sighting, now, stamp)
         rectifier = self._rectifier
+        window = with_frame(window, sighting, rectifier.camera, rectifier.body_from_rect0, self._held)
+        window = self._bound(window, sighting, now, stamp)
         try:
-            window, problem, used = solved(window, rectifier.camera, rectifier.body_from_rect0)
+            window, leaving = solved(window, self._held)
         except np.linalg.LinAlgError:
+            if self._failed and now.crane is not None:
+                self.window = None  # what is held may be the cause, and encoders know where to begin anew
+            self._failed = True
             return RefusedFrame(seen.stamp_ns, "the sensors together have no solution here")
-        if sighting is not None:
-            self._last_seen_ns = stamp
+        self._failed = False
         pose = window.pose(len(window.problem.start) - 1)
         covariance = window.covariance
-        leaving = window.leaving(self._held)
-        self.window = without_first(window, problem, used, leaving) if leaving else window
+        self.window = without(window, leaving) if leaving else window
         return PosedFrame(seen.stamp_ns, pose, covariance)
 
     def _now(self, stamp_ns: int) -> Readings:
@@ -133,7 +134,7 @@ class LiveEstimator:
             has_latency=now.crane is not None, has_imu=now.imu is not None,
         )  # fmt: skip
         state = State(start_values(problem), np.empty((0, 4)), np.zeros(2))
-        window = Window(problem, (), state, np.empty(0, np.int64))
+        window = Window(problem, state, np.empty(0, np.int64))
         return self._with_attitudes(window, 0, now)
 
     def _grown(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
@@ -147,7 +148,7 @@ class LiveEstimator:
             parts = preintegrated(np.array([last_ns, *stamps]), now.imu, now.noise, window.bias)
         poses, speeds = self._started(window, stamps, parts, sighting, now)
         grew = grown(window, stamps, poses, speeds, parts)
-        if now.imu is not None and self._stays(stamp, last_ns, sighting, now):
+        if now.imu is not None and self._stays(window, stamp, sighting, now):
             quiet = quiet_at(grew.problem.stamp_ns[first:], now.imu, now.noise)
             still = (*grew.problem.still, *(first + int(k) for k in np.flatnonzero(quiet)))
             grew = replace(grew, problem=replace(grew.problem, still=still))
@@ -168,7 +169,7 @@ class LiveEstimator:
                 speeds.append(state.velocity_mps)
             return poses, speeds
         end = old
-        at = np.flatnonzero(window.problem.stamp_ns == self._last_seen_ns)
+        at = np.flatnonzero(window.problem.stamp_ns == window.seen_ns)
         if sighting is not None and sighting.motion is not None and at.size:
             mount, motion = self._rectifier.body_from_rect0, sighting.motion
             moved = Pose("rect0", "rect0", motion.rotation, motion.translation).inverse()
@@ -184,16 +185,17 @@ class LiveEstimator:
         poses = [Pose(old.target, "body", end.rotation, old.translation + s * way) for s in share]
         return poses, [way / seconds] * len(stamps)
 
-    def _stays(self, stamp: int, last_ns: int, sighting: Sighting | None, now: Readings) -> bool:
+    def _stays(self, window: Window, stamp: int, sighting: Sighting | None, now: Readings) -> bool:
         """Whether encoders, else pictures, see no way since the last node. (An IMU sees none at any constant
         speed.)
         """
+        last_ns = int(window.problem.stamp_ns[-1])
         if now.crane is not None:
             window_ns = seconds_to_ns(FIT_S)
             fits = [fit_position(now.crane, ns, window_ns) for ns in (last_ns, stamp)]
             places = [fit.position_m for fit in fits if not isinstance(fit, Failed)]
             return len(places) == 2 and float(np.linalg.norm(places[1] - places[0])) < MOST_STILL_M
-        if sighting is None or sighting.motion is None or self._last_seen_ns != last_ns:
+        if sighting is None or sighting.motion is None or window.seen_ns != last_ns:
             return False
         return float(np.linalg.norm(sighting.motion.translation)) < MOST_STILL_M
 
@@ -203,15 +205,16 @@ class LiveEstimator:
         """
         if now.crane is None:
             return window
-        crane, problem, added = self._crane, window.problem, []
+        crane, problem, stood, added = self._crane, window.problem, window.stood, []
         for k in range(first, len(problem.start)):
             sigma = crane.attitude_std_deg * 1.6
             if k in problem.still:
-                if self._stood:
+                if stood:
                     continue
-                sigma, self._stood = crane.sway_std_deg, True
+                sigma, stood = crane.sway_std_deg, True
             added.append(Attitude(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
-        return replace(window, problem=replace(problem, attitudes=problem.attitudes + tuple(added)))
+        told = replace(problem, attitudes=problem.attitudes + tuple(added))
+        return replace(window, problem=told, stood=stood)
 
     def _bound(self, window: Window, sighting: Sighting | None, now: Readings, stamp: int) -> Window:
         """With the encoders' places of nodes whose fit has come to be complete, 0.4 s apart; at once where
@@ -220,12 +223,13 @@ class LiveEstimator:
         if now.crane is None:
             return window
         crane, placed, problem = with_seen_noise(now.crane), list(window.problem.placed), window.problem
+        placed_ns = window.placed_ns
         complete, last = stamp + seconds_to_ns(SENSOR_DELAY_S - FIT_S), len(problem.start) - 1
         by_imu = last > 0 and problem.preintegrated[-1] is not None
         loose = not by_imu and (sighting is None or sighting.motion is None)
         for k, node_ns in enumerate(problem.stamp_ns.tolist()):
             at_once = loose and k == last
-            near = node_ns - self._last_placed_ns < 0.97 * seconds_to_ns(PLACE_SPACING_S)
+            near = placed_ns is not None and node_ns - placed_ns < 0.97 * seconds_to_ns(PLACE_SPACING_S)
             if not at_once and (near or node_ns > complete):
                 continue
             fit = fit_position(crane, node_ns, seconds_to_ns(self._crane.window_s if at_once else FIT_S))
@@ -234,5 +238,5 @@ class LiveEstimator:
             place = fit.position_m + crane.crane_to_body_m
             sigma = float(np.sqrt(fit.covariance[0, 0]))
             placed.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
-            self._last_placed_ns = node_ns
-        return replace(window, problem=replace(problem, placed=tuple(placed)))
+            placed_ns = node_ns
+        return replace(window, problem=replace(problem, placed=tuple(placed)), placed_ns=placed_ns)

@@ -73,32 +73,3 @@ def _to_border(system: System) -> Float64:
     result = system.forward[:, 1:].copy()
     solve_back(system.factor, result)
     return result
-
-
-@dataclass(frozen=True, eq=False)
-class Newest:
-    """The last node's covariance (n, n), of pose (body axes), velocity (reference) and biases (accelerometer,
-    gyro), the rig's drift taken as known; swing (n, 2) by which it goes with the drift.
-    """
-
-    covariance: Float64
-    swing: Float64
-
-
-def newest(system: System) -> Newest:
-    """Of a system at its best state, without the work for all the other nodes."""
-    factor, size = system.factor, system.layout.size
-    own, _ = system.schur(system.forward)
-    last = len(factor.first) - size
-    row, column = np.nonzero(np.tri(size))
-    lower = np.zeros((size, size))
-    lower[row, column] = factor.values[factor.offset[last + row] + last + column]
-    inverse = np.linalg.inv(lower)
-    covariance = inverse.T @ inverse
-    by_border = -inverse.T @ system.forward[last:, 1:]
-    swing = by_border[:, -2:]
-    if len(own) == 3:
-        to_latency = by_border[:, :1]
-        covariance = covariance + to_latency @ to_latency.T / own[0, 0]
-        swing = swing - to_latency @ (own[:1, 1:] / own[0, 0])
-    return Newest(covariance, swing)

@@ -127,32 +127,33 @@ class Pieces:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What nodes that have left say of the first P ones that stay, to second order about `at`.
+    """What nodes that have left say of those that stay, to second order about `at`.
 
-    at: GTSAM's values of these nodes, and of the latency where there is one; drift (2,) of the rig. matrix
-    (n, n) and gradient (n,) of their unknowns, node by node, then the latency and the drift.
+    nodes: (P,) those it binds; at: GTSAM's values of these; border (b,) of what all nodes share. matrix
+    (n, n) and gradient (n,) of their unknowns, node by node, then the border.
     """
 
+    nodes: Int64
     at: Any
-    drift: Float64
+    border: Float64
     matrix: Float64
     gradient: Float64
 
     @cached_property
-    def poses(self) -> tuple[Any, ...]:
-        """(P,) GTSAM's, of the nodes."""
-        count = len(gtsam.utilities.extractPose3(self.at))
-        return tuple(self.at.atPose3(X(k)) for k in range(count))
+    def _poses(self) -> tuple[Any, ...]:
+        return tuple(self.at.atPose3(X(k)) for k in self.nodes.tolist())
 
     @cached_property
-    def inertial(self) -> Float64:
-        """(P, 9) velocities and biases; (P, 0) without an IMU."""
-        return inertial_of(self.at, len(self.poses))
+    def _inertial(self) -> Float64:
+        return inertial_of(self.at, self.nodes)
 
-    @cached_property
-    def latency(self) -> Float64:
-        """(1,) of the encoders; (0,) without."""
-        return latency_of(self.at)
+    def since(self, values: Any) -> Float64:
+        """How far the nodes' unknowns have moved from `at`, node by node in one row."""
+        moved = [
+            at.localCoordinates(values.atPose3(X(k)))
+            for k, at in zip(self.nodes.tolist(), self._poses, strict=True)
+        ]
+        return np.column_stack([moved, inertial_of(values, self.nodes) - self._inertial]).ravel()
 
 
 def poses_of(values: Any) -> Float64:
@@ -163,12 +164,12 @@ def poses_of(values: Any) -> Float64:
     return poses
 
 
-def inertial_of(values: Any, count: int) -> Float64:
-    """(count, 9) of the first nodes' velocities and biases in GTSAM's values; (count, 0) without an IMU."""
+def inertial_of(values: Any, nodes: Int64) -> Float64:
+    """(P, 9) velocities and biases of the nodes in GTSAM's values; (P, 0) without an IMU."""
     if not values.exists(V(0)):
-        return np.empty((count, 0))
-    velocity = [values.atVector(V(k)) for k in range(count)]
-    return np.column_stack([velocity, [values.atConstantBias(B(k)).vector() for k in range(count)]])
+        return np.empty((len(nodes), 0))
+    velocity = [values.atVector(V(k)) for k in nodes.tolist()]
+    return np.column_stack([velocity, [values.atConstantBias(B(k)).vector() for k in nodes.tolist()]])
 
 
 def latency_of(values: Any) -> Float64:
@@ -234,7 +235,7 @@ class Problem:
             node, first = self.places[self.sightings.node], self.sightings.first
             begin, end = node[first[:-1]], node[first[1:] - 1]
         piece = None if self.pieces is None else self.pieces.piece
-        return layout(15 if self.has_imu else 6, len(self.kept), begin, end, piece, self.prior is not None)
+        return layout(15 if self.has_imu else 6, len(self.kept), begin, end, piece)
 
     @property
     def border(self) -> int:

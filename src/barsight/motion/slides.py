@@ -47,7 +47,7 @@ def pieces_of(problem: Problem, state: State, used: Bool) -> Pieces | None:
     """Strips across the way, apart in height; None where there are too few of them, or fewer points than
     pieces that say how they slide."""
     seen = problem.sightings
-    if seen is None or not problem.has_latency or problem.prior is not None:
+    if seen is None or not problem.has_latency:
         return None
     camera = seen.camera
     disparity = float(np.median(seen.stereo[:, 0] - seen.stereo[:, 2] + camera.doffs_px))

@@ -23,7 +23,7 @@ from barsight.motion.gaps import without_gaps
 from barsight.motion.graph import chain_of
 from barsight.motion.layout import Layout
 from barsight.motion.point_kernels import Guess, Rig, Sights, residuals
-from barsight.motion.problem import Pieces, Prior, Problem, StereoSightings, inertial_of, latency_of, poses_of
+from barsight.motion.problem import Pieces, Problem, StereoSightings, latency_of, poses_of
 from barsight.motion.rig_drift import HUBER_SIGMAS
 from barsight.motion.system import System
 
@@ -144,8 +144,6 @@ def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
         spread(reduced, layout.node, layout.piece, rows, gradient, side, corner, corner_gradient)
     if problem.pieces is not None:
         _hold_pieces(problem.pieces, state.pieces, layout, rows, gradient, side, corner)
-    if problem.prior is not None:
-        _add_prior(problem.prior, state, rows, gradient, side, corner, corner_gradient)
     return System(
         rows, gradient, side, corner, corner_gradient, layout, problem.kept, gaps, len(problem.start),
         problem.has_latency,
@@ -168,34 +166,13 @@ def _hold_pieces(
     corner[-3, -3] += 2 * (pieces.count + 1)
 
 
-def _add_prior(
-    prior: Prior, state: State, rows: Band, gradient: Float64, side: Float64, corner: Float64,
-    corner_gradient: Float64,
-) -> None:  # fmt: skip
-    border = len(corner)
-    count = len(prior.matrix) - border
-    slope = prior.gradient + prior.matrix @ _since(prior, state)
-    band.add_dense(prior.matrix, count, rows)
-    gradient[:count] += slope[:count]
-    side[:, :count] += prior.matrix[count:, :count]
-    corner += prior.matrix[count:, count:]
-    corner_gradient += slope[count:]
-
-
-def _since(prior: Prior, state: State) -> Float64:
-    """(n,) how far the state has moved from where the prior stands."""
-    count = len(prior.poses)
-    turned = [pose.localCoordinates(state.values.atPose3(X(k))) for k, pose in enumerate(prior.poses)]
-    nodes = np.column_stack([turned, inertial_of(state.values, count) - prior.inertial])
-    return np.concatenate(
-        [nodes.ravel(), latency_of(state.values) - prior.latency, state.drift - prior.drift]
-    )
-
-
 def moved(
-    problem: Problem, state: State, used: Bool, step: Float64, pieces: Float64, border: Float64
-) -> State:
-    """The state after a step of the nodes', the pieces' and the border's unknowns; the points follow."""
+    problem: Problem, state: State, used: Bool, step: Float64, pieces: Float64, border: Float64,
+    seen_step: Float64 | None = None,
+) -> State:  # fmt: skip
+    """The state after a step of the nodes', the pieces' and the border's unknowns; the points follow.
+    seen_step: (K, 6) by which pictures move, where not as the poses do.
+    """
     by_node = step.reshape(len(problem.start), -1)
     vectors = gtsam.VectorValues()
     for k, part in enumerate(by_node):
@@ -208,7 +185,7 @@ def moved(
     points, shared = state.points, np.concatenate([pieces, border[-2:]])
     if problem.sightings is not None:
         points = points.copy()
-        poses = np.ascontiguousarray(by_node[problem.kept, :6])
+        poses = np.ascontiguousarray(by_node[problem.kept, :6] if seen_step is None else seen_step)
         rig, sights = rig_of(problem.sightings), sights_of(problem, used)
         substitute(rig, sights, guess_of(problem, state), poses, shared, points, np.empty(len(points)))
     return replace(
@@ -219,9 +196,6 @@ def moved(
 
 def cost_of(problem: Problem, graph: Any, state: State, used: Bool) -> float:
     cost = float(graph.error(state.values)) + encoders_cost(state.values, problem)
-    if problem.prior is not None:
-        since = _since(problem.prior, state)
-        cost += float(since @ (problem.prior.gradient + problem.prior.matrix @ since / 2))
     if problem.pieces is not None:
         cost += problem.pieces.cost(state.pieces)
     if problem.sightings is None:

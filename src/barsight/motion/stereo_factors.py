@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.features.guided import triangulate
 from barsight.motion.problem import Problem, StereoSightings
 
@@ -16,16 +16,16 @@ MOST_WHITENED = 4.0
 """Single far residuals say nothing of what neighbours share."""
 
 
-def start_points(problem: Problem, poses: Float64 | None = None) -> Float64:
+def start_points(problem: Problem, poses: Float64 | None = None, which: Int64 | None = None) -> Float64:
     """(T, 4) place in the reference as the first sighting has it, and slide: none. poses: (M, 4, 4), the
-    problem's own start if None.
+    problem's own start if None. which: (T,) points, all if None.
     """
     seen = problem.sightings
     if seen is None:
         return np.empty((0, 4))
     if poses is None:
         poses = np.array([pose.matrix for pose in problem.start])
-    begin = seen.first[:-1]
+    begin = seen.first[:-1] if which is None else seen.first[which]
     in_body = seen.body_from_rect0.apply(triangulate(seen.stereo[begin], seen.camera))
     first = poses[seen.node[begin]]
     points = (first[:, :3, :3] @ in_body[:, :, None])[:, :, 0] + first[:, :3, 3]

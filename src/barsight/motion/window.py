@@ -7,60 +7,53 @@ every point that was seen at a frame which leaves has ended and is taken out who
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, E, V, X
+from gtsam.symbol_shorthand import B, V, X
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.inertial.model import BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated
-from barsight.motion import band
-from barsight.motion.batch import FARTHEST_OUTLIER_SIGMAS, LEAST_AGREEING, LEAST_FACTOR
-from barsight.motion.drift_search import drifted
-from barsight.motion.encoders import agreeing
-from barsight.motion.graph import factors
-from barsight.motion.marginals import Newest, newest
-from barsight.motion.problem import Prior, Problem, StereoSightings
+from barsight.motion.problem import LEAST_SIGMA_PX, Problem, StereoSightings
 from barsight.motion.sightings import Sighting
-from barsight.motion.solver import State, linearise, moved, sighting_residuals
-from barsight.motion.stereo_factors import nearness, often, persistence, start_points, taken_up
-from barsight.motion.system import System
-
-NOISE_SHARE = 0.2
-"""By how much one window's noise moves the running one."""
+from barsight.motion.solver import State
+from barsight.motion.stereo_factors import start_points
+from barsight.motion.window_system import (
+    Newest,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """problem: of the nodes held, numbered from 0, its sightings left out. sightings: of the frames held,
-    each with its node. state: the unknowns, points named by `names` (T,). frames: how many there were yet;
-    frame_nodes: those held. noise: sightings' sigma as they show it over the stated one. newest: the last
-    node's covariance; drift_covariance (2, 2) of the rig's drift.
+    """problem: of the nodes held, numbered from 0, and what their frames saw, sigma as stated. state: the
+    unknowns, points named by `names` (T,), NaN as long as they were seen once. slide: a turn of all pictures
+    about the camera's axis, rad (`slides`). frames: how many there were yet; frame_nodes: those held. noise:
+    sightings' sigma as they show it over the stated one. newest: the last node's covariance; drift_covariance
+    (2, 2) of the rig's drift. seen_ns, placed_ns: stamps of the last node that pictures saw and of the last
+    that encoders placed; stood: whether the attitude at rest has been told.
     """
 
     problem: Problem
-    sightings: tuple[tuple[int, Sighting], ...]
     state: State
     names: Int64
+    slide: float = 0.0
     frames: int = 0
     noise: float | None = None
     drift_covariance: Float64 | None = None
     frame_nodes: tuple[int, ...] = ()
     newest: Newest | None = None
+    seen_ns: int | None = None
+    placed_ns: int | None = None
+    stood: bool = False
 
     def pose(self, node: int) -> Pose:
         """reference_from_body."""
         pose = self.state.values.atPose3(X(node))
         target = self.problem.start[0].target
         return Pose(target, "body", pose.rotation().matrix(), np.asarray(pose.translation()))
-
-    def leaving(self, held: int) -> int:
-        """How many nodes are before the frames to hold."""
-        return self.frame_nodes[-held] if len(self.frame_nodes) > held else 0
 
     @property
     def body(self) -> BodyState:
@@ -109,156 +102,39 @@ def grown(
     return replace(window, problem=problem, state=replace(window.state, values=values))
 
 
-def with_frame(window: Window, sighting: Sighting | None, held: int) -> Window:
+def with_frame(
+    window: Window, sighting: Sighting | None, camera: RectifiedCamera, body_from_rect0: Pose, held: int
+) -> Window:
     """The last node is a frame that shows `sighting`; points begin anew every `held` frames."""
     node, count = len(window.problem.start) - 1, window.frames
-    seen = window.sightings
-    if sighting is not None:
-        piece = sighting.track * 1_000_000 + (count + sighting.track) // held
-        seen = (*seen, (node, replace(sighting, track=piece)))
-    return replace(window, sightings=seen, frames=count + 1, frame_nodes=(*window.frame_nodes, node))
-
-
-def solved(window: Window, camera: RectifiedCamera, mount: Pose) -> tuple[Window, Problem, Bool]:
-    """With the unknowns as they fit best; the problem solved and which of its sightings were used. Raises
-    LinAlgError where the measurements leave an unknown undetermined.
-    """
-    problem, names, points = window.problem, window.names, window.state.points
-    seen: StereoSightings | None = None
-    used = np.zeros(0, np.bool_)
-    if window.sightings:
-        seen = StereoSightings.of(
-            [s for _, s in window.sightings], [node for node, _ in window.sightings], camera, mount
-        )
-        stated = seen.sigma_px
-        names = np.sort(np.concatenate([s.track for _, s in window.sightings]))
-        names = names[np.diff(names, prepend=-1) > 0]
-        problem = replace(problem, sightings=replace(seen, sigma_px=(window.noise or 1.0) * stated))
-        points = _points(window, problem, names)
-        used = often(seen, np.ones(len(seen.node), np.bool_))
-    state = replace(window.state, points=points)
-    graph = factors(problem)
-    # The frame before was solved, so little is left to do: one step before outliers leave, one after.
-    system = linearise(problem, graph, state, used)
-    state = moved(problem, state, used, *system.step(problem.free))
-    noise = window.noise
-    if seen is not None and used.any():
-        residual = sighting_residuals(problem, state, used)
-        share = np.abs(residual) / stated[:, None]
-        factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])) * taken_up(seen, used))
-        used = often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
-        shown = replace(seen, sigma_px=factor * stated)
-        now = factor * persistence(residual, shown, used) * nearness(residual, shown, used)
-        noise = now if noise is None else (1 - NOISE_SHARE) * noise + NOISE_SHARE * now
-        problem = replace(problem, sightings=replace(seen, sigma_px=noise * stated))
-        system = linearise(problem, graph, state, used)
-    covariance = None
-    if problem.offset_prior_px > 0 and used.any():
-        state, drift = drifted(problem, state, system, used)
-        covariance = drift.covariance
-    elif used.any():
-        state = moved(problem, state, used, *system.step(problem.free))
-    kept = tuple(
-        place for place, fits in zip(problem.placed, agreeing(state.values, problem), strict=True) if fits
-    )
-    if len(kept) > LEAST_AGREEING * len(problem.placed):
-        problem = replace(problem, placed=kept)
-    result = replace(
-        window, problem=replace(problem, sightings=None), state=state, names=names, noise=noise,
-        drift_covariance=covariance, newest=newest(system),
+    grew = replace(window, frames=count + 1, frame_nodes=(*window.frame_nodes, node))
+    if sighting is None:
+        return grew
+    grew = replace(grew, seen_ns=int(window.problem.stamp_ns[-1]))
+    name = sighting.track * 1_000_000 + (count + sighting.track) // held
+    nodes, sigma = np.full(len(name), node), np.hypot(sighting.sigma_px, LEAST_SIGMA_PX)
+    stereo, mount = sighting.stereo, body_from_rect0
+    old = window.problem.sightings
+    if old is not None:
+        name, nodes = np.append(window.names[old.track], name), np.append(old.node, nodes)
+        stereo, sigma = np.vstack([old.stereo, stereo]), np.append(old.sigma_px, sigma)
+        mount = old.body_from_rect0
+    order = np.argsort(name, kind="stable")
+    first = np.diff(name[order], prepend=-1) > 0
+    names = name[order][first]
+    seen = StereoSightings(nodes[order], np.cumsum(first) - 1, stereo[order], sigma[order], camera, mount)
+    points = np.full((len(names), 4), np.nan)
+    points[np.searchsorted(names, window.names)] = _placed(window)
+    return replace(
+        grew, problem=replace(window.problem, sightings=seen), names=names,
+        state=replace(window.state, points=points),
     )  # fmt: skip
-    return result, problem, used
 
 
-def _points(window: Window, problem: Problem, names: Int64) -> Float64:
-    """Of each point its place as known, else as its first sighting has it from the pose as known."""
-    points = start_points(problem, window.state.poses)
-    at = np.searchsorted(window.names, names).clip(0, max(0, len(window.names) - 1))
-    if len(window.names):
-        known = window.names[at] == names
-        points[known] = window.state.points[at[known]]
+def _placed(window: Window) -> Float64:
+    """(T, 4) the points, those seen once where that sighting has them."""
+    points = window.state.points.copy()
+    new = np.flatnonzero(np.isnan(points[:, 0]))
+    if len(new):
+        points[new] = start_points(window.problem, window.state.poses, new)
     return points
-
-
-def without_first(window: Window, problem: Problem, used: Bool, count: int) -> Window:
-    """Without the first `count` nodes. problem, used: as `solved` gave them, sightings included."""
-    seen, state = problem.sightings, window.state
-    leaving = np.zeros_like(used)
-    if seen is not None:
-        ended = np.zeros(len(seen.first) - 1, np.bool_)
-        ended[seen.track[seen.node < count]] = True
-        leaving = used & ended[seen.track]
-    part = replace(
-        problem, placed=tuple(p for p in problem.placed if p.node < count),
-        attitudes=tuple(a for a in problem.attitudes if a.node < count),
-    )  # fmt: skip
-    system = linearise(part, factors(part, count), state, leaving)
-    matrix, gradient = _without(system, count * system.layout.size)
-    values = _renumbered(state, problem, count)
-    prior = Prior(values, state.drift, matrix, gradient)
-    stays = ~ended if seen is not None else np.ones(0, np.bool_)
-    sightings = [
-        (node - count, _chosen(s, stays[np.searchsorted(window.names, s.track)]))
-        for node, s in window.sightings
-        if node >= count
-    ]
-    left = replace(
-        window.problem, start=problem.start[count:], stamp_ns=problem.stamp_ns[count:],
-        preintegrated=problem.preintegrated[count:], prior=prior,
-        placed=tuple(replace(p, node=p.node - count) for p in window.problem.placed if p.node >= count),
-        attitudes=tuple(
-            replace(a, node=a.node - count) for a in window.problem.attitudes if a.node >= count
-        ),
-        still=tuple(k - count for k in problem.still if k >= count),
-    )  # fmt: skip
-    return replace(
-        window, problem=left, sightings=tuple((k, s) for k, s in sightings if len(s.track)),
-        state=replace(state, values=values),
-        frame_nodes=tuple(k - count for k in window.frame_nodes if k >= count),
-    )  # fmt: skip
-
-
-def _without(system: System, count: int) -> tuple[Float64, Float64]:
-    """Matrix and gradient of all unknowns but the first `count`, which are taken out."""
-    n = len(system.gradient)
-    border = len(system.corner)
-    whole = np.empty((n + border, n + border))
-    band.whole(system.rows, whole[:n, :n])
-    whole[n:, :n], whole[:n, n:] = system.side, system.side.T
-    whole[n:, n:] = system.corner
-    slope = np.concatenate([system.gradient, system.corner_gradient])
-    share = np.linalg.solve(whole[:count, :count], whole[:count, count:]).T
-    matrix = whole[count:, count:] - share @ whole[:count, count:]
-    return (matrix + matrix.T) / 2, slope[count:] - share @ slope[:count]
-
-
-def _renumbered(state: State, problem: Problem, count: int) -> gtsam.Values:
-    nodes = range(count, len(problem.start))
-    values = gtsam.Values()
-    if problem.has_imu:
-        biases = gtsam.VectorValues()
-        for k in nodes:
-            biases.insert(B(k - count), state.values.atConstantBias(B(k)).vector())
-        values = _no_biases(len(nodes)).retract(biases)
-    for k in nodes:
-        values.insert(X(k - count), state.values.atPose3(X(k)))
-        if problem.has_imu:
-            values.insert(V(k - count), state.values.atVector(V(k)))
-    if problem.has_latency:
-        values.insert(E(0), state.values.atVector(E(0)))
-    return values
-
-
-@cache
-def _no_biases(count: int) -> gtsam.Values:
-    """To add vectors to: to insert a bias itself takes thirty times as long."""
-    values = gtsam.Values()
-    for k in range(count):
-        values.insert(B(k), gtsam.imuBias.ConstantBias())
-    return values
-
-
-def _chosen(sighting: Sighting, kept: Bool) -> Sighting:
-    return replace(
-        sighting, track=sighting.track[kept], stereo=sighting.stereo[kept], sigma_px=sighting.sigma_px[kept]
-    )
