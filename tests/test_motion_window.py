@@ -1,0 +1,79 @@
+"""The live window's own algebra against NumPy's."""
+
+import numpy as np
+
+from barsight.motion import dense
+from barsight.motion.window_system import SLIDE_SIGMA_RAD, SLIDE_WAY_M, Equations, prior_of, slid_on
+
+
+def positive(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n + 3))
+    return root @ root.T, rng.normal(size=n)
+
+
+def test_a_dense_system_is_solved() -> None:
+    """Also where its last unknowns are fixed."""
+    matrix, right = positive(0, 23)
+    factor, x = matrix.copy(), right.copy()
+    assert dense.factorise(factor, x)
+    np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix))
+    forward = x.copy()
+    dense.solve_back(factor, 0, x)
+    np.testing.assert_allclose(x, np.linalg.solve(matrix, right))
+    known = np.append(forward[:-2], [0.3, -0.7])
+    dense.solve_back(factor, 2, known)
+    np.testing.assert_allclose(matrix[:-2] @ known, right[:-2])
+    np.testing.assert_allclose(dense.product(matrix, right), matrix @ right)
+    assert not dense.factorise(-matrix, right.copy())
+
+
+def test_bands_and_blocks_are_added() -> None:
+    matrix, _ = positive(1, 12)
+    rows = np.zeros((12, 6))
+    band = np.where(abs(np.subtract.outer(range(12), range(12))) < 6, matrix, 0)
+    for i in range(12):
+        for j in range(max(0, i - 5), i + 1):
+            rows[i, j - i + 5] = matrix[i, j]
+    result = np.zeros((20, 20))
+    dense.add_band(rows, 5, result)
+    np.testing.assert_array_equal(result[5:17, 5:17], band)
+    blocks = np.zeros((2, 6, 12))
+    blocks[0, :, 6:], blocks[1] = matrix[:6, :6], matrix[6:]
+    result = np.zeros((20, 20))
+    dense.add_blocks(blocks, 8, result)
+    at = np.r_[0:6, 8:14]
+    np.testing.assert_array_equal(result[np.ix_(at, at)], matrix)
+
+
+def test_a_prior_says_the_same_of_what_stays() -> None:
+    matrix, gradient = positive(2, 9)
+    step = np.linspace(-1, 1, 9)
+    left, slope = prior_of(Equations(matrix, gradient, ()), step, 4)
+    best = -np.linalg.solve(matrix, gradient)
+    np.testing.assert_allclose(np.linalg.inv(left), np.linalg.inv(matrix)[4:, 4:])
+    np.testing.assert_allclose(-np.linalg.solve(left, slope), (best - step)[4:])
+
+
+def test_a_slide_is_forgotten() -> None:
+    """As a new unknown that the old one, taken out, is bound to; after a long way nothing is left of it."""
+    matrix, gradient = positive(3, 7)
+    matrix *= SLIDE_SIGMA_RAD**-2
+    slide, keeps = 1e-4, np.exp(-1 / SLIDE_WAY_M)
+    fresh = 1 / ((1 - keeps**2) * SLIDE_SIGMA_RAD**2)
+    whole, right = np.zeros((8, 8)), np.append(gradient, 0)
+    whole[:7, :7] = matrix
+    by = np.zeros(8)
+    by[4], by[7] = -keeps, 1  # (slide + new) - keeps (slide + old)
+    whole += fresh * np.outer(by, by)
+    right += fresh * (1 - keeps) * slide * by
+    covariance = np.linalg.inv(whole)
+    order = [0, 1, 2, 3, 7, 5, 6]
+    found, slope = slid_on(matrix, gradient, slide, 1.0)
+    np.testing.assert_allclose(np.linalg.inv(found), covariance[np.ix_(order, order)], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.solve(found, slope), np.linalg.solve(whole, right)[order], rtol=1e-6, atol=1e-15
+    )
+    far, slope = slid_on(matrix, gradient, slide, 1e3)
+    np.testing.assert_allclose(np.linalg.inv(far)[4, 4], SLIDE_SIGMA_RAD**2)
+    np.testing.assert_allclose(np.linalg.solve(far, slope)[4], slide)
