@@ -1,12 +1,15 @@
 """What residuals say of the sightings' noise: what a fit took up of it, and what neighbours share."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from barsight.calibration.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.motion.problem import StereoSightings
-from barsight.motion.stereo_factors import nearness, taken_up
+from barsight.motion.stereo_factors import nearness, persistence, taken_up
 from motion_recordings import ideal_rig
 
 FRAMES, POINTS = 20, 800
@@ -66,3 +69,35 @@ def test_what_a_fit_takes_up_is_given_back() -> None:
         residual = error - error.mean(axis=1, keepdims=True)
         used = np.ones(len(node), np.bool_)
         assert abs(residual.std() * taken_up(seen, used) / 0.1 - 1) < 0.02
+
+
+def slow_nearness(residual: Float64, seen: StereoSightings, used: np.ndarray) -> float:
+    scaled = np.clip(residual[used] / seen.sigma_px[used, None], -4, 4)
+    cell = (seen.stereo[used, :2] * (8 / seen.camera.width)).astype(np.int64)
+    _, name = np.unique(np.column_stack([seen.node[used], cell]), axis=0, return_inverse=True)
+    sums = np.array([np.bincount(name.ravel(), axis) for axis in scaled.T])
+    return float(max(1.0, (sums**2).sum() / (scaled**2).sum()) ** 0.5)
+
+
+def slow_persistence(residual: Float64, seen: StereoSightings, used: np.ndarray) -> float:
+    order = np.flatnonzero(used)
+    track = seen.track[order]
+    length = np.bincount(track)[track[:-1]]
+    pair = (track[:-1] == track[1:]) & (length >= 5)
+    scaled = residual[order] / seen.sigma_px[order, None]
+    first, second = scaled[:-1][pair], scaled[1:][pair]
+    shared = 2 * (first * second).sum() / ((first**2).sum() + (second**2).sum())
+    correlation = float(np.clip(shared + (1 / length[pair]).mean(), 0.0, 0.8))
+    return float(((1 + correlation) / (1 - correlation)) ** 0.5)
+
+
+def test_the_kernels_say_what_arrays_say() -> None:
+    rng = np.random.default_rng(4)
+    seen = seen_once_each(rng)
+    track, node = np.sort(rng.integers(0, 2500, len(seen.node))), rng.permutation(seen.node)
+    seen = replace(seen, track=track, node=node, sigma_px=rng.uniform(0.05, 0.3, len(track)))
+    shared = rng.normal(0, 0.1, (2500, 3))[track] + rng.normal(0, 0.05, (FRAMES, 3))[node]
+    residual, used = shared + rng.normal(0, 0.1, shared.shape), rng.random(len(track)) < 0.8
+    assert persistence(residual, seen, used) == pytest.approx(slow_persistence(residual, seen, used))
+    assert nearness(residual, seen, used) == pytest.approx(slow_nearness(residual, seen, used))
+    assert nearness(residual, seen, np.zeros_like(used)) == persistence(residual, seen, used & False) == 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64, kernel
 from barsight.features.guided import triangulate
 from barsight.motion.problem import Problem, StereoSightings
 
@@ -56,15 +56,10 @@ def nearness(residual: Float64, seen: StereoSightings, used: Bool) -> float:
     cell, an eighth of the picture wide, don't add up like independent ones: the sums' squares over the
     single ones' is the variance that counts.
     """
-    if not used.any():
-        return 1.0
-    scaled = np.clip(residual[used] / seen.sigma_px[used, None], -MOST_WHITENED, MOST_WHITENED)
-    cell = (seen.stereo[used, :2] * (CELLS / seen.camera.width)).astype(np.int64)
-    cell -= cell.min(axis=0)
-    across, down = cell.max(axis=0) + 1
-    name = (seen.node[used] * across + cell[:, 0]) * down + cell[:, 1]
-    sums = np.array([np.bincount(name, axis) for axis in scaled.T])
-    return float(max(1.0, (sums**2).sum() / max(float((scaled**2).sum()), 1e-12)) ** 0.5)
+    sums, single = _shared_squares(
+        residual, seen.sigma_px, seen.stereo, seen.node, used, CELLS / seen.camera.width
+    )
+    return float(max(1.0, sums / max(single, 1e-12)) ** 0.5)
 
 
 def persistence(residual: Float64, seen: StereoSightings, used: Bool) -> float:
@@ -74,14 +69,56 @@ def persistence(residual: Float64, seen: StereoSightings, used: Bool) -> float:
     correlation r between neighbours n sightings are worth n (1 - r) / (1 + r) [AR(1)]. The fitted points
     take off each track's mean, which lowers the correlation seen by about 1 / n.
     """
-    order = np.flatnonzero(used)
-    track = seen.track[order]
-    length = np.bincount(track)[track[:-1]]
-    pair = (track[:-1] == track[1:]) & (length >= LEAST_PERSISTENT)
-    if pair.sum() < LEAST_PAIRS:
+    pairs, product, squares, shorter = _neighbours(residual, seen.sigma_px, seen.track, used)
+    if pairs < LEAST_PAIRS:
         return 1.0
-    scaled = residual[order] / seen.sigma_px[order, None]
-    first, second = scaled[:-1][pair], scaled[1:][pair]
-    shared = 2 * (first * second).sum() / ((first**2).sum() + (second**2).sum())
-    correlation = float(np.clip(shared + (1 / length[pair]).mean(), 0.0, 0.8))
+    correlation = min(max(2 * product / squares + shorter / pairs, 0.0), 0.8)
     return float(((1 + correlation) / (1 - correlation)) ** 0.5)
+
+
+@kernel(fastmath=True)
+def _shared_squares(
+    residual: Float64, sigma: Float64, stereo: Float64, node: Int64, used: Bool, per_px: float
+) -> tuple[float, float]:
+    """Of the used residuals over their sigmas: the squares of each cell's sum, and of single ones."""
+    low, high, last = np.full(2, 1 << 40), np.full(2, -(1 << 40)), 0
+    for k in range(len(used)):
+        if used[k]:
+            last = max(last, node[k])
+            for a in range(2):
+                cell = int(stereo[k, a] * per_px)
+                low[a], high[a] = min(low[a], cell), max(high[a], cell)
+    sums, single = np.zeros((last + 1, max(high[0] - low[0] + 1, 0), max(high[1] - low[1] + 1, 0), 3)), 0.0
+    for k in range(len(used)):
+        if used[k]:
+            across, down = int(stereo[k, 0] * per_px) - low[0], int(stereo[k, 1] * per_px) - low[1]
+            for i in range(3):
+                scaled = min(max(residual[k, i] / sigma[k], -MOST_WHITENED), MOST_WHITENED)
+                sums[node[k], across, down, i] += scaled
+                single += scaled**2
+    return (sums**2).sum(), single
+
+
+@kernel(fastmath=True)
+def _neighbours(
+    residual: Float64, sigma: Float64, track: Int64, used: Bool
+) -> tuple[int, float, float, float]:
+    """Pairs of neighbouring used sightings of points seen often: how many, their residuals' products and
+    squares, over their sigmas, and one over the point's sightings, all summed.
+    """
+    counts = np.zeros(0 if len(track) == 0 else track[-1] + 1, np.int64)
+    for k in range(len(used)):
+        counts[track[k]] += used[k]
+    pairs, product, squares, shorter, old = 0, 0.0, 0.0, 0.0, -1
+    for k in range(len(used)):
+        if not used[k]:
+            continue
+        if old >= 0 and track[old] == track[k] and counts[track[k]] >= LEAST_PERSISTENT:
+            pairs += 1
+            shorter += 1 / counts[track[k]]
+            for i in range(3):
+                first, second = residual[old, i] / sigma[old], residual[k, i] / sigma[k]
+                product += first * second
+                squares += first**2 + second**2
+        old = k
+    return pairs, product, squares, shorter

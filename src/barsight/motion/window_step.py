@@ -104,11 +104,11 @@ def _about_axis(body_from_rect0: Pose, angle: float) -> Pose:
     """The camera turned about its own axis."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return body_from_rect0 @ Pose("rect0", "rect0", turn, np.zeros(3))
+    return replace(body_from_rect0, rotation=body_from_rect0.rotation @ turn)
 
 
 def _placed_by_points(problem: Problem, state: State, used: Bool) -> State:
-    """The newest frame where the known points have it, then the points where all frames have them."""
+    """The newest frame where the known points have it, then its points where all frames have them."""
     seen, node = problem.sightings, len(problem.start) - 1
     assert seen is not None
     rig, sights = rig_of(seen), sights_of(problem, used)
@@ -120,6 +120,9 @@ def _placed_by_points(problem: Problem, state: State, used: Bool) -> State:
             values.update(X(node), values.atPose3(X(node)).retract(-np.linalg.solve(normal, gradient)))
             state = replace(state, values=values)
     points, still = state.points.copy(), np.zeros((len(problem.kept), 6))
+    shown = np.zeros(len(points), np.bool_)
+    shown[seen.track[seen.node == node]] = True
+    sights = sights._replace(used=used & shown[seen.track])
     substitute(rig, sights, guess_of(problem, state), still, np.zeros(2), points, np.empty(len(points)))
     return replace(state, points=points)
 
@@ -131,7 +134,7 @@ def without(window: Window, leaving: Leaving) -> Window:
     gone = len(window.frame_nodes) - len(stayed)
     matrix, gradient = prior_of(leaving.equations, leaving.step, gone * width_of(problem))
     if problem.has_latency:
-        way = window.pose(count).translation - window.pose(0).translation
+        way = window.state.poses[count, :3, 3] - window.state.poses[0, :3, 3]
         matrix, gradient = slid_on(matrix, gradient, window.slide, float(np.linalg.norm(way)))
     values, border = _renumbered(window.state, problem, count), border_of(problem, window.state, window.slide)
     prior = Prior(stayed, values, border, matrix, gradient)
