@@ -17,6 +17,8 @@ from barsight.core.types import Source
 from barsight.result_folder import TORN_TIFF
 
 BANDS = 4
+READ_BYTES = 1 << 22
+"""tifffile would read ahead 256 MiB."""
 LONGEST_PX = 2400
 MOST_PIXELS = 3_000_000
 MOST_STRIPS = 12
@@ -93,7 +95,7 @@ def _reduce(path: Path, page: tifffile.TiffPage) -> Raster:
     sums = np.zeros((3, *small))
     counts = np.zeros((3, *small), np.int32)
     codes = np.zeros((BANDS, *small), np.int32)
-    for data, index, _ in page.segments(maxworkers=1):
+    for data, index, _ in page.segments(maxworkers=1, buffersize=READ_BYTES):
         if data is None:
             continue
         band, row, column = int(index[0]), int(index[2]), int(index[3])
