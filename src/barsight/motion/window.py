@@ -21,9 +21,7 @@ from barsight.motion.problem import LEAST_SIGMA_PX, Problem, StereoSightings
 from barsight.motion.sightings import Sighting
 from barsight.motion.solver import State
 from barsight.motion.stereo_factors import start_points
-from barsight.motion.window_system import (
-    Newest,
-)
+from barsight.motion.window_system import Newest
 
 
 @dataclass(frozen=True, eq=False)
