@@ -131,9 +131,8 @@ def match_guided(
     """Looks for the patches of `source` at `places` (N, 2), `depth` (N,) m off, in both pictures of `pair`.
 
     From the predicted place in the left picture, by full-size pictures alone where that is near enough, then
-    across to the right one. repeat_px: (N,) how far off
-    each patch's likeness is (the bars' pitch); an ellipse of 2 sigma that reaches a quarter of it is
-    ambiguous.
+    across to the right one. repeat_px: (N,) how far off each patch's likeness is (the bars' pitch); an
+    ellipse of 2 sigma that reaches a quarter of it is ambiguous.
     """
     count = len(places)
     ambiguous = np.zeros(count, dtype=np.bool_)

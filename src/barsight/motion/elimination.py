@@ -14,8 +14,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
 from barsight.motion.band import Band
-from barsight.motion.layout import Layout
 from barsight.motion.point_kernels import Guess, Rig, Sights, disparity_off, rows, slide_off
+
+NO_PIECES = np.empty((0, 2), np.int64)
 
 
 class Reduced(NamedTuple):
@@ -33,14 +34,13 @@ class Reduced(NamedTuple):
     corner_gradient: Float64
 
     @classmethod
-    def empty(cls, layout: Layout) -> Reduced:
-        """Zeros."""
-        nodes = len(layout.node)
+    def empty(cls, nodes: int, reach: int, seen: Int64 = NO_PIECES) -> Reduced:
+        """Zeros. seen: (S, 2) the first and last node that see a piece."""
         first, longest = np.zeros(1, np.int64), nodes
-        if len(layout.seen):
-            first, longest = layout.seen[:, 0].copy(), int((layout.seen[:, 1] - layout.seen[:, 0]).max()) + 1
+        if len(seen):
+            first, longest = seen[:, 0].copy(), int((seen[:, 1] - seen[:, 0]).max()) + 1
         return cls(
-            np.zeros((nodes, 6, 6 * layout.reach)), np.zeros(6 * nodes), first,
+            np.zeros((nodes, 6, 6 * reach)), np.zeros(6 * nodes), first,
             np.zeros((len(first), 4, 6 * longest)), np.zeros((len(first), 4, 4)), np.zeros((len(first), 4)),
         )  # fmt: skip
 

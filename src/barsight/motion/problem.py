@@ -220,6 +220,11 @@ class Problem:
         """(K,) the nodes of the system."""
         return np.arange(len(self.start)) if self.asked is None else self.asked
 
+    @property
+    def width(self) -> int:
+        """Unknowns a node: a pose, with an IMU velocity and biases."""
+        return 15 if self.has_imu else 6
+
     @cached_property
     def places(self) -> Int64:
         """(M,) where the system has each node; those taken out beforehand: nowhere."""
@@ -235,7 +240,7 @@ class Problem:
             node, first = self.places[self.sightings.node], self.sightings.first
             begin, end = node[first[:-1]], node[first[1:] - 1]
         piece = None if self.pieces is None else self.pieces.piece
-        return layout(15 if self.has_imu else 6, len(self.kept), begin, end, piece)
+        return layout(self.width, len(self.kept), begin, end, piece)
 
     @property
     def border(self) -> int:

@@ -139,7 +139,7 @@ def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:
         side[0, layout.nodes] = chain.side
         corner[0, 0], corner_gradient[0] = chain.corner, chain.corner_gradient
     if seen is not None and used.any():
-        reduced = Reduced.empty(layout)
+        reduced = Reduced.empty(len(layout.node), layout.reach, layout.seen)
         eliminate(rig_of(seen), sights_of(problem, used), guess_of(problem, state), reduced)
         spread(reduced, layout.node, layout.piece, rows, gradient, side, corner, corner_gradient)
     if problem.pieces is not None:

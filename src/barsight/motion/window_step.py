@@ -31,7 +31,6 @@ from barsight.motion.window_system import (
     prior_of,
     slid_on,
     step_of,
-    width_of,
 )
 
 NOISE_SHARE = 0.2
@@ -132,7 +131,7 @@ def without(window: Window, leaving: Leaving) -> Window:
     problem, count = window.problem, leaving.nodes
     stayed = np.array([k - count for k in window.frame_nodes if k >= count])
     gone = len(window.frame_nodes) - len(stayed)
-    matrix, gradient = prior_of(leaving.equations, leaving.step, gone * width_of(problem))
+    matrix, gradient = prior_of(leaving.equations, leaving.step, gone * problem.width)
     if problem.has_latency:
         way = window.state.poses[count, :3, 3] - window.state.poses[0, :3, 3]
         matrix, gradient = slid_on(matrix, gradient, window.slide, float(np.linalg.norm(way)))

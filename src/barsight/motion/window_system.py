@@ -62,11 +62,6 @@ class Solved:
     drift_covariance: Float64 | None
 
 
-def width_of(problem: Problem) -> int:
-    """Unknowns a node."""
-    return 15 if problem.has_imu else 6
-
-
 def border_of(problem: Problem, state: State, slide: float) -> Float64:
     """(b,) latency and slide if there are encoders, then the drift."""
     slides = [slide] if problem.has_latency else []
@@ -81,7 +76,7 @@ def slide_twist(body_from_rect0: Pose) -> Float64:
 
 def gathered(problem: Problem, state: State, used: Bool, first: int, end: int) -> Equations:
     """Of the used sightings, and of what else binds nodes first...end - 1 to each other and to node `end`."""
-    kept, size = problem.kept, width_of(problem)
+    kept, size = problem.kept, problem.width
     last = min(end, len(problem.start) - 1)
     within = kept[(kept >= first) & (kept <= last)]
     chain, gaps = without_gaps(_chain(problem, state, first, end, last), within - first)
@@ -105,7 +100,7 @@ def gathered(problem: Problem, state: State, used: Bool, first: int, end: int) -
 
 def _chain(problem: Problem, state: State, first: int, end: int, last: int) -> Chain:
     """Of nodes first...last."""
-    size = width_of(problem)
+    size = problem.width
     chain = chain_of(factors(problem, first, end), state.values, size, len(problem.start))
     placed = tuple(place for place in problem.placed if first <= place.node < end)
     add_encoders(chain, replace(problem, placed=placed), state.poses, latency_of(state.values))
@@ -114,12 +109,9 @@ def _chain(problem: Problem, state: State, first: int, end: int, last: int) -> C
 
 
 def _add_pictures(problem: Problem, state: State, used: Bool, matrix: Float64, gradient: Float64) -> None:
-    seen, nodes, size = problem.sightings, len(problem.kept), width_of(problem)
+    seen, nodes, size = problem.sightings, len(problem.kept), problem.width
     assert seen is not None
-    reduced = Reduced(
-        np.zeros((nodes, 6, 6 * nodes)), np.zeros(6 * nodes), np.zeros(1, np.int64),
-        np.zeros((1, 4, 6 * nodes)), np.zeros((1, 4, 4)), np.zeros((1, 4)),
-    )  # fmt: skip
+    reduced = Reduced.empty(nodes, nodes)
     eliminate(rig_of(seen), sights_of(problem, used), guess_of(problem, state), reduced)
     dense.add_blocks(reduced.band, size, matrix)
     at = (np.arange(nodes)[:, None] * size + np.arange(6)).ravel()
@@ -141,7 +133,7 @@ def _add_pictures(problem: Problem, state: State, used: Bool, matrix: Float64, g
 def of_prior(problem: Problem, state: State, slide: float) -> Equations:
     """What has left, at the present state; as long as nothing has, how far all may slide."""
     border = border_of(problem, state, slide)
-    whole = len(problem.kept) * width_of(problem) + len(border)
+    whole = len(problem.kept) * problem.width + len(border)
     matrix, gradient, prior = np.zeros((whole, whole)), np.zeros(whole), problem.prior
     if prior is not None:
         count = len(prior.matrix) - len(border)
@@ -158,7 +150,7 @@ def step_of(problem: Problem, state: State, slide: float, used: Bool, equations:
     """To where everything fits best. Raises LinAlgError where the measurements leave an unknown
     undetermined.
     """
-    size, matrix = width_of(problem), equations.matrix.copy()
+    size, matrix = problem.width, equations.matrix.copy()
     matrix[[-2, -1], [-2, -1]] += 1 / np.array(LOOSE) ** 2
     factor, forward = matrix, equations.gradient.copy()
     if not dense.factorise(factor, forward):
@@ -183,15 +175,10 @@ def step_of(problem: Problem, state: State, slide: float, used: Bool, equations:
 
 
 def _stepped(problem: Problem, state: State, used: Bool, step: Float64, gaps: tuple[Gap, ...]) -> State:
-    size, count = width_of(problem), len(problem.kept)
+    size, count = problem.width, len(problem.kept)
     latency = step[count * size : -3]
-    by_node = with_gaps(
-        step[: count * size].reshape(count, size),
-        float(latency.sum()),
-        problem.kept,
-        gaps,
-        len(problem.start),
-    )
+    by_node = step[: count * size].reshape(count, size)
+    by_node = with_gaps(by_node, float(latency.sum()), problem.kept, gaps, len(problem.start))
     pictures = by_node[problem.kept, :6]
     if problem.has_latency and problem.sightings is not None:
         pictures = pictures + step[-3] * slide_twist(problem.sightings.body_from_rect0)
