@@ -24,10 +24,12 @@ from barsight.yard.vetoes import Veto
 STEP_M = 0.01
 STRAY_FIELD_M = 0.03
 """Steel this near to a face or the beam is drawn to it."""
-MAX_RISE_M = 0.010
-"""A patch that the map shows this much above the faces' plane obstructs."""
+MAX_RISE_M = 0.012
+"""A patch that the map shows this much above the faces' plane obstructs, by medians over 50 mm squares."""
+MAX_NARROW_RISE_M = 0.020
+"""The same for what is too narrow for those: by medians over 30 mm squares."""
 MIN_PATCH_CELLS = 4
-"""Cells (10 mm) of the smallest patch that counts: a strap's buckle has more, a single wrong match fewer."""
+"""Cells of STEP_M of the smallest patch that counts."""
 MAX_HOLE_M = 0.08
 """An unseen place narrower than this, with its rim seen below the plane, hides nothing that stands."""
 
@@ -57,20 +59,23 @@ def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
 
 
 def _obstructed(rise: Float64, region: Region) -> list[Veto]:
-    """Report the highest connected patch over the plane."""
-    over = (region.faces | region.beam) & (rise > MAX_RISE_M)
-    _, patch, boxes, _ = cv2.connectedComponentsWithStats(over.astype(np.uint8), connectivity=8)
-    large = np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= MIN_PATCH_CELLS) + 1
-    if large.size == 0:
-        return []
-    highest = np.where(np.isin(patch, large), rise, -np.inf)
-    at = np.unravel_index(int(np.argmax(highest)), highest.shape)
-    along, across = region.grid[at]
-    reason = (
-        f"something stands {1e3 * highest[at]:.0f} mm above the faces' plane, {along:+.2f} m along and "
-        f"{across:+.2f} m across the beam, {1e3 * MAX_RISE_M:.0f} mm are allowed"
-    )
-    return [Veto("obstructed", reason)]
+    """Report the highest connected patch over the plane. rise: (V, U), -inf where unseen."""
+    known = np.maximum(rise, -1.0).astype(np.float32)
+    for side, allowed_m in ((5, MAX_RISE_M), (3, MAX_NARROW_RISE_M)):
+        smooth = cv2.medianBlur(known, side)
+        over = (region.faces | region.beam) & (smooth > allowed_m)
+        _, patch, boxes, _ = cv2.connectedComponentsWithStats(over.astype(np.uint8), connectivity=8)
+        large = np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= MIN_PATCH_CELLS) + 1
+        if large.size:
+            highest = np.where(np.isin(patch, large), smooth, -np.inf)
+            at = np.unravel_index(int(np.argmax(highest)), highest.shape)
+            along, across = region.grid[at]
+            reason = (
+                f"something stands {1e3 * highest[at]:.0f} mm above the faces' plane, {along:+.2f} m along "
+                f"and {across:+.2f} m across the beam, {1e3 * allowed_m:.0f} mm are allowed"
+            )
+            return [Veto("obstructed", reason)]
+    return []
 
 
 def _unseen(unproven: Bool, region: Region) -> list[Veto]:
