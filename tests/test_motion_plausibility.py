@@ -12,11 +12,13 @@ from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame
 from barsight.evaluation.drift import compare
 from barsight.inertial.model import without_saturation
 from barsight.motion.crane import CraneSettings, with_seen_noise
+from barsight.motion.encoder_jumps import NOISE_SIGMAS, find_jumps, jump_test
 from barsight.motion.fusion import FusedTrajectory, FusionSettings, _untied
 from barsight.motion.plausibility import check_crane
 from barsight.motion.sightings import Sighting
 from barsight.recording.open import open_recording
 from barsight.recording.truth import read_ground_truth
+from drawn_cranes import drawn_crane
 from spoiled_recording import SpoiledRecording, frozen_between, late, with_outliers
 
 
@@ -55,6 +57,62 @@ def test_a_jump_leaves_the_longer_side(size_m: float) -> None:
     assert "at 13.0 s" in checked.warnings[0]
     assert abs(float(checked.warnings[0].split("jump by ")[1].split(" mm")[0]) - 1e3 * abs(size_m)) < 4
     assert checked.samples.stamp_ns.max() < 13_000_000_000
+
+
+@pytest.mark.parametrize(("hz", "amplitude_m"), [(1.3, 0.006), (1.5, 0.006), (1.5, 0.011), (3.0, 0.0025)])
+@pytest.mark.parametrize("rate_hz", [20, 50])
+def test_an_oscillating_trolley_jumps_nowhere(hz: float, amplitude_m: float, rate_hz: int) -> None:
+    time = np.arange(0, 30, 1 / rate_hz)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        sway = amplitude_m * np.sin(2 * np.pi * hz * time + rng.uniform(0, 2 * np.pi))
+        place = np.column_stack([0.5 * time, 0.4 + sway, 0 * time + 8])
+        read = (place + rng.normal(0, 0.001, place.shape)).round(3)
+        crane = CraneSamples((1e9 * time).astype(np.int64), read, np.zeros(3), np.eye(3), 0.001)
+        checked = check_crane(crane)
+        assert checked.warnings == () and len(checked.samples.stamp_ns) == len(time)
+
+
+def clean_that_lose_readings(seeds: range) -> list[int]:
+    """Seeds of drawn cranes without a fault from which something is left out all the same."""
+    return [seed for seed in seeds if check_crane(drawn_crane(seed).readings).warnings]
+
+
+def found_jumps(seeds: range, jump_m: float) -> tuple[int, int]:
+    """Jumps found within three readings, of those that the readings can show (97.5 %)."""
+    found = can = 0
+    for seed in seeds:
+        drawn = drawn_crane(seed, jump_m=jump_m)
+        test = jump_test(drawn.readings)
+        assert test is not None and drawn.fault is not None
+        if jump_m > test.smallest_m * (1 + 2 / NOISE_SIGMAS):
+            can += 1
+            found += any(abs(at - drawn.fault) <= 3 for at, _ in find_jumps(drawn.readings))
+    return found, can
+
+
+def test_drawn_cranes_lose_what_is_wrong_and_nothing_else() -> None:
+    assert clean_that_lose_readings(range(100, 160)) == []
+    for jump_m in (0.02, 0.1):
+        found, can = found_jumps(range(100, 130), jump_m)
+        assert found >= 0.9 * can and can >= 10
+
+
+@pytest.mark.slow
+def test_five_hundred_drawn_cranes() -> None:
+    seeds = range(10000, 10500)
+    lost = clean_that_lose_readings(seeds)
+    print(f"clean cranes that lose a reading: {len(lost)} of {len(seeds)} {lost}")
+    assert len(lost) <= 3
+    for jump_m in (0.008, 0.012, 0.02, 0.03, 0.1):
+        found, can = found_jumps(seeds, jump_m)
+        print(f"jumps of {1e3 * jump_m:.0f} mm found: {found} of the {can} that the readings can show")
+        assert found >= 0.93 * can
+    frozen = [drawn_crane(seed, frozen_s=0.5) for seed in seeds]
+    frozen = [one for one in frozen if one.fault is not None]
+    told = sum(any("frozen" in text for text in check_crane(one.readings).warnings) for one in frozen)
+    print(f"freezes of 0.5 s found: {told} of {len(frozen)}")
+    assert told >= 0.98 * len(frozen)
 
 
 def test_the_noise_is_what_the_readings_show() -> None:

@@ -13,15 +13,16 @@ from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.motion.crane import fit_position
+from barsight.motion.encoder_jumps import find_jumps
 from barsight.motion.sightings import Sighting
 from barsight.motion.sway import turned_angle
 
-SIDE = 8
-"""Readings on either side that a jump is measured from."""
-LEAST_JUMP_SIGMAS = 8.0
-LEAST_JUMP_M = 0.01
 LEAST_FROZEN = 5
-LEAST_FROZEN_SPEED_MPS = 0.05
+SIDE, SPEED_WINDOW_S = 8, 0.3
+"""The speed before a freeze is taken over so many readings, or so long where that is more."""
+MIN_HELD_M, HELD_SIGMAS = 0.01, 8.0
+"""A crane that froze would have gone further than this, and than so many sigma of a reading."""
+MAX_BRAKING_MPS2 = 1.0
 MOST_FRAMES_OFF = 2
 MANY_STEPS = 8
 """Recordings that leave fewer steps are looked at for one frame off only."""
@@ -55,7 +56,7 @@ def check_crane(crane: CraneSamples) -> CheckedCrane:
         )
         away = (samples.stamp_ns >= crane.stamp_ns[first]) & (samples.stamp_ns <= crane.stamp_ns[last])
         samples = _chosen(samples, ~away)
-    jumps = _jumps(samples)
+    jumps = find_jumps(samples)
     if jumps:
         bounds = [0, *(k for k, _ in jumps), len(samples.stamp_ns)]
         longest = int(np.argmax(np.diff(bounds)))
@@ -185,59 +186,31 @@ def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
 
 
 def _frozen(crane: CraneSamples) -> list[tuple[int, int]]:
-    """Stretches (first, last) of equal readings that a moving crane runs into."""
-    same = np.r_[False, (np.diff(crane.position_m, axis=0) == 0).all(axis=1), False]
+    """Find stretches (first, last) of equal readings that a moving crane runs into or comes out of elsewhere.
+
+    A crane that turns gives equal readings too, of coarse encoders most of all, but stays near them.
+    """
+    place, time = crane.position_m, (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
+    same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
     edges = np.flatnonzero(np.diff(same.astype(int)))
+    least = max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
     found = []
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        before = slice(max(0, first - SIDE), first)
         if last - first + 1 < LEAST_FROZEN or first < SIDE // 2:
             continue
-        time = (crane.stamp_ns[before] - crane.stamp_ns[first]) / NS_PER_S
-        line = np.polyfit(time, crane.position_m[before], 2 if len(time) >= 6 else 1)
-        if np.linalg.norm(line[-2]) > LEAST_FROZEN_SPEED_MPS:
+        after = place[last + 1 : last + 4]
+        away = float(np.linalg.norm(np.median(after, axis=0) - place[last])) if len(after) == 3 else 0.0
+        speed = _speed_before(place, time, int(first))
+        braked = min(float(time[last] - time[first]), speed / MAX_BRAKING_MPS2)
+        if max(away, (speed - MAX_BRAKING_MPS2 * braked / 2) * braked) > least:
             found.append((int(first), int(last)))
     return found
 
 
-def _jumps(crane: CraneSamples) -> list[tuple[int, float]]:
-    """(index of the first reading beyond, size m) of steps between neighbouring readings that stay."""
-    stamps, place = crane.stamp_ns, crane.position_m
-    if len(stamps) < 2 * SIDE + 1:
-        return []
-    step_ns = np.diff(stamps)
-    rate = np.diff(place, axis=0) / step_ns[:, None]
-    found: list[tuple[int, float]] = []
-    for k in range(SIDE, len(stamps) - SIDE):
-        around = slice(k - SIDE, k + SIDE - 1)
-        if step_ns[around].max() > 3 * np.median(step_ns):
-            continue
-        excess = np.linalg.norm((rate[k - 1] - np.median(rate[around], axis=0)) * step_ns[k - 1])
-        if excess < max(LEAST_JUMP_M, LEAST_JUMP_SIGMAS * crane.position_std_m) / 2:
-            continue
-        size = _step(crane, k)
-        if size > max(LEAST_JUMP_M, LEAST_JUMP_SIGMAS * crane.position_std_m):
-            if found and k - found[-1][0] <= SIDE:
-                found[-1] = max(found[-1], (k, size), key=lambda jump: jump[1])
-            else:
-                found.append((k, size))
-    return found
-
-
-def _step(crane: CraneSamples, k: int) -> float:
-    """m by which the readings from k on stand off those before, over a common parabola; Cauchy's weights.
-
-    0 where it isn't clear.
-    """
-    around = slice(k - SIDE, k + SIDE)
-    time = (crane.stamp_ns[around] - crane.stamp_ns[k]) / NS_PER_S
-    design = np.column_stack([np.ones(2 * SIDE), time, time**2, np.arange(2 * SIDE) >= SIDE])
-    values, weights = crane.position_m[around], np.ones(2 * SIDE)
-    for _ in range(10):
-        fit, *_ = np.linalg.lstsq(design * weights[:, None], values * weights[:, None], rcond=None)
-        residual = np.linalg.norm(values - design @ fit, axis=1) / (3**0.5 * crane.position_std_m)
-        weights = 1 / np.sqrt(1 + (residual / 3) ** 2)
-    information = (design * weights[:, None] ** 2).T @ design
-    sigma = float(np.sqrt(np.linalg.inv(information)[3, 3])) * crane.position_std_m
-    size = float(np.linalg.norm(fit[3]))
-    return size if size > LEAST_JUMP_SIGMAS * sigma else 0.0
+def _speed_before(place: Float64, time: Float64, first: int) -> float:
+    """Median speed (m/s) over the readings before one, by those half a window apart."""
+    begin = min(int(np.searchsorted(time, time[first] - SPEED_WINDOW_S)), max(0, first - SIDE))
+    half = (first - begin + 1) // 2
+    old, new = slice(begin, first + 1 - half), slice(begin + half, first + 1)
+    rates = (place[new] - place[old]) / (time[new] - time[old])[:, None]
+    return float(np.linalg.norm(np.median(rates, axis=0)))
