@@ -60,8 +60,8 @@ def settings_page(uses: dict[type, list[tuple[str, str]]]) -> str:
     """A section for each class: who takes it under which prefix, then a row a field."""
     lines = [
         "# Settings\n\nEvery setting is a flag (`--map.cell-m 0.02`) and a key of a TOML file "
-        "(`[map]`, `cell_m = 0.02`) for the commands that take `--config`. Flags go before the file. A part's "
-        "flags begin as its section says: `--map.*` means `--map.cell-m` and so on.\n"
+        "(`[map]`, `cell_m = 0.02`) for the commands that take `--config`. Flags go before the file. A "
+        "part's flags begin as its section says: `--map.*` means `--map.cell-m` and so on.\n"
     ]
     for kind, reached in uses.items():
         about = "" if (kind.__doc__ or "").startswith(f"{kind.__name__}(") else inspect.getdoc(kind) or ""

@@ -41,7 +41,7 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             out: A folder written by barsight measure.
-            magnet: TOML file of the magnet; docs/yard.md describes one. Without it an example is assumed.
+            magnet: TOML file of the magnet (docs/how-to/describe-a-magnet.md). Without it nothing is offered.
             settings: What a lift must fulfil.
             config: TOML file with settings; flags go before it.
         """

@@ -51,7 +51,7 @@ def run(arguments: Sequence[str]) -> None:
             settings: Settings of the stages.
             config: TOML file with settings; flags go before it.
             resume: Keep what is done beside OUT until the end; a killed run started again with it goes on.
-            magnet: TOML file of the magnet that lifts are chosen for; docs/yard.md describes one.
+            magnet: TOML file of the magnet that lifts are chosen for (docs/how-to/describe-a-magnet.md).
             overwrite: Replace the result files of an earlier run in OUT.
             verbose: Print the time that each stage took.
         """
