@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import tyro
 
-_POSITIONAL = tyro.conf.Positional[int].__metadata__[0]  # type: ignore[attr-defined]
+_POSITIONAL = tyro.conf.Positional[int].__metadata__[0]
 _NAMES = {int: "whole number", float: "number", str: "text", bool: "yes or no", Path: "path"}
 
 
@@ -99,10 +99,10 @@ def documented(kind: type) -> dict[str, str]:
     """The docstring after each field of a class and its bases, on one line."""
     said: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
+        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body
         for field, after in pairwise(body):
             if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                said[field.target.id] = _cell(str(after.value.value))  # type: ignore[union-attr,attr-defined]
+                said[field.target.id] = _cell(str(after.value.value))
     return said
 
 
