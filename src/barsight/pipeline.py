@@ -33,6 +33,7 @@ from barsight.evaluation.agreement import agree
 from barsight.kept import keeping_folder, once
 from barsight.mapping.contours import cut_contours
 from barsight.mapping.election import Sights
+from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse
 from barsight.mapping.look import apart, apart_by_encoders, choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
@@ -103,14 +104,17 @@ def measure(
     advance: Advance,
     resume: Path | None = None,
     magnet: Magnet | None = None,
-    write: Callable[[Surface], None] = lambda _: None,
+    write: Callable[[Surface, FreeSpace], None] = lambda _surface, _free: None,
+    judged_at: Literal["now", "end"] = "now",
 ) -> Measurement:
     """Measure a recording. `scratch` is an empty folder for the map's tiles; the caller removes it.
 
     resume: a folder that keeps the trajectory and each frame's disparity (about 16 MB for 1.3 megapixels), so
     that a killed run goes on where it was; the caller removes it when all is written.
-    magnet: what lifts are chosen for; the package's documented example where there is none.
-    write: given the surface as soon as it is finished, in a thread beside the search for bundles.
+    magnet: what lifts are chosen for; where there is none, they are judged for the package's example and
+    all forbidden (`no-magnet`).
+    write: given surface and free space as soon as they are finished, beside the search for bundles.
+    judged_at: when lifts are judged: now, or at the recording's last frame, to look back.
 
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
@@ -168,6 +172,7 @@ def measure(
         body_from_rect0 = rectifier.body_from_rect0
         placer = Placer(stereo, body_from_rect0, cell_m, per_pixel, settings.map.max_sigma_m, watch)
         store = TileStore(scratch, settings.map.resident_tiles)
+        free = FreeSpace(cell_m)
         preview = None
         placed: list[Pose] = []
         for done, (frame, posed, neighbours) in enumerate(_placed(matched, poses), start=1):
@@ -180,6 +185,8 @@ def measure(
                 with watch("fuse", 1):
                     fuse(store, view.cells, settings.map)
                 placed.append(posed.reference_from_body @ body_from_rect0)
+                with watch("free space", 1):
+                    free.carve(view.cells, Sights.of([placed[-1]], rectifier.camera).eyes[0])
                 if preview is None or abs(done - len(poses) / 2) < 1:
                     preview = Preview(view.left, view.disparity_px)
             if done % _TIDIED_EVERY == 1:
@@ -205,8 +212,8 @@ def measure(
         speed_mps = _speed_along_x(trajectory)
         agreed = [agree(by_number[p.profile], p, speed_mps) for p in laser if p.profile in by_number]
 
-    with watch("bundles"), beside(lambda: write(surface)):
-        heights = surface_map(surface)
+    with watch("bundles"), beside(lambda: write(surface, free)):
+        heights = surface_map(surface, free)
         bundles = find_bundles(heights, settings.bundles)
         stock = (
             match_stock(expected, bundles)
@@ -233,11 +240,17 @@ def measure(
         warnings.append(Notice("frames-refused", f"{len(refusals)} of {frames_total} frames were refused"))
     with watch("lifts"):
         told = [(notice.code, notice.message) for notice in warnings]
-        forbidden = map_vetoes(told, trajectory.reference, 0.0, settings.lift)
+        captured_to_ns = int(trajectory.stamp_ns[-1])
+        now_ns = time.time_ns() if judged_at == "now" else captured_to_ns
+        forbidden = map_vetoes(
+            told, trajectory.reference, captured_to_ns, now_ns, settings.lift, has_magnet=magnet is not None
+        )
         window_ns = seconds_to_ns(settings.motion.crane.window_s)
         shift_ns = source.rig.timeshift_cam_imu_ns
         travel = Travel.of(trajectory, source.crane(), shift_ns, window_ns, first.range_m, rectifier.camera)
-        lifts = plan_lifts(heights, bundles, magnet or load_magnet(None), settings.lift, forbidden, travel)
+        lifts = plan_lifts(
+            heights, bundles, magnet or load_magnet(None), settings.lift, forbidden, travel, now_ns
+        )
     return Measurement(
         recording_path=source.path,
         recording_format=source.format,

@@ -8,7 +8,6 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -77,23 +76,12 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return summary
 
 
-def age_s(summary: dict[str, Any]) -> float | None:
-    """How long ago result.json says that it was measured; None where it doesn't say."""
-    try:
-        measured = datetime.fromisoformat(str(summary.get("measured_at")))
-    except ValueError:
-        return None
-    if measured.tzinfo is None:
-        return None
-    return (datetime.now(UTC) - measured).total_seconds()
-
-
 def read_heights(folder: Path) -> PartedMap:
-    """height.tif, and ortho.tif where there is one, read as parts of them are wanted.
+    """height.tif, and ortho.tif and free.tif where there are any, read as parts of them are wanted.
 
     Raises InputError, then or later, where one is missing or torn.
     """
-    path, photo = folder / "height.tif", folder / "ortho.tif"
+    path, photo, free = (folder / name for name in ("height.tif", "ortho.tif", "free.tif"))
     if not path.is_file():
         raise InputError(folder, "has no height.tif", _REMEDY)
     with _first_page(path) as page:
@@ -103,21 +91,25 @@ def read_heights(folder: Path) -> PartedMap:
         if page.planarconfig != 2 or not page.is_tiled or page.shape[0] < _BANDS:
             raise InputError(path, f"is not {_BANDS} planar bands in tiles", _REMEDY)
     x0_m, y0_m = float(tie[3]) + cell_m / 2, float(tie[4]) - (size[0] - 0.5) * cell_m
-    has_photo = photo.is_file()
-    if has_photo:
-        with _first_page(photo) as page:
-            if page.shape != size or page.dtype != np.uint8 or not page.is_tiled:
-                raise InputError(photo, "doesn't fit height.tif", _REMEDY)
+    for file, dtype in ((photo, np.uint8), (free, np.float32)):
+        if file.is_file():
+            with _first_page(file) as page:
+                if page.shape != size or page.dtype != dtype or not page.is_tiled:
+                    raise InputError(file, "doesn't fit height.tif", _REMEDY)
+
+    def layer(file: Path, rows: slice, columns: slice) -> NDArray[Any] | None:
+        if not file.is_file():
+            return None
+        with _first_page(file) as page:
+            found: NDArray[Any] = _rectangle(page, 1, rows, columns)[0]
+        return found
 
     def read(rows: slice, columns: slice) -> HeightMap:
         with _first_page(path) as page:
             z, sigma, views, source = _rectangle(page, _BANDS, rows, columns)
-        grey = None
-        if has_photo:
-            with _first_page(photo) as page:
-                grey = _rectangle(page, 1, rows, columns)[0]
+        grey, bounds = (layer(file, rows, columns) for file in (photo, free))
         x, y = x0_m + cell_m * columns.start, y0_m + cell_m * rows.start
-        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), grey)
+        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), grey, bounds)
 
     return PartedMap(x0_m, y0_m, cell_m, (size[0], size[1]), read)
 

@@ -13,9 +13,11 @@ from barsight.cli.arguments import call
 from barsight.cli.measure import measure_into, print_outcome
 from barsight.cli.progress import stages
 from barsight.core.errors import OutputError
+from barsight.core.files import atomic_path
 from barsight.pipeline import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
+from barsight.yard.magnet import example_magnet
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -25,18 +27,23 @@ def run(arguments: Sequence[str]) -> None:
         """Simulate a small yard, measure it, and compare with its truth and its simulated laser.
 
         Args:
-            out: The folder for the recording (OUT/recording) and the results (OUT/result).
+            out: The folder for the recording (OUT/recording), the example magnet that lifts are chosen for
+                (OUT/magnet.toml) and the results (OUT/result).
         """
         console = Console(stderr=True)
-        recording, result = out / "recording", out / "result"
-        for folder in (recording, result):
+        recording, magnet, result = (out / name for name in ("recording", "magnet.toml", "result"))
+        for folder in (recording, magnet, result):
             if folder.exists():
                 raise OutputError(f"{folder}: exists already; remove it or name another folder with -o")
         console.print("Simulating a small yard ...")
         with stages(console) as advance:
             simulate(recording, SimulationSettings.demo(), lambda n, total: advance("render", n, total))
-        console.print("Measuring it ...")
-        content = measure_into(recording, result, MeasureSettings(), console, truth_of=recording)
+        with atomic_path(magnet) as path:
+            path.write_text(example_magnet(), encoding="utf-8")
+        console.print("Measuring it; lifts are chosen for the example magnet, as of the recording's end ...")
+        content = measure_into(
+            recording, result, MeasureSettings(), console, truth_of=recording, magnet=magnet, judged_at="end"
+        )
         print_outcome(content, console, verbose=False)
         console.print(f"report: {result / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
         console.print(f"in 3D:  barsight view {result}", soft_wrap=True, highlight=False, markup=False)

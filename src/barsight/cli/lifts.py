@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -15,7 +16,7 @@ from rich.table import Table
 
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.report.page import write_report
-from barsight.result_folder import age_s, read_heights, read_summary
+from barsight.result_folder import read_heights, read_summary
 from barsight.yard.bundle_file import read_bundles
 from barsight.yard.lift import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lift_file import write_lifts
@@ -34,6 +35,7 @@ def run(arguments: Sequence[str]) -> None:
         magnet: Path | None = None,
         settings: Annotated[LiftSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
+        at: Literal["now", "end"] = "now",
     ) -> None:
         """Choose lift targets anew from a measured yard, without measuring again.
 
@@ -44,18 +46,23 @@ def run(arguments: Sequence[str]) -> None:
             magnet: TOML file of the magnet (docs/how-to/describe-a-magnet.md). Without it nothing is offered.
             settings: What a lift must fulfil.
             config: TOML file with settings; flags go before it.
+            at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
         """
         described = load_magnet(magnet)
         summary = read_summary(out)
         warnings = [(str(w.get("code")), str(w.get("message"))) for w in summary.get("warnings") or []]
         reference = str(summary.get("reference", "world"))
         travel = Travel.read(summary)
-        vetoes = map_vetoes(warnings, reference, age_s(summary), settings)
+        captured_to_ns = travel.captured_ns[1] if travel and travel.captured_ns else None
+        now_ns = captured_to_ns if at == "end" and captured_to_ns is not None else time.time_ns()
+        vetoes = map_vetoes(
+            warnings, reference, captured_to_ns, now_ns, settings, has_magnet=magnet is not None
+        )
         if travel is None:
             unknown = "result.json doesn't say how sure the trajectory is: measure again"
             vetoes = (*vetoes, Veto("trajectory-degraded", unknown))
         bundles = read_bundles(out / "bundles.json")
-        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes, travel)
+        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes, travel, now_ns)
         write_lifts(plan, reference, out / "lifts.json")
         write_report(out, out / "report.html")
         print_lifts(plan, Console(stderr=True))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -35,6 +35,7 @@ def run(arguments: Sequence[str]) -> None:
         settings: Annotated[MeasureSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
         magnet: Path | None = None,
+        at: Literal["now", "end"] = "now",
         overwrite: bool = False,
         resume: bool = False,
         verbose: Annotated[bool, tyro.conf.arg(aliases=("-v",))] = False,
@@ -52,12 +53,14 @@ def run(arguments: Sequence[str]) -> None:
             config: TOML file with settings; flags go before it.
             resume: Keep what is done beside OUT until the end; a killed run started again with it goes on.
             magnet: TOML file of the magnet that lifts are chosen for (docs/how-to/describe-a-magnet.md).
+                Without it nothing is offered.
+            at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             overwrite: Replace the result files of an earlier run in OUT.
             verbose: Print the time that each stage took.
         """
         console = Console(stderr=True)
         measured = measure_into(
-            recording, out, settings, console, overwrite=overwrite, resume=resume, magnet=magnet
+            recording, out, settings, console, overwrite=overwrite, resume=resume, magnet=magnet, judged_at=at
         )
         print_outcome(measured, console, verbose=verbose)
         console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
@@ -75,24 +78,26 @@ def measure_into(
     resume: bool = False,
     truth_of: Path | None = None,
     magnet: Path | None = None,
+    judged_at: Literal["now", "end"] = "now",
 ) -> dict[str, Any]:
     """Measure, write all files and the report into `out`, and return what result.json says.
 
     resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
     truth_of: a recording with truth to score against; only after the measuring is done.
+    judged_at: when lifts are judged, see `barsight.pipeline.measure`.
     """
     if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     recording = open_recording(path, settings.recording)
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
-    described = load_magnet(magnet)
+    described = load_magnet(magnet) if magnet is not None else None
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
         with stages(console) as advance:
             measured = measure(
                 recording, settings, scratch, advance, keep, described,
-                lambda surface: write_surface(surface, staging),
+                lambda surface, free: write_surface(surface, free, staging), judged_at,
             )  # fmt: skip
         content = summary(measured)
         write_results(measured, staging)

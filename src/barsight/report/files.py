@@ -18,6 +18,7 @@ from barsight.core.arrays import Float32
 from barsight.core.files import atomic_path
 from barsight.core.stamps import NS_PER_S, format_seconds
 from barsight.core.types import Contour, LaserProfile, Trajectory
+from barsight.mapping.free_space import UNPROVEN, FreeSpace
 from barsight.mapping.surface import Layers, Surface
 from barsight.measurement import Measurement, Preview
 from barsight.report.orthophoto import georeference, write_orthophoto
@@ -26,8 +27,8 @@ from barsight.yard.lift_file import write_lifts
 
 SCHEMA_VERSION = 1
 RESULT_FILES = (
-    "trajectory.tum", "cloud.ply", "height.tif", "contour.csv", "laser.csv", "bundles.json", "lifts.json",
-    "ortho.tif", "ortho.png", "preview.png", "result.json", "report.html",
+    "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "contour.csv", "laser.csv", "bundles.json",
+    "lifts.json", "ortho.tif", "ortho.png", "preview.png", "result.json", "report.html",
 )  # fmt: skip
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
@@ -37,9 +38,10 @@ _CLOUD_POINT = np.dtype(
 )
 
 
-def write_surface(surface: Surface, folder: Path) -> None:
-    """What the surface alone fills, into an existing folder: cloud, heights, orthophoto."""
+def write_surface(surface: Surface, free: FreeSpace, folder: Path) -> None:
+    """Write what the map alone fills into an existing folder: cloud, heights, free space, orthophoto."""
     write_height(surface, folder / "height.tif")
+    write_free(surface, free, folder / "free.tif")
     write_orthophoto(surface, folder)
     write_cloud(surface, folder / "cloud.ply")
 
@@ -138,17 +140,48 @@ def write_height(surface: Surface, target: Path) -> None:
         )
 
 
-def _height_tiles(surface: Surface) -> Iterator[Float32]:
+def write_free(surface: Surface, free: FreeSpace, target: Path) -> None:
+    """Write the upper bounds of what may stand in each cell (m) as a GeoTIFF on height.tif's grid."""
+
+    def tiles() -> Iterator[Float32]:
+        for row, column, height, width in _tiles_of(surface):
+            tile = np.full((_TILE, _TILE), UNPROVEN)
+            lowest = surface.rows[1] - row - height
+            part = free.window(surface.columns[0] + column, lowest, width, height)
+            tile[:height, :width] = np.round(part, 3)[::-1]
+            yield tile
+
+    with atomic_path(target) as path:
+        tifffile.imwrite(
+            path,
+            tiles(),
+            shape=surface.shape,
+            dtype=np.float32,
+            photometric="minisblack",
+            tile=(_TILE, _TILE),
+            compression="zlib",
+            metadata=None,
+            software=f"barsight {barsight.__version__}",
+            extratags=[*georeference(surface), (42113, "s", 0, "inf", True)],
+        )
+
+
+def _tiles_of(surface: Surface) -> Iterator[tuple[int, int, int, int]]:
+    """First row from the highest y, first column, height and width of each tile of a raster."""
     rows, columns = surface.shape
+    for row in range(0, rows, _TILE):
+        for column in range(0, columns, _TILE):
+            yield row, column, min(_TILE, rows - row), min(_TILE, columns - column)
+
+
+def _height_tiles(surface: Surface) -> Iterator[Float32]:
     for band in BANDS:
-        for row in range(0, rows, _TILE):
-            for column in range(0, columns, _TILE):
-                height, width = min(_TILE, rows - row), min(_TILE, columns - column)
-                lowest = surface.rows[1] - row - height
-                window = surface.window(surface.columns[0] + column, lowest, width, height)
-                tile = np.full((_TILE, _TILE), np.nan, np.float32)
-                tile[:height, :width] = _band(window, band)[::-1]
-                yield tile
+        for row, column, height, width in _tiles_of(surface):
+            lowest = surface.rows[1] - row - height
+            window = surface.window(surface.columns[0] + column, lowest, width, height)
+            tile = np.full((_TILE, _TILE), np.nan, np.float32)
+            tile[:height, :width] = _band(window, band)[::-1]
+            yield tile
 
 
 def _band(window: Layers, band: str) -> Float32:
@@ -209,6 +242,8 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "schema_version": SCHEMA_VERSION,
         "software": {"name": "barsight", "version": barsight.__version__},
         "measured_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "captured_from_ns": int(stamps[0]),
+        "captured_to_ns": int(stamps[-1]),
         "is_simulated": measurement.is_simulated,
         "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
         "reference": trajectory.reference,

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.yard.checks import count_vetoes, face_vetoes, load_vetoes, tall_veto
+from barsight.yard.checks import count_vetoes, face_vetoes, load_vetoes
+from barsight.yard.clearance import clearance_vetoes
 from barsight.yard.contact import NEWTON_PER_KG, UPPER, Contact, touch
 from barsight.yard.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, grip
 from barsight.yard.lift_settings import LiftSettings
@@ -18,6 +19,7 @@ from barsight.yard.magnet import Magnet, Tolerance
 from barsight.yard.stability import Footing, footing_vetoes
 from barsight.yard.travel import Travel, travel_vetoes
 from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.validity import Validity, age_vetoes, validity
 from barsight.yard.vetoes import Veto
 
 SCALES = (1.0, 1.5, 2.5)
@@ -27,7 +29,7 @@ SCALES = (1.0, 1.5, 2.5)
 @dataclass(frozen=True, eq=False)
 class Yard:
     """All that lifts are chosen from. vetoes: those that hold for the whole map. travel: None where the map
-    is not measured but given.
+    is not measured but given. now_ns: when lifts are judged, on the frames' clock.
     """
 
     heights: HeightMap
@@ -35,6 +37,7 @@ class Yard:
     footings: tuple[Footing, ...]
     vetoes: tuple[Veto, ...]
     travel: Travel | None = None
+    now_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +49,7 @@ class Lift:
     bound times safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
     overhang_m: bars beyond the outermost pole. tolerance: half sides of the box within which all this holds.
     safety: the smallest of pull over needed, capacity over load and tolerance over the crane's; at least 1
-    where nothing is vetoed.
+    where nothing is vetoed. validity: in time, None where no frame is known to have seen the place.
     """
 
     place: Placement
@@ -63,6 +66,7 @@ class Lift:
     tolerance: Tolerance
     safety: float
     vetoes: tuple[Veto, ...]
+    validity: Validity | None = None
 
 
 def assess(
@@ -81,6 +85,7 @@ def assess(
         )  # fmt: skip
     held = grip(place, magnet, magnet.tolerance, near, contact.z_m)
     load = tuple(near.bundles[k] for k in held.gripped)
+    valid = validity(yard.travel, place, settings) if yard.travel else None
     mass, middle = _load(load)
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.safety_factor
     away = np.array([place.x_m, place.y_m]) - middle
@@ -89,9 +94,10 @@ def assess(
     vetoes = [
         *yard.vetoes,
         *(travel_vetoes(yard.travel, place, magnet, settings) if yard.travel else ()),
+        *(age_vetoes(valid.from_ns, yard.now_ns, settings) if valid else ()),
         *count_vetoes(place, yard.heights, magnet, near, contact, held, settings),
         *face_vetoes(contact, needed, magnet, settings),
-        *tall_veto(place, yard.heights, magnet, contact),
+        *clearance_vetoes(place, yard.heights, magnet, contact),
         *load_vetoes(load, mass, along, across, overhang, magnet, settings),
         *(v for b in load for v in footing_vetoes(b, near.bundles, yard.footings, settings)),
     ]
@@ -112,7 +118,7 @@ def assess(
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
         contact, mass, needed, along, across, overhang,
         Tolerance(box.x_m * scale, box.y_m * scale, min(box.yaw_deg * scale, 20.0)),
-        float(np.nan_to_num(min(ratios))), tuple(vetoes),
+        float(np.nan_to_num(min(ratios))), tuple(vetoes), valid,
     )  # fmt: skip
 
 

@@ -19,7 +19,6 @@ from barsight.yard.vetoes import Veto
 
 MARGIN_M = 0.02
 """How far beyond its stated outline a bundle may show."""
-TALL_CELLS = 5
 STEP_M = 0.02
 
 
@@ -163,16 +162,6 @@ def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
     return frozen(np.concatenate(points))
 
 
-@lru_cache(maxsize=8)
-def _beam_grid(magnet: Magnet) -> Float64:
-    """(N, 2) along and across of places under the beam and as far beside it as the crane may miss."""
-    tolerance = magnet.tolerance
-    long, wide = magnet.beam.length_m / 2, magnet.beam.width_m / 2
-    grow = max(tolerance.x_m, tolerance.y_m) + math.radians(tolerance.yaw_deg) * long
-    v, u = np.arange(-long - grow, long + grow, STEP_M), np.arange(-wide - grow, wide + grow, STEP_M)
-    return frozen(np.stack([a.ravel() for a in np.meshgrid(v, u)], axis=1))
-
-
 def _in_yard(place: Placement, grid: Float64) -> Float64:
     """(N, 2) x and y of places given along and across the beam."""
     return np.array([place.x_m, place.y_m]) + grid[:, :1] * place.along + grid[:, 1:2] * place.across
@@ -197,18 +186,3 @@ def _unexplained(
     long = long + near.open_ends.any(axis=1) * BEYOND_OPEN_END_M
     own = ((beside < wide) & (beyond < long)).any(axis=1)
     return float((~own).sum() / len(points))
-
-
-def tall_veto(place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact) -> list[Veto]:
-    """Whether anything under the beam, or within the tolerance beside it, is higher than its underside."""
-    grid = _beam_grid(magnet)
-    xy = _in_yard(place, grid)
-    z = look_up(heights, xy[:, 0], xy[:, 1])
-    under = contact.centre_z_m + grid[:, 0] * math.tan(contact.pitch_rad) + magnet.beam.above_faces_m
-    rises = z - under
-    if int((rises > 0).sum()) < TALL_CELLS:
-        return []
-    return [
-        Veto("obstructed", f"something stands up to {1e3 * float(np.nanmax(rises)):.0f} mm above the beam's "
-             "underside")
-    ]  # fmt: skip

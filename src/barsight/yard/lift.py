@@ -17,6 +17,7 @@ from barsight.yard.stability import Footing, footings
 from barsight.yard.stretches import stretches
 from barsight.yard.travel import Travel
 from barsight.yard.types import Bundle, YardMap
+from barsight.yard.validity import age_vetoes
 from barsight.yard.vetoes import Veto
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
@@ -41,8 +42,9 @@ class LiftPlan:
     """offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
 
     vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
-    stands. sides: of the piles. free: places to set down the longest and widest bundle, in the order of
-    `set_down.RULE`.
+    stands. sides: of the piles. judged_at_ns: when, on the frames' clock; captured_ns: stamps of the first
+    and last frame, None where the map is given. free: places to set down the longest and widest bundle, in
+    the order of `set_down.RULE`.
     """
 
     magnet: Magnet
@@ -53,32 +55,34 @@ class LiftPlan:
     footings: tuple[Footing, ...]
     sides: tuple[PileSide, ...]
     free: tuple[FreePlace, ...]
+    judged_at_ns: int
+    captured_ns: tuple[int, int] | None
 
 
 def map_vetoes(
-    warnings: Iterable[tuple[str, str]], reference: str, age_s: float | None, settings: LiftSettings
-) -> tuple[Veto, ...]:
-    """What forbids every lift of a map: its warnings (code, sentence), its frame, its age (None: unknown)."""
+    warnings: Iterable[tuple[str, str]], reference: str, captured_to_ns: int | None, now_ns: int,
+    settings: LiftSettings, *, has_magnet: bool,
+) -> tuple[Veto, ...]:  # fmt: skip
+    """Forbid every lift of a map for its warnings (code, sentence), frame, age or want of a magnet.
+
+    captured_to_ns: stamp of its last frame, None where that isn't known; now_ns: on the same clock.
+    """
     vetoes = [Veto(FROM_WARNINGS[code], text) for code, text in warnings if code in FROM_WARNINGS]
     if reference != "yard":
         vetoes.append(Veto("no-yard-frame", f"the map is in the {reference} frame: no crane gave its place"))
-    if age_s is None:
-        vetoes.append(Veto("map-too-old", "when the map was measured is not known"))
-    elif age_s > settings.max_age_s:
-        vetoes.append(
-            Veto(
-                "map-too-old",
-                f"the map is {age_s / 60:.0f} min old, {settings.max_age_s / 60:.0f} are allowed",
-            )
-        )
+    if not has_magnet:
+        vetoes.append(Veto("no-magnet", "no magnet was described: give its file with --magnet"))
+    vetoes += age_vetoes(captured_to_ns, now_ns, settings)
     return tuple(vetoes)
 
 
 def plan_lifts(
     yard: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
-    vetoes: tuple[Veto, ...], travel: Travel | None = None,
+    vetoes: tuple[Veto, ...], travel: Travel | None = None, now_ns: int = 0,
 ) -> LiftPlan:  # fmt: skip
-    """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames."""
+    """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames.
+    now_ns: when the lifts are judged, on the frames' clock.
+    """
     parts, stands = stretches(yard), dict[int, Footing]()
     for part in parts:
         own = tuple(bundle for bundle in bundles if part.owns(bundle.centre_m))
@@ -88,7 +92,7 @@ def plan_lifts(
     for part in parts:
         near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
         heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
-        here = Yard(heights, BundleTable.of(near), standing, (), travel)
+        here = Yard(heights, BundleTable.of(near), standing, (), travel, now_ns)
         for number, group in enumerate(groups):
             if part.owns(group[0].centre_m):
                 lifts[number] = _best(group, here, magnet, settings)
@@ -113,11 +117,15 @@ def plan_lifts(
         standing,
         pile_sides(bundles, standing),
         free,
+        now_ns,
+        travel.captured_ns if travel else None,
     )
 
 
 def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:
-    return Lift(**{**vars(lift), "vetoes": (*vetoes, *lift.vetoes)})
+    said = {veto.code for veto in vetoes}
+    own = (veto for veto in lift.vetoes if veto.code not in said)
+    return Lift(**{**vars(lift), "vetoes": (*vetoes, *own)})
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:

@@ -55,6 +55,9 @@ def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
         {
             "schema_version": SCHEMA_VERSION,
             "reference": reference,
+            "captured_from_ns": plan.captured_ns[0] if plan.captured_ns else None,
+            "captured_to_ns": plan.captured_ns[1] if plan.captured_ns else None,
+            "judged_at_ns": plan.judged_at_ns,
             "rule": RULE,
             "magnet": asdict(plan.magnet),
             "settings": asdict(plan.settings),
@@ -84,6 +87,8 @@ def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
         "count_probability": lift.count_probability,
         "straddled": lift.straddled,
         "tolerance": asdict(lift.tolerance),
+        "valid_from_ns": lift.validity.from_ns if lift.validity else None,
+        "valid_until_ns": lift.validity.until_ns if lift.validity else None,
         "safety": lift.safety,
         "mass_kg": lift.mass.kg,
         "mass_sigma_kg": lift.mass.sigma_kg,

@@ -25,8 +25,8 @@ class LiftSettings:
     """A face nearer than this to steel lies on it."""
     max_refused_share: float = 0.5
     """Of the frames that see the place of the lift."""
-    max_age_s: float = 3600.0
-    """A map older than this is not lifted from."""
+    max_age_s: float = 600.0
+    """A place that was last seen longer ago than this is not lifted from."""
     max_overhang_share: float = 0.25
     """Of its width that a bundle may stand over the edge of what carries it."""
     max_lean_deg: float = 5.0

@@ -13,6 +13,8 @@ from barsight.core.errors import ConfigError
 from barsight.core.settings import expect_numbers
 from barsight.core.settings_file import read_settings
 
+_EXAMPLE = resources.files("barsight.yard").joinpath("example_magnet.toml")
+
 
 @dataclass(frozen=True)
 class Pole:
@@ -116,7 +118,7 @@ class Magnet:
             f"crane_capacity_kg {self.crane_capacity_kg:g} leaves nothing beside own_mass_kg "
             f"{self.own_mass_kg:g}",
         )
-        _expect(1 <= self.safety_factor <= 20, "safety_factor lies between 1 and 20")
+        _expect(2 <= self.safety_factor <= 20, "safety_factor lies between 2 and 20")
 
     @property
     def reach_m(self) -> float:
@@ -134,6 +136,11 @@ class Magnet:
         return max(abs(p.along_m) + p.length_m / 2 for p in self.poles)
 
 
+def example_magnet() -> str:
+    """The package's documented example, as TOML."""
+    return _EXAMPLE.read_text("utf-8")
+
+
 def load_magnet(path: Path | None) -> Magnet:
     """The magnet of a TOML file; the package's documented example where there is none.
 
@@ -142,7 +149,7 @@ def load_magnet(path: Path | None) -> Magnet:
     help_at = "docs/how-to/describe-a-magnet.md says how"
     if path is not None:
         return read_settings(path, Magnet, help_at, "--magnet")
-    with resources.as_file(resources.files("barsight.yard").joinpath("example_magnet.toml")) as example:
+    with resources.as_file(_EXAMPLE) as example:
         return read_settings(example, Magnet, help_at, "--magnet")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.types import Source
 from barsight.yard.contact import UPPER
 from barsight.yard.lift_settings import LiftSettings
@@ -104,13 +104,18 @@ def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
     return np.stack([np.where(count > 0, middle, np.nan), count / STATIONS], axis=1)
 
 
-def look_up(heights: HeightMap, x: Float64, y: Float64) -> Float64:
-    """Heights of the nearest cells; NaN where they were not seen."""
+def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, Int64, Bool]:
+    """Columns and rows of the nearest cells, and whether they lie in the map; (0, 0) where not."""
     column = np.floor((x - heights.x0_m) / heights.cell_m + 0.5).astype(np.int64)
     row = np.floor((y - heights.y0_m) / heights.cell_m + 0.5).astype(np.int64)
     rows, columns = heights.z_m.shape
     inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
-    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+    return np.where(inside, column, 0), np.where(inside, row, 0), inside
+
+
+def look_up(heights: HeightMap, x: Float64, y: Float64) -> Float64:
+    """Heights of the nearest cells; NaN where they were not seen."""
+    column, row, inside = nearest_cells(heights, x, y)
     source = heights.source[row, column]
     seen = inside & (source != Source.UNKNOWN) & (source != Source.FILLED)
     return np.where(seen, heights.z_m[row, column], np.nan).astype(np.float64)

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.surface import Surface, grey_levels
 from barsight.yard.types import HeightMap, YardMap
 
@@ -41,17 +42,18 @@ class PartedMap:
         return self._last[2]
 
 
-def surface_map(surface: Surface) -> PartedMap:
-    """All that a surface knows, read from its tiles."""
+def surface_map(surface: Surface, free: FreeSpace | None = None) -> PartedMap:
+    """All that a surface knows, read from its tiles; free: what lines of sight prove free."""
     cell_m = surface.cell_m
 
     def read(rows: slice, columns: slice) -> HeightMap:
         column, row = surface.columns[0] + columns.start, surface.rows[0] + rows.start
         layers = surface.window(column, row, columns.stop - columns.start, rows.stop - rows.start)
         grey = grey_levels(layers.intensity)
+        bounds = None if free is None else free.window(column, row, layers.z_m.shape[1], layers.z_m.shape[0])
         return HeightMap(
             column * cell_m, row * cell_m, cell_m,
-            layers.z_m, layers.sigma_m, layers.views, layers.source, grey,
+            layers.z_m, layers.sigma_m, layers.views, layers.source, grey, bounds,
         )  # fmt: skip
 
     return PartedMap(surface.columns[0] * cell_m, surface.rows[0] * cell_m, cell_m, surface.shape, read)

@@ -33,7 +33,7 @@ class Travel:
     place_m: (N, 2) the body, x and y. sigma_m: (N, 3) of the ground below it in x, y, z. off_m: (N,) by how
     much the encoders are off the trajectory, NaN where there are none; what a constant latency explains is
     taken off. refused_m: (R, 2) where the refused frames must have been. reach_m: how far from the body a
-    frame sees.
+    frame sees. stamp_ns: (N,) of the frames, rising.
     """
 
     place_m: Float64
@@ -41,6 +41,12 @@ class Travel:
     off_m: Float64
     refused_m: Float64
     reach_m: float
+    stamp_ns: Int64
+
+    @property
+    def captured_ns(self) -> tuple[int, int] | None:
+        """Stamps of the first and the last placed frame; None without any."""
+        return (int(self.stamp_ns[0]), int(self.stamp_ns[-1])) if self.stamp_ns.size else None
 
     @classmethod
     def of(
@@ -61,13 +67,14 @@ class Travel:
             _disagreement(stamps, places, crane, shift_ns, window_ns),
             _places_at(refused, stamps, places),
             range_m * float(np.hypot(camera.width, camera.height)) / 2 / camera.focal_px,
+            stamps,
         )  # fmt: skip
 
     @classmethod
     def read(cls, summary: dict[str, Any]) -> Travel | None:
         """From result.json; None where it doesn't say."""
         content = summary.get("travel")
-        if not isinstance(content, dict):
+        if not isinstance(content, dict) or content.get("stamp_ns") is None:
             return None
         arrays = {
             name: np.array(content[name], dtype=np.float64)
@@ -76,6 +83,7 @@ class Travel:
         return cls(
             arrays["place_m"].reshape(-1, 2), arrays["sigma_m"].reshape(-1, 3), arrays["off_m"].ravel(),
             arrays["refused_m"].reshape(-1, 2), float(content["reach_m"]),
+            np.array(content["stamp_ns"], dtype=np.int64),
         )  # fmt: skip
 
     def content(self) -> dict[str, Any]:

@@ -20,7 +20,8 @@ class HeightMap:
 
     Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
     NaN where unknown. views: float32. source: `Source`. grey: the orthophoto, levels from 1, 0 where nothing
-    was seen; None where there is none.
+    was seen; None where there is none. free_m: float32, upper bound of what may stand in the cell by lines
+    of sight that passed over it, inf where none did; None where no lines of sight are known.
     """
 
     x0_m: float
@@ -31,6 +32,7 @@ class HeightMap:
     views: Float32
     source: UInt8
     grey: UInt8 | None = None
+    free_m: Float32 | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -47,6 +49,7 @@ class HeightMap:
         return HeightMap(
             x0_m, y0_m, self.cell_m, self.z_m[cut], self.sigma_m[cut], self.views[cut], self.source[cut],
             None if self.grey is None else self.grey[cut],
+            None if self.free_m is None else self.free_m[cut],
         )  # fmt: skip
 
 

@@ -1,0 +1,83 @@
+"""Clearance: nothing may stand above the faces' plane under or beside the magnet, seen or not seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.core.types import Source
+from barsight.yard.footprint import Placement
+from barsight.yard.types import HeightMap
+from lift_yards import codes, judged, laid, map_of, record
+
+TOP_M = laid(0.3).top_z_m
+
+
+def with_block(
+    x_m: tuple[float, float], y_m: tuple[float, float], top_m: float | None, free_m: float = np.inf
+) -> HeightMap:
+    """One bundle and a block somewhere; without a top the place is unseen, and free from free_m up."""
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    x = heights.x0_m + np.arange(heights.shape[1]) * heights.cell_m
+    y = heights.y0_m + np.arange(heights.shape[0]) * heights.cell_m
+    rows = np.flatnonzero((y >= y_m[0]) & (y <= y_m[1]))[:, None]
+    columns = np.flatnonzero((x >= x_m[0]) & (x <= x_m[1]))
+    if top_m is not None:
+        heights.z_m[rows, columns] = top_m
+        return heights
+    free = np.full(heights.shape, np.inf, np.float32)
+    free[rows, columns] = free_m
+    heights.source[rows, columns] = Source.UNKNOWN
+    heights.z_m[rows, columns] = np.nan
+    return replace(heights, free_m=free)
+
+
+def found(heights: HeightMap) -> set[str]:
+    return codes(judged([laid(0.3)], (record(laid(0.3)),), Placement(0.3, 0.0, 0.0), heights=heights))
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "rise_m"),
+    [
+        ((0.0, 0.6), (0.65, 0.75), 0.06),  # a beam across a pole
+        ((0.28, 0.34), (2.3, 2.34), 0.02),  # a buckle under the last pole
+        ((0.36, 0.40), (-0.8, -0.4), 0.02),  # beside a face, within the stray field
+        ((0.0, 0.6), (-0.05, 0.05), 0.10),  # between two poles, under the beam
+        ((0.48, 0.52), (-3.0, 3.0), 0.70),  # a wall
+    ],
+)
+def test_what_stands_above_the_faces_obstructs(
+    x_m: tuple[float, float], y_m: tuple[float, float], rise_m: float
+) -> None:
+    assert "obstructed" in found(with_block(x_m, y_m, TOP_M + rise_m))
+
+
+def test_what_is_level_or_further_off_obstructs_nothing() -> None:
+    assert found(with_block((0.62, 1.2), (-3.0, 3.0), TOP_M + 0.7)) == set()
+    assert found(with_block((0.28, 0.34), (2.3, 2.34), TOP_M + 0.004)) == set()
+    assert found(with_block((0.3, 0.3), (0.5, 0.5), TOP_M + 0.3)) == set(), "one wrong match"
+
+
+@pytest.mark.parametrize("wall", [((0.42, 0.55), (-3.0, 3.0)), ((-0.1, 0.15), (1.0, 2.0))])
+def test_unseen_is_an_obstacle_unless_lines_of_sight_pass_there(
+    wall: tuple[tuple[float, float], tuple[float, float]],
+) -> None:
+    assert found(with_block(*wall, TOP_M + 0.7)) == {"obstructed"}
+    assert found(with_block(*wall, None)) == {"unknown-under-footprint"}
+    assert found(with_block(*wall, None, TOP_M + 0.7)) == {"unknown-under-footprint"}
+    assert found(with_block(*wall, None, TOP_M - 0.02)) == set()
+    heights = with_block(*wall, None)
+    assert found(replace(heights, free_m=None)) == {"unknown-under-footprint"}
+
+
+def test_an_unseen_face_needs_free_space_down_to_its_plane() -> None:
+    place = (0.2, 0.4), (1.05, 1.15)
+    assert "unknown-under-footprint" in found(with_block(*place, None, TOP_M + 0.05))
+    assert found(with_block(*place, None, TOP_M)) == set()
+
+
+def test_a_map_that_ends_beside_the_magnet_is_unseen_there() -> None:
+    heights = map_of([laid(0.3)], x_m=(-1.5, 0.4))
+    assert "unknown-under-footprint" in found(heights)
