@@ -127,7 +127,7 @@ def test_the_gyro_alone_follows_true_poses() -> None:
 
 
 def test_euroc_s_board(data: Path, tmp_path: Path) -> None:
-    """PnP takes the board for flat, which it isn't, and the lenses as published: docs/motion.md. The gyro
+    """PnP takes the board for flat, which it isn't, and the lenses as published. The gyro
     without any estimate is further from it than 0.3 degrees, too, even with a bias fitted to it.
     """
     recording = opened(cut(data / "euroc_april_imu", tmp_path / "part", 10.0), data)

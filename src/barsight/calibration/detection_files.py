@@ -45,7 +45,7 @@ def read_rows(path: Path, fields: tuple[str, ...] = FIELDS) -> Any:
     missing = [field for field in fields if field not in (rows.dtype.names or ())]
     if missing:
         raise CalibrationError(
-            path, f"lacks {', '.join(missing)}", "write every field of docs/calibration.md"
+            path, f"lacks {', '.join(missing)}", "write every field of docs/reference/recordings.md"
         )
     finite = np.isfinite(rows["u"]) & np.isfinite(rows["v"])
     if not finite.all():

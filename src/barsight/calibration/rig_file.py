@@ -1,6 +1,6 @@
 """Our own rig file: YAML, versioned, with the covariance of what was calibrated.
 
-docs/calibration.md describes the keys. Readers accept every version up to their own.
+docs/reference/rig-file.md describes the keys. Readers accept every version up to their own.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             out: A folder written by barsight measure.
-            magnet: TOML file of the magnet; docs/yard.md describes one. Without it nothing is offered.
+            magnet: TOML file of the magnet (docs/how-to/describe-a-magnet.md). Without it nothing is offered.
             settings: What a lift must fulfil.
             config: TOML file with settings; flags go before it.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.

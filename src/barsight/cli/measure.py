@@ -52,8 +52,8 @@ def run(arguments: Sequence[str]) -> None:
             settings: Settings of the stages.
             config: TOML file with settings; flags go before it.
             resume: Keep what is done beside OUT until the end; a killed run started again with it goes on.
-            magnet: TOML file of the magnet that lifts are chosen for; docs/yard.md describes one. Without it
-                nothing is offered.
+            magnet: TOML file of the magnet that lifts are chosen for (docs/how-to/describe-a-magnet.md).
+                Without it nothing is offered.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             overwrite: Replace the result files of an earlier run in OUT.
             verbose: Print the time that each stage took.

@@ -1,7 +1,7 @@
 """What travels between the stages: frozen records whose fields say shape, unit and frame.
 
 The frames are `yard` (or `world`), `body` (the IMU), `cam0`, `cam1` (raw cameras), `rect0` (the left camera
-after rectification) and `crane`; docs/conventions.md defines them. No match and no depth are NaN.
+after rectification) and `crane`; docs/reference/conventions.md defines them. No match and no depth are NaN.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ MOST_FRAMES_OFF = 2
 MANY_STEPS = 8
 """Recordings that leave fewer steps are looked at for one frame off only."""
 LEAST_STEPS = 2
-"""Five frames. They tell seven times in ten, seven frames always (docs/motion.md)."""
+"""Five frames. They tell seven times in ten, seven frames always (docs/explanation/motion.md)."""
 WINDOW_S = 0.35
 TURN_SIGMA_RAD = 5e-4
 WAY_SIGMA_M = 0.005

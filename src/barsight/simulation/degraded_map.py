@@ -2,7 +2,7 @@
 
 What goes wrong in a measured map is put on the exact heights: the cameras' field, places that no pair sees,
 edges that grow over what they hide, smoothing by the matching window, noise that is alike along the bars,
-a shared error, flying cells. docs/yard.md holds its errors against those of rendered and measured yards.
+a shared error, flying cells. benchmarks/results holds its errors against measured ones.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the magnet may be asked; docs/yard.md says what each means to a crane."""
+    """What the magnet may be asked; docs/how-to/describe-a-magnet.md explains each."""
 
     pitch_deg: float
     roll_deg: float
@@ -146,7 +146,7 @@ def load_magnet(path: Path | None) -> Magnet:
 
     Raises InputError for a file that can't be read, ConfigError for a value that can't be.
     """
-    help_at = "docs/yard.md says how to describe a magnet"
+    help_at = "docs/how-to/describe-a-magnet.md says how"
     if path is not None:
         return read_settings(path, Magnet, help_at, "--magnet")
     with resources.as_file(_EXAMPLE) as example:

@@ -34,7 +34,7 @@ VETOES = {
     "no-support": "What should carry the bundle isn't there, as far as can be seen.",
     "over-stanchion": "The bundle stands higher than the stanchions allow.",
 }
-"""Code to what it means; docs/yard.md lists each with the test that trips it."""
+"""Code to what it means; a test trips each."""
 
 
 @dataclass(frozen=True)
