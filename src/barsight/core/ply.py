@@ -22,8 +22,8 @@ _MAX_HEADER_BYTES = 1 << 16
 
 
 class _Header(NamedTuple):
-    """form: a key of _BYTE_ORDERS. size: in bytes. elements: name, count and fields (name and type, None where
-    one is a list) of each up to the vertices."""
+    """form: a key of _BYTE_ORDERS. size: in bytes. elements: name, count and fields (name and type; None for
+    lists) of each up to the vertices."""
 
     form: str
     size: int
