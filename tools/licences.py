@@ -21,7 +21,7 @@ _HEAD = """# Licences
 
 Barsight is under the Apache License 2.0 (`LICENSE`). Neither its repository nor its wheel holds code of
 others; pip installs the packages below beside it, each under its own licence. `python tools/licences.py`
-writes this page from the installed packages' metadata, and a test holds that none of the run time is under
+writes this page from the installed packages' metadata, and a test holds that none of them is under
 the GPL or AGPL.
 
 Some wheels bundle libraries: NumPy's and SciPy's for Linux OpenBLAS (BSD-3-Clause) and libgfortran (GPL-3.0
