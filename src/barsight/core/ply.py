@@ -97,10 +97,10 @@ def _read_ascii(file: BinaryIO, before: int, count: int, dtype: np.dtype[Any], r
     """Read `count` lines after `before` others; each number takes two bytes or more of the `rest`."""
     if 2 * count * len(dtype.names or ()) > rest + 1:
         raise ValueError(f"{count} vertices don't fit into {rest} bytes")
-    lines = (line.decode("ascii") for line in islice(file, before, before + count))
+    lines = [line.decode("ascii") for line in islice(file, before, before + count) if line.strip()]
+    if len(lines) != count:
+        raise ValueError(f"{len(lines)} of {count} vertices are there")
     if count == 0:
         return np.empty(0, dtype)
     table: NDArray[Any] = np.loadtxt(lines, dtype, comments=None, ndmin=1)
-    if len(table) != count:
-        raise ValueError(f"{len(table)} of {count} vertices are there")
     return table
