@@ -16,6 +16,9 @@ LEFT_M, TOP_M = -0.5, 1.0
 ROWS, COLUMNS = 150, 300
 BIAS_MM = (3.0, -2.0)
 PROFILE_Y_M = (0.45, -0.2)
+CLOUD_POINT = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("sigma_z", "<f4"), ("views", "<u2")]
+)
 
 
 def surface_m(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -96,22 +99,20 @@ def _write_profiles(folder: Path, laser: bool) -> None:
 
 
 def _write_cloud(path: Path) -> None:
-    kinds = [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("intensity", "u1"),
-        ("sigma_z", "<f4"),
-        ("views", "<u2"),
-    ]
-    points = np.zeros(5000, np.dtype(kinds))
+    points = np.zeros(5000, CLOUD_POINT)
     draw = np.random.default_rng(1)
     points["x"], points["y"] = draw.uniform(-0.5, 2.5, 5000), draw.uniform(-0.5, 1.0, 5000)
     points["z"] = surface_m(points["x"].astype(np.float64))
     points["intensity"] = draw.integers(0, 255, 5000)
     points["sigma_z"], points["views"] = 0.005, 4
-    names = {"<f4": "float", "u1": "uchar", "<u2": "ushort"}
-    fields = "".join(f"property {names[kind]} {name}\n" for name, kind in kinds)
+    write_points(path, points)
+
+
+def write_points(path: Path, points: NDArray[np.void]) -> None:
+    """A PLY of CLOUD_POINT's properties, as formats.md says."""
+    names = {"f4": "float", "u1": "uchar", "u2": "ushort"}
+    kinds = [(name, names[CLOUD_POINT[name].str[1:]]) for name in CLOUD_POINT.names or ()]
+    fields = "".join(f"property {kind} {name}\n" for name, kind in kinds)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {points.size}\n{fields}end_header\n"
     path.write_bytes(header.encode("ascii") + points.tobytes())
 

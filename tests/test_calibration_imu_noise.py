@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.imu_noise import ImuNoiseFit, fit_imu_noise
+from barsight.calibration.imu_noise import ImuNoiseFit, fit_imu_noise, overlapping_allan_variance
 from barsight.calibration.kalibr import read_imu_file
 from barsight.cli.main import run
 from barsight.core.errors import Failed
@@ -30,6 +30,32 @@ def fitted(samples: ImuSamples) -> ImuNoiseFit:
     fit = fit_imu_noise(samples)
     assert isinstance(fit, ImuNoiseFit)
     return fit
+
+
+def test_allan_deviation_of_published_data() -> None:
+    """W. J. Riley, The Calculation of Time Domain Frequency Stability (the test suite of NIST SP 1065):
+    NBS14's nine frequencies and 1000 of a congruential generator, with their overlapping Allan deviations.
+    """
+    nine = np.array([892.0, 809, 823, 798, 671, 644, 883, 903, 677])
+    assert np.sqrt(overlapping_allan_variance(nine, np.array([1, 2]))) == pytest.approx(
+        [91.22945, 85.95287], abs=5e-6
+    )
+    numbers = [1234567890]
+    while len(numbers) < 1000:
+        numbers.append(16807 * numbers[-1] % 2147483647)
+    thousand = np.array(numbers) / 2147483647
+    assert np.sqrt(overlapping_allan_variance(thousand, np.array([1, 10, 100]))) == pytest.approx(
+        [2.922319e-1, 9.159953e-2, 3.241343e-2], rel=2e-7
+    )
+
+
+def test_allan_variance_is_half_the_mean_square_of_neighbouring_averages_differences() -> None:
+    values = np.random.default_rng(6).normal(3.0, 2.0, 60)
+    for m in (1, 4, 12, 30):
+        averages = [sum(values[i : i + m]) / m for i in range(len(values) - m + 1)]
+        squares = [(averages[i + m] - averages[i]) ** 2 for i in range(len(averages) - m)]
+        slow = sum(squares) / len(squares) / 2
+        assert overlapping_allan_variance(values, np.array([m]))[0] == pytest.approx(slow, rel=1e-10)
 
 
 def test_known_noise_is_found_within_five_percent() -> None:

@@ -173,6 +173,8 @@ def test_readme_leads_to_every_command() -> None:
 
 def test_ci_runs_readmes_test_command() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    setup = ".venv/bin/python -m pip install --quiet --constraint requirements.lock --editable '.[dev]'"
-    assert setup in readme
-    assert setup in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    test_command = next(line for line in readme.splitlines() if line.endswith("-m pytest"))
+    ci = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    steps = [ci.index(step) for step in test_command.split(" && ")]
+    assert steps == sorted(steps)
+    assert steps[-1] == len(ci) - 1

@@ -1,16 +1,19 @@
 """Every format is read back by its own library and holds the same points."""
 
+import sys
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pye57
 import pytest
-from plyfile import PlyData, PlyElement
 from pypcd4 import PointCloud
 
+from barsight.cli.main import run
 from barsight.core.errors import ConfigError, InputError
+from barsight.core.ply import read_vertices
 from barsight.report.export import export
+from result_folders import CLOUD_POINT, write_points
 
 COUNT = 500
 
@@ -18,24 +21,16 @@ COUNT = 500
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     rng = np.random.default_rng(4)
-    kinds = [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("intensity", "u1"),
-        ("sigma_z", "<f4"),
-        ("views", "<u2"),
-    ]
-    points = np.empty(COUNT, kinds)
+    points = np.empty(COUNT, CLOUD_POINT)
     points["x"], points["y"] = rng.uniform(-30, 35, COUNT), rng.uniform(-4, 4, COUNT)
     points["z"], points["sigma_z"] = rng.uniform(0, 2, COUNT), rng.uniform(0.001, 0.02, COUNT)
     points["intensity"], points["views"] = rng.integers(0, 256, COUNT), rng.integers(2, 30, COUNT)
-    PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / "cloud.ply")
+    write_points(tmp_path / "cloud.ply", points)
     return tmp_path
 
 
 def expected(folder: Path) -> np.ndarray:
-    data = PlyData.read(folder / "cloud.ply")["vertex"].data
+    data = read_vertices(folder / "cloud.ply")
     return np.column_stack([data[n] for n in ("x", "y", "z", "intensity", "sigma_z", "views")]).astype(float)
 
 
@@ -83,3 +78,16 @@ def test_what_cant_be_exported(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         export(folder, folder / "copy.tif")
     assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize(("package", "kind"), [("laspy", "laz"), ("pypcd4", "pcd"), ("pye57", "e57")])
+def test_a_missing_extra_is_named(
+    folder: Path, package: str, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    before = sorted(folder.iterdir())
+    assert run(["export", str(folder), str(folder / f"points.{kind}")]) == 2
+    error = capsys.readouterr().err
+    assert error == f"barsight: {package} is not installed; run: pip install 'barsight[export]'\n"
+    assert sorted(folder.iterdir()) == before
+    assert run(["export", str(folder), str(folder / "points.csv")]) == 0

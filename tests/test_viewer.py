@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import http.client
 import socket
+import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
+from barsight.cli.main import run
 from barsight.core.errors import InputError, OutputError
 from barsight.core.types import Source
 from barsight.result_folder import read_cloud, read_heights
@@ -83,6 +85,15 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     cloud.unlink()
     with pytest.raises(InputError, match="no such file"):
         view(folder, 0, False)
+
+
+def test_a_missing_extra_is_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.delitem(sys.modules, "barsight.viewer.view")
+    assert run(["view", str(folder)]) == 2
+    assert capsys.readouterr().err == "barsight: viser is not installed; run: pip install 'barsight[view]'\n"
 
 
 def test_the_cloud_is_thinned_evenly(folder: Path) -> None:

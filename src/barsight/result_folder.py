@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
 
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
+from barsight.core.ply import read_vertices
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
 from barsight.yard.stretches import PartedMap
@@ -181,10 +181,9 @@ def read_cloud(path: Path, most_points: int | None = None) -> Cloud:
     if not path.is_file():
         raise InputError(path, "no such file", _REMEDY)
     try:
-        vertex = PlyData.read(path)["vertex"]
-    except (PlyParseError, KeyError, ValueError, OSError) as error:
+        data = read_vertices(path)
+    except (ValueError, OSError) as error:
         raise InputError(path, f"is torn ({error})", _REMEDY) from error
-    data = vertex.data
     missing = [name for name in PROPERTIES if name not in (data.dtype.names or ())]
     if missing:
         raise InputError(path, f"has no property {missing[0]}", _REMEDY)

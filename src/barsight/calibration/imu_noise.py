@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
-import allantools
 import numpy as np
 from scipy.optimize import nnls
 
@@ -148,17 +147,27 @@ def _allan(stretches: list[Float64], rate: float) -> tuple[Float64, Float64, Flo
     """tau (s), Allan variance and samples over which it was taken, octave by octave, of all stretches."""
     total: dict[int, list[float]] = {}
     for values in stretches:
-        octaves = 2.0 ** np.arange(int(np.log2(values.size / 5)) + 1)
-        tau, deviation, _, _ = allantools.oadev(
-            values - values.mean(), rate=rate, data_type="freq", taus=octaves / rate
-        )
-        for steps, one in zip(np.round(tau * rate).astype(int), deviation, strict=True):
-            entry = total.setdefault(int(steps), [0.0, 0.0])
-            entry[0] += one**2 * values.size
+        octaves = 2 ** np.arange(int(np.log2(values.size / 5)) + 1)
+        for m, one in zip(octaves, overlapping_allan_variance(values, octaves), strict=True):
+            entry = total.setdefault(int(m), [0.0, 0.0])
+            entry[0] += one * values.size
             entry[1] += values.size
     steps = np.array(sorted(total))
     sums = np.array([total[int(m)] for m in steps])
     return steps / rate, sums[:, 0] / sums[:, 1], sums[:, 1]
+
+
+def overlapping_allan_variance(values: Float64, steps: Int64) -> Float64:
+    """(T,) overlapping Allan variance of evenly sampled values at averaging times of `steps` samples each.
+
+    Half the mean square of the difference of neighbouring averages [NIST SP 1065]. steps: (T,), each
+    at most half of the samples.
+    """
+    phase = np.concatenate([[0.0], np.cumsum(values - values.mean())])
+    variances = np.empty(len(steps))
+    for k, m in enumerate(steps):
+        variances[k] = np.mean(np.square(phase[2 * m :] - 2 * phase[m:-m] + phase[: -2 * m])) / (2 * m**2)
+    return variances
 
 
 def _terms(tau_s: Float64) -> Float64:

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from barsight.cli.arguments import call
-from barsight.viewer.view import view
+from barsight.core.extras import extra
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -22,6 +22,8 @@ def run(arguments: Sequence[str]) -> None:
             port: The port on this machine to serve at.
             browser: Open the browser.
         """
+        with extra("view"):
+            from barsight.viewer.view import view
         view(out, port, browser)
 
     call(command, "view", arguments)

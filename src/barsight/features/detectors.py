@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int64, UInt8
+from barsight.core.extras import extra
 from barsight.features.orb import detect_orb
 
 DetectorName = Literal["sift", "surf", "orb"]
@@ -82,7 +83,8 @@ def _sift(image: UInt8, count: int) -> Keypoints:
 
 
 def _surf(image: UInt8, count: int) -> Keypoints:
-    from mahotas.features import surf  # OpenCV's wheels leave SURF out
+    with extra("bench"):
+        from mahotas.features import surf  # OpenCV's wheels leave SURF out
 
     found: Any = surf.surf(
         image, nr_octaves=4, nr_scales=6, initial_step_size=1, threshold=0.05, max_points=4 * count

@@ -10,12 +10,10 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import laspy
 import numpy as np
-import pye57
-from pypcd4 import PointCloud
 
 from barsight.core.errors import ConfigError, InputError
+from barsight.core.extras import extra
 from barsight.core.files import atomic_path
 from barsight.result_folder import Cloud, read_cloud
 
@@ -25,8 +23,9 @@ _LAS_STEP_M = 1e-4
 def export(folder: Path, target: Path) -> int:
     """Write `target` from the files of a measured folder; the points written (0 for a raster or a copy).
 
-    .ply and .tif are the folder's own files. Raises ConfigError for another suffix, InputError where the
-    folder lacks the file, OutputError where `target` can't be written.
+    .ply and .tif are the folder's own files, .csv needs nothing else, the others the extra `export`. Raises
+    ConfigError for another suffix or without the extra, InputError where the folder lacks the file,
+    OutputError where `target` can't be written.
     """
     kind = target.suffix.lower()
     copies = {".ply": "cloud.ply", ".tif": "height.tif", ".tiff": "height.tif"}
@@ -47,6 +46,8 @@ def export(folder: Path, target: Path) -> int:
 
 
 def _write_las(cloud: Cloud, path: Path, *, compress: bool) -> None:
+    with extra("export"):
+        import laspy
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.add_extra_dims(
         [laspy.ExtraBytesParams("sigma_z", "float32"), laspy.ExtraBytesParams("views", "uint16")]
@@ -64,12 +65,16 @@ def _write_las(cloud: Cloud, path: Path, *, compress: bool) -> None:
 
 
 def _write_pcd(cloud: Cloud, path: Path) -> None:
+    with extra("export"):
+        from pypcd4 import PointCloud
     columns = np.column_stack([cloud.xyz_m, cloud.intensity, cloud.sigma_m, cloud.views])
     fields = ("x", "y", "z", "intensity", "sigma_z", "views")
     PointCloud.from_points(columns.astype(np.float32), fields, (np.float32,) * 6).save(path)
 
 
 def _write_e57(cloud: Cloud, path: Path) -> None:
+    with extra("export"):
+        import pye57
     x, y, z = cloud.xyz_m.T.astype(np.float64)
     with pye57.E57(str(path), mode="w") as file:
         file.write_scan_raw({"cartesianX": x, "cartesianY": y, "cartesianZ": z, "intensity": cloud.intensity})
