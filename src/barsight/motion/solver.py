@@ -16,8 +16,8 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.levenberg_marquardt import Options, Termination, minimise
+from barsight.core.skyline import Band
 from barsight.motion import band
-from barsight.motion.band import Band
 from barsight.motion.elimination import Reduced, eliminate, spread, substitute
 from barsight.motion.encoders import add_encoders, encoders_cost
 from barsight.motion.gaps import without_gaps
