@@ -1,8 +1,8 @@
 """Factorise and solve symmetric matrices of which each row begins late: the skyline Cholesky factor.
 
 A factor's rows begin where the matrix's do [Jennings 1966], so nothing before is stored or worked on. Plain
-loops: LAPACK is two to five times as fast on one thread, but on its own threads it waits up to a hundred
-times as long where the machine is busy (benchmarks/results/2026-11-23-linear-algebra.md).
+loops: LAPACK is two to six times as fast on one thread, but slower than these on its own threads where the
+machine is busy (benchmarks/results/2026-11-23-linear-algebra.md).
 """
 
 from __future__ import annotations
