@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import FrameMismatchError
-from barsight.core.pose import Pose
+from barsight.core.pose import Pose, nearest_rotation
 
 angle = st.floats(-4, 4)
 length = st.floats(-100, 100)
@@ -136,3 +136,14 @@ def test_a_pose_neither_shares_nor_gives_away_its_arrays() -> None:
             array[0] = 7
     pose.matrix[0, 0] = 7
     assert pose.matrix[0, 0] == 1
+
+
+def test_the_nearest_rotation_is_kabschs_even_where_points_are_mirrored() -> None:
+    rng = np.random.default_rng(3)
+    source, turn = rng.normal(size=(20, 3)) * [1.0, 0.7, 0.1], Rotation.from_rotvec([0.3, -1.2, 2.0])
+    found = nearest_rotation(turn.apply(source).T @ source)
+    np.testing.assert_allclose(found, turn.as_matrix(), atol=1e-14)
+    mirrored = nearest_rotation((turn.apply(source) * [1, 1, -1]).T @ source)
+    kabsch, _ = Rotation.align_vectors(turn.apply(source) * [1, 1, -1], source)
+    np.testing.assert_allclose(mirrored, kabsch.as_matrix(), atol=1e-12)
+    assert np.linalg.det(mirrored) == pytest.approx(1)

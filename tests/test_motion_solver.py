@@ -10,6 +10,7 @@ import pytest
 from gtsam.symbol_shorthand import E, L, X
 from scipy.spatial.transform import Rotation
 
+from barsight.core import skyline
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.features.guided import project_stereo
@@ -46,11 +47,11 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
     matrix, rows = banded(rng, n, width)
     right = rng.normal(size=(2, n))
     expected = np.linalg.solve(matrix, right.T).T
-    factor = band.even(rows)
-    assert band.factorise(factor)
+    factor = skyline.even(rows)
+    assert skyline.factorise(factor)
     beside = right.T.copy()
-    band.solve_forward(factor, beside)
-    band.solve_back(factor, beside)
+    skyline.solve_forward(factor, beside)
+    skyline.solve_back(factor, beside)
     right = beside.T
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     blocks = np.empty((n // 3, 3, 3))
@@ -72,7 +73,7 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
 
 def test_an_undetermined_band_is_told() -> None:
     rows = np.array([[0.0, 1.0], [1.0, 1.0]])
-    assert not band.factorise(band.even(rows))
+    assert not skyline.factorise(skyline.even(rows))
 
 
 def test_rows_that_begin_late_are_solved_like_a_dense_matrix() -> None:
@@ -83,14 +84,14 @@ def test_rows_that_begin_late_are_solved_like_a_dense_matrix() -> None:
     matrix = np.where(held, np.tril(rng.normal(size=(n, n)), -1), 0)
     matrix = matrix + matrix.T
     matrix += np.diag(np.abs(matrix).sum(axis=1) + 0.5)
-    factor = band.empty(first)
+    factor = skyline.empty(first)
     for i in range(n):
         factor.values[factor.offset[i] + np.arange(first[i], i + 1)] = matrix[i, first[i] : i + 1]
     right = rng.normal(size=(n, 2))
     expected = np.linalg.solve(matrix, right)
-    assert band.factorise(factor)
-    band.solve_forward(factor, right)
-    band.solve_back(factor, right)
+    assert skyline.factorise(factor)
+    skyline.solve_forward(factor, right)
+    skyline.solve_back(factor, right)
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     diagonal, none = np.empty(n), np.empty((0, 1, 1))
     band.inverse_blocks(factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none)

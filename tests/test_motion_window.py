@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from barsight.core import skyline
 from barsight.motion import dense
 from barsight.motion.window_system import SLIDE_SIGMA_RAD, SLIDE_WAY_M, Equations, prior_of, slid_on
 
@@ -13,19 +14,16 @@ def positive(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_dense_system_is_solved() -> None:
-    """Also where its last unknowns are fixed."""
+    """Whole as a skyline."""
     matrix, right = positive(0, 23)
-    factor, x = matrix.copy(), right.copy()
-    assert dense.factorise(factor, x)
+    factor, x = matrix.copy(), right[:, None].copy()
+    assert skyline.factorise(skyline.full(factor))
     np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix))
-    forward = x.copy()
-    dense.solve_back(factor, 0, x)
-    np.testing.assert_allclose(x, np.linalg.solve(matrix, right))
-    known = np.append(forward[:-2], [0.3, -0.7])
-    dense.solve_back(factor, 2, known)
-    np.testing.assert_allclose(matrix[:-2] @ known, right[:-2])
+    skyline.solve_forward(skyline.full(factor), x)
+    skyline.solve_back(skyline.full(factor), x)
+    np.testing.assert_allclose(x[:, 0], np.linalg.solve(matrix, right))
     np.testing.assert_allclose(dense.product(matrix, right), matrix @ right)
-    assert not dense.factorise(-matrix, right.copy())
+    assert not skyline.factorise(skyline.full(-matrix))
 
 
 def test_bands_and_blocks_are_added() -> None:

@@ -13,7 +13,9 @@ import numpy as np
 
 from barsight.calibration.pose_spline import STATE
 from barsight.calibration.spline_kernels import ORDER
+from barsight.core import skyline
 from barsight.core.arrays import Float64, Int64, kernel
+from barsight.core.skyline import Band
 
 ROWS = 6
 LOCAL = STATE * ORDER
@@ -45,7 +47,7 @@ class Walks:
 
 @dataclass(frozen=True, eq=False)
 class ArrowSystem:
-    """The normal equations. chain: (N, LOCAL) lower band, column by column; border (N, P); common (P, P);
+    """The normal equations. chain: (N, LOCAL) the lower band as `skyline.even`; border (N, P); common (P, P);
     chain_gradient (N,), common_gradient (P,), both downhill."""
 
     chain: Float64
@@ -57,17 +59,18 @@ class ArrowSystem:
 
 @dataclass(frozen=True, eq=False)
 class Eliminated:
-    """The chain's factor (N, LOCAL), column by column; what it takes off: through (N, P) = chain^-1 border;
+    """The chain's factor; what it takes off: through (N, P) = chain^-1 border;
     information (P, P)."""
 
-    factor: Float64
+    factor: Band
     through: Float64
     information: Float64
 
     def chain_solve(self, right: Float64) -> Float64:
         """chain^-1 right, (N,)."""
         solved = right.reshape(-1, 1).copy()
-        _substitute(self.factor, solved)
+        skyline.solve_forward(self.factor, solved)
+        skyline.solve_back(self.factor, solved)
         return solved[:, 0]
 
 
@@ -83,9 +86,9 @@ def assemble(samples: Samples, walks: Walks, control_points: int) -> ArrowSystem
     information = 1 / walks.sigma**2
     whole = chain.reshape(control_points, STATE, LOCAL)
     bias = np.arange(6, STATE)
-    whole[:-1, bias, 0] += information
-    whole[1:, bias, 0] += information
-    whole[:-1, bias, STATE] -= information
+    whole[:-1, bias, LOCAL - 1] += information
+    whole[1:, bias, LOCAL - 1] += information
+    whole[1:, bias, LOCAL - 1 - STATE] -= information
     pull = walks.difference * information
     slope = gradient.reshape(control_points, STATE)
     slope[:-1, 6:] += pull
@@ -98,15 +101,17 @@ def eliminate(system: ArrowSystem, damping: float = 0.0) -> Eliminated:
 
     Raises LinAlgError where the chain is not determined.
     """
-    band = system.chain.copy()
-    diagonal = system.chain[:, 0].reshape(-1, STATE)
-    band[:, 0] += (damping * diagonal + RIDGE * np.median(diagonal, axis=0)).ravel()
-    if not _factorise(band):
+    chain = system.chain.copy()
+    diagonal = system.chain[:, -1].reshape(-1, STATE)
+    chain[:, -1] += (damping * diagonal + RIDGE * np.median(diagonal, axis=0)).ravel()
+    factor = skyline.even(chain)
+    if not skyline.factorise(factor):
         raise np.linalg.LinAlgError("the chain is not determined")
     through = system.border.copy()
-    _substitute(band, through)
+    skyline.solve_forward(factor, through)
+    skyline.solve_back(factor, through)
     common = system.common + damping * np.diag(np.diag(system.common))
-    return Eliminated(band, through, common - np.einsum("np,nq->pq", system.border, through))
+    return Eliminated(factor, through, common - np.einsum("np,nq->pq", system.border, through))
 
 
 def step(system: ArrowSystem, eliminated: Eliminated) -> tuple[Float64, Float64]:
@@ -171,7 +176,7 @@ def _add(
                 total = 0.0
                 for r in range(ROWS):
                     total += columns[m, r] * columns[n, r]
-                chain[j, live[n] - live[m]] += total
+                chain[base + live[n], LOCAL - 1 - live[n] + live[m]] += total
             for p in range(width):
                 total = 0.0
                 for r in range(ROWS):
@@ -184,47 +189,6 @@ def _add(
                     common_gradient[p] += value * residual[k, r]
                     for q in range(width):
                         common[p, q] += value * by_common[k, r, q]
-
-
-@kernel(fastmath=True)
-def _factorise(band: Float64) -> bool:
-    """The lower band of A, column by column, becomes that of L with L L^T = A; False where it can't be.
-
-    LAPACK's own starts threads for each small block, which then wait for each other.
-    """
-    count = len(band)
-    for j in range(count):
-        if not band[j, 0] > 0:
-            return False
-        band[j] /= np.sqrt(band[j, 0])
-        for a in range(1, min(LOCAL, count - j)):
-            value = band[j, a]
-            if value != 0.0:
-                for b in range(a, LOCAL):
-                    band[j + a, b - a] -= value * band[j, b]
-    return True
-
-
-@kernel(fastmath=True)
-def _substitute(factor: Float64, right: Float64) -> None:
-    """right (N, P) becomes (L L^T)^-1 right."""
-    count, width = right.shape
-    for j in range(count):
-        for p in range(width):
-            right[j, p] /= factor[j, 0]
-        for a in range(1, min(LOCAL, count - j)):
-            value = factor[j, a]
-            if value != 0.0:
-                for p in range(width):
-                    right[j + a, p] -= value * right[j, p]
-    for j in range(count - 1, -1, -1):
-        for a in range(1, min(LOCAL, count - j)):
-            value = factor[j, a]
-            if value != 0.0:
-                for p in range(width):
-                    right[j, p] -= value * right[j + a, p]
-        for p in range(width):
-            right[j, p] /= factor[j, 0]
 
 
 @kernel(fastmath=True)

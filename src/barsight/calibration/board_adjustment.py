@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,10 +17,12 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.lens_model import Lens, project
 from barsight.calibration.views import BoardView
 from barsight.core.arrays import Float64, Int64
+from barsight.core.levenberg_marquardt import Options, minimise
 from barsight.core.pose import skew
 
-MOST_STEPS = 100
-COST_TOLERANCE = 1e-12
+OPTIONS = Options(
+    max_steps=100, min_gain_ratio=1e-12, first_damping=1e-3, min_damping=1e-12, max_damping=1e10
+)
 NEAREST_Z_M = 1e-3
 SHAPE_PX = 0.2
 """The corner noise at which the board's shape is expected as `shape_basis` says."""
@@ -90,6 +93,27 @@ class _Normal:
     view_gradient: Float64
 
 
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    """A state and, made on use, its normal equations."""
+
+    lens: Lens
+    seen: tuple[Observed, ...]
+    huber_px: float | None
+    state: State
+
+    @cached_property
+    def normal(self) -> _Normal:
+        return _linearise(self.lens, self.seen, self.state, self.huber_px)
+
+    @property
+    def cost(self) -> float:
+        return self.normal.cost
+
+    def step(self, damping: float) -> _Iterate:
+        return replace(self, state=_move(self.state, self.normal, damping))
+
+
 def observe(
     views: Sequence[BoardView], board_points_m: Float64, basis: Float64, cameras: int
 ) -> tuple[Observed, ...]:
@@ -111,26 +135,16 @@ def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float 
     One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one.
     `converged` is False where the steps ran out.
     """
-    state, damping, steps, converged = start, 1e-3, 0, False
-    normal = _linearise(lens, seen, state, huber_px)
-    while steps < MOST_STEPS and not converged:
-        steps += 1
-        trial = _move(state, normal, damping)
-        after = None if trial is None else _linearise(lens, seen, trial, huber_px)
-        if trial is not None and after is not None and after.cost <= normal.cost:
-            converged = normal.cost - after.cost <= COST_TOLERANCE * normal.cost + 1e-18
-            state, normal, damping = trial, after, max(damping / 10, 1e-12)
-        else:
-            damping *= 10
-            converged = damping > 1e10
+    found = minimise(_Iterate(lens, seen, huber_px, start), OPTIONS)
+    state = found.best.state
     plain = _linearise(lens, seen, state, None)
     inverse = np.linalg.pinv(plain.boards, hermitian=True)
     lost = np.einsum("vci,vij,vdj->vcd", plain.mixed, inverse, plain.mixed)
     scores = plain.view_gradient - np.einsum("vci,vij,vj->vc", plain.mixed, inverse, plain.board_gradient)
     view_reduced = plain.view_common - lost
     return Solved(
-        state, plain.residuals, plain.common - lost.sum(axis=0), view_reduced, scores, steps,
-        converged and damping <= 1e10,
+        state, plain.residuals, plain.common - lost.sum(axis=0), view_reduced, scores, found.steps,
+        found.converged,
     )  # fmt: skip
 
 
@@ -204,18 +218,15 @@ def _derivatives(
     return observed.pixels - projected.pixels, by_common, projected.by_point @ by_board
 
 
-def _move(state: State, normal: _Normal, damping: float) -> State | None:
-    """The state after one damped step; None where the equations can't be solved."""
+def _move(state: State, normal: _Normal, damping: float) -> State:
+    """Take one damped step. Raises LinAlgError where the equations have no solution."""
     boards = normal.boards + damping * normal.boards * np.eye(6) + 1e-12 * np.eye(6)
     common = normal.common + damping * np.diag(np.diag(normal.common))
-    try:
-        inverse = np.linalg.inv(boards)
-        through = normal.mixed @ inverse
-        reduced = common - np.einsum("vci,vdi->cd", through, normal.mixed)
-        target = normal.gradient - np.einsum("vci,vi->c", through, normal.board_gradient)
-        step = np.linalg.solve(reduced, target)
-    except np.linalg.LinAlgError:
-        return None
+    inverse = np.linalg.inv(boards)
+    through = normal.mixed @ inverse
+    reduced = common - np.einsum("vci,vdi->cd", through, normal.mixed)
+    target = normal.gradient - np.einsum("vci,vi->c", through, normal.board_gradient)
+    step = np.linalg.solve(reduced, target)
     rest = normal.board_gradient - np.einsum("vci,c->vi", normal.mixed, step)
     return move(state, step, np.einsum("vij,vj->vi", inverse, rest))
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from barsight.calibration.arrow_system import (
     ROWS,
+    ArrowSystem,
     Eliminated,
     Samples,
     assemble,
@@ -19,11 +21,9 @@ from barsight.calibration.arrow_system import (
 from barsight.calibration.camera_imu_problem import Linearised, Problem, State, linearise, moved
 from barsight.calibration.pose_spline import STATE
 from barsight.core.arrays import Float64, Int64
+from barsight.core.levenberg_marquardt import Options, minimise
 
-MOST_STEPS = 40
-COST_TOLERANCE = 1e-8
-FIRST_DAMPING = 1e-6
-MOST_DAMPING = 1e8
+OPTIONS = Options(max_steps=60, min_gain_ratio=1e-8, first_damping=1e-6, min_damping=1e-9, max_damping=1e8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,34 +55,40 @@ LAGS = 4
 PROBES = 2
 
 
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    """A state and, made on use, what is linear there."""
+
+    problem: Problem
+    huber: float | None
+    state: State
+
+    @cached_property
+    def here(self) -> Linearised:
+        return linearise(self.problem, self.state, self.huber)
+
+    @cached_property
+    def system(self) -> ArrowSystem:
+        return assemble(self.here.samples, self.here.walks, len(self.state.spline.places_m))
+
+    @property
+    def cost(self) -> float:
+        return self.here.cost
+
+    def step(self, damping: float) -> _Iterate:
+        chain, common = step(self.system, eliminate(self.system, damping))
+        return replace(self, state=moved(self.state, chain.reshape(-1, STATE), common))
+
+
 def solve(problem: Problem, start: State, huber: float | None) -> Solution:
     """Levenberg-Marquardt from `start`; huber as in `linearise`. Raises LinAlgError where the way of the body
     is not determined."""
-    state, damping, steps, converged = start, FIRST_DAMPING, 0, False
-    here = linearise(problem, state, huber)
-    count = len(state.spline.places_m)
-    while steps < MOST_STEPS and not converged and damping < MOST_DAMPING:
-        steps += 1
-        system = assemble(here.samples, here.walks, count)
-        trial = after = None
-        while damping < MOST_DAMPING:
-            try:
-                chain, common = step(system, eliminate(system, damping))
-                trial = moved(state, chain.reshape(count, STATE), common)
-                after = linearise(problem, trial, huber)
-            except np.linalg.LinAlgError:
-                after = None
-            if after is not None and after.cost <= here.cost:
-                break
-            damping *= 10
-        if trial is None or after is None or after.cost > here.cost:
-            break
-        converged = here.cost - after.cost <= COST_TOLERANCE * here.cost
-        state, here, damping = trial, after, max(damping / 10, 1e-9)
+    found = minimise(_Iterate(problem, huber, start), OPTIONS)
+    state, here = found.best.state, found.best.here
     if huber is not None:
         here = linearise(problem, state, None)
-    eliminated = eliminate(assemble(here.samples, here.walks, count))
-    return Solution(state, here, eliminated, steps, converged)
+    eliminated = eliminate(assemble(here.samples, here.walks, len(state.spline.places_m)))
+    return Solution(state, here, eliminated, found.steps, found.converged)
 
 
 def sensor_spreads(problem: Problem, solution: Solution, seed: int = 0) -> tuple[Spread, Spread, Spread]:

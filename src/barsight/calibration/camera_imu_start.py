@@ -18,6 +18,7 @@ from barsight.calibration.stereo_start import board_pose
 from barsight.calibration.views import Corners
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
+from barsight.core.pose import nearest_rotation
 
 MOST_SHIFT_S = 1.0
 MOST_STEP_S = 0.35
@@ -186,8 +187,7 @@ def _turned(
         if kept.sum() < FEWEST_STEPS:
             return None
         a, b = rate[kept] - rate[kept].mean(axis=0), mean[kept] - mean[kept].mean(axis=0)
-        u, _, vt = np.linalg.svd(b.T @ a)
-        turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+        turn = nearest_rotation(b.T @ a)
         bias = mean[kept].mean(axis=0) - turn @ rate[kept].mean(axis=0)
         scale = float((b * (a @ turn.T)).sum() / (a**2).sum())
         size = float(np.sqrt((a**2).sum() * (b**2).sum()))

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -17,6 +16,7 @@ from rich.table import Table
 from barsight.cli.arguments import call
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_path
+from barsight.core.json_values import json_value
 from barsight.result_folder import read_heights, read_summary
 from barsight.yard.bundle_file import read_bundles
 from barsight.yard.changes import Change, compare_yards
@@ -58,15 +58,7 @@ def run(arguments: Sequence[str]) -> None:
 def _write(changes: tuple[Change, ...], target: Path) -> None:
     rows = [asdict(change) | {"significant": change.significant} for change in changes]
     with atomic_path(target) as path:
-        path.write_text(json.dumps({"changes": _plain(rows)}, indent=1, allow_nan=False) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        path.write_text(json.dumps({"changes": json_value(rows)}, indent=1, allow_nan=False) + "\n")
 
 
 def _print(changes: tuple[Change, ...], console: Console) -> None:

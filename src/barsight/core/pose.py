@@ -43,8 +43,7 @@ class Pose:
         if np.linalg.det(rotation) < 0:
             raise ValueError(f"{self.target}_from_{self.source} is a reflection (determinant -1)")
         if defect > 1e-12:
-            u, _, vt = np.linalg.svd(rotation)
-            rotation = u @ vt
+            rotation = nearest_rotation(rotation)
         rotation.flags.writeable = False
         translation.flags.writeable = False
         object.__setattr__(self, "rotation", rotation)
@@ -138,3 +137,14 @@ def skew(vectors: Float64) -> Float64:
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)
+
+
+def nearest_rotation(matrix: Float64) -> Float64:
+    """Project a matrix (3, 3) onto SO(3): U diag(1, 1, det U V^T) V^T of its singular vectors U, V.
+
+    Of the moment `sum target source^T` of centred points this is the rotation target from source with the
+    least squares [Kabsch 1976, Arun 1987, Umeyama 1991].
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    rotation: Float64 = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rotation

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from barsight.core.arrays import Float64, Int64
+from barsight.core.pose import nearest_rotation
 from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.core.types import PosedFrame, Trajectory
 from barsight.recording.truth import GroundTruth
@@ -116,9 +117,7 @@ def compare(
 def align(place: Float64, target: Float64) -> Float64:
     """(N, 3) places moved rigidly to fit the target best [Umeyama 1991], without scale."""
     centred, wanted = place - place.mean(axis=0), target - target.mean(axis=0)
-    u, _, vt = np.linalg.svd(wanted.T @ centred)
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    aligned: Float64 = centred @ (u @ mirror @ vt).T + target.mean(axis=0)
+    aligned: Float64 = centred @ nearest_rotation(wanted.T @ centred).T + target.mean(axis=0)
     return aligned
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.files import atomic_path
+from barsight.core.json_values import json_value
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -72,19 +73,9 @@ def timing(seconds: Sequence[float] | Float64) -> Timing:
 
 def write_json(target: Path, record: DataclassInstance) -> None:
     """A frozen record as JSON, whole or not at all; NaN and infinity become null."""
-    text = json.dumps(_without_nan(dataclasses.asdict(record)), indent=1) + "\n"
+    text = json.dumps(json_value(dataclasses.asdict(record)), indent=1) + "\n"
     with atomic_path(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-def _without_nan(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _without_nan(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_nan(one) for one in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
 
 
 def _commit() -> str:

@@ -9,6 +9,7 @@ from scipy.linalg import solve_triangular
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.core.pose import nearest_rotation
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, Trajectory
 from barsight.motion.crane import fit_position
@@ -61,8 +62,7 @@ def yard_from_moves(trajectory: Trajectory, crane: CraneSamples, shift_ns: int) 
     found = calibrate_yard(names, measured, yard, together, free, "world")
     assert not isinstance(found, Failed)
     attitude = np.mean([frame.reference_from_body.rotation for frame in trajectory.frames], axis=0)
-    u, _, vt = np.linalg.svd(found.alignment.target_from_source.rotation @ attitude)
-    return MovedYard(found, np.asarray(u @ vt))
+    return MovedYard(found, nearest_rotation(found.alignment.target_from_source.rotation @ attitude))
 
 
 def errors_together(measured: Float64, found: YardCalibration, time_s: Float64) -> Float64:

@@ -1,4 +1,4 @@
-"""Dense symmetric matrices of a hundred or two unknowns: filled, factorised and solved."""
+"""Fill dense symmetric matrices of a hundred or two unknowns."""
 
 from __future__ import annotations
 
@@ -8,46 +8,11 @@ from barsight.core.arrays import Float64, kernel
 
 
 @kernel(fastmath=True)
-def factorise(matrix: Float64, right: Float64) -> bool:
-    """Replaces the lower half of a symmetric matrix (n, n) by its Cholesky factor, right (n,) by that one's
-    inverse times it; false where it isn't positive definite. BLAS's threads wait for each other where the
-    machine is busy, here and in `product`.
-    """
-    n = len(matrix)
-    for i in range(n):
-        for j in range(i + 1):
-            mine, other = matrix[i, :j], matrix[j, :j]
-            total = 0.0
-            for k in range(j):
-                total += mine[k] * other[k]
-            left = matrix[i, j] - total
-            if j < i:
-                matrix[i, j] = left / matrix[j, j]
-            elif left > 0:
-                matrix[i, i] = np.sqrt(left)
-            else:
-                return False
-        total = 0.0
-        for k in range(i):
-            total += matrix[i, k] * right[k]
-        right[i] = (right[i] - total) / matrix[i, i]
-    return True
-
-
-@kernel(fastmath=True)
-def solve_back(factor: Float64, known: int, x: Float64) -> None:
-    """Replaces x (n,), but for its last `known`, by the inverse of the factor's transpose times it."""
-    n = len(factor)
-    for i in range(n - 1, -1, -1):
-        if i < n - known:
-            x[i] /= factor[i, i]
-        for k in range(min(i, n - known)):
-            x[k] -= factor[i, k] * x[i]
-
-
-@kernel(fastmath=True)
 def product(matrix: Float64, vector: Float64) -> Float64:
-    """Of a matrix (m, n) and a vector (n,)."""
+    """Multiply a matrix (m, n) by a vector (n,).
+
+    BLAS's threads wait for each other where the machine is busy.
+    """
     result = np.empty(len(matrix))
     for i in range(len(matrix)):
         total = 0.0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
-from barsight.motion.band import Band
+from barsight.core.skyline import Band
 from barsight.motion.point_kernels import Guess, Rig, Sights, disparity_off, rows, slide_off
 
 NO_PIECES = np.empty((0, 2), np.int64)

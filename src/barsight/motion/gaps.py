@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from barsight.core import skyline
 from barsight.core.arrays import Float64, Int64
-from barsight.motion import band
 
 
 @dataclass(eq=False)
@@ -71,13 +71,13 @@ def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Gap:
     if end * size < len(chain.rows):
         right[-size:, size:-2] = _link(chain.rows, end).T
     right[:, -2], right[:, -1] = chain.side[here], chain.gradient[here]
-    factor = band.even(chain.rows[here].copy())
-    if not band.factorise(factor):
+    factor = skyline.even(chain.rows[here].copy())
+    if not skyline.factorise(factor):
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
-    band.solve_forward(factor, right)
+    skyline.solve_forward(factor, right)
     taken = np.empty((right.shape[1], right.shape[1]))
-    band.products(right, taken)
-    band.solve_back(factor, right)
+    skyline.products(right, taken)
+    skyline.solve_back(factor, right)
     row, column = np.tril_indices(size)
     for node, part in ((k - 1, slice(size)), (k, slice(size, 2 * size))):
         if 0 <= node * size < len(left.rows):

@@ -13,9 +13,9 @@ from functools import cached_property
 
 import numpy as np
 
+from barsight.core import skyline
 from barsight.core.arrays import Int64
-from barsight.motion import band
-from barsight.motion.band import Band
+from barsight.core.skyline import Band
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Layout:
 
     def zeros(self) -> Band:
         """A band for all of them."""
-        return band.empty(self.first)
+        return skyline.empty(self.first)
 
 
 def layout(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None) -> Layout:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.motion.band import inverse_blocks, solve_back, solve_forward
+from barsight.core.skyline import solve_back, solve_forward
+from barsight.motion.band import inverse_blocks
 from barsight.motion.system import System
 
 NO_PAIRS = np.empty((0, 2), np.int64)

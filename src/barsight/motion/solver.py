@@ -15,8 +15,9 @@ import numpy as np
 from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64
+from barsight.core.levenberg_marquardt import Options, Termination, minimise
+from barsight.core.skyline import Band
 from barsight.motion import band
-from barsight.motion.band import Band
 from barsight.motion.elimination import Reduced, eliminate, spread, substitute
 from barsight.motion.encoders import add_encoders, encoders_cost
 from barsight.motion.gaps import without_gaps
@@ -86,6 +87,28 @@ def sighting_residuals(problem: Problem, state: State, used: Bool) -> Float64:
     return result
 
 
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    """A state, its cost and, made on use and let go with it, its system: never are two held."""
+
+    problem: Problem
+    graph: Any
+    used: Bool
+    state: State
+
+    @cached_property
+    def cost(self) -> float:
+        return cost_of(self.problem, self.graph, self.state, self.used)
+
+    @cached_property
+    def system(self) -> System:
+        return linearise(self.problem, self.graph, self.state, self.used)
+
+    def step(self, damping: float) -> _Iterate:
+        step = self.system.step(self.problem.free, damping)
+        return replace(self, state=moved(self.problem, self.state, self.used, *step))
+
+
 def optimise(
     problem: Problem,
     graph: Any,
@@ -94,34 +117,16 @@ def optimise(
     most: int = MOST_ITERATIONS,
     least_gain: float = RELATIVE_GAIN,
 ) -> tuple[State, System]:
-    """The state that fits best and its system. [Levenberg 1944, Marquardt 1963]
+    """Find the state that fits best, and its system, by Levenberg-Marquardt.
 
     graph: GTSAM's factors of all but sightings and encoders. The rig's drift stays. least_gain: the share of
     the cost that a step must save for another to follow. Raises LinAlgError where the measurements leave an
     unknown undetermined.
     """
-    free = problem.free
-    cost, damping = cost_of(problem, graph, state, used), 0.0
-    system = linearise(problem, graph, state, used)
-    for _ in range(most):
-        try:
-            trial = moved(problem, state, used, *system.step(free, damping))
-            lower = cost_of(problem, graph, trial, used)
-        except np.linalg.LinAlgError:
-            if damping > 1:
-                raise
-            lower = np.inf
-        if not lower <= cost:
-            if cost - lower > -RELATIVE_GAIN * cost or damping > 1e6:
-                break
-            damping = max(1e-5, 10 * damping)
-            continue
-        gain, cost, state, damping = cost - lower, lower, trial, damping / 10 if damping > 1e-5 else 0.0
-        del system  # the largest thing here: never two of them
-        system = linearise(problem, graph, state, used)
-        if gain < least_gain * max(cost, 1e-9):
-            break
-    return state, system
+    found = minimise(_Iterate(problem, graph, used, state), Options(most, least_gain, 0.0, 1e-5, 1e6))
+    if found.termination is Termination.SINGULAR:
+        raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
+    return found.best.state, found.best.system
 
 
 def linearise(problem: Problem, graph: Any, state: State, used: Bool) -> System:

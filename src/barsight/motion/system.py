@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
+from barsight.core import skyline
 from barsight.core.arrays import Bool, Float64, Int64
-from barsight.motion import band
-from barsight.motion.band import Band
+from barsight.core.skyline import Band
 from barsight.motion.gaps import Gap, with_gaps
 from barsight.motion.layout import Layout
 from barsight.motion.rig_drift import LOOSE
@@ -42,7 +42,7 @@ class System:
     def _factor(self, damping: float) -> Band:
         factor = self.rows._replace(values=self.rows.values.copy())
         factor.values[factor.offset + np.arange(len(factor.offset))] *= 1 + damping
-        if not band.factorise(factor):
+        if not skyline.factorise(factor):
             raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
         return factor
 
@@ -53,13 +53,13 @@ class System:
 
     def _forward(self, factor: Band) -> Float64:
         result = np.column_stack([self.gradient, self.side.T])
-        band.solve_forward(factor, result)
+        skyline.solve_forward(factor, result)
         return result
 
     def schur(self, forward: Float64) -> tuple[Float64, Float64]:
         """The border's own matrix (b, b) and gradient (b,)."""
         taken = np.empty((forward.shape[1], forward.shape[1]))
-        band.products(forward, taken)
+        skyline.products(forward, taken)
         loose = np.zeros(len(self.corner))
         loose[-2:] = 1 / np.array(LOOSE) ** 2
         return self.corner - taken[1:, 1:] + np.diag(loose), self.corner_gradient - taken[1:, 0]
@@ -79,7 +79,7 @@ class System:
             right = right + left @ border
             border[free] = -np.linalg.solve(left[np.ix_(free, free)], right[free])
         step = -(forward[:, :1] + forward[:, 1:] @ border[:, None])
-        band.solve_back(factor, step)
+        skyline.solve_back(factor, step)
         latency = float(border[0]) if self.has_latency else 0.0
         by_node = step[self.layout.nodes].reshape(-1, self.layout.size)
         by_node = with_gaps(by_node, latency, self.kept, self.gaps, self.nodes)

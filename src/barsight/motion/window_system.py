@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from barsight.core import skyline
 from barsight.core.arrays import Bool, Float64
 from barsight.core.pose import Pose, skew
 from barsight.motion import dense
@@ -152,17 +153,20 @@ def step_of(problem: Problem, state: State, slide: float, used: Bool, equations:
     """
     size, matrix = problem.width, equations.matrix.copy()
     matrix[[-2, -1], [-2, -1]] += 1 / np.array(LOOSE) ** 2
-    factor, forward = matrix, equations.gradient.copy()
-    if not dense.factorise(factor, forward):
+    band, right = skyline.full(matrix), equations.gradient[:, None].copy()
+    if not skyline.factorise(band):
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
+    skyline.solve_forward(band, right)
+    factor, forward = matrix, right[:, 0]
     covariance, by_drift = None, np.zeros(2)
     if problem.offset_prior_px > 0 and used.any():
         own = np.tril(factor[-2:, -2:])
         best = state.drift - np.linalg.solve(own.T, forward[-2:])
         drift = weigh(best, np.linalg.inv(own @ own.T).astype(np.float64), problem)
         by_drift, covariance = np.array([drift.yaw_rad, drift.scale]) - state.drift, drift.covariance
-    step = np.concatenate([-forward[:-2], by_drift])
-    dense.solve_back(factor, 2, step)
+    left = -right[:-2] - (by_drift @ factor[-2:, :-2])[:, None]
+    skyline.solve_back(skyline.Band(band.values, band.first[:-2], band.offset[:-2]), left)
+    step = np.concatenate([left[:, 0], by_drift])
     tail = len(matrix) - len(problem.kept) * size + size
     own = np.tril(factor[-tail:, -tail:])
     information = own @ own.T

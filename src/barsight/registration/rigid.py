@@ -8,7 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, expect_shape
 from barsight.core.errors import Failed
-from barsight.core.pose import Pose, skew
+from barsight.core.pose import Pose, nearest_rotation, skew
 
 LEAST_POINTS = 3
 LEAST_WIDTH = 0.01
@@ -47,8 +47,8 @@ def align(
     frames: (target, source). covariance_m2: (N, 3, 3) of each pair's difference, target axes; points count
     by its trace, and the stated covariance follows from it whole. Without it all count alike and one sigma
     for all is taken from the residuals.
-    W = sum q'' p''^T = U S V^T is minimised by R = V diag(1, 1, det(V U^T)) U^T [Arun 1987, Umeyama 1991];
-    the paper prints its transpose. Failed `few-points`, `collinear`.
+    The rotation is the one nearest to sum p'' q''^T; the paper prints its transpose.
+    Failed `few-points`, `collinear`.
     """
     expect_shape("source", source, (None, 3))
     expect_shape("target", target, (len(source), 3))
@@ -64,9 +64,8 @@ def align(
     line = _line(q, weight)
     if line is not None:
         return line
-    u, stretch, vt = np.linalg.svd((weight[:, None] * q).T @ p)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    rotation = vt.T @ (sign[:, None] * u.T)
+    moment = p.T @ (weight[:, None] * q)
+    rotation = nearest_rotation(moment)
     centre = np.average(target, 0, weight)
     translation = centre - rotation @ np.average(source, 0, weight)
     residuals = target - source @ rotation.T - translation
@@ -86,7 +85,7 @@ def align(
         Pose(*frames, rotation, translation),
         _covariance(turned, centre - translation, weight, spread),
         residuals,
-        float(sign @ stretch) / extent,
+        float((rotation * moment).sum()) / extent,
         float(np.sqrt(along)) / extent,
         sigma,
         chi2,

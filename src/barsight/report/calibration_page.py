@@ -14,6 +14,7 @@ from barsight.calibration.stereo_removal import view_rms
 from barsight.calibration.stereo_verdict import Assessment, tilts
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.core.json_values import json_value
 from barsight.report.page import Figure, number, write_summary_page
 from barsight.report.plots import Plot, numbers
 
@@ -60,7 +61,7 @@ def calibration_summary(calibration: StereoCalibration, assessment: Assessment) 
         "epipolar_rms_px": float(np.sqrt((assessment.epipolar_px**2).mean())),
         "coverage": [float(picture_grid(calibration, camera).covered.mean()) for camera in (0, 1)],
         "depth": [
-            {"range_m": r, "sigma_median_mm": _finite(1e3 * m), "sigma_max_mm": _finite(1e3 * w)}
+            {"range_m": r, "sigma_median_mm": json_value(1e3 * m), "sigma_max_mm": json_value(1e3 * w)}
             for r, (m, w) in zip(assessment.ranges_m, assessment.depth_sigma_m, strict=True)
         ],
         "cross_validation": {"failed": cross.reason}
@@ -228,7 +229,3 @@ def _line(name: str, x: Float64, y: Float64, colour: str) -> dict[str, Any]:
         "type": "scatter", "mode": "lines", "name": name, "x": numbers(x, 3), "y": numbers(y, 4),
         "line": {"color": colour, "width": 1.4},
     }  # fmt: skip
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -12,6 +12,7 @@ import numpy as np
 import barsight
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed
+from barsight.core.json_values import json_value
 from barsight.core.motion_detail import InSigmas
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import Trajectory
@@ -85,7 +86,7 @@ def odometry_summary(result: OdometryResult) -> dict[str, Any]:
         "warnings": list(trajectory.warnings),
         "length_m": trajectory.length_m,
         "seconds": _seconds(trajectory.stamp_ns[-1:], trajectory)[0],
-        "drift": None if result.drift is None else _without_nan(dataclasses.asdict(result.drift)),
+        "drift": None if result.drift is None else json_value(dataclasses.asdict(result.drift)),
         "rig_drift": _rig_drift(trajectory),
         "residuals_in_sigma": {
             name: {
@@ -267,7 +268,3 @@ def _line(name: str, x: Float64, y: Float64, colour: int) -> Trace:
 
 def _or_null(row: Float64) -> list[float] | None:
     return row.tolist() if np.isfinite(row).all() else None
-
-
-def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 import barsight
 from barsight.core.errors import Failed
+from barsight.core.json_values import json_value
 from barsight.core.types import RigDrift
 from barsight.motion.rig_check import RigCheck
 from barsight.motion.row_drift import COLUMNS, ROWS, RowDrift
@@ -23,17 +23,13 @@ FARTHEST = 2.0
 
 def rig_check_summary(check: RigCheck, source: str) -> dict[str, Any]:
     """Everything of the report as JSON values: angles in degrees, shares in %, costs in mm."""
-    lines = [
-        {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
-        for row in map(asdict, check.lines)
-    ]
     return {
         "schema": 1,
         "software": {"name": "barsight", "version": barsight.__version__},
         "source": source,
         "state": check.state,
-        "range_m": None if math.isnan(check.range_m) else check.range_m,
-        "lines": lines,
+        "range_m": json_value(check.range_m),
+        "lines": json_value([asdict(line) for line in check.lines]),
     }
 
 

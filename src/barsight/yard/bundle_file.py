@@ -12,6 +12,7 @@ import numpy as np
 
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
+from barsight.core.json_values import DIGITS, json_value
 from barsight.yard.stock_list import StockMatch
 from barsight.yard.types import Bar, Bundle, BundleSigma
 
@@ -33,7 +34,7 @@ def write_bundles(
         "schema_version": SCHEMA_VERSION,
         "reference": reference,
         "bundles": [_record(bundle) for bundle in bundles],
-        "stock": None if stock is None else _plain(asdict(stock)),
+        "stock": None if stock is None else json_value(asdict(stock), DIGITS),
     }
     with atomic_path(target) as path:
         path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -97,7 +98,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
             for bar in bundle.bar_axes
         ],
     }
-    plain: dict[str, Any] = _plain(record)
+    plain: dict[str, Any] = json_value(record, DIGITS)
     return plain
 
 
@@ -136,16 +137,3 @@ def _bundle(record: dict[str, Any]) -> Bundle:
             for bar in record["bar_axes"]
         ),
     )  # fmt: skip
-
-
-def _plain(value: Any) -> Any:
-    """As JSON knows it: arrays as lists, floats to a micrometre (nine decimals where small), NaN as null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.9g}") if np.isfinite(value) else None
-    return value

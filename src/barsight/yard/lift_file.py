@@ -11,6 +11,7 @@ from typing import Any
 
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
+from barsight.core.json_values import DIGITS, json_value
 from barsight.yard.assess import Lift
 from barsight.yard.lift import RULE, LiftPlan
 from barsight.yard.stability import Footing
@@ -51,7 +52,7 @@ def read_lifts(path: Path) -> dict[str, Any]:
 
 def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
     """What lifts.json says."""
-    content: dict[str, Any] = _plain(
+    content: dict[str, Any] = json_value(
         {
             "schema_version": SCHEMA_VERSION,
             "reference": reference,
@@ -67,7 +68,8 @@ def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
             "footings": [_footing(footing) for footing in plan.footings],
             "sides": [asdict(side) for side in plan.sides],
             "free_places": [asdict(place) for place in plan.free],
-        }
+        },
+        DIGITS,
     )
     return content
 
@@ -135,14 +137,3 @@ def _footing(footing: Footing) -> dict[str, Any]:
 
 def _rounded(metres: float) -> float | None:
     return round(metres, 4) if math.isfinite(metres) else None
-
-
-def _plain(value: Any) -> Any:
-    """As JSON knows it: tuples as lists, nine digits, what isn't finite as null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.9g}") if math.isfinite(value) else None
-    return value

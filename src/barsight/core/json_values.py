@@ -1,0 +1,29 @@
+"""Convert results to values that JSON can hold."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+DIGITS = 9
+"""Significant digits of a result's documents: a micrometre in any yard."""
+
+
+def json_value(value: Any, digits: int | None = None) -> Any:
+    """Replace NaN and infinity by None, arrays and tuples by lists, NumPy scalars by Python's, at any depth.
+
+    digits: significant digits that floats are rounded to; all where None.
+    """
+    if isinstance(value, dict):
+        return {key: json_value(item, digits) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return json_value(value.tolist(), digits)
+    if isinstance(value, list | tuple):
+        return [json_value(item, digits) for item in value]
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return None
+        return value if digits is None else float(f"{value:.{digits}g}")
+    return value

@@ -1,0 +1,90 @@
+"""Minimise a cost by damped Gauss-Newton steps [Levenberg 1944, Marquardt 1963]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+_TINY = 1e-18
+_FACTOR = 10.0
+
+
+class Iterate(Protocol):
+    """A state with its cost, and the step from there. What costs memory or time should be made on use:
+    a trial that is refused is asked for its cost only.
+    """
+
+    @property
+    def cost(self) -> float:
+        """The sum that is minimised. May raise LinAlgError."""
+
+    def step(self: I, damping: float) -> I:
+        """Solve the normal equations, their diagonal raised by the share `damping`, and move.
+
+        Raises LinAlgError where they have no solution.
+        """
+
+
+I = TypeVar("I", bound=Iterate)  # noqa: E741
+
+
+@dataclass(frozen=True)
+class Options:
+    """max_steps: trials, the refused ones included. min_gain_ratio: the share of the cost below which a
+    step's gain, or loss, ends the search. Damping begins at `first_damping`, falls to 0 below `min_damping`
+    and ends the search above `max_damping`.
+    """
+
+    max_steps: int
+    min_gain_ratio: float
+    first_damping: float
+    min_damping: float
+    max_damping: float
+
+
+class Termination(Enum):
+    """Why the search ended."""
+
+    CONVERGED = "converged"
+    MAX_STEPS = "max-steps"
+    MAX_DAMPING = "max-damping"
+    SINGULAR = "singular"
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum(Generic[I]):
+    """The best iterate, the steps tried, and why no more were."""
+
+    best: I
+    steps: int
+    termination: Termination
+
+    @property
+    def converged(self) -> bool:
+        """Whether further steps would gain next to nothing."""
+        return self.termination is Termination.CONVERGED
+
+
+def minimise(best: I, options: Options) -> Minimum[I]:
+    """Find a minimum from the iterate `best` on; never ends at a higher cost."""
+    damping = options.first_damping
+    for steps in range(1, options.max_steps + 1):
+        try:
+            trial = best.step(damping)
+            loss, failure = trial.cost - best.cost, Termination.MAX_DAMPING
+        except np.linalg.LinAlgError:
+            loss, failure = np.inf, Termination.SINGULAR
+        converged = abs(loss) <= options.min_gain_ratio * best.cost + _TINY
+        if loss <= 0:
+            best = trial
+            damping = damping / _FACTOR if damping > options.min_damping else 0.0
+        elif damping > options.max_damping:
+            return Minimum(best, steps, failure)
+        else:
+            damping = max(options.min_damping, _FACTOR * damping)
+        if converged:
+            return Minimum(best, steps, Termination.CONVERGED)
+    return Minimum(best, options.max_steps, Termination.MAX_STEPS)
