@@ -14,7 +14,7 @@ FLOORS = {
     "motion": 3,
     "mapping": 4,
     "yard": 5,
-    "measurement": 6, "evaluation": 6, "result_folder": 6, "kept": 6,
+    "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6,
     "report": 7, "pipeline": 7, "simulation": 7, "plant": 7, "viewer": 7,
     "cli": 8,
 }  # fmt: skip

@@ -14,13 +14,14 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
+from barsight.checkpoint import checkpoint_folder, once, pictures_digest
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.memory import give_back
 from barsight.core.parallel import begun_map, beside
@@ -30,13 +31,13 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory
 from barsight.evaluation.agreement import agree
-from barsight.kept import keeping_folder, once
 from barsight.mapping.contours import cut_contours
 from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.look import apart, apart_by_encoders, choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Surface, finish
+from barsight.mapping.surface import Surface
+from barsight.mapping.surface_election import SurfaceElection
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import Matched, Matcher, Neighbour, Placer
 from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, digest, plain
@@ -132,7 +133,7 @@ def measure(
     configuration, inputs = plain(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
-        kept = keeping_folder(resume, digest([barsight.__version__, configuration, inputs]))
+        kept = checkpoint_folder(resume, _checkpoint_key(recording, configuration, inputs))
 
     matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), rectifier, watch)
     early = _known_early(source, settings, rectifier, first.range_m)
@@ -192,7 +193,7 @@ def measure(
     with watch("surface"):
         min_views = settings.map.min_views if used > 1 else 1
         sights = Sights.of(placed, rectifier.camera, per_pixel)
-        surface = finish(store, scratch, cell_m, min_views, settings.map, sights)
+        surface = SurfaceElection(store, scratch, cell_m, settings.map).finish(min_views, sights)
         give_back()
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")
@@ -265,6 +266,13 @@ def measure(
         stock=stock,
         travel=travel,
     )
+
+
+def _checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
+    """A digest of all that trajectory and disparities depend on."""
+    stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
+    rig = plain(asdict(recording.rig))
+    return digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
 
 
 def _known_early(
