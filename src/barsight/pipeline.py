@@ -7,7 +7,6 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -23,7 +22,7 @@ from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
 from barsight.checkpoint import checkpoint_folder, once, pictures_digest
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.memory import give_back
+from barsight.core.memory import give_back, peak_memory_mib
 from barsight.core.parallel import begun_map, beside
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
@@ -259,7 +258,7 @@ def measure(
         stages=tuple(StageTime(*entry) for entry in watch.entries()),
         warnings=tuple(warnings),
         seconds=time.perf_counter() - start,
-        peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        peak_memory_mib=peak_memory_mib(),
         preview=preview,
         bundles=bundles,
         lifts=lifts,

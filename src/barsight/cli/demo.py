@@ -10,9 +10,10 @@ import tyro
 from rich.console import Console
 
 from barsight.cli.arguments import call
-from barsight.cli.measure import measure_into, print_outcome
+from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
 from barsight.core.errors import OutputError
+from barsight.measure_folder import measure_into
 from barsight.pipeline import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
@@ -36,7 +37,8 @@ def run(arguments: Sequence[str]) -> None:
         with stages(console) as advance:
             simulate(recording, SimulationSettings.demo(), lambda n, total: advance("render", n, total))
         console.print("Measuring it ...")
-        content = measure_into(recording, result, MeasureSettings(), console, truth_of=recording)
+        with stages(console) as advance:
+            content = measure_into(recording, result, MeasureSettings(), advance=advance, truth_of=recording)
         print_outcome(content, console, verbose=False)
         console.print(f"report: {result / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
         console.print(f"in 3D:  barsight view {result}", soft_wrap=True, highlight=False, markup=False)
