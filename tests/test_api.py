@@ -4,6 +4,7 @@ import gc
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import barsight as bs
 from barsight.cli.main import run
 from cli_runs import FAST
 
-NOTEBOOK = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
+NOTEBOOK: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
 
 
 def test_a_notebook_measures_looks_and_saves(

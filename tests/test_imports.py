@@ -17,7 +17,7 @@ FLOORS = {
     "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "board_views": 6,
     "report": 7, "pipeline": 7, "simulation": 7, "plant": 7, "viewer": 7,
     "result": 8, "pair_matching": 8, "measure_folder": 8,
-    "api": 9,
+    "api": 9, "session": 9,
     "cli": 10,
 }  # fmt: skip
 ROOT = Path(barsight.__file__).parent

@@ -12,7 +12,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from barsight.api import calibrate_stereo, disparity, load, measure, open_recording
+    from barsight.api import calibrate_stereo, disparity, load, measure, open_recording, packets
     from barsight.calibration.rig import StereoRig
     from barsight.calibration.stereo_calibration import StereoCalibration
     from barsight.core.errors import BarsightError
@@ -20,18 +20,19 @@ if TYPE_CHECKING:
     from barsight.pipeline import MeasureSettings
     from barsight.result import Lifts, LiftTarget, Yard
     from barsight.result_folder import CameraPath
+    from barsight.session import Session, Snapshot
     from barsight.yard.types import Bundle, HeightMap
 
     __version__: str
 
 __all__ = [
     "BarsightError", "Bundle", "CameraPath", "Contour", "Disparity", "HeightMap", "LiftTarget", "Lifts",
-    "MeasureSettings", "StereoCalibration", "StereoRig", "Yard", "__version__", "calibrate_stereo",
-    "disparity", "load", "measure", "open_recording",
+    "MeasureSettings", "Session", "Snapshot", "StereoCalibration", "StereoRig", "Yard", "__version__",
+    "calibrate_stereo", "disparity", "load", "measure", "open_recording", "packets",
 ]  # fmt: skip
 
 _HOMES = {
-    "barsight.api": ("calibrate_stereo", "disparity", "load", "measure", "open_recording"),
+    "barsight.api": ("calibrate_stereo", "disparity", "load", "measure", "open_recording", "packets"),
     "barsight.calibration.rig": ("StereoRig",),
     "barsight.calibration.stereo_calibration": ("StereoCalibration",),
     "barsight.core.errors": ("BarsightError",),
@@ -39,6 +40,7 @@ _HOMES = {
     "barsight.pipeline": ("MeasureSettings",),
     "barsight.result": ("LiftTarget", "Lifts", "Yard"),
     "barsight.result_folder": ("CameraPath",),
+    "barsight.session": ("Session", "Snapshot"),
     "barsight.yard.types": ("Bundle", "HeightMap"),
 }
 

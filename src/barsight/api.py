@@ -23,6 +23,7 @@ from barsight.measure_folder import measure_into, unheard
 from barsight.pair_matching import match_pictures
 from barsight.pipeline import Advance, MeasureSettings
 from barsight.recording.open import open_recording as open_path
+from barsight.recording.packets import packets as packets
 from barsight.recording.stored import Source
 from barsight.result import Yard
 from barsight.stereo.settings import StereoSettings

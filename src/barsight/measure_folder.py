@@ -10,6 +10,7 @@ from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
 from barsight.evaluation.truth import score
 from barsight.pipeline import Advance, MeasureSettings, measure
+from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.files import RESULT_FILES, summary, write_results, write_summary, write_surface
 from barsight.report.page import write_report
@@ -39,8 +40,29 @@ def measure_into(
     """
     if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
-    recording = open_recording(path, settings.recording)
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
+    content = write_measured(
+        open_recording(path, settings.recording), out, settings, advance=advance, overwrite=overwrite,
+        keep=keep, truth_of=truth_of, magnet=magnet, report=report,
+    )  # fmt: skip
+    if keep is not None:
+        shutil.rmtree(keep, ignore_errors=True)
+    return content
+
+
+def write_measured(
+    recording: Recording,
+    out: Path,
+    settings: MeasureSettings,
+    *,
+    advance: Advance = unheard,
+    overwrite: bool = False,
+    keep: Path | None = None,
+    truth_of: Path | None = None,
+    magnet: Path | None = None,
+    report: bool = True,
+) -> dict[str, Any]:
+    """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from."""
     described = load_magnet(magnet)
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
@@ -57,6 +79,4 @@ def measure_into(
         write_summary(content, staging / "result.json")
         if report:
             write_report(staging, staging / "report.html")
-    if keep is not None:
-        shutil.rmtree(keep, ignore_errors=True)
     return content

@@ -132,11 +132,11 @@ def measure(
     configuration, inputs = plain(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
-        kept = checkpoint_folder(resume, _checkpoint_key(recording, configuration, inputs))
+        kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
 
     matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), rectifier, watch)
     early = _known_early(source, settings, rectifier, first.range_m)
-    match = _match(matcher, kept)
+    match = matching(matcher, kept)
     # Pictures are matched on the core that the trajectory leaves idle.
     begun = islice(source.frames(early), len(early))
     with ExitStack() as pools:
@@ -158,7 +158,7 @@ def measure(
         matched: Iterator[Matched | Refusal] = ahead
         if late is not None:
             rest = source.frames({stamp for stamp in poses if stamp >= late})
-            match = _match(replace(matcher, rectifier=rectifier), kept)
+            match = matching(replace(matcher, rectifier=rectifier), kept)
             after = pools.enter_context(begun_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
 
@@ -267,7 +267,7 @@ def measure(
     )
 
 
-def _checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
+def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
     """A digest of all that trajectory and disparities depend on."""
     stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
     rig = plain(asdict(recording.rig))
@@ -293,7 +293,11 @@ def _known_early(
     return frozenset(chosen[:_MATCHED_AHEAD])
 
 
-def _match(matcher: Matcher, kept: Path | None) -> Callable[[StereoFrame | RefusedFrame], Matched | Refusal]:
+def matching(
+    matcher: Matcher, kept: Path | None
+) -> Callable[[StereoFrame | RefusedFrame], Matched | Refusal]:
+    """Match frames, each once for all runs that keep checkpoints in `kept`."""
+
     def match(frame: StereoFrame | RefusedFrame) -> Matched | Refusal:
         if isinstance(frame, RefusedFrame):
             return Refusal("recording", frame)

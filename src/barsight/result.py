@@ -64,6 +64,11 @@ class Yard:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.summary = read_summary(folder)
+        self._kept: object = None
+
+    def keep(self, owner: object) -> None:
+        """Hold on to the owner of `folder`, with which it goes."""
+        self._kept = owner
 
     @cached_property
     def height_map(self) -> HeightMap:
