@@ -213,11 +213,11 @@ def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
             elected = [t.stat().st_ino for t in sorted(shown[-2].folder.glob("surface_0_*"))]
             assert elected == [t.stat().st_ino for t in sorted(shown[-1].folder.glob("surface_0_*"))]
         surface = election.finish(2, Sights.of(poses, CAMERA))
-        ends[kind] = surface, {p.name: p.read_bytes() for p in surface.folder.glob("*.npy")}
         clouds = [
             np.concatenate([getattr(p, n).ravel() for n in ("xyz_m", "sigma_z_m")]) for p in surface.cloud()
         ]
-        ends[kind] += (np.concatenate(clouds).tobytes(),)
+        files = {path.name: path.read_bytes() for path in surface.folder.glob("*.npy")}
+        ends[kind] = surface, files, np.concatenate(clouds).tobytes()
         if shown:
             read_tile.cache_clear()
             np.testing.assert_array_equal(shown[1].window(0, 200, 300, 90).z_m, first.z_m)

@@ -1,6 +1,7 @@
 """Packets pushed one by one: snapshots on the way, and at the end the bytes of the batch."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import barsight as bs
 from barsight.api import with_settings
 from barsight.core.types import StereoFrame
 
-SETTINGS = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
+SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
 FILES = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply", "bundles.json", "lifts.json")
 
 

@@ -48,12 +48,13 @@ from barsight.recording.sensors import imu_hints
 from barsight.stereo.settings import StereoSettings, make_method
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
-from barsight.yard.lift import map_vetoes, plan_lifts
+from barsight.yard.lift import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet, load_magnet
 from barsight.yard.stock_list import match_stock, read_stock, stock_warnings
 from barsight.yard.stretches import surface_map
 from barsight.yard.travel import Travel
+from barsight.yard.types import Bundle, YardMap
 
 Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
@@ -232,12 +233,12 @@ def measure(
     if refusals:
         warnings.append(Notice("frames-refused", f"{len(refusals)} of {frames_total} frames were refused"))
     with watch("lifts"):
-        told = [(notice.code, notice.message) for notice in warnings]
-        forbidden = map_vetoes(told, trajectory.reference, 0.0, settings.lift)
+        crane_shift_ns = source.rig.timeshift_cam_imu_ns
         window_ns = seconds_to_ns(settings.motion.crane.window_s)
-        shift_ns = source.rig.timeshift_cam_imu_ns
-        travel = Travel.of(trajectory, source.crane(), shift_ns, window_ns, first.range_m, rectifier.camera)
-        lifts = plan_lifts(heights, bundles, magnet or load_magnet(None), settings.lift, forbidden, travel)
+        travel = Travel.of(
+            trajectory, source.crane(), crane_shift_ns, window_ns, first.range_m, rectifier.camera
+        )
+        lifts = _lifts(heights, bundles, magnet, settings.lift, warnings, trajectory.reference, travel)
     return Measurement(
         recording_path=source.path,
         recording_format=source.format,
@@ -265,6 +266,16 @@ def measure(
         stock=stock,
         travel=travel,
     )
+
+
+def _lifts(
+    heights: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet | None, settings: LiftSettings,
+    warnings: list[Notice], reference: str, travel: Travel,
+) -> LiftPlan:  # fmt: skip
+    """Choose lifts on a map that was measured just now."""
+    told = [(notice.code, notice.message) for notice in warnings]
+    forbidden = map_vetoes(told, reference, 0.0, settings)
+    return plan_lifts(heights, bundles, magnet or load_magnet(None), settings, forbidden, travel)
 
 
 def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:

@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -65,31 +66,35 @@ class SurfaceElection:
             made.mkdir()
         self._work = work
         self._boxes: dict[TileKey, tuple[tuple[int, int], Float64 | None]] = {}
-        self._winners: dict[TileKey, tuple[object, int]] = {}
-        self._figures: dict[TileKey, tuple[object, _Figures]] = {}
+        self._winners: dict[TileKey, tuple[tuple[object, ...], int]] = {}
+        self._figures: dict[TileKey, tuple[tuple[object, ...], _Figures]] = {}
         self._height_m = np.inf
 
     def snapshot(self, min_views: int, sights: Sights) -> Surface:
-        """The surface as it stands; only tiles that changed are elected anew. It stays as it is."""
+        """The surface as it stands, of its own from now on; only tiles that changed are elected anew.
+
+        A tile that lies beside one that changed waits for its own next change, or for `finish`.
+        """
         if not abs(sights.height_m - self._height_m) <= _KEPT_HEIGHT_M:
             self._height_m = sights.height_m
-        return self._surface(min_views, sights)
+        return self._surface(min_views, sights, beside=False)
 
     def finish(self, min_views: int, sights: Sights) -> Surface:
         """The surface at the end; the tiles in `store` are given up."""
         self._height_m = sights.height_m
-        surface = self._surface(min_views, sights)
+        surface = self._surface(min_views, sights, beside=True)
         self._store.clear()
         shutil.rmtree(self._work)
         return surface
 
-    def _surface(self, min_views: int, sights: Sights) -> Surface:
+    def _surface(self, min_views: int, sights: Sights, *, beside: bool) -> Surface:
+        """beside: whether tiles count as changed for what lies beside them too."""
         keys = self._store.keys()
         read_tile.cache_clear()
         _read_first.cache_clear()
         self._look(keys, min_views)
-        self._elect(keys, min_views, sights)
-        self._finish(keys, sights)
+        self._elect(keys, min_views, sights, beside)
+        self._finish(keys, sights, beside)
         folder = self._linked(keys)
         figures = [self._figures[key][1] for key in keys]
         columns = [column for one in figures if one.columns for column in one.columns]
@@ -121,14 +126,15 @@ class SurfaceElection:
         for key, box in ordered_map(look, ((key, self._store.read(key)) for key in changed)):
             self._boxes[key] = states[key], box
 
-    def _elect(self, keys: list[TileKey], min_views: int, sights: Sights) -> None:
-        """Elect tiles that changed, or round which one did, or that more views look at."""
+    def _elect(self, keys: list[TileKey], min_views: int, sights: Sights, beside: bool) -> None:
+        """Elect tiles that changed; if `beside`, also those round which one did or that new views look at."""
         known = frozenset(keys)
 
-        def state(key: TileKey) -> object:
+        def state(key: TileKey) -> tuple[object, ...]:
             box = self._boxes[key][1]
             views: Int64 = np.flatnonzero(sights.touching(*box)) if box is not None else np.empty(0, np.int64)
-            return views.tobytes(), tuple(self._boxes.get(other, (None,))[0] for other in _around(key))
+            around = tuple(self._boxes.get(other, (None,))[0] for other in _around(key))
+            return self._boxes[key][0], views.tobytes(), around
 
         def elect_tile(item: tuple[TileKey, Float32]) -> TileKey:
             key, tile = item
@@ -139,12 +145,12 @@ class SurfaceElection:
             return key
 
         states = {key: state(key) for key in keys}
-        changed = [key for key in keys if key not in self._winners or self._winners[key][0] != states[key]]
+        changed = _changed(states, self._winners, beside)
         for key in ordered_map(elect_tile, ((key, self._store.read(key)) for key in changed)):
-            self._winners[key] = states[key], self._winners.get(key, (None, 0))[1] + 1
+            self._winners[key] = states[key], (self._winners[key][1] if key in self._winners else 0) + 1
 
-    def _finish(self, keys: list[TileKey], sights: Sights) -> None:
-        """Average, sharpen and fill tiles that were elected anew, or round which one was."""
+    def _finish(self, keys: list[TileKey], sights: Sights, beside: bool) -> None:
+        """Average, sharpen and fill tiles that were elected anew; if `beside`, also those round them."""
         known = frozenset(keys)
 
         def finish_tile(key: TileKey) -> tuple[TileKey, _Figures]:
@@ -154,11 +160,12 @@ class SurfaceElection:
             part.write(self._finished, key)
             return key, _figures(key, layers)
 
-        states = {
-            key: (self._height_m, tuple(self._winners.get(other, (None, 0))[1] for other in _around(key)))
+        turns = {key: turn for key, (_, turn) in self._winners.items()}
+        states: dict[TileKey, tuple[object, ...]] = {
+            key: ((turns[key], self._height_m), tuple(turns.get(other, 0) for other in _around(key)))
             for key in keys
         }
-        changed = [key for key in keys if key not in self._figures or self._figures[key][0] != states[key]]
+        changed = _changed(states, self._figures, beside)
         for key, figures in ordered_map(finish_tile, changed):
             self._figures[key] = states[key], figures
 
@@ -194,6 +201,17 @@ class SurfaceElection:
             for name in (tile_file, cloud_file):
                 os.link(name(self._finished, key), name(folder, key))
         return folder
+
+
+def _changed(
+    states: dict[TileKey, tuple[object, ...]],
+    done: Mapping[TileKey, tuple[tuple[object, ...], object]],
+    beside: bool,
+) -> list[TileKey]:
+    """Tiles that weren't done in the state they are in: its first part is their own, the rest is of what lies
+    round them."""
+    part = slice(None) if beside else slice(1)
+    return [key for key, state in states.items() if key not in done or done[key][0][part] != state[part]]
 
 
 def _around(key: TileKey) -> list[TileKey]:
