@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -47,12 +47,13 @@ class Snapshot:
     """The map as it stands. surface: None while nothing is seen by two views, or no encoders say where.
 
     poses_from: `crane`, the encoders' poses, until `finish` estimates them from all sensors. frames: in the
-    map.
+    map. owner: the session, in whose folder the surface lies.
     """
 
     surface: Surface | None
     frames: int
     poses_from: str = "crane"
+    owner: object = field(default=None, repr=False)
 
     @cached_property
     def height_map(self) -> HeightMap | None:
@@ -134,7 +135,7 @@ class Session:
             return Snapshot(None, 0 if held is None else len(held.placed))
         sights = Sights.of(held.placed, self._rectifier.camera, held.per_pixel)
         surface = held.election.snapshot(self._settings.map.min_views, sights)
-        return Snapshot(surface, len(held.placed))
+        return Snapshot(surface, len(held.placed), owner=self)
 
     def finish(self) -> Yard:
         """The yard from all packets, as `measure` has it of the same recording."""
