@@ -14,7 +14,8 @@ from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Surface, finish
+from barsight.mapping.surface import Surface
+from barsight.mapping.surface_election import SurfaceElection
 from barsight.mapping.tiles import TileStore
 
 
@@ -56,7 +57,8 @@ def fused(
     for one in views:
         fuse(store, one, settings)
         poses.append(high_above(one, cell_m))
-    return finish(store, folder, cell_m, settings.min_views, settings, Sights.of(poses, FAR_CAMERA))
+    election = SurfaceElection(store, folder, cell_m, settings)
+    return election.finish(settings.min_views, Sights.of(poses, FAR_CAMERA))
 
 
 HEIGHT_M = 5000.0

@@ -1,17 +1,22 @@
 """The same files from one recording: killed at any moment and gone on with, whatever is matched early."""
 
 import json
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from barsight import pipeline
+from barsight.calibration.rig_file import write_rig_file
+from barsight.checkpoint import checkpoint_folder, once
 from barsight.cli.main import run
-from barsight.kept import keeping_folder, once
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
-from cli_runs import FAST
+from cli_runs import FAST, cut_short, pictures
 
 SAME = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
 
@@ -37,7 +42,7 @@ def test_a_killed_run_goes_on(
     in_one_go, out, keep = folder / "one", folder / "out", folder / ".out.resume"
     assert run(["measure", str(recording), "-o", str(in_one_go), *FAST]) == 0
     command = ["measure", str(recording), "-o", str(out), *FAST, "--resume"]
-    for stage, call in (("make_estimator", 1), ("fuse", 2), ("finish", 1)):
+    for stage, call in (("make_estimator", 1), ("fuse", 2), ("SurfaceElection", 1)):
         with monkeypatch.context() as patch:
             killed_at(patch, stage, call)
             assert run(command) == 130
@@ -85,11 +90,11 @@ def counting_matches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-def test_other_settings_start_anew(tmp_path: Path) -> None:
-    first = keeping_folder(tmp_path / "kept", "a" * 64)
+def test_another_key_starts_anew(tmp_path: Path) -> None:
+    first = checkpoint_folder(tmp_path / "kept", "a" * 64)
     assert once(first, "x", lambda: 1) == 1
     assert once(first, "x", lambda: 2) == 1
-    second = keeping_folder(tmp_path / "kept", "b" * 64)
+    second = checkpoint_folder(tmp_path / "kept", "b" * 64)
     assert once(second, "x", lambda: 2) == 2
     assert not first.exists()
     assert once(None, "x", lambda: 3) == 3
@@ -99,3 +104,69 @@ def test_a_failure_leaves_nothing_to_go_on_from(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
         once(tmp_path, "x", lambda: 1 // 0)
     assert list(tmp_path.iterdir()) == []
+
+
+def change_a_picture(recording: Path) -> tuple[str, ...]:
+    first = pictures(recording, "cam0")[0]
+    picture = cv2.imread(str(first), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    picture[100:110, 100:110] ^= 1
+    cv2.imwrite(str(first), picture)
+    return ()
+
+
+def change_the_rig(recording: Path) -> tuple[str, ...]:
+    rig = recording.parent / "rig.yaml"
+    own = open_recording(recording).rig
+    write_rig_file(rig, replace(own, timeshift_cam_imu_ns=own.timeshift_cam_imu_ns + 1_000_000))
+    return ("--recording.rig", str(rig))
+
+
+def change_a_setting(recording: Path) -> tuple[str, ...]:
+    return ("--map.fill-m", "0.1")
+
+
+@pytest.mark.parametrize("change", [change_a_picture, change_the_rig, change_a_setting, None])
+def test_checkpoints_hold_only_for_what_made_them(
+    recording: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[Path], tuple[str, ...]] | None,
+) -> None:
+    command = ["measure", str(recording), "-o", str(recording.parent / "out"), *FAST, "--resume"]
+    with monkeypatch.context() as patch:
+        killed_at(patch, "SurfaceElection", 1)
+        assert run(command) == 130
+    flags = ("--bundles.slice-m", "0.3") if change is None else change(recording)
+    with monkeypatch.context() as patch:
+        matched = counting_matches(patch)
+        assert run([*command, *flags]) == 0
+    assert len(matched) == (0 if change is None else 4)
+    capsys.readouterr()
+
+
+def test_torn_checkpoints_are_made_anew(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One cut short, one with a wrong bit, one empty, one that is a pickle."""
+    one, out = recording.parent / "one", recording.parent / "out"
+    assert run(["measure", str(recording), "-o", str(one), *FAST]) == 0
+    command = ["measure", str(recording), "-o", str(out), *FAST, "--resume"]
+    with monkeypatch.context() as patch:
+        killed_at(patch, "SurfaceElection", 1)
+        assert run(command) == 130
+    trajectory, *kept = sorted(recording.parent.glob(".out.resume/*/*.npz"), reverse=True)
+    assert trajectory.stem == "trajectory"
+    cut_short(trajectory)
+    content = bytearray(kept[0].read_bytes())
+    content[len(content) // 2] ^= 1
+    kept[0].write_bytes(content)
+    kept[1].write_bytes(b"")
+    kept[2].write_bytes(pickle.dumps({"tree": 1}))
+    with monkeypatch.context() as patch:
+        matched = counting_matches(patch)
+        assert run(command) == 0
+    assert len(matched) == 3
+    for name in SAME:
+        assert (out / name).read_bytes() == (one / name).read_bytes(), name
+    capsys.readouterr()

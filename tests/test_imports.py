@@ -14,9 +14,11 @@ FLOORS = {
     "motion": 3,
     "mapping": 4,
     "yard": 5,
-    "measurement": 6, "evaluation": 6, "result_folder": 6, "kept": 6,
+    "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "board_views": 6,
     "report": 7, "pipeline": 7, "simulation": 7, "plant": 7, "viewer": 7,
-    "cli": 8,
+    "result": 8, "pair_matching": 8, "measure_folder": 8,
+    "api": 9, "session": 9,
+    "cli": 10,
 }  # fmt: skip
 ROOT = Path(barsight.__file__).parent
 OPTIONAL_ONCE = ("viser", "plotly", "rosbags")

@@ -12,7 +12,8 @@ from barsight.mapping.election import Sights, first_heights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Layers, finish
+from barsight.mapping.surface import Layers
+from barsight.mapping.surface_election import SurfaceElection
 from barsight.mapping.tiles import FIELDS, SLOTS, VIEWS, TileStore, Z
 from mapping_views import FAR_CAMERA, block, high_above, view
 
@@ -56,7 +57,11 @@ def surface_of(views: list[CellObservations], folder: Path) -> Layers:
     for one in views:
         fuse(store, one, MapSettings())
     sights = Sights.of([pose_at(x) for x in EYES_X_M], CAMERA)
-    return finish(store, folder, CELL_M, 2, MapSettings(fill_m=0.0), sights).window(-200, 0, 400, 12)
+    return (
+        SurfaceElection(store, folder, CELL_M, MapSettings(fill_m=0.0))
+        .finish(2, sights)
+        .window(-200, 0, 400, 12)
+    )
 
 
 def test_what_is_seen_is_elected_and_what_hangs_in_the_air_is_not(tmp_path: Path) -> None:
@@ -129,7 +134,7 @@ def test_views_with_few_points_a_cell_owe_few_votes(tmp_path: Path) -> None:
         one = view(x[hit], y[hit], np.zeros(int(hit.sum())))
         fuse(store, one, MapSettings())
         poses.append(high_above(one, 0.01))
-    surface = finish(store, tmp_path, 0.01, 2, MapSettings(fill_m=0.0), Sights.of(poses, far))
+    surface = SurfaceElection(store, tmp_path, 0.01, MapSettings(fill_m=0.0)).finish(2, Sights.of(poses, far))
     known = surface.window(0, 0, 60, 60).source == Source.VISION
     np.testing.assert_array_equal(known.ravel(), votes >= 2)
 
@@ -148,7 +153,10 @@ def test_beneath_a_surface_that_the_border_cuts_off_nothing_is_known(
         fuse(store, view(x, y, top_m), MapSettings())
     sights = Sights.of([pose_at(eye) for eye in EYES_X_M], camera)
     known = np.isfinite(
-        finish(store, tmp_path, CELL_M, 2, MapSettings(fill_m=0.0), sights).window(-30, 0, 60, 43).z_m
+        SurfaceElection(store, tmp_path, CELL_M, MapSettings(fill_m=0.0))
+        .finish(2, sights)
+        .window(-30, 0, 60, 43)
+        .z_m
     )
     assert known[38:42, 30:].any() == known_beneath
     assert known[10:25, 30:].all()

@@ -6,10 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barsight.core.pose import Pose
 from barsight.core.types import Source
+from barsight.mapping.election import Sights
+from barsight.mapping.fusion import fuse
+from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Layers, fill_gaps
-from mapping_views import block, fused, view
+from barsight.mapping.surface import Layers, fill_gaps, read_tile
+from barsight.mapping.surface_election import SurfaceElection
+from barsight.mapping.tiles import TileStore
+from mapping_views import FAR_CAMERA, block, fused, high_above, view
 
 
 def height_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -178,3 +184,53 @@ def test_the_cloud_agrees_with_the_surface_on_bars(tmp_path: Path) -> None:
     beneath = np.full((60, 60), np.nan)
     beneath[row[~top], column[~top]] = sigma[~top]
     np.testing.assert_allclose(beneath, layers.sigma_m, rtol=0.1)
+
+
+def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
+    """Views along a way, a snapshot after each: the last surface has the bytes of one without snapshots,
+    tiles far behind aren't elected anew, and the first snapshot still shows what it showed."""
+    settings = MapSettings(along_m=0.1)
+    rng = np.random.default_rng(5)
+    views = []
+    for step in range(6):
+        x, y = block(300, 90, 200 * step, 200)
+        bars = 0.5 + np.sqrt(0.03**2 - (0.01 * x % 0.06 - 0.03) ** 2)
+        views += [view(x, y, bars + rng.normal(0, 0.002, x.shape), 0.002) for _ in range(2)]
+    ends = {}
+    for kind in ("once", "often"):
+        folder = tmp_path / kind
+        folder.mkdir()
+        store, poses, shown = TileStore(folder, 64), [], []
+        election = SurfaceElection(store, folder, 0.01, settings)
+        for one in views:
+            fuse(store, one, settings)
+            poses.append(low_above(one))
+            if kind == "often":
+                shown.append(election.snapshot(2, Sights.of(poses, CAMERA)))
+        if shown:
+            first = shown[1].window(0, 200, 300, 90)
+            assert np.isfinite(first.z_m).mean() > 0.9
+            elected = [t.stat().st_ino for t in sorted(shown[-2].folder.glob("surface_0_*"))]
+            assert elected == [t.stat().st_ino for t in sorted(shown[-1].folder.glob("surface_0_*"))]
+        surface = election.finish(2, Sights.of(poses, CAMERA))
+        clouds = [
+            np.concatenate([getattr(p, n).ravel() for n in ("xyz_m", "sigma_z_m")]) for p in surface.cloud()
+        ]
+        files = {path.name: path.read_bytes() for path in surface.folder.glob("*.npy")}
+        ends[kind] = surface, files, np.concatenate(clouds).tobytes()
+        if shown:
+            read_tile.cache_clear()
+            np.testing.assert_array_equal(shown[1].window(0, 200, 300, 90).z_m, first.z_m)
+    assert ends["once"][1:] == ends["often"][1:]
+    assert len(ends["once"][1]) == len(surface.tiles) > 8
+    assert ends["once"][0].seen == ends["often"][0].seen > 100_000
+    assert replace(ends["once"][0], folder=tmp_path) == replace(ends["often"][0], folder=tmp_path)
+
+
+CAMERA = replace(FAR_CAMERA, focal_px=1000.0, cx_px=150.0, cy_px=150.0, width=300, height=300)
+
+
+def low_above(one: CellObservations) -> Pose:
+    """A camera 10 m above a view's middle that sees 3 m."""
+    pose = high_above(one, 0.01)
+    return replace(pose, translation=np.array([*pose.translation[:2], 10.5]))

@@ -17,4 +17,4 @@ def on_page_content(content: str, **_: object) -> str:
 
 def _rendered(match: re.Match[str]) -> str:
     display = "block" if match[2] == "[" else "inline"
-    return convert(html.unescape(match[3]).strip(), display=display)
+    return str(convert(html.unescape(match[3]).strip(), display=display))

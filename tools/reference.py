@@ -14,16 +14,16 @@ import io
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NoReturn, get_type_hints
+from typing import Any, NoReturn, cast, get_type_hints
 
 import docstring_parser
 import tyro
-from reference_codes import codes_page
-from reference_schemas import schemas_page
-from reference_settings import Use, settings_page, shown, type_text, walk
 
 import barsight
 from barsight.cli import main
+from reference_codes import codes_page
+from reference_schemas import schemas_page
+from reference_settings import Use, settings_page, shown, type_text, walk
 
 PAGES = Path(__file__).parents[1] / "docs" / "reference"
 PACKAGE = Path(barsight.__file__).parent
@@ -74,7 +74,7 @@ def _reached(*words: str) -> tuple[Callable[..., None] | None, str]:
     def stop(function: Callable[..., None], **_: object) -> NoReturn:
         raise Parsed(function)
 
-    parse, tyro.cli = tyro.cli, stop
+    parse, tyro.cli = tyro.cli, cast(Any, stop)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
@@ -109,9 +109,10 @@ def _section(command: Command) -> str:
     for name, parameter in inspect.signature(command.function).parameters.items():
         use = Use.of(name, hints[name])
         if dataclasses.is_dataclass(use.kind):
-            anchor = use.kind.__name__.lower()
+            kind = cast(type, use.kind)
+            anchor = kind.__name__.lower()
             where = f"`--{use.prefix}.*`" if use.prefix else "flags without a prefix"
-            taken.append(f"[`{use.kind.__name__}`](settings.md#{anchor}) ({where})")
+            taken.append(f"[`{kind.__name__}`](settings.md#{anchor}) ({where})")
             continue
         default = "required" if parameter.default is inspect.Parameter.empty else shown(parameter.default)
         said = " ".join(about.get(name, "").split())

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
+from typing import Any
 
 
-def codes_page(error: type, vetoes: dict[str, str], warnings: dict[str, str], interrupted: int) -> str:
+def codes_page(error: type[Any], vetoes: dict[str, str], warnings: dict[str, str], interrupted: int) -> str:
     """error: the root of the exceptions that end a run, each with its `exit_code`."""
     exits = {0: "Done."}
     for kind in _family(error):
@@ -22,8 +23,9 @@ def codes_page(error: type, vetoes: dict[str, str], warnings: dict[str, str], in
     )
 
 
-def _family(kind: type) -> list[type]:
-    return [kind, *(below for child in kind.__subclasses__() for below in _family(child))]
+def _family(kind: type[Any]) -> list[type[Any]]:
+    children: list[type[Any]] = kind.__subclasses__()
+    return [kind, *(below for child in children for below in _family(child))]
 
 
 def _table(head: str, rows: dict[str, str]) -> str:

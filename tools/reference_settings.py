@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import tyro
 
-_POSITIONAL = tyro.conf.Positional[int].__metadata__[0]
+_POSITIONAL = cast(Any, tyro.conf.Positional[int]).__metadata__[0]
 _NAMES = {int: "whole number", float: "number", str: "text", bool: "yes or no", Path: "path"}
 
 
@@ -99,10 +99,11 @@ def documented(kind: type) -> dict[str, str]:
     """The docstring after each field of a class and its bases, on one line."""
     said: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body
-        for field, after in pairwise(body):
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(tree, ast.ClassDef)
+        for field, after in pairwise(tree.body):
             if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                said[field.target.id] = _cell(str(after.value.value))
+                said[ast.unparse(field.target)] = _cell(str(ast.literal_eval(after.value)))
     return said
 
 

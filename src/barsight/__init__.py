@@ -1,5 +1,64 @@
-"""Barsight: measure a yard of steel bars from a travelling crane with two cameras and an IMU."""
+"""Barsight: measure a yard of steel bars from a travelling crane with two cameras and an IMU.
 
-from importlib.metadata import version
+import barsight as bs
+yard = bs.measure("recording", preset="fast")
+yard.height_map, yard.bundles, yard.lifts
+yard.save("out")
+"""
 
-__version__ = version("barsight")
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from barsight.api import calibrate_stereo, disparity, load, measure, open_recording, packets
+    from barsight.calibration.rig import StereoRig
+    from barsight.calibration.stereo_calibration import StereoCalibration
+    from barsight.core.errors import BarsightError
+    from barsight.core.types import Contour, Disparity
+    from barsight.pipeline import MeasureSettings
+    from barsight.result import Lifts, LiftTarget, Yard
+    from barsight.result_folder import CameraPath
+    from barsight.session import Session, Snapshot
+    from barsight.yard.types import Bundle, HeightMap
+
+    __version__: str
+
+__all__ = [
+    "BarsightError", "Bundle", "CameraPath", "Contour", "Disparity", "HeightMap", "LiftTarget", "Lifts",
+    "MeasureSettings", "Session", "Snapshot", "StereoCalibration", "StereoRig", "Yard", "__version__",
+    "calibrate_stereo", "disparity", "load", "measure", "open_recording", "packets",
+]  # fmt: skip
+
+_HOMES = {
+    "barsight.api": ("calibrate_stereo", "disparity", "load", "measure", "open_recording", "packets"),
+    "barsight.calibration.rig": ("StereoRig",),
+    "barsight.calibration.stereo_calibration": ("StereoCalibration",),
+    "barsight.core.errors": ("BarsightError",),
+    "barsight.core.types": ("Contour", "Disparity"),
+    "barsight.pipeline": ("MeasureSettings",),
+    "barsight.result": ("LiftTarget", "Lifts", "Yard"),
+    "barsight.result_folder": ("CameraPath",),
+    "barsight.session": ("Session", "Snapshot"),
+    "barsight.yard.types": ("Bundle", "HeightMap"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name on its first use [PEP 562]."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: Any = version("barsight")
+    else:
+        home = next((home for home, names in _HOMES.items() if name in names), None)
+        if home is None:
+            raise AttributeError(f"module 'barsight' has no attribute {name!r}")
+        value = getattr(importlib.import_module(home), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

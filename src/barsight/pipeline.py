@@ -7,22 +7,22 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 import barsight
 from barsight.calibration.rectification import Rectifier
 from barsight.calibration.rig_uncertainty import disparity_sigma_px
+from barsight.checkpoint import checkpoint_folder, once, pictures_digest
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.memory import give_back
+from barsight.core.memory import give_back, peak_memory_mib
 from barsight.core.parallel import begun_map, beside
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
@@ -30,14 +30,14 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory
 from barsight.evaluation.agreement import agree
-from barsight.kept import keeping_folder, once
 from barsight.mapping.contours import cut_contours
 from barsight.mapping.election import Sights
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse
 from barsight.mapping.look import apart, apart_by_encoders, choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Surface, finish
+from barsight.mapping.surface import Surface
+from barsight.mapping.surface_election import SurfaceElection
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import Matched, Matcher, Neighbour, Placer
 from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, digest, plain
@@ -49,12 +49,13 @@ from barsight.recording.sensors import imu_hints
 from barsight.stereo.settings import StereoSettings, make_method
 from barsight.yard.bundle_settings import BundleSettings
 from barsight.yard.bundles import find_bundles
-from barsight.yard.lift import map_vetoes, plan_lifts
+from barsight.yard.lift import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet import Magnet, load_magnet
 from barsight.yard.stock_list import match_stock, read_stock, stock_warnings
 from barsight.yard.stretches import surface_map
 from barsight.yard.travel import Travel
+from barsight.yard.types import Bundle, YardMap
 
 Advance = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
@@ -136,11 +137,11 @@ def measure(
     configuration, inputs = plain(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
-        kept = keeping_folder(resume, digest([barsight.__version__, configuration, inputs]))
+        kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
 
     matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), rectifier, watch)
     early = _known_early(source, settings, rectifier, first.range_m)
-    match = _match(matcher, kept)
+    match = matching(matcher, kept)
     # Pictures are matched on the core that the trajectory leaves idle.
     begun = islice(source.frames(early), len(early))
     with ExitStack() as pools:
@@ -162,7 +163,7 @@ def measure(
         matched: Iterator[Matched | Refusal] = ahead
         if late is not None:
             rest = source.frames({stamp for stamp in poses if stamp >= late})
-            match = _match(replace(matcher, rectifier=rectifier), kept)
+            match = matching(replace(matcher, rectifier=rectifier), kept)
             after = pools.enter_context(begun_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
 
@@ -199,7 +200,7 @@ def measure(
     with watch("surface"):
         min_views = settings.map.min_views if used > 1 else 1
         sights = Sights.of(placed, rectifier.camera, per_pixel)
-        surface = finish(store, scratch, cell_m, min_views, settings.map, sights)
+        surface = SurfaceElection(store, scratch, cell_m, settings.map).finish(min_views, sights)
         give_back()
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")
@@ -239,18 +240,12 @@ def measure(
     if refusals:
         warnings.append(Notice("frames-refused", f"{len(refusals)} of {frames_total} frames were refused"))
     with watch("lifts"):
-        told = [(notice.code, notice.message) for notice in warnings]
-        captured_to_ns = int(trajectory.stamp_ns[-1])
-        now_ns = time.time_ns() if judged_at == "now" else captured_to_ns
-        forbidden = map_vetoes(
-            told, trajectory.reference, captured_to_ns, now_ns, settings.lift, has_magnet=magnet is not None
-        )
+        crane_shift_ns = source.rig.timeshift_cam_imu_ns
         window_ns = seconds_to_ns(settings.motion.crane.window_s)
-        shift_ns = source.rig.timeshift_cam_imu_ns
-        travel = Travel.of(trajectory, source.crane(), shift_ns, window_ns, first.range_m, rectifier.camera)
-        lifts = plan_lifts(
-            heights, bundles, magnet or load_magnet(None), settings.lift, forbidden, travel, now_ns
+        travel = Travel.of(
+            trajectory, source.crane(), crane_shift_ns, window_ns, first.range_m, rectifier.camera
         )
+        lifts = _lifts(heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at)
     return Measurement(
         recording_path=source.path,
         recording_format=source.format,
@@ -271,13 +266,34 @@ def measure(
         stages=tuple(StageTime(*entry) for entry in watch.entries()),
         warnings=tuple(warnings),
         seconds=time.perf_counter() - start,
-        peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        peak_memory_mib=peak_memory_mib(),
         preview=preview,
         bundles=bundles,
         lifts=lifts,
         stock=stock,
         travel=travel,
     )
+
+
+def _lifts(
+    heights: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet | None, settings: LiftSettings,
+    warnings: list[Notice], trajectory: Trajectory, travel: Travel, judged_at: Literal["now", "end"],
+) -> LiftPlan:  # fmt: skip
+    """Choose lifts, judged now or at the last frame."""
+    told = [(notice.code, notice.message) for notice in warnings]
+    captured_to_ns = int(trajectory.stamp_ns[-1])
+    now_ns = time.time_ns() if judged_at == "now" else captured_to_ns
+    forbidden = map_vetoes(
+        told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=magnet is not None
+    )
+    return plan_lifts(heights, bundles, magnet or load_magnet(None), settings, forbidden, travel, now_ns)
+
+
+def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
+    """A digest of all that trajectory and disparities depend on."""
+    stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
+    rig = plain(asdict(recording.rig))
+    return digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
 
 
 def _known_early(
@@ -299,7 +315,11 @@ def _known_early(
     return frozenset(chosen[:_MATCHED_AHEAD])
 
 
-def _match(matcher: Matcher, kept: Path | None) -> Callable[[StereoFrame | RefusedFrame], Matched | Refusal]:
+def matching(
+    matcher: Matcher, kept: Path | None
+) -> Callable[[StereoFrame | RefusedFrame], Matched | Refusal]:
+    """Match frames, each once for all runs that keep checkpoints in `kept`."""
+
     def match(frame: StereoFrame | RefusedFrame) -> Matched | Refusal:
         if isinstance(frame, RefusedFrame):
             return Refusal("recording", frame)

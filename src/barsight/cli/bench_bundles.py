@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
 import time
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from barsight.cli.measure import measure_into
 from barsight.core.errors import ConfigError
 from barsight.evaluation.bundle_scores import (
     BundleErrors,
@@ -24,6 +22,7 @@ from barsight.evaluation.bundle_scores import (
     score_bundles,
 )
 from barsight.evaluation.stereo_provenance import write_json
+from barsight.measure_folder import measure_into
 from barsight.pipeline import MeasureSettings
 from barsight.result_folder import read_heights
 from barsight.simulation.bundle_bench import bench_bundles, rendered_yards
@@ -112,5 +111,5 @@ def _measured(folder: Path, settings: SimulationSettings) -> tuple[Path, Path]:
     if not recording.is_dir():
         simulate(recording, settings)
     if not (out / "result.json").is_file():
-        measure_into(recording, out, MeasureSettings(), Console(file=io.StringIO()))
+        measure_into(recording, out, MeasureSettings())
     return recording, out

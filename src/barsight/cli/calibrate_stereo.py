@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from barsight.calibration.board_detection import detect
-from barsight.calibration.boards import Board, parse_board
-from barsight.calibration.detection_files import has_detections, read_detections
+from barsight.board_views import views_from_detections, views_from_pictures
+from barsight.calibration.boards import parse_board
+from barsight.calibration.detection_files import has_detections
 from barsight.calibration.lens_model import Lens
 from barsight.calibration.rig_file import write_rig_file
 from barsight.calibration.stereo_calibration import StereoCalibration, calibrate_stereo
 from barsight.calibration.stereo_verdict import Verdict, assess, summary_sentence
-from barsight.calibration.views import BoardView, Corners, Removed
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
-from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.errors import ConfigError
 from barsight.core.files import atomic_path, expect_output
-from barsight.core.parallel import ordered_map
-from barsight.core.types import RefusedFrame
-from barsight.recording.open import BAG_KINDS, open_recording
-from barsight.recording.picture_pairs import ReadPair, find_pairs, read_pair_files
 from barsight.report.calibration_page import write_calibration_report
 
 COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.REDO: "red"}
-Size = tuple[int, int]
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -62,10 +55,10 @@ def run(arguments: Sequence[str]) -> None:
         console = Console(stderr=True)
         target = parse_board(board)
         if pictures.is_dir() and has_detections(pictures):
-            views, sizes, left_out = _from_detections(pictures, target, most_views, resolution)
+            views, sizes, left_out = views_from_detections(pictures, target, most_views, resolution)
         else:
             with stages(console) as advance:
-                views, sizes, left_out = _from_pictures(pictures, target, most_views, advance)
+                views, sizes, left_out = views_from_pictures(pictures, target, most_views, advance)
         calibration = calibrate_stereo(views, target, lens, sizes, pictures, left_out)
         assessment = assess(calibration, range_m)
         html, data = out.with_suffix(".html"), out.with_suffix(".json")
@@ -87,75 +80,6 @@ def _expect(out: Path, range_m: float, most_views: int) -> None:
         raise ConfigError(f"--range-m {range_m:g} can't be; give the working distance in metres")
     if most_views < 6:
         raise ConfigError(f"--most-views {most_views} is too few; give 6 or more")
-
-
-def _from_detections(
-    folder: Path, board: Board, most_views: int, resolution: str | None
-) -> tuple[list[BoardView], tuple[Size, Size], list[Removed]]:
-    try:
-        width, height = (int(part) for part in (resolution or "").lower().split("x"))
-    except ValueError:
-        raise ConfigError(
-            f"detections need the cameras' --resolution as WIDTHxHEIGHT, not {resolution!r}"
-        ) from None
-    views = read_detections(folder, board)
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(most_views, len(views))).astype(int))
-    return [views[n] for n in chosen], ((width, height), (width, height)), []
-
-
-def _from_pictures(
-    path: Path, board: Board, most_views: int, advance: Callable[[str, int, int], None]
-) -> tuple[list[BoardView], tuple[Size, Size], list[Removed]]:
-    count, pairs = _pairs(path, most_views)
-    views: list[BoardView] = []
-    left_out: list[Removed] = []
-    sizes: list[Size | None] = [None, None]
-    found = ordered_map(lambda pair: _detected(board, pair), pairs)
-    for done, (pair, corners) in enumerate(found, 1):
-        advance("corners", done, count)
-        left_out += [Removed(pair.name, camera, reason) for camera, reason in pair.problems]
-        usable: list[Corners | None] = [None, None]
-        for camera, (image, result) in enumerate(zip((pair.left, pair.right), corners, strict=True)):
-            if image is None or result is None:
-                continue
-            size = (image.shape[1], image.shape[0])
-            first = sizes[camera] or size
-            sizes[camera] = first
-            if size != first:
-                reason = f"is {size[0]}x{size[1]}, the first picture is {first[0]}x{first[1]}"
-                left_out.append(Removed(pair.name, f"cam{camera}", f"{reason}: of another camera"))
-            elif isinstance(result, Failed):
-                left_out.append(Removed(pair.name, f"cam{camera}", result.reason))
-            else:
-                usable[camera] = result
-        if usable != [None, None]:
-            views.append(BoardView(pair.name, usable[0], usable[1]))
-    if sizes[0] is None or sizes[1] is None:
-        raise InputError(path, "no picture can be read", "check the files")
-    return views, (sizes[0], sizes[1]), left_out
-
-
-def _pairs(path: Path, most: int) -> tuple[int, Sequence[ReadPair] | map[ReadPair]]:
-    """How many pairs, and the pairs: of a bag through its reader, of a folder file by file."""
-    is_bag = path.suffix in BAG_KINDS or (path / "metadata.yaml").is_file()
-    if is_bag:
-        recording = open_recording(path)
-        total = len(recording.index.stamps_ns)
-        step = max(-(-total // most), 1)
-        frames = [frame for n, frame in enumerate(recording.frames()) if n % step == 0]
-        return len(frames), [
-            ReadPair(str(f.stamp_ns), None, None, (("both", f.reason),))
-            if isinstance(f, RefusedFrame)
-            else ReadPair(str(f.stamp_ns), f.left, f.right, ())
-            for f in frames
-        ]
-    found = find_pairs(path)
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).astype(int))
-    return len(chosen), map(read_pair_files, [found[n] for n in chosen])
-
-
-def _detected(board: Board, pair: ReadPair) -> tuple[ReadPair, list[Corners | Failed | None]]:
-    return pair, [None if image is None else detect(board, image) for image in (pair.left, pair.right)]
 
 
 def _print(console: Console, calibration: StereoCalibration, out: Path, html: Path) -> None:

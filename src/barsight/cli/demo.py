@@ -10,10 +10,11 @@ import tyro
 from rich.console import Console
 
 from barsight.cli.arguments import call
-from barsight.cli.measure import measure_into, print_outcome
+from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_path
+from barsight.measure_folder import measure_into
 from barsight.pipeline import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
@@ -41,9 +42,11 @@ def run(arguments: Sequence[str]) -> None:
         with atomic_path(magnet) as path:
             path.write_text(example_magnet(), encoding="utf-8")
         console.print("Measuring it; lifts are chosen for the example magnet, as of the recording's end ...")
-        content = measure_into(
-            recording, result, MeasureSettings(), console, truth_of=recording, magnet=magnet, judged_at="end"
-        )
+        with stages(console) as advance:
+            content = measure_into(
+                recording, result, MeasureSettings(), advance=advance, truth_of=recording, magnet=magnet,
+                judged_at="end",
+            )  # fmt: skip
         print_outcome(content, console, verbose=False)
         console.print(f"report: {result / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
         console.print(f"in 3D:  barsight view {result}", soft_wrap=True, highlight=False, markup=False)

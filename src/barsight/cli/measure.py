@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,14 +14,8 @@ from rich.table import Table
 
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
-from barsight.core.errors import OutputError
-from barsight.core.files import atomic_directory
-from barsight.evaluation.truth import score
-from barsight.pipeline import MeasureSettings, measure
-from barsight.recording.open import open_recording
-from barsight.report.files import RESULT_FILES, summary, write_results, write_summary, write_surface
-from barsight.report.page import write_report
-from barsight.yard.magnet import load_magnet
+from barsight.measure_folder import measure_into
+from barsight.pipeline import MeasureSettings
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -59,56 +52,15 @@ def run(arguments: Sequence[str]) -> None:
             verbose: Print the time that each stage took.
         """
         console = Console(stderr=True)
-        measured = measure_into(
-            recording, out, settings, console, overwrite=overwrite, resume=resume, magnet=magnet, judged_at=at
-        )
+        with stages(console) as advance:
+            measured = measure_into(
+                recording, out, settings, advance=advance, overwrite=overwrite, resume=resume, magnet=magnet,
+                judged_at=at,
+            )  # fmt: skip
         print_outcome(measured, console, verbose=verbose)
         console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "measure", arguments)
-
-
-def measure_into(
-    path: Path,
-    out: Path,
-    settings: MeasureSettings,
-    console: Console,
-    *,
-    overwrite: bool = False,
-    resume: bool = False,
-    truth_of: Path | None = None,
-    magnet: Path | None = None,
-    judged_at: Literal["now", "end"] = "now",
-) -> dict[str, Any]:
-    """Measure, write all files and the report into `out`, and return what result.json says.
-
-    resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
-    truth_of: a recording with truth to score against; only after the measuring is done.
-    judged_at: when lifts are judged, see `barsight.pipeline.measure`.
-    """
-    if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
-        raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
-    recording = open_recording(path, settings.recording)
-    keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
-    described = load_magnet(magnet) if magnet is not None else None
-    with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
-        scratch = staging / "scratch"
-        scratch.mkdir()
-        with stages(console) as advance:
-            measured = measure(
-                recording, settings, scratch, advance, keep, described,
-                lambda surface, free: write_surface(surface, free, staging), judged_at,
-            )  # fmt: skip
-        content = summary(measured)
-        write_results(measured, staging)
-        shutil.rmtree(scratch)
-        if truth_of is not None:
-            content["truth"] = score(truth_of, staging)
-        write_summary(content, staging / "result.json")
-        write_report(staging, staging / "report.html")
-    if keep is not None:
-        shutil.rmtree(keep, ignore_errors=True)
-    return content
 
 
 def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -> None:

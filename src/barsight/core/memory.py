@@ -1,10 +1,19 @@
-"""Memory that was freed, given back to the system."""
+"""The memory of this process: its peak, and giving back what was freed."""
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
 from functools import cache
+
+
+def peak_memory_mib() -> float:
+    """The most that this process has held so far; NaN where the system doesn't tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return float("nan")
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def give_back() -> None:

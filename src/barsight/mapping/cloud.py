@@ -52,15 +52,18 @@ class CloudPart:
         return replace(self, xyz_m=xyz, sigma_z_m=np.where(self.elected, sigma_m.ravel()[self.cell], beside))
 
     def write(self, folder: Path, key: TileKey) -> None:
-        """Into the tile's file."""
-        np.savez(_file(folder, key), **{field.name: getattr(self, field.name) for field in fields(self)})
+        """Write the tile's file anew: links to an older one keep what they show."""
+        path = cloud_file(folder, key)
+        path.unlink(missing_ok=True)
+        np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
 
 
 def read_part(folder: Path, key: TileKey) -> CloudPart:
     """The tile's points as they were written last."""
-    with np.load(_file(folder, key)) as part:
+    with np.load(cloud_file(folder, key)) as part:
         return CloudPart(**part)
 
 
-def _file(folder: Path, key: TileKey) -> Path:
+def cloud_file(folder: Path, key: TileKey) -> Path:
+    """Name the file of a tile's points."""
     return folder / f"cloud_{key[0]}_{key[1]}.npz"

@@ -18,7 +18,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, Int8, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.mapping.lines_of_sight import STRIDE, density, free, inside, may_be_covered
@@ -55,9 +55,14 @@ class Sights:
             np.array([pose.apply(both) for pose in poses]).reshape(-1, 2, 3),
         )
 
-    def pixel_m(self, z_m: Float32) -> Float32:
-        """How wide a pixel is on the ground at heights z_m, seen from the views' median height."""
-        above = np.abs(np.float32(np.median(self.eyes[..., 2])) - z_m)
+    @property
+    def height_m(self) -> float:
+        """The cameras' median height."""
+        return float(np.median(self.eyes[..., 2]))
+
+    def pixel_m(self, z_m: Float32, height_m: float) -> Float32:
+        """The width of a pixel on the ground at heights z_m, m, seen from height_m."""
+        above = np.abs(np.float32(height_m) - z_m)
         return np.asarray(above / np.float32(self.camera.focal_px), np.float32)
 
     def planes(self) -> Float64:
@@ -74,15 +79,20 @@ class Sights:
         high = [(size - 1 - _BORDER_PX) * depth - place for place, size in sides]
         return np.ascontiguousarray(np.moveaxis(np.array(low + high), 1, 2))
 
-    def near(self, low_m: Float64, high_m: Float64) -> Sights:
-        """Those views alone whose left picture may hold something of the box from low_m to high_m (3,)."""
+    def touching(self, low_m: Float64, high_m: Float64) -> Bool:
+        """(K,) whether a view's left picture may hold something of the box from low_m to high_m (3,)."""
         corners = np.array(list(product(*zip(low_m, high_m, strict=True))))
         x, y, depth = np.moveaxis(corners @ self.rotation.mT + self.translation[:, None], -1, 0)
         camera = self.camera
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = camera.focal_px * x / depth + camera.cx_px, camera.focal_px * y / depth + camera.cy_px
         touched = (u.max(1) >= 0) & (u.min(1) <= camera.width) & (v.max(1) >= 0) & (v.min(1) <= camera.height)
-        chosen = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
+        chosen: Bool = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
+        return chosen
+
+    def near(self, low_m: Float64, high_m: Float64) -> Sights:
+        """Those views alone that are `touching` the box."""
+        chosen = self.touching(low_m, high_m)
         return replace(
             self,
             rotation=self.rotation[chosen],
@@ -124,11 +134,10 @@ def elect(
     """
     known = np.isfinite(around)
     ceiling = float(around[known].max()) if known.any() else 0.0
-    held = tile[..., Z][tile[..., VIEWS] >= min_views]
-    if held.size == 0:
+    box = supported_box(tile, key, cell_m, min_views)
+    if box is None:
         return np.full(tile.shape[:2], -1, np.int8)
     corner = np.array(key, np.float64) * TILE_CELLS
-    box = np.array([[*corner, held.min() / cell_m], [*(corner + TILE_CELLS), held.max() / cell_m]]) * cell_m
     sights = sights.near(*box)
     around = np.where(known, around, _NOTHING)
     roof = np.asarray(cv2.dilate(around, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)), np.float32)
@@ -137,6 +146,17 @@ def elect(
         cell_m / sights.spacing_rad,
     )  # fmt: skip
     return _elected(tile, share, expected, cell_m, float(min_views), settings.own_share, settings.along_share)
+
+
+def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) -> Float64 | None:
+    """(2, 3) m, the lowest and the highest corner of the heights that min_views support; None without any."""
+    held = tile[..., Z][tile[..., VIEWS] >= min_views]
+    if held.size == 0:
+        return None
+    corner = np.array(key, np.float64) * TILE_CELLS
+    low, high = held.min() / cell_m, held.max() / cell_m
+    box: Float64 = np.array([[*corner, low], [*(corner + TILE_CELLS), high]]) * cell_m
+    return box
 
 
 @kernel()

@@ -102,7 +102,7 @@ def apart(frames: Sequence[PosedFrame], rectifier: Rectifier, range_m: float, le
     ahead = np.array([0.0, 0.0, range_m])
     seen = [(frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead) for frame in frames]
     stamps = [frame.stamp_ns for frame in frames]
-    return set(_spread(stamps, np.array(seen), _least_way_m(rectifier.camera, range_m, least_shift)))
+    return set(_spread(stamps, np.array(seen), least_way_m(rectifier.camera, range_m, least_shift)))
 
 
 def apart_by_encoders(
@@ -116,10 +116,11 @@ def apart_by_encoders(
     start = int(crane.stamp_ns[0])
     at, known = (np.asarray(times) - start for times in (np.array(stamps_ns) + shift_ns, crane.stamp_ns))
     places = np.column_stack([np.interp(at, known, axis) for axis in crane.position_m.T])
-    return _spread(stamps_ns, places, _least_way_m(camera, range_m, least_shift))
+    return _spread(stamps_ns, places, least_way_m(camera, range_m, least_shift))
 
 
-def _least_way_m(camera: RectifiedCamera, range_m: float, least_shift: float) -> float:
+def least_way_m(camera: RectifiedCamera, range_m: float, least_shift: float) -> float:
+    """The way on a surface range_m away that least_shift of a picture's shorter side spans, m."""
     return least_shift * min(camera.width, camera.height) * range_m / camera.focal_px
 
 

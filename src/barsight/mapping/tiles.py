@@ -31,23 +31,23 @@ class TileStore:
         self._scratch = scratch
         self._resident = resident
         self._held: OrderedDict[TileKey, Float32] = OrderedDict()
-        self._known: set[TileKey] = set()
+        self._versions: dict[TileKey, int] = {}
 
     def keys(self) -> list[TileKey]:
         """All tiles that hold anything, in a fixed order."""
-        return sorted(self._known)
+        return sorted(self._versions)
 
     def take(self, key: TileKey) -> Float32:
         """The tile to read and write; a fresh one where there is none yet."""
         tile = self._held.pop(key, None)
         if tile is None:
             self.hold(self._resident - 1)
-            if key in self._known:
+            if key in self._versions:
                 tile = np.load(self._file(key))
             else:
                 tile = np.zeros((TILE_CELLS, TILE_CELLS, SLOTS, FIELDS), np.float32)
-                self._known.add(key)
         self._held[key] = tile
+        self._versions[key] = self._versions.get(key, 0) + 1
         return tile
 
     def hold(self, most: int) -> None:
@@ -61,11 +61,16 @@ class TileStore:
         tile = self._held.get(key)
         return np.load(self._file(key)) if tile is None else tile
 
-    def drop(self, key: TileKey) -> None:
-        """Forget a tile."""
-        self._held.pop(key, None)
-        self._known.discard(key)
-        self._file(key).unlink(missing_ok=True)
+    def version(self, key: TileKey) -> int:
+        """Count how often a tile was taken; 0 where there is none."""
+        return self._versions.get(key, 0)
+
+    def clear(self) -> None:
+        """Forget all tiles."""
+        for key in self._versions:
+            self._file(key).unlink(missing_ok=True)
+        self._held.clear()
+        self._versions.clear()
 
     def _file(self, key: TileKey) -> Path:
         return self._scratch / f"slots_{key[0]}_{key[1]}.npy"

@@ -7,11 +7,12 @@ All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, count
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
+from barsight.core.errors import ConfigError
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,36 @@ class HeightMap:
         """(rows, columns)."""
         rows, columns = self.z_m.shape
         return rows, columns
+
+    @property
+    def x_m(self) -> Float64:
+        """(columns,) the cells' centres."""
+        return np.asarray(self.x0_m + self.cell_m * np.arange(self.shape[1]), np.float64)
+
+    @property
+    def y_m(self) -> Float64:
+        """(rows,) the cells' centres."""
+        return np.asarray(self.y0_m + self.cell_m * np.arange(self.shape[0]), np.float64)
+
+    def to_xarray(self) -> Any:
+        """The same as an xarray.Dataset with coordinates `y` and `x` and units as attributes.
+
+        Raises ConfigError where xarray isn't installed.
+        """
+        try:
+            from xarray import Dataset
+        except ImportError as error:
+            raise ConfigError("xarray isn't installed; pip install 'barsight[notebook]'") from error
+        units = {"z_m": "m", "sigma_m": "m", "views": "1", "source": "0 unknown 1 vision 2 laser 3 filled"}
+        layers = {name: (("y", "x"), getattr(self, name), {"units": unit}) for name, unit in units.items()}
+        centres = {"y": ("y", self.y_m, {"units": "m"}), "x": ("x", self.x_m, {"units": "m"})}
+        return Dataset(layers, centres, {"cell_m": self.cell_m})
+
+    def _repr_html_(self) -> str:
+        """A picture of the heights for a notebook."""
+        from barsight.yard.map_picture import picture_html
+
+        return picture_html(self)
 
     def part(self, rows: slice, columns: slice) -> HeightMap:
         """A rectangle of the map, by cells from start to stop; the arrays are shared."""

@@ -1,0 +1,118 @@
+"""The Python API: what `import barsight as bs` offers, each a thin call of the library."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from barsight.board_views import views_from_pictures
+from barsight.calibration.boards import parse_board
+from barsight.calibration.lens_model import Lens
+from barsight.calibration.rig import StereoRig
+from barsight.calibration.stereo_calibration import StereoCalibration
+from barsight.calibration.stereo_calibration import calibrate_stereo as solve_stereo
+from barsight.core.arrays import UInt8
+from barsight.core.errors import ConfigError
+from barsight.core.types import Disparity
+from barsight.measure_folder import measure_into, unheard
+from barsight.pair_matching import match_pictures
+from barsight.pipeline import Advance, MeasureSettings
+from barsight.recording.open import open_recording as open_path
+from barsight.recording.packets import packets as packets
+from barsight.recording.stored import Source
+from barsight.result import Yard
+from barsight.stereo.settings import StereoSettings
+
+
+def open_recording(path: Path | str) -> Source:
+    """The recording at `path`: an EuRoC folder, a ROS bag or a KITTI sequence. Raises InputError."""
+    return open_path(Path(path))
+
+
+def measure(
+    recording: Path | str,
+    *,
+    preset: Literal["best", "fast"] = "best",
+    magnet: Path | str | None = None,
+    at: Literal["now", "end"] = "now",
+    advance: Advance = unheard,
+    **settings: Any,
+) -> Yard:
+    """Measure a recording; the files lie in a temporary folder, which goes with the yard unless saved.
+
+    magnet: TOML file of the magnet that lifts are chosen for; without it none is offered. at: when lifts are
+    judged: now, or at the recording's end, to look back. advance: told of progress (stage, done, total).
+    settings: fields of `MeasureSettings`; those of a stage as a mapping, `map={"cell_m": 0.02}`.
+    Raises a BarsightError whose text is one line where nothing can be measured.
+    """
+    chosen: MeasureSettings = with_settings(MeasureSettings(), {"preset": preset, **settings})
+    described = None if magnet is None else Path(magnet)
+    out = Path(tempfile.mkdtemp(prefix="barsight."))
+    try:
+        measure_into(
+            Path(recording), out, chosen, advance=advance, magnet=described, judged_at=at, report=False
+        )
+    except BaseException:
+        shutil.rmtree(out, ignore_errors=True)
+        raise
+    yard = Yard(out)
+    weakref.finalize(yard, shutil.rmtree, out, ignore_errors=True)
+    return yard
+
+
+def load(folder: Path | str) -> Yard:
+    """The yard of a folder that `barsight measure` or `Yard.save` wrote. Raises InputError."""
+    return Yard(Path(folder))
+
+
+def disparity(
+    left: Path | str | UInt8,
+    right: Path | str | UInt8,
+    *,
+    rig: Path | str | StereoRig | None = None,
+    range_px: tuple[int, int] | None = None,
+    **settings: Any,
+) -> Disparity:
+    """Match two pictures: the left one's disparity and its sigma, px, NaN where there is no match.
+
+    left, right: files or (H, W) uint8, rectified unless a rig is given. range_px: candidates from, to; found
+    from the pictures if None. settings: fields of `StereoSettings`.
+    """
+    chosen: StereoSettings = with_settings(StereoSettings(), settings)
+    if range_px is not None:
+        chosen = replace(chosen, lowest_disparity_px=range_px[0], highest_disparity_px=range_px[1])
+    first, second = (Path(one) if isinstance(one, str) else one for one in (left, right))
+    return match_pictures(first, second, chosen, Path(rig) if isinstance(rig, str) else rig)[1]
+
+
+def calibrate_stereo(
+    pictures: Path | str, board: str, *, lens: str = Lens.RADTAN4.value, max_views: int = 150
+) -> StereoCalibration:
+    """Calibrate two cameras from pictures of a board that both see; `.rig` is what measuring needs.
+
+    pictures, board, lens: as `barsight calibrate stereo` takes them.
+    """
+    known = [one.value for one in Lens]
+    if lens not in known:
+        raise ConfigError(f"lens is {lens!r}; give one of {', '.join(known)}")
+    target, path = parse_board(board), Path(pictures)
+    views, sizes, left_out = views_from_pictures(path, target, max_views, unheard)
+    return solve_stereo(views, target, Lens(lens), sizes, path, left_out)
+
+
+def with_settings(default: Any, told: Mapping[str, Any]) -> Any:
+    """A settings record with some fields told, nested ones as mappings. Raises ConfigError."""
+    known = sorted(field.name for field in fields(default))
+    for name in told:
+        if name not in known:
+            raise ConfigError(f"{type(default).__name__} has no {name!r}; it has {', '.join(known)}")
+    parts = {
+        name: with_settings(getattr(default, name), part) if isinstance(part, Mapping) else part
+        for name, part in told.items()
+    }
+    return replace(default, **parts)

@@ -1,0 +1,128 @@
+"""Checkpoints of a run: results kept whole as data beside the output until the run ends well."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import zipfile
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from barsight.core.errors import Failed
+from barsight.core.files import atomic_path
+from barsight.core.motion_detail import Inertial, InSigmas, MotionDetail, Relative
+from barsight.core.pose import Pose
+from barsight.core.types import (
+    Disparity,
+    PosedFrame,
+    RectifiedCamera,
+    RectifiedPair,
+    RefusedFrame,
+    RigDrift,
+    Trajectory,
+)
+from barsight.mapping.view import Matched
+from barsight.recording.base import Recording
+from barsight.recording.picture_files import PictureFiles
+
+T = TypeVar("T")
+
+_KEPT: dict[str, Any] = {
+    kind.__name__: kind
+    for kind in (
+        Trajectory, PosedFrame, RefusedFrame, Pose, RigDrift, MotionDetail, Inertial, InSigmas, Relative,
+        Matched, RectifiedPair, RectifiedCamera, Disparity, Failed,
+    )
+}  # fmt: skip
+_TORN = (OSError, EOFError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile)
+"""What reading raises on a file that is cut short or is something else."""
+
+
+def checkpoint_folder(root: Path, key: str) -> Path:
+    """Make the folder of one measurement under `root`; what stands there under other keys is removed.
+
+    key: tells all that the results depend on.
+    """
+    folder = root / key[:32]
+    root.mkdir(parents=True, exist_ok=True)
+    for other in root.iterdir():
+        if other != folder:
+            shutil.rmtree(other)
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def pictures_digest(recording: Recording) -> str:
+    """SHA-256 over all picture files of a recording; empty for a bag, whose file `digests` has whole."""
+    if not isinstance(recording, PictureFiles):
+        return ""
+    found = hashlib.sha256()
+    for image in recording.stored_images():
+        found.update(f"{image.camera} {image.stamp_ns} {len(image.data)} ".encode())
+        found.update(image.data)
+    return found.hexdigest()
+
+
+def once(folder: Path | None, name: str, make: Callable[[], T]) -> T:
+    """make()'s result, or what an earlier run kept of it under this name; without a folder nothing is kept.
+
+    The file appears whole or not at all; one that is torn is made anew.
+    """
+    if folder is None:
+        return make()
+    file = folder / f"{name}.npz"
+    if file.is_file():
+        try:
+            kept: T = read_checkpoint(file)
+        except _TORN:
+            pass
+        else:
+            return kept
+    made = make()
+    with atomic_path(file) as path:
+        write_checkpoint(made, path)
+    return made
+
+
+def write_checkpoint(value: Any, path: Path) -> None:
+    """Write frozen records as an npz file: the arrays, and a tree of all else as JSON."""
+    arrays: dict[str, Any] = {}
+    tree = json.dumps(_plain(value, arrays)).encode()
+    with path.open("wb") as stream:
+        np.savez(stream, tree=np.frombuffer(tree, np.uint8), **arrays)
+
+
+def read_checkpoint(path: Path) -> Any:
+    """Read back what `write_checkpoint` wrote."""
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        return _record(json.loads(file["tree"].tobytes()), file)
+
+
+def _plain(value: Any, arrays: dict[str, Any]) -> Any:
+    if isinstance(value, np.ndarray):
+        name = f"a{len(arrays)}"
+        arrays[name] = value
+        return {"array": name}
+    if is_dataclass(value):
+        kind = type(value).__name__
+        content = {field.name: _plain(getattr(value, field.name), arrays) for field in fields(value)}
+        assert kind in _KEPT, f"{kind} is kept nowhere"
+        return {"kind": kind, "fields": content}
+    if isinstance(value, tuple):
+        return [_plain(item, arrays) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _record(tree: Any, arrays: Any) -> Any:
+    if isinstance(tree, list):
+        return tuple(_record(item, arrays) for item in tree)
+    if not isinstance(tree, dict):
+        return tree
+    if "array" in tree:
+        return arrays[tree["array"]]
+    return _KEPT[tree["kind"]](**{name: _record(item, arrays) for name, item in tree["fields"].items()})

@@ -1,0 +1,85 @@
+"""Measure a recording into a folder of result files."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, Literal
+
+from barsight.core.errors import OutputError
+from barsight.core.files import atomic_directory
+from barsight.evaluation.truth import score
+from barsight.pipeline import Advance, MeasureSettings, measure
+from barsight.recording.base import Recording
+from barsight.recording.open import open_recording
+from barsight.report.files import RESULT_FILES, summary, write_results, write_summary, write_surface
+from barsight.report.page import write_report
+from barsight.yard.magnet import load_magnet
+
+
+def unheard(stage: str, done: int, total: int) -> None:
+    """Take progress that nobody asked for."""
+
+
+def measure_into(
+    path: Path,
+    out: Path,
+    settings: MeasureSettings,
+    *,
+    advance: Advance = unheard,
+    overwrite: bool = False,
+    resume: bool = False,
+    truth_of: Path | None = None,
+    magnet: Path | None = None,
+    judged_at: Literal["now", "end"] = "now",
+    report: bool = True,
+) -> dict[str, Any]:
+    """Measure, write all files and, if asked, the report into `out`; return what result.json says.
+
+    resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
+    truth_of: a recording with truth to score against; only after the measuring is done. judged_at: when
+    lifts are judged, see `barsight.pipeline.measure`.
+    """
+    if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
+        raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
+    keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
+    content = write_measured(
+        open_recording(path, settings.recording), out, settings, advance=advance, overwrite=overwrite,
+        keep=keep, truth_of=truth_of, magnet=magnet, judged_at=judged_at, report=report,
+    )  # fmt: skip
+    if keep is not None:
+        shutil.rmtree(keep, ignore_errors=True)
+    return content
+
+
+def write_measured(
+    recording: Recording,
+    out: Path,
+    settings: MeasureSettings,
+    *,
+    advance: Advance = unheard,
+    overwrite: bool = False,
+    keep: Path | None = None,
+    truth_of: Path | None = None,
+    magnet: Path | None = None,
+    judged_at: Literal["now", "end"] = "now",
+    report: bool = True,
+) -> dict[str, Any]:
+    """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from."""
+    described = load_magnet(magnet) if magnet is not None else None
+    with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
+        scratch = staging / "scratch"
+        scratch.mkdir()
+        measured = measure(
+            recording, settings, scratch, advance, keep, described,
+            lambda surface, free: write_surface(surface, free, staging), judged_at,
+        )  # fmt: skip
+        content = summary(measured)
+        write_results(measured, staging)
+        shutil.rmtree(scratch)
+        if truth_of is not None:
+            content["truth"] = score(truth_of, staging)
+        write_summary(content, staging / "result.json")
+        if report:
+            write_report(staging, staging / "report.html")
+    return content

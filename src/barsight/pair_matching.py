@@ -1,0 +1,123 @@
+"""The disparity of one pair of pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.any_rig_file import read_rig_file
+from barsight.calibration.rectification import Rectifier
+from barsight.calibration.rig import StereoRig
+from barsight.core.arrays import UInt8
+from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, MeasurementError
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
+from barsight.evaluation.stereo_scenes import pair_from_images
+from barsight.mapping.view import disparity_range
+from barsight.recording.images import TornImageError, decode_with_colour
+from barsight.stereo.disparity_range import nothing_to_match
+from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
+from barsight.stereo.settings import MethodName, StereoSettings, make_method
+
+Picture = Path | UInt8
+"""A file, or (H, W) uint8."""
+_IN_COLOUR: tuple[MethodName, ...] = ("csca",)
+"""Methods that look at colours."""
+_REMEDIES = {
+    "swapped": "exchange the two pictures or give --range A:B",
+    "same-image": "give two pictures of one pair",
+}
+_LEAST_SIZE = (3, 16)
+"""Rows and columns below which nothing is matched."""
+
+
+def match_pictures(
+    left: Picture, right: Picture, settings: StereoSettings, rig: Path | StereoRig | None = None
+) -> tuple[RectifiedPair, Disparity]:
+    """Match two pictures, rectified unless a rig is given: the rectified pair and its disparity.
+
+    Raises InputError, CalibrationError, ConfigError or MeasurementError where they can't be matched.
+    """
+    pair = _pair(left, right, rig, settings.method)
+    candidates = disparity_range(pair, settings)
+    if isinstance(candidates, Failed):
+        if candidates.code not in _REMEDIES:
+            raise MeasurementError(f"{_name(left)}: {candidates.reason}")
+        raise InputError(_name(left), candidates.reason, _REMEDIES[candidates.code])
+    _expect_inside(candidates, pair)
+    disparity = make_method(settings)(pair, candidates)
+    if disparity.coverage == 0:
+        span = f"no pixel has a match from {candidates.lowest_px} to {candidates.highest_px} px"
+        raise MeasurementError(f"{_name(left)}: {nothing_to_match(pair) or span}")
+    return pair, disparity
+
+
+def _name(picture: Picture) -> Path:
+    return picture if isinstance(picture, Path) else Path("picture")
+
+
+def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: MethodName) -> RectifiedPair:
+    """The rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
+    (left_grey, left_colour), (right_grey, right_colour) = _read(left), _read(right)
+    frame = StereoFrame(0, left_grey, right_grey)
+    colours = None
+    if method in _IN_COLOUR and left_colour is not None and right_colour is not None:
+        colours = left_colour, right_colour
+    if rig is not None:
+        rectifier = Rectifier(rig if isinstance(rig, StereoRig) else read_rig_file(rig))
+        pair = rectifier(frame)
+        if isinstance(pair, Failed):
+            named = rig if isinstance(rig, Path) else _name(left)
+            raise CalibrationError(named, pair.reason, "give the rig of these pictures")
+        if colours is not None:
+            pair = _with_colours(pair, rectifier, *colours)
+    else:
+        if frame.left.shape != frame.right.shape:
+            sizes = " and ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (frame.left, frame.right))
+            raise InputError(
+                _name(right), f"the pictures' sizes differ ({sizes})", "give two pictures of one pair"
+            )
+        pair = pair_from_images(frame.left, frame.right, *(colours or ()))
+    if any(side < least for side, least in zip(pair.left.shape, _LEAST_SIZE, strict=True)):
+        rows, columns = _LEAST_SIZE
+        size = f"{pair.camera.width}x{pair.camera.height}"
+        raise InputError(
+            _name(left), f"is {size}: {columns}x{rows} at least can be matched", "give whole pictures"
+        )
+    offset = vertical_offset(pair.left, pair.right)
+    if not isinstance(offset, Failed) and offset > MOST_OFFSET_PX:
+        remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their --rig"
+        raise InputError(
+            _name(left), f"the pair is not rectified: matches lie {offset:.1f} px off their rows", remedy
+        )
+    return pair
+
+
+def _with_colours(pair: RectifiedPair, rectifier: Rectifier, left: UInt8, right: UInt8) -> RectifiedPair:
+    channels = [rectifier(StereoFrame(0, left[:, :, one], right[:, :, one])) for one in range(3)]
+    pairs = [one for one in channels if not isinstance(one, Failed)]
+    left, right = np.dstack([one.left for one in pairs]), np.dstack([one.right for one in pairs])
+    return replace(pair, left_colour=left, right_colour=right)
+
+
+def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
+    if not isinstance(path, Path):
+        if path.dtype != np.uint8 or path.ndim != 2:
+            raise InputError("picture", "is no (H, W) array of uint8", "give grey levels, or a file")
+        return path, None
+    try:
+        return decode_with_colour(path.read_bytes())
+    except OSError as error:
+        raise InputError(path, f"can't be read ({error.strerror})", "check the name") from error
+    except TornImageError as error:
+        raise InputError(path, str(error), "give another picture") from error
+
+
+def _expect_inside(candidates: DisparityRange, pair: RectifiedPair) -> None:
+    """Raises ConfigError where no candidate, or more than the picture's width of them, can be."""
+    width = pair.camera.width
+    if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
+        raise ConfigError(
+            f"the range {candidates.lowest_px}:{candidates.highest_px} doesn't fit a picture {width} px wide"
+        )

@@ -1,0 +1,89 @@
+"""The Python API: a recording measured as in a notebook."""
+
+import gc
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import barsight as bs
+from barsight.cli.main import run
+from cli_runs import FAST
+
+NOTEBOOK: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
+
+
+def test_a_notebook_measures_looks_and_saves(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same files as from the command line, and what they say as arrays."""
+    yard = bs.measure(whole, **NOTEBOOK)
+    heights = yard.height_map
+    assert heights.z_m.shape == heights.sigma_m.shape == (heights.y_m.size, heights.x_m.size)
+    np.testing.assert_allclose(np.diff(heights.x_m), 0.05)
+    assert np.isfinite(heights.z_m).mean() > 0.5
+    contour = yard.contours[0]
+    row = int(np.abs(heights.y_m - contour.y_m[0]).argmin())
+    known = np.isfinite(contour.z_m)
+    near = np.interp(contour.x_m[known], heights.x_m, np.nan_to_num(heights.z_m[row]))
+    assert np.median(np.abs(near - contour.z_m[known])) < 0.02
+    assert yard.trajectory.position_m.shape == (4, 3)
+    assert len(yard.lifts) + len(yard.lifts.refused) <= max(1, len(yard.bundles))
+    assert 'src="data:image/png;base64,' in yard._repr_html_()
+    saved = yard.save(tmp_path / "saved")
+    assert (saved / "report.html").stat().st_size > 100_000
+    assert run(["measure", str(whole), "-o", str(tmp_path / "out"), *FAST]) == 0
+    for name in ("height.tif", "contour.csv", "trajectory.tum", "bundles.json", "lifts.json"):
+        assert (saved / name).read_bytes() == (tmp_path / "out" / name).read_bytes(), name
+    with pytest.raises(bs.BarsightError, match="not empty"):
+        yard.save(saved)
+    np.testing.assert_array_equal(bs.load(saved).height_map.z_m, heights.z_m)
+    folder = yard.folder
+    del yard, heights
+    gc.collect()
+    assert not folder.exists()
+    capsys.readouterr()
+
+
+def test_misspelt_settings_and_missing_recordings_say_so(tmp_path: Path) -> None:
+    with pytest.raises(bs.BarsightError, match=r"MapSettings has no 'cel_m'; it has .*cell_m"):
+        bs.measure(tmp_path, map={"cel_m": 0.05})
+    with pytest.raises(bs.BarsightError, match="no such file"):
+        bs.open_recording(tmp_path / "none")
+    with pytest.raises(bs.BarsightError, match=r"no result\.json"):
+        bs.load(tmp_path)
+    with pytest.raises(bs.BarsightError, match="lens is 'round'; give one of"):
+        bs.calibrate_stereo(tmp_path, "checkerboard:9x6:0.025", lens="round")
+
+
+def test_a_disparity_of_two_arrays() -> None:
+    rng = np.random.default_rng(1)
+    scene = rng.integers(0, 255, (80, 240), np.uint8)
+    found = bs.disparity(scene[:, :200], scene[:, 12:212], range_px=(0, 32), method="sgbm")
+    inner = found.disparity_px[10:-10, 60:-20]
+    assert np.isfinite(inner).mean() > 0.9
+    assert abs(float(np.nanmedian(inner)) - 12) < 0.1
+
+
+def test_without_xarray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = np.zeros((2, 3), np.float32)
+    heights = bs.HeightMap(1.0, 2.0, 0.5, one, one, one, one.astype(np.uint8))
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "xarray", None)
+        with pytest.raises(bs.BarsightError, match=r"barsight\[notebook\]"):
+            heights.to_xarray()
+    dataset = pytest.importorskip("xarray") and heights.to_xarray()
+    assert dataset.z_m.sel(x=2.0, y=2.5).item() == 0
+
+
+def test_importing_loads_nothing_heavy_and_needs_no_unix() -> None:
+    code = "import sys; sys.modules['resource'] = None; import barsight as bs; print({names})"
+    light = code.format(names="[n for n in ('numpy', 'cv2', 'numba', 'scipy') if n in sys.modules]")
+    assert subprocess.check_output([sys.executable, "-c", light], text=True).strip() == "[]"
+    every = code.format(names="[n for n in bs.__all__ if getattr(bs, n) is None]")
+    assert subprocess.check_output([sys.executable, "-c", every], text=True).strip() == "[]"
+    with pytest.raises(AttributeError, match="no attribute 'mesure'"):
+        bs.mesure  # noqa: B018

@@ -1,0 +1,56 @@
+"""Packets pushed one by one: snapshots on the way, and at the end the bytes of the batch."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import barsight as bs
+from barsight.api import with_settings
+from barsight.core.types import StereoFrame
+
+SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
+FILES = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply", "bundles.json", "lifts.json")
+
+
+def test_packets_with_snapshots_end_as_the_batch(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    session = bs.Session(
+        recording.rig, with_settings(bs.MeasureSettings(), SETTINGS), imu_noise=recording.imu_noise()
+    )
+    shown = []
+    for packet in bs.packets(recording):
+        session.push(packet)
+        if isinstance(packet, StereoFrame):
+            shown.append(session.snapshot())
+    assert shown[0].surface is None
+    assert [one.frames for one in shown] == sorted(one.frames for one in shown)
+    last = session.snapshot()
+    assert last.frames >= 2 and last.poses_from == "crane"
+    batch = bs.measure(whole, **SETTINGS)
+    yard = session.finish()
+    for name in FILES:
+        assert (yard.folder / name).read_bytes() == (batch.folder / name).read_bytes(), name
+    heights, final = last.height_map, yard.height_map
+    assert heights is not None
+    x, y = (
+        np.intersect1d(np.rint(a / 0.05), np.rint(b / 0.05))
+        for a, b in ((heights.x_m, final.x_m), (heights.y_m, final.y_m))
+    )
+    parts = [
+        one.z_m[np.ix_(np.isin(np.rint(one.y_m / 0.05), y), np.isin(np.rint(one.x_m / 0.05), x))]
+        for one in (heights, final)
+    ]
+    assert np.isfinite(parts[0]).mean() > 0.3
+    assert np.nanmedian(np.abs(parts[0] - parts[1])) < 0.01
+
+
+def test_a_late_packet_is_refused(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    session = bs.Session(recording.rig)
+    first, second = (frame for frame, _ in zip(recording.frames(), range(2), strict=False))
+    session.push(second)
+    with pytest.raises(bs.BarsightError, match="comes late; push packets in time's order"):
+        session.push(first)
+    assert session.snapshot().surface is None
