@@ -21,7 +21,7 @@ from barsight.cli.measure import measure_into
 from barsight.pipeline import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
-from barsight.yard.magnet import example_magnet
+from barsight.yard.lifting.magnet import example_magnet
 
 BARS = (
     "90mm:7", "60mm:7", "40mm:19", "90mm:7,40mm:19", "60mm:19", "40mm:37", "50mm:7,90mm:7", "60mm:19,25mm:37",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.types import RectifiedCamera, RectifiedPair
-from barsight.features.patches import PatchPair, patch_pair
+from barsight.features.patch_alignment import PatchPair, patch_pair
 from synthetic_scenes import Texture, quantised
 
 CAMERA = RectifiedCamera(900.0, 320.0, 240.0, 0.4, 0.0, 640, 480)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.boards import parse_board
-from barsight.calibration.camera import Camera, Distortion
-from barsight.calibration.views import BoardView, Corners
+from barsight.calibration.boards.board import parse_board
+from barsight.calibration.boards.board_views import BoardView, Corners
+from barsight.calibration.geometry.camera import Camera, Distortion
 
 SIZE = (1280, 1024)
 RADTAN = Distortion.RADTAN

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from barsight.yard.assess import Lift, Yard, assess
-from barsight.yard.footprint import BundleTable, Placement
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet import Magnet, load_magnet
-from barsight.yard.stability import footings
+from barsight.yard.lifting.assessment import Lift, Yard, assess
+from barsight.yard.lifting.footprint import BundleTable, Placement
+from barsight.yard.lifting.magnet import Magnet, load_magnet
+from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle, BundleSigma, HeightMap
 from yard_maps import Laid, draw
 

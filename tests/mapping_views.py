@@ -10,12 +10,12 @@ import numpy as np
 
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
-from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Surface
-from barsight.mapping.surface_election import SurfaceElection
+from barsight.mapping.surface.height_selection import Sights
+from barsight.mapping.surface.incremental import SurfaceElection
+from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.camera import Camera
-from barsight.calibration.documents import ImuNoise
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 from barsight.recording.base import FrameIndex

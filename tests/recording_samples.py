@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from barsight.recording.stored import Source
+from barsight.recording.stored_images import Source
 
 DATA = Path(os.environ.get("BARSIGHT_DATA", Path(__file__).parents[1] / "../shared/data")).resolve()
 WIDTH, HEIGHT = 64, 48

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.calibration.documents import ImuNoise
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples
-from barsight.features.guided import project_stereo
+from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import GRAVITY_MPS2
-from barsight.motion.sightings import Sighting
-from barsight.recording.truth import GroundTruth
+from barsight.motion.frontend.tracking import Sighting
+from barsight.recording.formats.ground_truth import GroundTruth
 from motion_recordings import MemoryRecording, ideal_rig
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -68,7 +68,7 @@ def steady(
 
 def with_motion(sightings: list[Sighting], poses: list[Pose], rectifier: Rectifier) -> tuple[Sighting, ...]:
     """As the front end tells the motion since the sighting before."""
-    from barsight.features.guided import PredictedMotion
+    from barsight.features.guided_matching import PredictedMotion
 
     told = [sightings[0]]
     for k in range(1, len(sightings)):

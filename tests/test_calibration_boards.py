@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.calibration.board_detection import detect
-from barsight.calibration.boards import parse_board
-from barsight.calibration.views import Corners
+from barsight.calibration.boards.board import parse_board
+from barsight.calibration.boards.board_views import Corners
+from barsight.calibration.boards.detection import detect
 from barsight.core.errors import ConfigError, Failed
 from barsight.simulation.board import draw_board
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from barsight.calibration.camera import Camera, Distortion
+from barsight.calibration.geometry.camera import Camera, Distortion
 
 CAMERAS = {
     "none": (Distortion.NONE, ()),

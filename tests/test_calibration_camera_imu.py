@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.arrow_system import predicted
-from barsight.calibration.board_shape import bent
-from barsight.calibration.boards import Board
-from barsight.calibration.camera_imu_calibration import (
+from barsight.calibration.boards.board import Board
+from barsight.calibration.boards.board_views import BoardView, Corners
+from barsight.calibration.boards.board_warp import bent
+from barsight.calibration.camera_imu.arrowhead_system import predicted
+from barsight.calibration.camera_imu.calibration import (
     CameraImuCalibration,
     calibrate_camera_imu,
     mount_differences,
 )
-from barsight.calibration.camera_imu_problem import Mount, Problem, State, linearise, moved
-from barsight.calibration.camera_imu_setup import prepare
-from barsight.calibration.rig import StereoRig
-from barsight.calibration.views import BoardView, Corners
+from barsight.calibration.camera_imu.problem import Mount, Problem, State, linearise, moved
+from barsight.calibration.camera_imu.setup import prepare
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError
 from barsight.core.types import ImuSamples
 from camera_imu_recordings import BOARD, NOISE, Truth, simulated, true_rig, without_extrinsics

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.camera import Camera, Distortion
-from barsight.calibration.documents import ImuNoise, canonical_pose, read_document
-from barsight.calibration.euroc import read_imu, read_rig, write_imu, write_rig
-from barsight.calibration.kalibr import read_camchain, read_imu_file, write_camchain, write_imu_file
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.files.euroc import read_imu, read_rig, write_imu, write_rig
+from barsight.calibration.files.kalibr import read_camchain, read_imu_file, write_camchain, write_imu_file
+from barsight.calibration.files.yaml_document import ImuNoise, canonical_pose, read_document
+from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError
 from recording_samples import NOISE, camera_yaml, mounts, real
 

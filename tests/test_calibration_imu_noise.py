@@ -5,12 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.imu_noise import ImuNoiseFit, fit_imu_noise, overlapping_allan_variance
-from barsight.calibration.kalibr import read_imu_file
+from barsight.calibration.camera_imu.allan_deviation import (
+    ImuNoiseFit,
+    fit_imu_noise,
+    overlapping_allan_variance,
+)
+from barsight.calibration.files.kalibr import read_imu_file
 from barsight.cli.main import run
 from barsight.core.errors import Failed
 from barsight.core.types import ImuSamples
-from barsight.recording.imu_log import read_imu_log
+from barsight.recording.formats.imu_log import read_imu_log
 
 RATE_HZ, DENSITY, WALK = 100.0, np.array([1.5e-3, 2e-2]), np.array([8e-4, 1e-2])
 

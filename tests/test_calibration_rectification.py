@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.camera import Camera, Distortion
-from barsight.calibration.rectification import Rectifier
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import StereoFrame

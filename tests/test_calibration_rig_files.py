@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.any_rig_file import RigFormat, chosen_rig, read_rig_file, write_any_rig
-from barsight.calibration.board_shape import BentBoard
-from barsight.calibration.calibration_uncertainty import depth_sigma
-from barsight.calibration.camera import Camera, Distortion
-from barsight.calibration.documents import canonical_pose
-from barsight.calibration.lens_model import Lens
-from barsight.calibration.rig import StereoRig
-from barsight.calibration.rig_file import read_board, read_covariance, write_rig_file
-from barsight.calibration.rig_uncertainty import disparity_sigma_px
-from barsight.calibration.stereo_calibration import calibrate_stereo
+from barsight.calibration.boards.board_warp import BentBoard
+from barsight.calibration.files.rig_file import read_board, read_covariance, write_rig_file
+from barsight.calibration.files.rig_formats import RigFormat, chosen_rig, read_rig_file, write_any_rig
+from barsight.calibration.files.yaml_document import canonical_pose
+from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.projection import Lens
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.calibration.stereo.calibration import calibrate_stereo
+from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
+from barsight.calibration.stereo.projection_uncertainty import depth_sigma
 from barsight.cli.main import run
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose

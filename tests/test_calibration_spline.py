@@ -4,7 +4,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.arrow_system import (
+from barsight.calibration.camera_imu.arrowhead_system import (
     LOCAL,
     ROWS,
     Samples,
@@ -16,8 +16,8 @@ from barsight.calibration.arrow_system import (
     pulled,
     step,
 )
-from barsight.calibration.pose_spline import STATE, PoseSpline, inverse_right_jacobian, locate
-from barsight.calibration.spline_kernels import CUMULATIVE, DEGREE, ORDER, rotation_at, weights
+from barsight.calibration.camera_imu.pose_spline import STATE, PoseSpline, inverse_right_jacobian, locate
+from barsight.calibration.camera_imu.spline_kernels import CUMULATIVE, DEGREE, ORDER, rotation_at, weights
 
 STEP_S = 0.1
 

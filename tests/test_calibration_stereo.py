@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.boards import parse_board
-from barsight.calibration.calibration_uncertainty import depth_sigma, sample_pairs, triangulate
-from barsight.calibration.cross_validation import CrossValidation, cross_validate
-from barsight.calibration.detection_files import read_detections
-from barsight.calibration.lens_model import Lens, project
-from barsight.calibration.stereo_calibration import StereoCalibration, calibrate_stereo
-from barsight.calibration.stereo_verdict import Verdict, assess
-from barsight.calibration.views import BoardView
+from barsight.calibration.boards.board import parse_board
+from barsight.calibration.boards.board_views import BoardView
+from barsight.calibration.boards.detection_files import read_detections
+from barsight.calibration.geometry.projection import Lens, project
+from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
+from barsight.calibration.stereo.cross_validation import CrossValidation, cross_validate
+from barsight.calibration.stereo.projection_uncertainty import depth_sigma, sample_pairs, triangulate
+from barsight.calibration.stereo.verdict import Verdict, assess
 from barsight.core.errors import CalibrationError
 from calibration_views import BOARD, CAM0, CAM1, ROTATION, SIZE, TRANSLATION_M, place, seen, simulated
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from barsight.calibration.board_detection import detect
-from barsight.calibration.boards import parse_board
-from barsight.calibration.rig_file import read_covariance
-from barsight.calibration.views import Corners
+from barsight.calibration.boards.board import parse_board
+from barsight.calibration.boards.board_views import Corners
+from barsight.calibration.boards.detection import detect
+from barsight.calibration.files.rig_file import read_covariance
 from barsight.cli.main import run
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.any_rig_file import read_rig_file
-from barsight.calibration.euroc import read_rig
-from barsight.calibration.kalibr import read_camchain, write_imu_file
-from barsight.calibration.rig_file import read_covariance, write_rig_file
-from barsight.calibration.views import BoardView
+from barsight.calibration.boards.board_views import BoardView
+from barsight.calibration.files.euroc import read_rig
+from barsight.calibration.files.kalibr import read_camchain, write_imu_file
+from barsight.calibration.files.rig_file import read_covariance, write_rig_file
+from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.cli.main import run
 from barsight.core.types import ImuSamples
 from camera_imu_recordings import BOARD, NOISE, draw_recording, simulated, true_rig, without_extrinsics

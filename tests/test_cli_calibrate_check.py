@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.rig_file import write_rig_file
+from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
-from barsight.motion.self_calibration import turned_right
+from barsight.motion.rig_check.self_calibration import turned_right
 from barsight.recording.open import open_recording
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.calibration.rig_file import write_rig_file
+from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
 from barsight.stereo.disparity_files import read_disparity
 from motion_recordings import ideal_rig

@@ -11,7 +11,7 @@ import cv2
 import pytest
 
 from barsight import pipeline
-from barsight.calibration.rig_file import write_rig_file
+from barsight.calibration.files.rig_file import write_rig_file
 from barsight.checkpoint import checkpoint_folder, once
 from barsight.cli.main import run
 from barsight.recording.base import RecordingSettings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barsight.core.arrays import Float64
-from barsight.core.levenberg_marquardt import Options, Termination, minimise
+from barsight.core.linalg.levenberg_marquardt import Options, Termination, minimise
 
 OPTIONS = Options(100, 1e-14, 0.0, 1e-6, 1e8)
 

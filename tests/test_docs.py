@@ -17,7 +17,7 @@ import tyro
 
 from barsight.cli import main
 from barsight.core.settings_file import read_settings
-from barsight.yard.magnet import Magnet
+from barsight.yard.lifting.magnet import Magnet
 from cli_runs import FAST
 
 ROOT = Path(__file__).parents[1]

@@ -5,7 +5,7 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.types import Agreement, Contour, LaserProfile, Source
-from barsight.evaluation.agreement import agree, difference, smooth_places
+from barsight.mapping.agreement import agree, difference, smooth_places
 
 X = np.round(5 + 0.01 * np.arange(8), 4)
 

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from barsight.benchmarks.provenance import write_json
+from barsight.benchmarks.stereo.middlebury import bench_stereo, scene_table, stereo_table
+from barsight.benchmarks.stereo.middlebury_scenes import load_scene, load_scenes
+from barsight.benchmarks.stereo.scores import score_disparity
+from barsight.benchmarks.stereo.speed import bench_speed, speed_table
 from barsight.core.errors import InputError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
-from barsight.evaluation.stereo_bench import bench_stereo, scene_table, stereo_table
-from barsight.evaluation.stereo_provenance import write_json
-from barsight.evaluation.stereo_scenes import load_scene, load_scenes
-from barsight.evaluation.stereo_scores import score_disparity
-from barsight.evaluation.stereo_speed import bench_speed, speed_table
 from barsight.stereo.disparity_files import write_disparity
 
 

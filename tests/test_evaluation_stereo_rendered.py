@@ -10,28 +10,24 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.core.errors import Failed
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
-from barsight.evaluation.stereo_bar_edges import bar_diameter, find_outlines, tangent_planes
-from barsight.evaluation.stereo_bar_fit import BarFit, BarGuess, fit_bar
-from barsight.evaluation.stereo_bar_scenes import PosedScene, bar_over_floor, tilted_floor
-from barsight.evaluation.stereo_limit import noise_limit_px
-from barsight.evaluation.stereo_provenance import write_json
-from barsight.evaluation.stereo_render import BAR, FLOOR, Bar, Rendered, render
-from barsight.evaluation.stereo_scenes import pair_from_images
-from barsight.evaluation.stereo_steps import steps_picture
-from barsight.evaluation.stereo_subpixel import (
+from barsight.benchmarks.provenance import write_json
+from barsight.benchmarks.stereo.bar_edges import bar_diameter, find_outlines, tangent_planes
+from barsight.benchmarks.stereo.bar_fit import BarFit, BarGuess, fit_bar
+from barsight.benchmarks.stereo.bar_renderer import BAR, FLOOR, Bar, Rendered, render
+from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, tilted_floor
+from barsight.benchmarks.stereo.cramer_rao_bound import noise_limit_px
+from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
+from barsight.benchmarks.stereo.steps import steps_picture
+from barsight.benchmarks.stereo.subpixel import (
     bench_subpixel,
     fraction_bias,
     inner,
     pixel_errors,
     subpixel_table,
 )
-from barsight.evaluation.stereo_target_size import (
-    bench_target_size,
-    measure_bar,
-    target_size_table,
-)
+from barsight.benchmarks.stereo.target_size import bench_target_size, measure_bar, target_size_table
+from barsight.core.errors import Failed
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from barsight.core.errors import InputError
 from barsight.core.types import Contour, Source
-from barsight.evaluation.truth import score
+from barsight.evaluation.score import score
 from barsight.mapping.settings import MapSettings
-from barsight.report.files import write_contours, write_height
+from barsight.report.result_files import write_contours, write_height
 from mapping_views import block, fused, view
 
 X = np.round(1 + 0.01 * np.arange(120), 4)

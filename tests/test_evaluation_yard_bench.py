@@ -6,9 +6,9 @@ from typing import get_args
 
 import pytest
 
-from barsight.cli.bench_yard import Method
+from barsight.benchmarks.yard.field_test import VARIANTS
+from barsight.cli.bench.yard import Method
 from barsight.cli.main import run
-from barsight.evaluation.yard_bench import VARIANTS
 from barsight.simulation.simulate import simulate
 from cli_runs import TINY
 

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 
 from barsight.core.types import RectifiedCamera, RectifiedPair
-from barsight.features.guided import PredictedMotion, match_guided, predict_places, project_stereo
-from barsight.features.patches import PatchPair, patch_pair
+from barsight.features.guided_matching import PredictedMotion, match_guided, predict_places, project_stereo
+from barsight.features.patch_alignment import PatchPair, patch_pair
 
 CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 0.4, 0.0, 320, 240)
 DEPTH_M = 6.0

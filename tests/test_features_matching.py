@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barsight.benchmarks.motion.matching import bench_features, bench_matching
 from barsight.core.arrays import UInt8
 from barsight.core.errors import InputError
 from barsight.core.types import RectifiedCamera
-from barsight.evaluation.matching_bench import bench_features, bench_matching
 from barsight.features.detectors import DETECTORS, DetectorName, make_detector
-from barsight.features.guided import project_stereo
+from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import (
     follows_trend,
     is_mutual,

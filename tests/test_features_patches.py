@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from barsight.core.arrays import Float64, UInt8
 from barsight.features.orb import detect_orb
-from barsight.features.patches import HALF_PX, locate, patch_image
+from barsight.features.patch_alignment import HALF_PX, locate, patch_image
 from synthetic_scenes import Texture, quantised
 
 

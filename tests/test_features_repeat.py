@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barsight.benchmarks.motion.matching import _stereo
+from barsight.benchmarks.motion.matching_truth import TrueStep, true_steps
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.evaluation.matching_bench import _stereo
-from barsight.evaluation.matching_truth import TrueStep, true_steps
-from barsight.features.guided import PredictedMotion, triangulate
-from barsight.features.repeat import repeat_px
+from barsight.features.guided_matching import PredictedMotion, triangulate
+from barsight.features.self_similarity import repeat_px
 from barsight.features.tracks import Tracks, TrackSettings, detect_corners
-from barsight.motion.sightings import FrontEndSettings, consensus
+from barsight.motion.frontend.tracking import FrontEndSettings, consensus
 
 PLACES = np.array([[60.0, 50], [250, 200], [600, 470]])
 

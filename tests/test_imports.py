@@ -1,4 +1,4 @@
-"""The house: a package imports only from floors below its own."""
+"""The house: a package imports only from floors below its own, a room only from rooms before it."""
 
 import ast
 from pathlib import Path
@@ -14,14 +14,45 @@ FLOORS = {
     "motion": 3,
     "mapping": 4,
     "yard": 5,
-    "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "board_views": 6,
-    "report": 7, "pipeline": 7, "simulation": 7, "plant": 7, "viewer": 7,
+    "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "simulation": 6, "board_views": 6,
+    "report": 7, "pipeline": 7, "benchmarks": 7, "plant": 7, "viewer": 7,
     "result": 8, "pair_matching": 8, "measure_folder": 8,
     "api": 9, "session": 9,
     "cli": 10,
 }  # fmt: skip
+ROOMS = {
+    "calibration": ("geometry", "boards", "files", "stereo", "camera_imu"),
+    "recording": (".", "formats", "writers", "open"),
+    "stereo": (".", "direct.kernels", "direct.semiglobal", "direct", "baselines", "settings"),
+    "motion": (
+        ".", "crane", "frontend", "frame_to_frame", "linear", "problem", "batch", "fixed_lag", "rig_check",
+        "settings",
+    ),
+    "core": (".", "linalg"),
+    "mapping": (".", "surface"),
+    "yard": (".", "bundles.fitting", "bundles", "stability", "lifting", "inventory"),
+    "report": (".", "calibration"),
+    "benchmarks": (".", "stereo", "motion", "yard"),
+    "cli": (".", "calibrate", "bench"),
+}  # fmt: skip
+"""A room imports only from itself and from those before it; "." stands for the package's own modules."""
+APART = {
+    ("stereo.baselines", "stereo.direct"), ("stereo.baselines", "stereo.direct.semiglobal"),
+    ("stereo.baselines", "stereo.direct.kernels"),
+    ("motion.linear", "motion.crane"), ("motion.linear", "motion.frontend"),
+    ("motion.linear", "motion.frame_to_frame"), ("motion.rig_check", "motion.fixed_lag"),
+    ("yard.stability", "yard.bundles"), ("yard.stability", "yard.bundles.fitting"),
+    ("yard.lifting", "yard.bundles"), ("yard.lifting", "yard.bundles.fitting"),
+    ("yard.inventory", "yard.bundles"), ("yard.inventory", "yard.bundles.fitting"),
+    ("yard.inventory", "yard.lifting"),
+    ("benchmarks.yard", "benchmarks.stereo"), ("benchmarks.yard", "benchmarks.motion"),
+    ("benchmarks.motion", "benchmarks.stereo"), ("cli.bench", "cli.calibrate"),
+}  # fmt: skip
+"""Rooms of which the first doesn't import the second either."""
+MAX_MODULES = 16
 ROOT = Path(barsight.__file__).parent
-OPTIONAL_ONCE = ("viser", "plotly", "rosbags")
+OPTIONAL = {"viser": 1, "plotly": 1, "rosbags": 2}
+"""Optional libraries, and the number of files that import them: of rosbags one reads and one writes."""
 
 
 def imported_modules(tree: ast.AST) -> list[str]:
@@ -35,28 +66,89 @@ def imported_modules(tree: ast.AST) -> list[str]:
     return names
 
 
-def violations(package: str, source: str) -> list[str]:
-    wrong = []
+def room_of(module: str) -> tuple[str, str]:
+    """Package and room of `motion.batch.fusion` (without `barsight.`): the longest name that ROOMS lists."""
+    package, _, rest = module.partition(".")
+    rooms = [r for r in ROOMS.get(package, ()) if rest == r or rest.startswith(f"{r}.")]
+    return package, max(rooms, key=len, default=".")
+
+
+def violations(module: str, source: str) -> list[str]:
+    """Imports of `module` (without `barsight.`) that point up or across."""
+    package, room = room_of(module)
+    wrong: list[str] = []
     for name in imported_modules(ast.parse(source)):
-        parts = name.split(".")
-        if parts[0] != "barsight" or len(parts) < 2 or parts[1] not in FLOORS:
+        if not name.startswith("barsight."):
             continue
-        if parts[1] != package and FLOORS[parts[1]] >= FLOORS[package]:
+        other_package, other = room_of(name.removeprefix("barsight."))
+        if other_package not in FLOORS:
+            continue
+        if other_package != package:
+            up = FLOORS[other_package] >= FLOORS[package]
+        elif package in ROOMS:
+            order = ROOMS[package]
+            up = order.index(other) > order.index(room)
+            up = up or (f"{package}.{room}", f"{package}.{other}") in APART
+        else:
+            up = False
+        if up:
             wrong.append(name)
     return wrong
 
 
 SOURCES = sorted(path for path in ROOT.rglob("*.py") if path.parent != ROOT or path.stem[0] != "_")
+FOLDERS = sorted({path.parent for path in SOURCES})
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_point_down(path: Path) -> None:
-    package = path.relative_to(ROOT).parts[0].removesuffix(".py")
+    module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    package, room = room_of(module)
     assert package in FLOORS, f"{package} has no floor"
-    assert violations(package, path.read_text(encoding="utf-8")) == []
+    assert path.stem == "__init__" or room in ROOMS.get(package, (".",)), (
+        f"{module} is in no room of {package}"
+    )
+    assert violations(module, path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_rooms_are_small_and_say_what_they_are_for(folder: Path) -> None:
+    modules = [path for path in folder.glob("*.py") if not path.stem.startswith("__")]
+    assert len(modules) <= MAX_MODULES
+    assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8")))
+
+
+def test_every_folder_has_its_place() -> None:
+    for package, rooms in ROOMS.items():
+        listed = {package.replace(".", "/")} | {f"{package}/{room.replace('.', '/')}" for room in rooms}
+        found = {
+            p.relative_to(ROOT).as_posix() for p in FOLDERS if p.relative_to(ROOT).parts[:1] == (package,)
+        }
+        assert found <= listed
+
+
+@pytest.mark.parametrize("library", OPTIONAL)
+def test_optional_libraries_are_imported_in_few_files(library: str) -> None:
+    importing = [
+        path
+        for path in SOURCES
+        if library in {n.split(".")[0] for n in imported_modules(ast.parse(path.read_text(encoding="utf-8")))}
+    ]
+    assert len(importing) <= OPTIONAL[library]
 
 
 def test_an_import_that_points_up_is_found() -> None:
-    assert violations("stereo", "from barsight.motion import crane") == ["barsight.motion.crane"]
-    assert violations("stereo", "import barsight.recording.base") == ["barsight.recording.base"]
-    assert violations("motion", "from barsight.stereo import sgbm") == []
+    found = ["barsight.motion.crane"]
+    assert violations("stereo.direct.pipeline", "from barsight.motion import crane") == found
+    assert violations("stereo.sgbm", "import barsight.recording.base") == ["barsight.recording.base"]
+    assert violations("motion.batch.fusion", "from barsight.stereo import sgbm") == []
+
+
+def test_an_import_between_rooms_is_found() -> None:
+    found = ["barsight.motion.batch.fusion.Fusion"]
+    assert violations("motion.crane.sway", "from barsight.motion.batch.fusion import Fusion") == found
+    assert violations("motion.fixed_lag.smoother", "from barsight.motion.batch.fusion import Fusion") == []
+    across = "import barsight.stereo.direct.pipeline"
+    assert violations("stereo.baselines.census", across) == ["barsight.stereo.direct.pipeline"]
+    assert violations("stereo.settings", across) == []
+    assert violations("stereo.sgbm", "from barsight.stereo import settings") == ["barsight.stereo.settings"]

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.documents import ImuNoise
+from barsight.calibration.files.yaml_document import ImuNoise
 from barsight.core.errors import Failed
 from barsight.core.types import ImuSamples
 from barsight.inertial.model import BodyState, ImuBias, corrected, integrate_slowly
 from barsight.inertial.preintegration import Preintegrated, Preintegrator
-from barsight.recording.truth import read_ground_truth
+from barsight.recording.formats.ground_truth import read_ground_truth
 
 NOISE = ImuNoise(2e-4, 2e-5, 2e-3, 1e-3, 200.0)
 EUROC_NOISE = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3, 200.0)

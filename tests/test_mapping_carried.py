@@ -11,7 +11,7 @@ import tifffile
 from barsight.cli.main import run
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
-from barsight.mapping.carried import carried_along
+from barsight.mapping.ego_mask import carried_along
 
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.5, 0.0, 640, 480)
 DEPTH_M, WAY_M = 7.5, 0.5

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from barsight.core.types import Contour, LaserProfile, Source
-from barsight.mapping.contours import cut, cut_contours, smoothed
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Surface
+from barsight.mapping.surface.contours import cut, cut_contours, smoothed
+from barsight.mapping.surface.surface import Surface
 from mapping_views import block, fused, view
 
 CELL_M = 0.01

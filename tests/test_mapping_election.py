@@ -8,12 +8,12 @@ import pytest
 
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera, Source
-from barsight.mapping.election import Sights, first_heights
 from barsight.mapping.fusion import fuse
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Layers
-from barsight.mapping.surface_election import SurfaceElection
+from barsight.mapping.surface.height_selection import Sights, first_heights
+from barsight.mapping.surface.incremental import SurfaceElection
+from barsight.mapping.surface.surface import Layers
 from barsight.mapping.tiles import FIELDS, SLOTS, VIEWS, TileStore, Z
 from mapping_views import FAR_CAMERA, block, high_above, view
 

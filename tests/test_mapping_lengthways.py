@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from barsight.mapping.lengthways import blur_sigma, lengthways, sharpened, valleys
+from barsight.mapping.surface.directional_filter import blur_sigma, lengthways, sharpened, valleys
 
 CELL_M, GATE_M, REACH = 0.01, 0.015, 12
 BLUR_CELLS = 0.7

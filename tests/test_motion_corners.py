@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.detection_files import NAMES
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.boards.detection_files import NAMES
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.types import RefusedFrame
 from barsight.evaluation.board_poses import board_poses, by_gyro_alone_deg
-from barsight.evaluation.drift import Drift, compare
-from barsight.motion.crane import CraneSettings
-from barsight.motion.fusion import FusedTrajectory, FusionSettings
-from barsight.recording import corners
+from barsight.evaluation.trajectory_error import Drift, compare
+from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.recording.base import RecordingSettings
-from barsight.recording.corners import CornerRecording
+from barsight.recording.formats import board_corners as corners
+from barsight.recording.formats.board_corners import CornerRecording
+from barsight.recording.formats.ground_truth import GroundTruth
 from barsight.recording.open import open_recording
-from barsight.recording.truth import GroundTruth
 from camera_imu_recordings import START_NS, Way, simulated
 
 

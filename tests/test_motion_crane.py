@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.types import CraneSamples, ImuSamples
-from barsight.motion.crane import CraneSettings, CraneTrajectory, fit_position
-from barsight.motion.parabola import ROUNDS, fit_parabola
-from barsight.motion.sway import sway_at, turned_angle
+from barsight.motion.crane.encoder_trajectory import CraneSettings, CraneTrajectory, fit_position
+from barsight.motion.crane.robust_parabola import ROUNDS, fit_parabola
+from barsight.motion.crane.sway import sway_at, turned_angle
 from motion_recordings import MemoryRecording, ideal_rig
 
 START_NS = 1_700_000_000_603_500_001

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.documents import ImuNoise
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, Trajectory
-from barsight.evaluation.drift import Drift, compare
-from barsight.features.guided import project_stereo, triangulate
-from barsight.motion import fusion
-from barsight.motion.crane import CraneSettings
-from barsight.motion.fusion import FusedTrajectory, FusionSettings
-from barsight.motion.sightings import Sighting
+from barsight.evaluation.trajectory_error import Drift, compare
+from barsight.features.guided_matching import project_stereo, triangulate
+from barsight.motion.batch import fusion
+from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings
+from barsight.motion.frontend.tracking import Sighting
 from barsight.recording.base import Recording
+from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
 from barsight.recording.open import open_recording
-from barsight.recording.truth import GroundTruth, read_ground_truth
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
 from barsight.simulation.settings import CameraSettings, MotionSettings, SensorSettings
 from barsight.simulation.trajectory import CraneTrajectory

@@ -7,21 +7,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, RefusedFrame, StereoFrame, Trajectory
-from barsight.evaluation.drift import compare
+from barsight.evaluation.trajectory_error import compare
 from barsight.inertial.model import ORDINARY_NOISE
-from barsight.motion import fusion, live
-from barsight.motion.crane import CraneSettings
-from barsight.motion.fusion import FusedTrajectory, FusionSettings
-from barsight.motion.live import LiveSettings, LiveTrajectory
-from barsight.motion.live_estimator import LiveEstimator
-from barsight.motion.readings import Readings
+from barsight.motion.batch import fusion
+from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings
+from barsight.motion.fixed_lag import estimator as live
+from barsight.motion.fixed_lag.estimator import LiveSettings, LiveTrajectory
+from barsight.motion.fixed_lag.sensor_buffer import Readings
+from barsight.motion.fixed_lag.smoother import LiveEstimator
 from barsight.recording.base import Recording
+from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.recording.open import open_recording
-from barsight.recording.truth import read_ground_truth
 from motion_recordings import MemoryRecording, ideal_rig
 from simulated_ways import steady
 from test_motion_fusion import simulated

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose, skew
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame, Trajectory
-from barsight.features.guided import project_stereo, stereo_jacobian, triangulate, triangulated_by
-from barsight.motion.odometry import StereoOdometry
-from barsight.motion.step import Step, carried, in_world, refine
-from barsight.motion.step_kernel import step_equations
-from barsight.motion.views import OdometrySettings
+from barsight.features.guided_matching import project_stereo, stereo_jacobian, triangulate, triangulated_by
+from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
+from barsight.motion.frontend.relative_pose import Step, carried, in_world, refine
+from barsight.motion.frontend.relative_pose_kernel import step_equations
+from barsight.motion.frontend.stereo_features import OdometrySettings
+from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.recording.open import open_recording
-from barsight.recording.truth import read_ground_truth
 from motion_recordings import MemoryRecording, ideal_rig
 from synthetic_scenes import Texture, quantised
 

@@ -8,13 +8,13 @@ import pytest
 
 from bar_pictures import CAMERA, bar_view
 from barsight.core.errors import Failed
-from barsight.features.guided import GuidedMatches, PredictedMotion
-from barsight.features.patches import PatchPair, patch_pair
+from barsight.features.guided_matching import GuidedMatches, PredictedMotion
+from barsight.features.patch_alignment import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, TrackSettings, carry_on
-from barsight.motion.sightings import FrontEndSettings, consensus, look_at_corners
-from barsight.motion.step import move
-from barsight.motion.views import View
-from barsight.stereo.disparity_range import coarse_disparity
+from barsight.motion.frontend.relative_pose import move
+from barsight.motion.frontend.stereo_features import View
+from barsight.motion.frontend.tracking import FrontEndSettings, consensus, look_at_corners
+from barsight.stereo.search_range import coarse_disparity
 
 WAY_M = 0.5
 

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame
-from barsight.evaluation.drift import compare
+from barsight.evaluation.trajectory_error import compare
 from barsight.inertial.model import without_saturation
-from barsight.motion.crane import CraneSettings, with_seen_noise
-from barsight.motion.encoder_jumps import NOISE_SIGMAS, find_jumps, jump_test
-from barsight.motion.fusion import FusedTrajectory, FusionSettings, _untied
-from barsight.motion.plausibility import check_crane
-from barsight.motion.sightings import Sighting
+from barsight.motion.batch.fault_detection import check_crane
+from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings, _untied
+from barsight.motion.crane.encoder_jumps import NOISE_SIGMAS, find_jumps, jump_test
+from barsight.motion.crane.encoder_trajectory import CraneSettings, with_seen_noise
+from barsight.motion.frontend.tracking import Sighting
+from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.recording.open import open_recording
-from barsight.recording.truth import read_ground_truth
 from drawn_cranes import drawn_crane
 from spoiled_recording import SpoiledRecording, frozen_between, late, with_outliers
 

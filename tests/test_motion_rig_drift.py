@@ -7,17 +7,17 @@ from typing import cast
 import numpy as np
 import pytest
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, RigDrift
-from barsight.features.guided import project_stereo
-from barsight.motion import fusion
-from barsight.motion.crane import CraneSettings
-from barsight.motion.fusion import FusedTrajectory, FusionSettings
-from barsight.motion.problem import Problem
-from barsight.motion.rig_drift import MATCHING_BIAS_PX, weigh, with_own_bias
-from barsight.motion.self_calibration import is_drifted, left_open_px, self_calibrated, turned_right
-from barsight.motion.sightings import Sighting
+from barsight.features.guided_matching import project_stereo
+from barsight.motion.batch import fusion
+from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings
+from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.problem.problem import Problem
+from barsight.motion.problem.rig_drift import MATCHING_BIAS_PX, weigh, with_own_bias
+from barsight.motion.rig_check.self_calibration import is_drifted, left_open_px, self_calibrated, turned_right
 from motion_recordings import MemoryRecording, ideal_rig
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
-from barsight.motion.problem import StereoSightings
-from barsight.motion.stereo_factors import nearness, persistence, taken_up
+from barsight.motion.problem.problem import StereoSightings
+from barsight.motion.problem.stereo_factors import nearness, persistence, taken_up
 from motion_recordings import ideal_rig
 
 FRAMES, POINTS = 20, 800

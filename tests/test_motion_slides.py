@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.calibration.rectification import Rectifier
-from barsight.evaluation.drift import compare
-from barsight.features.guided import triangulate
-from barsight.motion import slides
-from barsight.motion.sightings import Sighting
-from barsight.recording.truth import GroundTruth
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.evaluation.trajectory_error import compare
+from barsight.features.guided_matching import triangulate
+from barsight.motion.batch import apparent_motion as slides
+from barsight.motion.frontend.tracking import Sighting
+from barsight.recording.formats.ground_truth import GroundTruth
 from test_motion_fusion import NoisyRecording, fused, simulated
 
 COMMON_RAD, OWN_RAD = 2.5e-4, 3e-4

@@ -10,20 +10,20 @@ import pytest
 from gtsam.symbol_shorthand import E, L, X
 from scipy.spatial.transform import Rotation
 
-from barsight.core import skyline
+from barsight.core.linalg import skyline
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
-from barsight.features.guided import project_stereo
+from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ImuBias
-from barsight.motion import band
-from barsight.motion.gaps import Chain, with_gaps, without_gaps
-from barsight.motion.graph import factors, start_values
-from barsight.motion.marginals import marginals, piece_variances
-from barsight.motion.problem import Attitude, Pieces, Placed, Problem, StereoSightings
-from barsight.motion.rig_drift import HUBER_SIGMAS
-from barsight.motion.sightings import Sighting
-from barsight.motion.solver import State, cost_of, moved, optimise
-from barsight.motion.stereo_factors import often, start_points
+from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.linear import skyline
+from barsight.motion.linear.chain_elimination import Chain, with_gaps, without_gaps
+from barsight.motion.problem.gauss_newton import State, cost_of, moved, optimise
+from barsight.motion.problem.gtsam_factors import factors, start_values
+from barsight.motion.problem.marginals import marginals, piece_variances
+from barsight.motion.problem.problem import Attitude, Pieces, Placed, Problem, StereoSightings
+from barsight.motion.problem.rig_drift import HUBER_SIGMAS
+from barsight.motion.problem.stereo_factors import often, start_points
 
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.3, 4.0, 640, 480)
 MOUNT = Pose("body", "rect0", Rotation.from_rotvec([0.1, -0.3, 1.5]).as_matrix(), np.array([0.1, -0.2, 0.3]))
@@ -57,7 +57,7 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
     blocks = np.empty((n // 3, 3, 3))
     pairs = np.array([[k, k + 1] for k in range(n // 3 - 1)], np.int64).reshape(-1, 2)
     cross, diagonal = np.empty((len(pairs), 3, 3)), np.empty(n)
-    band.inverse_blocks(factor, np.arange(0, n, 3), diagonal, blocks, pairs, cross)
+    skyline.inverse_blocks(factor, np.arange(0, n, 3), diagonal, blocks, pairs, cross)
     inverse = np.linalg.inv(matrix)
     np.testing.assert_allclose(diagonal, np.diag(inverse), rtol=1e-8)
     for k, block in enumerate(cross):
@@ -94,7 +94,7 @@ def test_rows_that_begin_late_are_solved_like_a_dense_matrix() -> None:
     skyline.solve_back(factor, right)
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     diagonal, none = np.empty(n), np.empty((0, 1, 1))
-    band.inverse_blocks(factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none)
+    skyline.inverse_blocks(factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none)
     np.testing.assert_allclose(diagonal, np.diag(np.linalg.inv(matrix)), rtol=1e-9)
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError
 from barsight.core.types import RefusedFrame, StereoFrame
-from barsight.motion.crane import CraneSettings
-from barsight.motion.stitching import PaperStitching, StitchingSettings
-from barsight.motion.views import OdometrySettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings
+from barsight.motion.frame_to_frame.stitching import PaperStitching, StitchingSettings
+from barsight.motion.frontend.stereo_features import OdometrySettings
 from motion_recordings import MemoryRecording, ideal_rig
 from test_motion_odometry import picture_pair
 

@@ -2,9 +2,15 @@
 
 import numpy as np
 
-from barsight.core import skyline
-from barsight.motion import dense
-from barsight.motion.window_system import SLIDE_SIGMA_RAD, SLIDE_WAY_M, Equations, prior_of, slid_on
+from barsight.core.linalg import skyline
+from barsight.motion.fixed_lag.window_equations import (
+    SLIDE_SIGMA_RAD,
+    SLIDE_WAY_M,
+    Equations,
+    prior_of,
+    slid_on,
+)
+from barsight.motion.linear import dense_cholesky
 
 
 def positive(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -22,7 +28,7 @@ def test_a_dense_system_is_solved() -> None:
     skyline.solve_forward(skyline.full(factor), x)
     skyline.solve_back(skyline.full(factor), x)
     np.testing.assert_allclose(x[:, 0], np.linalg.solve(matrix, right))
-    np.testing.assert_allclose(dense.product(matrix, right), matrix @ right)
+    np.testing.assert_allclose(dense_cholesky.product(matrix, right), matrix @ right)
     assert not skyline.factorise(skyline.full(-matrix))
 
 
@@ -34,12 +40,12 @@ def test_bands_and_blocks_are_added() -> None:
         for j in range(max(0, i - 5), i + 1):
             rows[i, j - i + 5] = matrix[i, j]
     result = np.zeros((20, 20))
-    dense.add_band(rows, 5, result)
+    dense_cholesky.add_band(rows, 5, result)
     np.testing.assert_array_equal(result[5:17, 5:17], band)
     blocks = np.zeros((2, 6, 12))
     blocks[0, :, 6:], blocks[1] = matrix[:6, :6], matrix[6:]
     result = np.zeros((20, 20))
-    dense.add_blocks(blocks, 8, result)
+    dense_cholesky.add_blocks(blocks, 8, result)
     at = np.r_[0:6, 8:14]
     np.testing.assert_array_equal(result[np.ix_(at, at)], matrix)
 

@@ -14,12 +14,12 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from barsight.calibration.any_rig_file import read_rig_file
-from barsight.calibration.rig_file import write_rig_file
+from barsight.calibration.files.rig_file import write_rig_file
+from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.core.errors import CalibrationError, InputError
 from barsight.core.types import RefusedFrame, StereoFrame
-from barsight.recording import bag
 from barsight.recording.base import RecordingSettings
+from barsight.recording.formats import bag
 from barsight.recording.open import open_recording
 from recording_samples import HEIGHT, NOISE, START_NS, WIDTH, camera_yaml, mounts, picture, png, stamps
 

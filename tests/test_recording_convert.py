@@ -8,11 +8,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import OutputError
-from barsight.recording import stored
-from barsight.recording.convert import Target, convert
-from barsight.recording.euroc import EurocRecording
+from barsight.recording import stored_images
+from barsight.recording.formats.euroc import EurocRecording
+from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.recording.open import open_recording
-from barsight.recording.truth import read_ground_truth
+from barsight.recording.writers.convert import Target, convert
 from recording_samples import assert_same, camera_yaml, mounts, png, real, stamps, write_euroc, write_imu
 
 TARGETS: tuple[Target, ...] = ("euroc", "ros2-mcap", "ros2-sqlite3", "ros1")
@@ -152,7 +152,7 @@ def test_pictures_are_handed_on_one_at_a_time(tmp_path: Path, monkeypatch: pytes
     alive = 0
     most = 0
 
-    class Counted(stored.StoredImage):
+    class Counted(stored_images.StoredImage):
         def __del__(self) -> None:
             nonlocal alive
             alive -= 1

@@ -292,7 +292,7 @@ def test_a_recording_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.Mo
     def refuse(path: Path) -> None:
         raise PermissionError(13, "Permission denied", str(path / "cam0" / "sensor.yaml"))
 
-    monkeypatch.setattr("barsight.recording.euroc.read_rig", refuse)
+    monkeypatch.setattr("barsight.recording.formats.euroc.read_rig", refuse)
     with pytest.raises(InputError, match=r"cam0/sensor\.yaml: no permission to read it"):
         open_recording(tmp_path)
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.recording.images import PNG_SIGNATURE, TornImageError, check_png, decode_gray, to_gray
+from barsight.recording.image_decoding import PNG_SIGNATURE, TornImageError, check_png, decode_gray, to_gray
 from recording_samples import picture, png
 
 

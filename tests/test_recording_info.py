@@ -8,7 +8,7 @@ import yaml
 from rich.console import Console
 
 from barsight.recording.info import describe, stream_info
-from barsight.recording.info_print import print_info
+from barsight.recording.info_tables import print_info
 from barsight.recording.open import open_recording
 from recording_samples import START_NS, camera_yaml, mounts, real, stamps, write_euroc
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError
-from barsight.recording.tables import read_image_list, read_table
+from barsight.recording.formats.euroc_tables import read_image_list, read_table
 
 COLUMNS = ("timestamp", "a", "b")
 GOOD = "#timestamp [ns],a,b\n1403715273262142977,1.5,-2e-3\n1403715273262142979,0.1,7\n"

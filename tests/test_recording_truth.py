@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError
-from barsight.recording.truth import find_ground_truth, read_ground_truth, truth_as_euroc
+from barsight.recording.formats.ground_truth import find_ground_truth, read_ground_truth, truth_as_euroc
 from recording_samples import real
 
 EUROC = "#timestamp,p,q\n7,1,2,3,1,0,0,0,0.1,0.2\n9,4,5,6,0,1,0,0,0.1,0.2\n"

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, Trajectory
-from barsight.motion.crane_moves import MovedYard, yard_from_moves
+from barsight.motion.crane.crane_moves import MovedYard, yard_from_moves
 from barsight.registration.yard import YardCalibration, calibrate_yard
 
 TRUTH = Pose(

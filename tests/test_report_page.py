@@ -14,9 +14,9 @@ import pytest
 
 from barsight.core.errors import InputError, OutputError
 from barsight.core.types import Contour, LaserProfile, Source
+from barsight.report.map_images import cut_strips, hillshade, paint_height, read_raster
 from barsight.report.page import number, render_page, write_report
-from barsight.report.page_path import turned_since_start_deg
-from barsight.report.pictures import cut_strips, hillshade, paint_height, read_raster
+from barsight.report.page_trajectory import turned_since_start_deg
 from barsight.report.plots import compare, contour_plot, keep_extremes
 from barsight.result_folder import CameraPath, read_contours, read_laser
 from result_folders import BIAS_MM, CELL_M, LEFT_M, TOP_M, bands, summary, write_folder, write_height

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from barsight.simulation.lift_bench import bench_lifts, bench_yard, count_truly
-from barsight.yard.footprint import Placement
+from barsight.benchmarks.yard.lift_targets import bench_lifts, bench_yard, count_truly
+from barsight.yard.lifting.footprint import Placement
 from lift_yards import MAGNET
 
 

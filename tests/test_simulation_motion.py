@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.simulation.sensors import (
-    GRAVITY_MPS2,
-    exact_imu,
-    record_encoders,
-    record_imu,
-    seconds,
-    stamps,
-)
+from barsight.simulation.sensors import GRAVITY_MPS2, exact_imu, record_encoders, record_imu, seconds, stamps
 from barsight.simulation.settings import CameraSettings, MotionSettings, SensorSettings
 from barsight.simulation.trajectory import CraneTrajectory
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barsight.calibration.camera import Camera, Distortion
+from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.simulation.lighting import Lamps, Lightmap, bake, hall_lamps

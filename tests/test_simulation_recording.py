@@ -15,7 +15,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation, Slerp
 
-from barsight.calibration.camera import Camera, Distortion
+from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, OutputError
 from barsight.core.pose import Pose

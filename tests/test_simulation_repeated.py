@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barsight.benchmarks.yard.repeated_recording import repeat
 from barsight.core.errors import InputError
-from barsight.simulation.repeated import repeat
 
 START_NS, STEP_NS = 1_700_000_000_000_000_000, 50_000_000
 

@@ -13,12 +13,12 @@ import pytest
 
 from barsight.core.errors import ConfigError
 from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
-from barsight.stereo.barsight import BarsightSettings, BarsightStereo
-from barsight.stereo.confidence import vertical_error_px
-from barsight.stereo.refinement import RefinementSettings
+from barsight.stereo.direct.confidence import vertical_error_px
+from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, value_and_slope
+from barsight.stereo.direct.pipeline import BarsightSettings, BarsightStereo
+from barsight.stereo.direct.refinement import RefinementSettings
 from barsight.stereo.settings import StereoSettings, make_method
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
-from barsight.stereo.spline import row_coefficients, value_and_slope
 
 DATA = Path(os.environ.get("BARSIGHT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 HEIGHT, WIDTH = 240, 360

@@ -8,19 +8,26 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from barsight.core.errors import ConfigError
-from barsight.stereo.confidence import bend_around, beside_edges, start_disagreement
-from barsight.stereo.consistency import agrees, lands_on, without_islands
-from barsight.stereo.curvature import curvature_row
-from barsight.stereo.edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
-from barsight.stereo.filling import fill
-from barsight.stereo.half_size import carried_up, halved
-from barsight.stereo.plane_fits import SupportShape, fit_planes
-from barsight.stereo.pulls import compare, lengthen, noise_power, weigh
-from barsight.stereo.semiglobal import SemiGlobalSettings, match
-from barsight.stereo.settling import blend, settle, variances
-from barsight.stereo.spline import row_coefficients, row_slope, value_and_slope
-from barsight.stereo.supports import TILE_COLUMNS, TILE_ROWS, axis_means, empty_frame, inside, tile_axes
-from barsight.stereo.windows import window_means
+from barsight.stereo.direct.confidence import bend_around, beside_edges, start_disagreement
+from barsight.stereo.direct.consistency import agrees, lands_on, without_islands
+from barsight.stereo.direct.curvature import curvature_row
+from barsight.stereo.direct.depth_edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
+from barsight.stereo.direct.disparity_update import blend, settle, variances
+from barsight.stereo.direct.kernels.box_sums import window_means
+from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
+from barsight.stereo.direct.kernels.pyramid import carried_up, halved
+from barsight.stereo.direct.occlusion_filling import fill
+from barsight.stereo.direct.photometric_residuals import compare, lengthen, noise_power, weigh
+from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
+from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match
+from barsight.stereo.direct.support_regions import (
+    TILE_COLUMNS,
+    TILE_ROWS,
+    axis_means,
+    empty_frame,
+    inside,
+    tile_axes,
+)
 
 HEIGHT, WIDTH = 40, 70
 

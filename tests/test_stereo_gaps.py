@@ -3,7 +3,7 @@
 import numpy as np
 
 from barsight.core.types import Disparity
-from barsight.stereo.gaps import in_gap, without_gaps
+from barsight.stereo.masking import in_gap, without_gaps
 
 
 def steel(level: float, seed: int = 0) -> np.ndarray:

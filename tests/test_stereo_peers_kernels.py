@@ -8,17 +8,17 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from barsight.core.types import DisparityRange
-from barsight.stereo.bilateral import bilateral_update
-from barsight.stereo.census_transform import HEIGHT_PX, WIDTH_PX, WORST, census_codes, census_cost
-from barsight.stereo.cross_regions import cross_filter, cross_regions
-from barsight.stereo.csca import _Scale, _tie, scale_weights
-from barsight.stereo.gradient_cost import GradientCostSettings, cost_images, gradient_cost
-from barsight.stereo.guided import colour_guided_filter, guided_filter
-from barsight.stereo.left_right import agreement, filled_from_behind, weighted_median
-from barsight.stereo.nonlocal_tree import refined
-from barsight.stereo.outliers import region_vote
-from barsight.stereo.spanning_tree import spanning_tree, tree_filter
-from barsight.stereo.winner import between_candidates, no_winners, sweep, take_slices
+from barsight.stereo.baselines.bilateral_filter import bilateral_update
+from barsight.stereo.baselines.census_transform import HEIGHT_PX, WIDTH_PX, WORST, census_codes, census_cost
+from barsight.stereo.baselines.cross_aggregation import cross_filter, cross_regions
+from barsight.stereo.baselines.csca import _Scale, _tie, scale_weights
+from barsight.stereo.baselines.gradient_cost import GradientCostSettings, cost_images, gradient_cost
+from barsight.stereo.baselines.guided_filter import colour_guided_filter, guided_filter
+from barsight.stereo.baselines.left_right_check import agreement, filled_from_behind, weighted_median
+from barsight.stereo.baselines.nonlocal_aggregation import refined
+from barsight.stereo.baselines.region_voting import region_vote
+from barsight.stereo.baselines.spanning_tree import spanning_tree, tree_filter
+from barsight.stereo.baselines.winner_takes_all import between_candidates, no_winners, sweep, take_slices
 
 
 @pytest.fixture

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
+from barsight.benchmarks.stereo.middlebury_scenes import load_scenes, pair_from_images
+from barsight.benchmarks.stereo.scores import StereoScore, score_disparity
 from barsight.core.errors import ConfigError
 from barsight.core.types import DisparityRange, RectifiedPair
-from barsight.evaluation.stereo_scenes import load_scenes, pair_from_images
-from barsight.evaluation.stereo_scores import StereoScore, score_disparity
-from barsight.stereo.assembly import OutputSettings
-from barsight.stereo.census import Census, CensusSettings
-from barsight.stereo.csca import Csca, CscaSettings
+from barsight.stereo.baselines.census import Census, CensusSettings
+from barsight.stereo.baselines.csca import Csca, CscaSettings
+from barsight.stereo.baselines.nonlocal_aggregation import Nonlocal, NonlocalSettings
+from barsight.stereo.baselines.paper import Paper, PaperSettings
+from barsight.stereo.baselines.postprocessing import OutputSettings
 from barsight.stereo.method import StereoMethod
-from barsight.stereo.nonlocal_tree import Nonlocal, NonlocalSettings
-from barsight.stereo.paper import Paper, PaperSettings
 from barsight.stereo.settings import StereoSettings, make_method
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 

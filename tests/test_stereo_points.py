@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from barsight.core.types import Disparity, RectifiedPair
-from barsight.stereo.points import refine_grid, triangulate
+from barsight.stereo.triangulation import refine_grid, triangulate
 from synthetic_scenes import slanted_pair
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.types import DisparityRange, RectifiedPair
-from barsight.stereo.disparity_range import coarse_disparity, find_range
+from barsight.stereo.search_range import coarse_disparity, find_range
 from synthetic_scenes import camera, slanted_pair
 
 

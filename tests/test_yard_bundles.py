@@ -7,9 +7,9 @@ import pytest
 
 from barsight.core.errors import ConfigError
 from barsight.core.types import Source
-from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.bundles import find_bundles
-from barsight.yard.headings import find_headings
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.headings import find_headings
 from barsight.yard.types import Bundle, HeightMap
 from yard_maps import Laid, draw
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.yard.changes import Change, compare_yards
+from barsight.yard.inventory.changes import Change, compare_yards
 from barsight.yard.types import Bundle
 from lift_yards import SIGMA, laid, map_of, record
 

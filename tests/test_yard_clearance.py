@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.types import Source
-from barsight.yard.footprint import Placement
+from barsight.yard.lifting.footprint import Placement
 from barsight.yard.types import HeightMap
 from lift_yards import codes, judged, laid, map_of, record
 

@@ -17,10 +17,10 @@ from barsight.mapping.settings import MapSettings
 from barsight.report.orthophoto import orthophoto, write_orthophoto
 from barsight.result_folder import read_heights
 from barsight.viewer.yard_lines import yard_lines
-from barsight.yard.bundle_file import write_bundles
-from barsight.yard.lift_file import read_lifts
-from barsight.yard.magnet import example_magnet
-from barsight.yard.travel import Travel
+from barsight.yard.inventory.bundle_file import write_bundles
+from barsight.yard.lifting.lift_file import read_lifts
+from barsight.yard.lifting.magnet import example_magnet
+from barsight.yard.lifting.travel_accuracy import Travel
 from lift_yards import laid, map_of, record
 from mapping_views import block, fused, view
 from result_folders import summary

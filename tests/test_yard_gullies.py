@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.bundles import find_bundles
-from barsight.yard.gullies import _rests, _shading
-from barsight.yard.outline import STEP_M, hexagon, turned_hexagon
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.outline import STEP_M, hexagon, turned_hexagon
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.gully_shading import _rests, _shading
 from yard_maps import Laid, draw, photographed
 
 SETTINGS = BundleSettings()

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barsight.yard.bundle_newton import Heights, _normal_equations
-from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.matching import _KNOWN, _SPREAD_M, _match, make_templates
-from barsight.yard.outline import STEP_M, hexagon, make_outline, trace_with_changes
-from barsight.yard.selection import choose
+from barsight.yard.bundles.fitting.gauss_newton import Heights, _normal_equations
+from barsight.yard.bundles.fitting.outline import STEP_M, hexagon, make_outline, trace_with_changes
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.fitting.template_matching import _KNOWN, _SPREAD_M, _match, make_templates
+from barsight.yard.bundles.set_packing import choose
 
 SMOOTHING_M = 0.006
 

@@ -16,19 +16,19 @@ from scipy.optimize import linprog
 
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import Source
-from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.bundles import find_bundles
-from barsight.yard.contact import touch
-from barsight.yard.footprint import BundleTable, Placement, grip
-from barsight.yard.lift import map_vetoes, plan_lifts
-from barsight.yard.lift_file import lifts_content, read_lifts, schema, write_lifts
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.load import mass_of
-from barsight.yard.magnet import Beam, Magnet, Tolerance
-from barsight.yard.set_down import CLEARANCE_M, COARSE_M, free_places
-from barsight.yard.settle import rest
-from barsight.yard.travel import Travel
+from barsight.yard.lifting.contact import touch
+from barsight.yard.lifting.footprint import BundleTable, Placement, grip
+from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
+from barsight.yard.lifting.magnet import Beam, Magnet, Tolerance
+from barsight.yard.lifting.resting_plane import rest
+from barsight.yard.lifting.set_down import CLEARANCE_M, COARSE_M, free_places
+from barsight.yard.lifting.targets import map_vetoes, plan_lifts
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.vetoes import VETOES, Veto
+from barsight.yard.weight import mass_of
 from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
 from yard_maps import Laid
 

@@ -10,9 +10,11 @@ import barsight
 from barsight.cli.main import run
 from barsight.core.errors import BarsightError, ConfigError, InputError
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet import load_magnet
+from barsight.yard.lifting.magnet import load_magnet
 
-EXAMPLE = (Path(barsight.__file__).parent / "yard" / "example_magnet.toml").read_text(encoding="utf-8")
+EXAMPLE = (Path(barsight.__file__).parent / "yard" / "lifting" / "example_magnet.toml").read_text(
+    encoding="utf-8"
+)
 
 
 def test_the_example_is_assumed_where_no_file_is_given(tmp_path: Path) -> None:

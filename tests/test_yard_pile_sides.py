@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.yard.pile_sides import pile_sides
-from barsight.yard.stability import footings
+from barsight.yard.stability.pile_sides import pile_sides
+from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle
 from lift_yards import SETTINGS, SIGMA, laid, map_of, record
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError
-from barsight.yard.bundle_file import read_bundles, schema, write_bundles
-from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.bundles import find_bundles
-from barsight.yard.stock_list import Expected, match_stock, read_stock, stock_warnings
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.inventory.bundle_file import read_bundles, schema, write_bundles
+from barsight.yard.inventory.stock_list import Expected, match_stock, read_stock, stock_warnings
 from barsight.yard.types import Bundle
 from yard_maps import Laid, draw
 

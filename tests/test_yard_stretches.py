@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barsight.yard import stretches as cutting
-from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.bundles import find_bundles
-from barsight.yard.lift import plan_lifts
+from barsight.yard import sections as cutting
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.stretches import part_about, patches, stretches
+from barsight.yard.lifting.targets import plan_lifts
+from barsight.yard.sections import part_about, patches, stretches
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET
 from yard_maps import Laid, draw

@@ -6,8 +6,8 @@ import numpy as np
 
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
-from barsight.yard.footprint import Placement
-from barsight.yard.travel import Travel, travel_vetoes
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.travel_accuracy import Travel, travel_vetoes
 from lift_yards import MAGNET, SETTINGS
 
 CAMERA = RectifiedCamera(1250.0, 320.0, 256.0, 0.5, 0.0, 640, 512)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from barsight.api import calibrate_stereo, disparity, load, measure, open_recording, packets
-    from barsight.calibration.rig import StereoRig
-    from barsight.calibration.stereo_calibration import StereoCalibration
+    from barsight.calibration.geometry.rig import StereoRig
+    from barsight.calibration.stereo.calibration import StereoCalibration
     from barsight.core.errors import BarsightError
     from barsight.core.types import Contour, Disparity
     from barsight.pipeline import MeasureSettings
@@ -33,8 +33,8 @@ __all__ = [
 
 _HOMES = {
     "barsight.api": ("calibrate_stereo", "disparity", "load", "measure", "open_recording", "packets"),
-    "barsight.calibration.rig": ("StereoRig",),
-    "barsight.calibration.stereo_calibration": ("StereoCalibration",),
+    "barsight.calibration.geometry.rig": ("StereoRig",),
+    "barsight.calibration.stereo.calibration": ("StereoCalibration",),
     "barsight.core.errors": ("BarsightError",),
     "barsight.core.types": ("Contour", "Disparity"),
     "barsight.pipeline": ("MeasureSettings",),

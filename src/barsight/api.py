@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from barsight.board_views import views_from_pictures
-from barsight.calibration.boards import parse_board
-from barsight.calibration.lens_model import Lens
-from barsight.calibration.rig import StereoRig
-from barsight.calibration.stereo_calibration import StereoCalibration
-from barsight.calibration.stereo_calibration import calibrate_stereo as solve_stereo
+from barsight.calibration.boards.board import parse_board
+from barsight.calibration.geometry.projection import Lens
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.calibration.stereo.calibration import StereoCalibration
+from barsight.calibration.stereo.calibration import calibrate_stereo as solve_stereo
 from barsight.core.arrays import UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity
@@ -24,7 +24,7 @@ from barsight.pair_matching import match_pictures
 from barsight.pipeline import Advance, MeasureSettings
 from barsight.recording.open import open_recording as open_path
 from barsight.recording.packets import packets as packets
-from barsight.recording.stored import Source
+from barsight.recording.stored_images import Source
 from barsight.result import Yard
 from barsight.stereo.settings import StereoSettings
 

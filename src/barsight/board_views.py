@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.board_detection import detect
-from barsight.calibration.boards import Board
-from barsight.calibration.detection_files import read_detections
-from barsight.calibration.views import BoardView, Corners, Removed
+from barsight.calibration.boards.board import Board
+from barsight.calibration.boards.board_views import BoardView, Corners, Removed
+from barsight.calibration.boards.detection import detect
+from barsight.calibration.boards.detection_files import read_detections
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.parallel import ordered_map
 from barsight.core.types import RefusedFrame
+from barsight.recording.formats.image_pairs import ReadPair, find_pairs, read_pair_files
 from barsight.recording.open import BAG_KINDS, open_recording
-from barsight.recording.picture_pairs import ReadPair, find_pairs, read_pair_files
 
 Size = tuple[int, int]
 

@@ -28,7 +28,7 @@ from barsight.core.types import (
 )
 from barsight.mapping.view import Matched
 from barsight.recording.base import Recording
-from barsight.recording.picture_files import PictureFiles
+from barsight.recording.formats.image_folders import PictureFiles
 
 T = TypeVar("T")
 

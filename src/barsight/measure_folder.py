@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
-from barsight.evaluation.truth import score
+from barsight.evaluation.score import score
 from barsight.pipeline import Advance, MeasureSettings, measure
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
-from barsight.report.files import RESULT_FILES, summary, write_results, write_summary, write_surface
 from barsight.report.page import write_report
-from barsight.yard.magnet import load_magnet
+from barsight.report.result_files import RESULT_FILES, summary, write_results, write_summary, write_surface
+from barsight.yard.lifting.magnet import load_magnet
 
 
 def unheard(stage: str, done: int, total: int) -> None:

@@ -12,10 +12,10 @@ import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
-from barsight.mapping.surface import Surface
-from barsight.yard.lift import LiftPlan
-from barsight.yard.stock_list import StockMatch
-from barsight.yard.travel import Travel
+from barsight.mapping.surface.surface import Surface
+from barsight.yard.inventory.stock_list import StockMatch
+from barsight.yard.lifting.targets import LiftPlan
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.types import Bundle
 
 

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.any_rig_file import read_rig_file
-from barsight.calibration.rectification import Rectifier
-from barsight.calibration.rig import StereoRig
+from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
+from barsight.calibration.files.rig_formats import read_rig_file
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import UInt8
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, MeasurementError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
-from barsight.evaluation.stereo_scenes import pair_from_images
 from barsight.mapping.view import disparity_range
-from barsight.recording.images import TornImageError, decode_with_colour
-from barsight.stereo.disparity_range import nothing_to_match
-from barsight.stereo.rows import MOST_OFFSET_PX, vertical_offset
+from barsight.recording.image_decoding import TornImageError, decode_with_colour
+from barsight.stereo.search_range import nothing_to_match
 from barsight.stereo.settings import MethodName, StereoSettings, make_method
+from barsight.stereo.vertical_offset import MOST_OFFSET_PX, vertical_offset
 
 Picture = Path | UInt8
 """A file, or (H, W) uint8."""

@@ -18,8 +18,8 @@ from typing import Any, Literal
 import numpy as np
 
 import barsight
-from barsight.calibration.rectification import Rectifier
-from barsight.calibration.rig_uncertainty import disparity_sigma_px
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
 from barsight.checkpoint import checkpoint_folder, once, pictures_digest
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.memory import give_back, peak_memory_mib
@@ -29,32 +29,32 @@ from barsight.core.settings import expect_numbers
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory
-from barsight.evaluation.agreement import agree
-from barsight.mapping.contours import cut_contours
-from barsight.mapping.election import Sights
+from barsight.mapping.agreement import agree
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse
-from barsight.mapping.look import apart, apart_by_encoders, choose_cell, first_look, points_per_pixel
+from barsight.mapping.scene_extent import apart, apart_by_encoders, choose_cell, first_look, points_per_pixel
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface import Surface
-from barsight.mapping.surface_election import SurfaceElection
+from barsight.mapping.surface.contours import cut_contours
+from barsight.mapping.surface.height_selection import Sights
+from barsight.mapping.surface.incremental import SurfaceElection
+from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import Matched, Matcher, Neighbour, Placer
 from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, digest, plain
-from barsight.motion.self_calibration import self_calibrated
+from barsight.motion.rig_check.self_calibration import self_calibrated
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
-from barsight.recording.selection import SelectedSensors
-from barsight.recording.sensors import imu_hints
+from barsight.recording.sensor_samples import imu_hints
+from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.settings import StereoSettings, make_method
-from barsight.yard.bundle_settings import BundleSettings
-from barsight.yard.bundles import find_bundles
-from barsight.yard.lift import LiftPlan, map_vetoes, plan_lifts
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.inventory.stock_list import match_stock, read_stock, stock_warnings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet import Magnet, load_magnet
-from barsight.yard.stock_list import match_stock, read_stock, stock_warnings
-from barsight.yard.stretches import surface_map
-from barsight.yard.travel import Travel
+from barsight.yard.lifting.magnet import Magnet, load_magnet
+from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
+from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
 
 Advance = Callable[[str, int, int], None]

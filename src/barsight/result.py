@@ -13,11 +13,11 @@ from typing import Any
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.types import Contour
-from barsight.report.files import RESULT_FILES
 from barsight.report.page import write_report
+from barsight.report.result_files import RESULT_FILES
 from barsight.result_folder import CameraPath, read_contours, read_heights, read_path, read_summary
-from barsight.yard.bundle_file import read_bundles
-from barsight.yard.lift_file import read_lifts
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle, HeightMap
 
 

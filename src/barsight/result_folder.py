@@ -20,7 +20,7 @@ from barsight.core.errors import InputError
 from barsight.core.ply import read_vertices
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
-from barsight.yard.stretches import PartedMap
+from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap
 
 PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")

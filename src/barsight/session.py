@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from barsight.calibration.documents import ImuNoise
-from barsight.calibration.rectification import Rectifier
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.checkpoint import checkpoint_folder
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, MeasurementError
@@ -22,23 +22,23 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import CraneSamples, PosedFrame, StereoFrame
-from barsight.mapping.election import Sights
 from barsight.mapping.fusion import fuse
-from barsight.mapping.look import FirstLook, choose_cell, first_look, least_way_m, points_per_pixel
-from barsight.mapping.surface import Surface
-from barsight.mapping.surface_election import SurfaceElection
+from barsight.mapping.scene_extent import FirstLook, choose_cell, first_look, least_way_m, points_per_pixel
+from barsight.mapping.surface.height_selection import Sights
+from barsight.mapping.surface.incremental import SurfaceElection
+from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import Matched, Matcher, Placer
 from barsight.measure_folder import write_measured
 from barsight.measurement import Refusal, plain
-from barsight.motion.crane import CraneTrajectory
+from barsight.motion.crane.encoder_trajectory import CraneTrajectory
 from barsight.pipeline import MeasureSettings, checkpoint_key, matching
 from barsight.recording.base import FrameIndex
-from barsight.recording.forwarded import Forwarded
 from barsight.recording.packets import Packet, PacketRecording
+from barsight.recording.wrapper import Forwarded
 from barsight.result import Yard
 from barsight.stereo.settings import make_method
-from barsight.yard.stretches import surface_map
+from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap
 
 

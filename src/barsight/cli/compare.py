@@ -18,8 +18,8 @@ from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import json_value
 from barsight.result_folder import read_heights, read_summary
-from barsight.yard.bundle_file import read_bundles
-from barsight.yard.changes import Change, compare_yards
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.inventory.changes import Change, compare_yards
 
 
 def run(arguments: Sequence[str]) -> None:

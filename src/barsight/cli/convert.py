@@ -12,8 +12,8 @@ from rich.console import Console
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.recording.base import RecordingSettings
-from barsight.recording.convert import Target, convert
 from barsight.recording.open import open_recording
+from barsight.recording.writers.convert import Target, convert
 
 
 def run(arguments: Sequence[str]) -> None:

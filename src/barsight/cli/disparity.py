@@ -13,14 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from barsight.cli.arguments import call
-from barsight.core.errors import (
-    ConfigError,
-    OutputError,
-)
+from barsight.core.errors import ConfigError, OutputError
 from barsight.core.types import Disparity
 from barsight.measurement import Preview
 from barsight.pair_matching import match_pictures
-from barsight.report.files import write_preview
+from barsight.report.result_files import write_preview
 from barsight.stereo.disparity_files import write_disparity
 from barsight.stereo.settings import StereoSettings
 

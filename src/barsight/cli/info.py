@@ -12,7 +12,7 @@ from rich.console import Console
 from barsight.cli.arguments import call
 from barsight.recording.base import RecordingSettings
 from barsight.recording.info import describe
-from barsight.recording.info_print import print_info
+from barsight.recording.info_tables import print_info
 from barsight.recording.open import open_recording
 
 

@@ -17,12 +17,12 @@ from rich.table import Table
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.report.page import write_report
 from barsight.result_folder import read_heights, read_summary
-from barsight.yard.bundle_file import read_bundles
-from barsight.yard.lift import LiftPlan, map_vetoes, plan_lifts
-from barsight.yard.lift_file import write_lifts
+from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet import load_magnet
-from barsight.yard.travel import Travel
+from barsight.yard.lifting.lift_file import write_lifts
+from barsight.yard.lifting.magnet import load_magnet
+from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.vetoes import Veto
 
 

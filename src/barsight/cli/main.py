@@ -29,6 +29,8 @@ COMMANDS = {
     "export": "Write a measured cloud or map as PLY, PCD, LAS, LAZ, E57, GeoTIFF or CSV",
     "report": "Write report.html anew from a measured yard's files",
 }
+GROUPS = ("bench", "calibrate")
+"""Commands that are packages: `command.py` in them finds the second word."""
 INTERRUPTED = 130
 
 
@@ -53,7 +55,7 @@ def run(arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
     try:
-        module = importlib.import_module(f"barsight.cli.{name}")
+        module = importlib.import_module(f"barsight.cli.{name}" + (".command" if name in GROUPS else ""))
         module.run(rest)
     except BarsightError as error:
         return _refuse(str(error), error.exit_code)

@@ -13,21 +13,21 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_directory
 from barsight.core.types import Trajectory
 from barsight.evaluation.board_poses import board_poses, by_gyro_alone_deg
-from barsight.evaluation.drift import Drift, compare, frame_errors
-from barsight.motion.example import matching_example
+from barsight.evaluation.trajectory_error import Drift, compare, frame_errors
+from barsight.motion.frontend.matching_example import matching_example
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
-from barsight.recording.corners import CornerRecording
+from barsight.recording.formats.board_corners import CornerRecording
+from barsight.recording.formats.ground_truth import GroundTruth, find_ground_truth, read_ground_truth
 from barsight.recording.open import open_recording
-from barsight.recording.truth import GroundTruth, find_ground_truth, read_ground_truth
-from barsight.report.files import write_relative, write_trajectory
 from barsight.report.odometry_page import OdometryResult, write_odometry_page
+from barsight.report.result_files import write_relative, write_trajectory
 
 
 def run(arguments: Sequence[str]) -> None:

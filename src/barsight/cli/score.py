@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from barsight.cli.arguments import call
-from barsight.evaluation.truth import score
+from barsight.evaluation.score import score
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -1,1 +1,1 @@
-"""Floor 6: agreement with references, scores against truth, benchmarks."""
+"""Floor 6: measured results against truth."""

@@ -7,14 +7,14 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from barsight.calibration.detection_files import NAMES, read_rows
+from barsight.calibration.boards.detection_files import NAMES, read_rows
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import ImuSamples
-from barsight.motion.corners import LEAST_POINTS
-from barsight.recording.corners import CornerRecording
-from barsight.recording.truth import GroundTruth
+from barsight.motion.frontend.board_corners import LEAST_POINTS
+from barsight.recording.formats.board_corners import CornerRecording
+from barsight.recording.formats.ground_truth import GroundTruth
 
 FIELDS = ("stamp_ns", "u", "v", "x", "y", "z")
 LEAST_POSES = 3

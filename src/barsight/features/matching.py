@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.types import RectifiedCamera
-from barsight.features.guided import project_stereo
+from barsight.features.guided_matching import project_stereo
 from barsight.features.orb import Features
 
 ROW_PX = 1.5

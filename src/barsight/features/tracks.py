@@ -15,14 +15,14 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import RectifiedPair
-from barsight.features.guided import (
+from barsight.features.guided_matching import (
     GuidedMatches,
     Predicted,
     match_across,
     match_guided,
     triangulate,
 )
-from barsight.features.patches import PatchImage, PatchPair
+from barsight.features.patch_alignment import PatchImage, PatchPair
 
 MOST_VIEWS = 8
 TILES = 4

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from barsight.calibration.rectification import Rectifier
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair, StereoFrame
-from barsight.mapping.carried import carried_along
+from barsight.mapping.ego_mask import carried_along
 from barsight.mapping.observation import CellObservations, observe
-from barsight.stereo.disparity_range import find_range
-from barsight.stereo.gaps import keep, surer_than, without_gaps
+from barsight.stereo.masking import keep, surer_than, without_gaps
 from barsight.stereo.method import StereoMethod
-from barsight.stereo.points import triangulate
+from barsight.stereo.search_range import find_range
 from barsight.stereo.settings import StereoSettings
+from barsight.stereo.triangulation import triangulate
 
 
 @dataclass(frozen=True, eq=False)

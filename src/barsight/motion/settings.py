@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from barsight.motion.crane import CraneSettings, CraneTrajectory
+from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings, CraneTrajectory
 from barsight.motion.estimator import TrajectoryEstimator
-from barsight.motion.fusion import FusedTrajectory, FusionSettings
-from barsight.motion.live import LiveSettings, LiveTrajectory
-from barsight.motion.odometry import StereoOdometry
-from barsight.motion.stitching import PaperStitching, StitchingSettings
-from barsight.motion.views import OdometrySettings
+from barsight.motion.fixed_lag.estimator import LiveSettings, LiveTrajectory
+from barsight.motion.frame_to_frame.stitching import PaperStitching, StitchingSettings
+from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
+from barsight.motion.frontend.stereo_features import OdometrySettings
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from barsight.calibration.documents import ImuNoise
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import ConfigError
-from barsight.core.types import (
-    CraneSamples,
-    ImuSamples,
-    LaserProfile,
-    RefusedFrame,
-    StereoFrame,
-)
+from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 
 
 @dataclass(frozen=True)

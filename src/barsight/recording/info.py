@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.camera import Camera
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Int64
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import CraneSamples, LaserProfile, RefusedFrame
-from barsight.recording.sensors import imu_hints
-from barsight.recording.stored import Source
+from barsight.recording.sensor_samples import imu_hints
+from barsight.recording.stored_images import Source
 
 GAP_FACTOR = 1.5
 LARGE_SHIFT_S = 0.5

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from barsight.calibration.detection_files import has_detections
+from barsight.calibration.boards.detection_files import has_detections
 from barsight.core.errors import InputError
-from barsight.recording.bag import BagRecording
 from barsight.recording.base import RecordingSettings
-from barsight.recording.corners import CornerRecording
-from barsight.recording.euroc import EurocRecording
-from barsight.recording.kitti import KittiRecording, is_kitti
-from barsight.recording.stored import Source
+from barsight.recording.formats.bag import BagRecording
+from barsight.recording.formats.board_corners import CornerRecording
+from barsight.recording.formats.euroc import EurocRecording
+from barsight.recording.formats.kitti import KittiRecording, is_kitti
+from barsight.recording.stored_images import Source
 
 BAG_KINDS = {".bag": "ros1", ".mcap": "ros2-mcap", ".db3": "ros2-sqlite3"}
 KNOWN = (

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from barsight.calibration.documents import ImuNoise
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 from barsight.recording.base import FrameIndex, Recording

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.camera import Camera
+from barsight.calibration.geometry.camera import Camera
 from barsight.core.arrays import Int64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.stamps import Pairing, pair_stamps, seconds_to_ns
 from barsight.core.types import RefusedFrame
 from barsight.recording.base import FrameIndex
-from barsight.recording.images import TornImageError, decode_gray
+from barsight.recording.image_decoding import TornImageError, decode_gray
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,11 @@ from barsight.core.json_values import json_value
 from barsight.core.motion_detail import InSigmas
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import Trajectory
-from barsight.evaluation.drift import Drift, FrameErrors
-from barsight.motion.example import MatchingExample
-from barsight.report.match_pictures import match_pictures
+from barsight.evaluation.trajectory_error import Drift, FrameErrors
+from barsight.motion.frontend.matching_example import MatchingExample
+from barsight.report.match_images import match_pictures
 from barsight.report.page import Figure, number, write_summary_page
-from barsight.report.page_path import path_plots
+from barsight.report.page_trajectory import path_plots
 from barsight.report.plots import SERIES, Plot, Trace, keep_extremes, numbers
 from barsight.result_folder import CameraPath
 

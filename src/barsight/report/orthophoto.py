@@ -12,7 +12,7 @@ import tifffile
 import barsight
 from barsight.core.arrays import UInt8
 from barsight.core.files import atomic_path
-from barsight.mapping.surface import Surface, grey_levels
+from barsight.mapping.surface.surface import Surface, grey_levels
 
 NO_DATA = 0
 _COLUMNS = 1024

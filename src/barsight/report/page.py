@@ -15,18 +15,12 @@ from plotly.offline import get_plotlyjs
 
 from barsight.core.files import atomic_path
 from barsight.core.parallel import beside
-from barsight.report.match_pictures import Picture
+from barsight.report.map_images import preview_uri, read_raster
+from barsight.report.match_images import Picture
 from barsight.report.page_maps import MapFigure, map_figures
-from barsight.report.page_path import path_plots
+from barsight.report.page_trajectory import path_plots
 from barsight.report.page_yard import yard_part
-from barsight.report.pictures import preview_uri, read_raster
-from barsight.report.plots import (
-    Plot,
-    compare,
-    contour_plot,
-    histogram_plot,
-    limits_plot,
-)
+from barsight.report.plots import Plot, compare, contour_plot, histogram_plot, limits_plot
 from barsight.result_folder import read_contours, read_laser, read_path, read_summary
 
 NONE = "–"
@@ -216,4 +210,4 @@ def environment() -> jinja2.Environment:
 
 def resource(name: str) -> str:
     """The text of one of this package's files."""
-    return resources.files("barsight.report").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("barsight.report").joinpath("templates", name).read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import UInt8
 from barsight.core.types import LaserProfile, Source
-from barsight.report.pictures import (
+from barsight.report.map_images import (
     FILLED_TINT_RGB,
     SOURCE_RGB,
     Raster,

@@ -11,10 +11,10 @@ import numpy as np
 
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import InputError
+from barsight.report.map_images import Raster, paint_height, robust_range
 from barsight.report.page_maps import LARGE_TEXT, Drawing, Key, MapFigure, Shape, draw_map
-from barsight.report.pictures import Raster, paint_height, robust_range
-from barsight.yard.bundle_file import read_bundles
-from barsight.yard.lift_file import read_lifts
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle
 
 FREE_RGB, COVERED_RGB, LIFT_RGB = "#39d353", "#f2b134", "#ff2fb3"

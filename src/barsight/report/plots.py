@@ -12,7 +12,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.types import Contour, LaserProfile, Source
-from barsight.evaluation.agreement import difference
+from barsight.mapping.agreement import difference
 
 MOST_POINTS = 20_000
 MOST_SCATTER = 3_000

@@ -1,1 +1,1 @@
-"""Floor 7: renders a bar yard with exact truth, as a recording in the EuRoC layout."""
+"""Floor 6: rendered recordings with exact truth."""

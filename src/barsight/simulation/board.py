@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.boards import Board, BoardKind
-from barsight.calibration.camera import Camera, Distortion
+from barsight.calibration.boards.board import Board, BoardKind
+from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.core.arrays import UInt8
 
 CAMERA = Camera(640, 512, 600.0, 600.0, 319.5, 255.5, Distortion.RADTAN, (-0.2, 0.06, 0.0, 0.0))

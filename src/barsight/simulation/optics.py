@@ -9,8 +9,8 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.camera import Camera, Distortion
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns

@@ -13,8 +13,8 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
-from barsight.simulation import layout
-from barsight.simulation.carried import cover, plate_at
+from barsight.simulation import euroc_files
+from barsight.simulation.hanging_plate import cover, plate_at
 from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
 from barsight.simulation.render import Look, render
@@ -98,26 +98,28 @@ def frame_stamps(settings: SimulationSettings, trajectory: CraneTrajectory) -> I
 def _write_slow_sensors(mav0: Path, world: World, surface: SurfaceTruth) -> ImuRecord:
     settings, trajectory, rig = world.settings, world.trajectory, world.mounted.rig
     sensors, lever = settings.sensors, np.array(CRANE_TO_BODY_M)
-    layout.write_body(mav0)
+    euroc_files.write_body(mav0)
     for name, camera, mounting in (
         ("cam0", rig.cam0, rig.body_from_cam0),
         ("cam1", rig.cam1, rig.body_from_cam1),
     ):
-        layout.write_camera(mav0 / name, camera, mounting, world.frame_stamp_ns, sensors.timeshift_cam_imu_s)
+        euroc_files.write_camera(
+            mav0 / name, camera, mounting, world.frame_stamp_ns, sensors.timeshift_cam_imu_s
+        )
     imu = record_imu(trajectory, sensors, _stream(settings, 4))
-    layout.write_imu(mav0 / "imu0", imu, sensors)
+    euroc_files.write_imu(mav0 / "imu0", imu, sensors)
     stamp_ns, place = record_encoders(trajectory, sensors, lever, _stream(settings, 5))
     nominal = world.mounted.nominal_yard_from_body
-    layout.write_crane(mav0 / "crane0", stamp_ns, place, lever, nominal, sensors)
+    euroc_files.write_crane(mav0 / "crane0", stamp_ns, place, lever, nominal, sensors)
     if sensors.laser_y_m:
         noise = _stream(settings, 6).normal(0, 1, surface.profile_z_m.shape) * sensors.laser_std_m
-        layout.write_laser(
+        euroc_files.write_laser(
             mav0 / "laser0", surface.profile_x_m, surface.profile_y_m, surface.profile_z_m + noise,
             sensors.laser_std_m,
         )  # fmt: skip
     truth_ns = stamps(trajectory.duration_s, GROUND_TRUTH_HZ)
     motion = trajectory.at(seconds(truth_ns))
-    layout.write_ground_truth(
+    euroc_files.write_ground_truth(
         mav0 / "state_groundtruth_estimate0", truth_ns, motion.position_m, _quaternions(motion.yard_from_body)
     )
     return imu
@@ -149,7 +151,7 @@ def _write_pictures(
                 cover(radiance, plate, rays[k], side, yard_from_cam, tile)
             noise = _stream(settings, 9, 2 * number + k)
             image = expose(radiance, shares[k], gain, settings.camera, noise)
-            layout.write_png(folder / "mav0" / name / "data" / f"{stamp}.png", image)
+            euroc_files.write_png(folder / "mav0" / name / "data" / f"{stamp}.png", image)
             if number in deep:
                 depth = true_depth(world.scene, camera, yard_from_cam, plate)
                 np.savez_compressed(folder / "truth" / f"depth_{name}_{stamp}.npz", z=depth)

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from barsight.calibration.camera import Camera
-from barsight.calibration.rig import StereoRig
+from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.pose import Pose
-from barsight.simulation.carried import Plate
+from barsight.simulation.hanging_plate import Plate
 from barsight.simulation.optics import sample_rays
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene

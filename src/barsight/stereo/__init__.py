@@ -1,1 +1,1 @@
-"""Floor 2: dense stereo. One file per method, each a function from a rectified pair to `Disparity`."""
+"""Floor 2: stereo methods behind one Protocol, their noise, triangulation and files."""

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from barsight.core.errors import ConfigError
-from barsight.stereo.barsight import BarsightSettings, BarsightStereo
-from barsight.stereo.census import Census, CensusSettings
-from barsight.stereo.csca import Csca, CscaSettings
+from barsight.stereo.baselines.census import Census, CensusSettings
+from barsight.stereo.baselines.csca import Csca, CscaSettings
+from barsight.stereo.baselines.nonlocal_aggregation import Nonlocal, NonlocalSettings
+from barsight.stereo.baselines.paper import Paper, PaperSettings
+from barsight.stereo.direct.pipeline import BarsightSettings, BarsightStereo
 from barsight.stereo.method import StereoMethod
-from barsight.stereo.nonlocal_tree import Nonlocal, NonlocalSettings
-from barsight.stereo.paper import Paper, PaperSettings
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 MethodName = Literal["sgbm", "csca", "nonlocal", "census", "paper", "barsight"]

@@ -10,7 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import Source
 from barsight.result_folder import Cloud
-from barsight.yard.stretches import patches
+from barsight.yard.sections import patches
 from barsight.yard.types import YardMap
 
 SOURCE_RGB = {

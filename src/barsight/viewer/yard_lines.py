@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64
-from barsight.yard.bundle_file import read_bundles
-from barsight.yard.lift_file import read_lifts
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle
 
 POLE_HEIGHT_M = 0.15

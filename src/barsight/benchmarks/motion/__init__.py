@@ -1,0 +1,1 @@
+"""Benchmarks of feature matching and of the estimators' speed."""

@@ -1,0 +1,287 @@
+"""`bench features` and `bench matching`: the paper's tables 2 and 3 with every filter's precision and recall.
+
+Truth is the true depth of a view and the true poses: a match is true within 2 px of where the feature's
+point truly reprojects. Needs a recording with encoders, IMU and stored true depth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+from scipy.spatial import cKDTree
+
+from barsight.benchmarks.motion.matching_truth import TrueStep, reprojected, true_steps
+from barsight.benchmarks.provenance import Provenance, Timing, provenance, timed, timing
+from barsight.core.arrays import Bool, Float64, UInt8
+from barsight.core.errors import Failed, InputError
+from barsight.core.pose import Pose
+from barsight.core.stamps import seconds_to_ns
+from barsight.features.detectors import DETECTORS, DetectorName, Keypoints, make_detector
+from barsight.features.guided_matching import (
+    PredictedMotion,
+    match_across,
+    match_left,
+    predict_places,
+    triangulate,
+)
+from barsight.features.matching import follows_trend, is_mutual, nearest, on_one_plane, passes_ratio
+from barsight.features.patch_alignment import PatchPair
+from barsight.features.self_similarity import repeat_px
+from barsight.features.tracks import Tracks
+from barsight.inertial.model import GRAVITY_MPS2, ORDINARY_NOISE, BodyState, ImuBias
+from barsight.inertial.preintegration import Preintegrator
+from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.motion.frontend.motion_prediction import CranePredictor
+from barsight.motion.frontend.tracking import FrontEndSettings, consensus
+from barsight.stereo.search_range import coarse_disparity
+
+TRUE_PX = 2.0
+TREND_PX = 5.0
+"""How near a match must be to the paper's motion trend."""
+NEIGHBOURS = 5
+GUESSED_PX = 2.0
+"""How far a disparity taken from neighbours that agree may be off (1 sigma)."""
+
+
+@dataclass(frozen=True)
+class FeatureRow:
+    """One detector on one picture."""
+
+    recording: str
+    detector: str
+    features: int
+    time: Timing
+
+
+@dataclass(frozen=True)
+class MatchRow:
+    """One filter after one detector on one pair of views. precision, kept: shares; kept is of the true
+    initial matches (NaN where there are none).
+    """
+
+    recording: str
+    detector: str
+    step: str
+    pairs: int
+    precision: float
+    kept: float
+    ms: float
+
+
+@dataclass(frozen=True)
+class MatchingBench:
+    """The rows and where they were made."""
+
+    made: Provenance
+    features: tuple[FeatureRow, ...]
+    matches: tuple[MatchRow, ...]
+
+
+def bench_features(
+    paths: tuple[Path, ...], detectors: tuple[DetectorName, ...] = DETECTORS, count: int = 2000,
+    repeats: int = 5,
+) -> MatchingBench:  # fmt: skip
+    """[paper Table 2]: how many features, how fast, on the first view with true depth of each recording."""
+    rows = []
+    for path in paths:
+        image = true_steps(path)[0].old.pair.left
+        for name in detectors:
+            found, seconds = timed(_detecting(name, image, count), repeats)
+            rows.append(FeatureRow(path.name, name, len(found), timing(seconds)))
+    return MatchingBench(provenance(), tuple(rows), ())
+
+
+def _detecting(name: DetectorName, image: UInt8, count: int) -> Callable[[], Keypoints]:
+    return lambda: make_detector(name)(image, count)
+
+
+def bench_matching(
+    paths: tuple[Path, ...], detectors: tuple[DetectorName, ...] = DETECTORS, count: int = 2000
+) -> MatchingBench:
+    """[paper Table 3], with precision and recall; the rows of a recording's steps are added up."""
+    rows: list[MatchRow] = []
+    for path in paths:
+        steps = true_steps(path)
+        for name in detectors:
+            tables = [_match(step, name, count) for step in steps]
+            for k, first in enumerate(tables[0]):
+                parts = [table[k] for table in tables]
+                pairs, right = sum(part[1] for part in parts), sum(part[2] for part in parts)
+                true = sum(part[3] for part in parts)
+                rows.append(
+                    MatchRow(
+                        path.name, name, first[0], pairs, right / pairs if pairs else float("nan"),
+                        sum(part[4] for part in parts) / true if true else float("nan"),
+                        1e3 * sum(part[5] for part in parts) / len(parts),
+                    )
+                )  # fmt: skip
+    return MatchingBench(provenance(), (), tuple(rows))
+
+
+def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, int, int, int, int, float]]:
+    """Of every step: name, judged pairs, true ones, true initial ones, true initial ones kept, seconds."""
+    detector = make_detector(name)
+    begin = time.perf_counter()
+    first, second = detector(step.old.pair.left, count), detector(step.new.pair.left, count)
+    places = first.pixels.astype(np.float64)
+    forward = nearest(first.descriptors, second.descriptors)
+    backward = nearest(second.descriptors, first.descriptors)
+    start = time.perf_counter() - begin
+    target = second.pixels[forward.index].astype(np.float64)
+    true_place = reprojected(step, places)
+    judged = np.isfinite(true_place).all(axis=1)
+    initial_true = judged & (np.linalg.norm(target - true_place, axis=1) < TRUE_PX)
+
+    rows: list[tuple[str, int, int, int, int, float]] = []
+
+    def row(label: str, kept: Bool, found: Float64, seconds: float) -> None:
+        kept = kept & judged
+        with np.errstate(invalid="ignore"):
+            right = kept & (np.linalg.norm(found - true_place, axis=1) < TRUE_PX)
+        both = right & initial_true
+        rows.append(
+            (label, int(kept.sum()), int(right.sum()), int(initial_true.sum()), int(both.sum()), seconds)
+        )
+
+    everything = forward.index >= 0
+    row("initial", everything, target, start)
+    mutual = is_mutual(forward, backward)
+    row("mutual", mutual, target, start)
+    clear = mutual & passes_ratio(forward)
+    row("ratio, mutual", clear, target, start)
+    begin = time.perf_counter()
+    plane = np.zeros(len(places), np.bool_)
+    plane[mutual] = on_one_plane(places[mutual], target[mutual])
+    plane_s = time.perf_counter() - begin
+    row("homography", plane, target, start + plane_s)
+    begin = time.perf_counter()
+    stereo, sigma, known = _stereo(step.old, places)
+    points = triangulate(np.where(known[:, None], stereo, [1e3, 0, 0]), step.rectifier.camera)
+    moved = _trend(step)
+    trend = plane & known & follows_trend(points, target, *moved, step.rectifier.camera, TREND_PX)
+    row("homography, trend", trend, target, start + plane_s + time.perf_counter() - begin)
+    begin = time.perf_counter()
+    kept, found = _ours(step, stereo, sigma, known)
+    row("ours", kept, found, start / 2 + time.perf_counter() - begin)
+    return rows
+
+
+def _stereo(pair: PatchPair, places: Float64) -> tuple[Float64, Float64, Bool]:
+    """u, v, right u (N, 3), sigma (N,) and which features have a depth."""
+    camera = pair.pair.camera
+    coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px)
+    row = (places[:, 1] * coarse.shape[0] / camera.height).astype(int)
+    column = (places[:, 0] * coarse.shape[1] / camera.width).astype(int)
+    guess = coarse[row, column].astype(np.float64)
+    right = match_across(pair, places, np.where(np.isfinite(guess), guess, 0.0))
+    known = right.found & np.isfinite(guess)
+    return np.column_stack([places, right.pixels[:, 0]]), right.sigma_px, known
+
+
+def _trend(step: TrueStep) -> tuple[Float64, Float64]:
+    """new_from_old of rect0 by [paper Eq. 11]: the IMU from nominal attitude and the encoders' speed."""
+    recording, shift = step.recording, step.recording.rig.timeshift_cam_imu_ns
+    imu, crane = recording.imu(), recording.crane()
+    if imu is None or crane is None:
+        raise InputError(
+            recording.path, "the motion trend needs IMU and encoders", "choose another recording"
+        )
+    old_ns, new_ns = step.old.pair.stamp_ns + shift, step.new.pair.stamp_ns + shift
+    noise = recording.imu_noise() or ORDINARY_NOISE
+    # A crane's way begins and ends at rest, so the means over it are the biases (the paper calibrates them).
+    up_in_body = crane.yard_from_body_nominal.T @ np.array([0.0, 0.0, GRAVITY_MPS2])
+    bias = ImuBias(imu.gyro_radps.mean(axis=0), imu.accel_mps2.mean(axis=0) - up_in_body)
+    place = fit_position(crane, old_ns, seconds_to_ns(0.35))
+    motion = Preintegrator(imu, noise).between(old_ns, new_ns, bias)
+    if isinstance(place, Failed) or isinstance(motion, Failed):
+        raise InputError(
+            recording.path, "IMU or encoders don't cover a view with true depth", "choose another"
+        )
+    start = BodyState(crane.yard_from_body_nominal, place.position_m, place.velocity_mps)
+    end = motion.predict(start)
+    body_from_rect0 = step.rectifier.body_from_rect0
+    yard_from_old = Pose("yard", "body", start.rotation, start.position_m) @ body_from_rect0
+    yard_from_new = Pose("yard", "body", end.rotation, end.position_m) @ body_from_rect0
+    moved = yard_from_new.inverse() @ yard_from_old
+    return moved.rotation, moved.translation
+
+
+def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple[Bool, Float64]:
+    """(N,) and (N, 2): which features are found again in their ellipses and agree in 3D, and where."""
+    recording, settings = step.recording, FrontEndSettings()
+    crane, imu = recording.crane(), recording.imu()
+    assert crane is not None and imu is not None
+    bias = imu.gyro_radps.mean(axis=0)
+    shift = recording.rig.timeshift_cam_imu_ns
+    predictor = CranePredictor(crane, imu, bias, step.rectifier, shift)
+    prediction = predictor(step.old.pair.stamp_ns, step.new.pair.stamp_ns)
+    kept, found = np.zeros(len(stereo), np.bool_), np.full((len(stereo), 2), np.nan)
+    if prediction is None:
+        return kept, found
+    index = np.flatnonzero(known)
+    depth = triangulate(stereo[index], step.rectifier.camera)[:, 2]
+    tracks = Tracks(
+        (step.old.left,), step.old.pair, index, stereo[index], sigma[index], np.zeros(len(index), np.int64),
+        stereo[index, :2], depth,
+    )  # fmt: skip
+    agreed = consensus(tracks, step.new, prediction, settings)
+    if isinstance(agreed, Failed):
+        return kept, found
+    kept[index[agreed[0]]] = True
+    found[index] = agreed[1].stereo[:, :2]
+    _alone(step, stereo, known, agreed[2], kept, found)
+    return kept, found
+
+
+def _alone(
+    step: TrueStep, stereo: Float64, known: Bool, motion: PredictedMotion, kept: Bool, found: Float64
+) -> None:
+    """Adds to `kept` and `found` what only the left pictures show: features without a partner in the new
+    right picture, and those that had none in the old one, at the depth on which their neighbours agree.
+    """
+    camera, sigma_px = step.rectifier.camera, FrontEndSettings().tracks.sigma_px
+    nearest_known = cKDTree(stereo[known, :2]).query(stereo[:, :2], k=NEIGHBOURS)[1]
+    around = (stereo[known, 0] - stereo[known, 2])[nearest_known]
+    disparity = np.where(known, stereo[:, 0] - stereo[:, 2], np.median(around, axis=1))
+    points = triangulate(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
+    sigmas = np.where(known[:, None], sigma_px, [sigma_px, sigma_px, GUESSED_PX])
+    predicted = predict_places(points, sigmas, motion, camera)
+    repeats = repeat_px(step.old.pair.left, stereo[:, :2])
+    pixels, seen = match_left(
+        step.old.left, stereo[:, :2], points[:, 2], step.new, predicted, sigma_px, repeats
+    )
+    seen &= ~kept & (known | (np.ptp(around, axis=1) < GUESSED_PX))
+    kept |= seen
+    found[seen] = pixels[seen]
+
+
+def feature_table(bench: MatchingBench) -> Table:
+    """For the terminal."""
+    table = Table(title="Features (paper, Table 2)", title_justify="left")
+    for column in ("recording", "detector", "features", "ms"):
+        table.add_column(column)
+    for row in bench.features:
+        t = row.time
+        table.add_row(
+            row.recording, row.detector, str(row.features),
+            f"{t.median_ms:.0f} ({t.fastest_ms:.0f}-{t.slowest_ms:.0f})",
+        )  # fmt: skip
+    return table
+
+
+def match_table(bench: MatchingBench) -> Table:
+    """For the terminal."""
+    table = Table(title="Matches (paper, Table 3); true within 2 px", title_justify="left")
+    for column in ("recording", "detector", "step", "pairs", "precision %", "true kept %", "ms"):
+        table.add_column(column)
+    for row in bench.matches:
+        table.add_row(
+            row.recording, row.detector, row.step, str(row.pairs), f"{100 * row.precision:.1f}",
+            f"{100 * row.kept:.1f}", f"{row.ms:.0f}",
+        )  # fmt: skip
+    return table

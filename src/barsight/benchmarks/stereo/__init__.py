@@ -1,0 +1,1 @@
+"""Stereo benchmarks: Middlebury pairs, rendered bars, speed."""

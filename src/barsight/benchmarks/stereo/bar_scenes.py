@@ -1,0 +1,132 @@
+"""The rendered scenes of `bench subpixel` and `bench target-size`: a tilted floor, a bar lying on it.
+
+The camera is the one of the crane: 1250 px focal length, 0.5 m baseline; the paper doesn't say what its own
+was. Only a window of the image is rendered. The right image's window is moved by a whole number of pixels
+(`doffs_px`), as a search range found from the images would be.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.benchmarks.stereo.bar_renderer import Bar, BarScene, Surface
+from barsight.core.arrays import Float64
+from barsight.core.types import DisparityRange, RectifiedCamera
+
+FOCAL_PX, BASELINE_M = 1250.0, 0.5
+WIDTH_PX, HEIGHT_PX = 416, 384
+BAR_DIAMETER_M = 0.09
+_MARGIN_PX = 12
+
+
+@dataclass(frozen=True)
+class PoseSpread:
+    """How far the poses of a benchmark differ; each is drawn evenly from plus or minus these."""
+
+    roll_deg: float = 20.0
+    """The bar's direction in the image against the columns."""
+    tilt_deg: float = 8.0
+    """The floor's normal against the optical axis, about either image axis."""
+    off_centre_px: float = 40.0
+    """The bar's place in the window; its fraction of a pixel is as good as even."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedScene:
+    """A scene and the whole candidates that cover it. range_m: depth of the bar's (floor's) nearest point on
+    the window's middle ray.
+    """
+
+    scene: BarScene
+    candidates: DisparityRange
+    range_m: float
+    roll_deg: float
+
+
+def bar_over_floor(
+    rng: np.random.Generator,
+    range_m: float,
+    gloss: float,
+    raised_m: float = 0.0,
+    spread: PoseSpread | None = None,
+) -> PosedScene:
+    """A bar of 90 mm whose top is range_m deep at the window's middle; pose, light and texture by chance.
+
+    gloss: gray levels of the strongest highlight. raised_m: the free space between bar and floor.
+    """
+    spread = spread or PoseSpread()
+    normal = _tilted(rng, spread.tilt_deg)
+    roll = math.radians(rng.uniform(-spread.roll_deg, spread.roll_deg))
+    radius = BAR_DIAMETER_M / 2
+    middle = rng.uniform(-spread.off_centre_px, spread.off_centre_px, 2) / FOCAL_PX
+    top = range_m * np.array([middle[0], middle[1], 1.0])
+    centre = top - normal * radius
+    # The floor's direction that falls on the image's column, turned by the roll.
+    column = np.cross(normal, [math.cos(roll), math.sin(roll), 0.0])
+    axis = column / np.linalg.norm(column)
+    offset = float(normal @ (centre - normal * (radius + raised_m)))
+    pixel_m = range_m / FOCAL_PX
+    steel = Surface(
+        brightness=rng.uniform(45, 75),
+        contrast=0.12,
+        finest_m=2 * pixel_m,
+        stretch=3.0,
+        gloss=gloss,
+        sharpness=rng.uniform(20, 60),
+    )
+    bar = Bar(centre, axis, radius, steel)
+    return _finish(rng, normal, offset, bar, range_m, math.degrees(roll))
+
+
+def tilted_floor(rng: np.random.Generator, range_m: float, tilt_deg: float) -> PosedScene:
+    """The floor alone, its normal tilted by tilt_deg in a direction by chance."""
+    turn = rng.uniform(0, 2 * math.pi)
+    lean = math.tan(math.radians(tilt_deg))
+    normal = np.array([lean * math.cos(turn), lean * math.sin(turn), -1.0])
+    normal /= np.linalg.norm(normal)
+    return _finish(rng, normal, float(normal[2] * range_m), None, range_m, 0.0)
+
+
+def _tilted(rng: np.random.Generator, tilt_deg: float) -> Float64:
+    lean = np.tan(np.radians(rng.uniform(-tilt_deg, tilt_deg, 2)))
+    normal = np.array([lean[0], lean[1], -1.0])
+    unit: Float64 = normal / np.linalg.norm(normal)
+    return unit
+
+
+def _finish(
+    rng: np.random.Generator, normal: Float64, offset: float, bar: Bar | None, range_m: float, roll_deg: float
+) -> PosedScene:
+    """Light, floor, window and range round the geometry."""
+    camera, candidates = _window(normal, offset, range_m)
+    side = rng.uniform(0, 2 * math.pi)
+    height = math.radians(rng.uniform(35, 75))
+    lamp = np.array([math.cos(side) * math.cos(height), math.sin(side) * math.cos(height), -math.sin(height)])
+    floor = Surface(rng.uniform(100, 140), 0.09, 2 * range_m / FOCAL_PX)
+    ambient = float(rng.uniform(0.5, 0.8))
+    scene = BarScene(camera, normal, offset, floor, bar, lamp, ambient)
+    return PosedScene(scene, candidates, range_m, roll_deg)
+
+
+def _window(normal: Float64, offset: float, range_m: float) -> tuple[RectifiedCamera, DisparityRange]:
+    """The camera of the window, whose disparities begin a margin above zero, and their range.
+
+    The floor's disparity is f b (normal . ray) / offset; the bar's top is the nearest there is.
+    """
+    cx, cy = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
+    corners = [
+        FOCAL_PX * BASELINE_M * float(normal @ np.array([x / FOCAL_PX, y / FOCAL_PX, 1.0])) / offset
+        for x in (-cx, cx)
+        for y in (-cy, cy)
+    ]
+    lowest = math.floor(min(corners)) - _MARGIN_PX
+    # Along a tilted bar the nearest point of the window is nearer than in its middle, as the floor's is.
+    floor_middle = FOCAL_PX * BASELINE_M * float(normal[2]) / offset
+    rise = FOCAL_PX * BASELINE_M / range_m - floor_middle
+    highest = math.ceil(max(corners) + max(rise, 0.0) * max(corners) / floor_middle) + _MARGIN_PX
+    count = -(-(highest - lowest) // 16) * 16
+    camera = RectifiedCamera(FOCAL_PX, cx, cy, BASELINE_M, float(lowest), WIDTH_PX, HEIGHT_PX)
+    return camera, DisparityRange(0, count)

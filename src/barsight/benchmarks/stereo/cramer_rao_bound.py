@@ -1,0 +1,29 @@
+"""The limit that the images' noise sets to a match [Cramer 1946, Rao 1945]."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool
+from barsight.core.types import RectifiedPair
+from barsight.stereo.direct.refinement import RefinementSettings
+from barsight.stereo.sgbm import image_noise
+
+_WINDOW_PX = 21
+
+
+def noise_limit_px(pair: RectifiedPair, where: Bool) -> float:
+    """Sigma (px) that no estimate over our long support can beat: the root of twice the noise's variance over
+    the squared gradients that the support sums up; the median over `where`.
+
+    Noise is measured in the images; what it adds to the gradients' power is taken off. A Gaussian support of
+    sigmas a and b hears as much as 4 pi a b pixels in full.
+    """
+    shape = RefinementSettings()
+    noise = (image_noise(pair.left) ** 2 + image_noise(pair.right) ** 2) / 2
+    # A central difference halves the noise's variance.
+    slope = cv2.Sobel(pair.left, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    power = cv2.boxFilter(slope * slope, -1, (_WINDOW_PX, _WINDOW_PX)) - noise / 2
+    heard = 4 * np.pi * shape.along_px * shape.across_px
+    return float(np.median(np.sqrt(2 * noise / (heard * np.maximum(power[where], 0.1)))))

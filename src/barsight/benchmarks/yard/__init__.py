@@ -1,0 +1,1 @@
+"""Benchmarks of whole yards: the field test, bundles, lifts, length."""

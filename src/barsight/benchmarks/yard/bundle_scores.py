@@ -1,0 +1,228 @@
+"""Found bundles against the true ones of a simulated yard."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from barsight.benchmarks.provenance import Provenance, provenance
+from barsight.core.arrays import Float64
+from barsight.core.errors import InputError
+from barsight.yard.types import Bundle
+
+_INSIDE = 1.959964
+_COUNTS = ("free", "found", "claimed", "wrong", "said_count", "right_count")
+
+
+@dataclass(frozen=True, eq=False)
+class TrueBundle:
+    """centre_m: (3,) the axis at mid-length. on_top: no bundle lies on it."""
+
+    centre_m: Float64
+    yaw_rad: float
+    length_m: float
+    width_m: float
+    top_z_m: float
+    bar_diameter_m: float
+    bars: int
+    layer: int
+    on_top: bool
+
+
+@dataclass(frozen=True, eq=False)
+class BundleErrors:
+    """Errors of the free true bundles that were found, stacked over yards, and what was missed or false.
+
+    errors, sigmas: by figure (N,), found minus true; NaN where the figure is unknown. free: true bundles with
+    nothing on them; found: of those; claimed: found bundles said to be free; wrong: of those without a true
+    free one. said_count, right_count: pairs whose number of bars was said, and right.
+    """
+
+    errors: dict[str, Float64]
+    sigmas: dict[str, Float64]
+    free: int
+    found: int
+    claimed: int
+    wrong: int
+    said_count: int
+    right_count: int
+    confidence: Float64
+    is_right: Float64
+
+
+def read_true_bundles(recording: Path) -> tuple[TrueBundle, ...]:
+    """truth/bundles.json of a simulated recording."""
+    path = recording / "truth" / "bundles.json"
+    if not path.is_file():
+        raise InputError(path, "no such file", "give a simulated recording")
+    return tuple(
+        TrueBundle(
+            np.array(row["center"]), float(np.radians(row["yaw_deg"])), row["length"],
+            2 * row["bundle_radius"], row["top_z"], row["bar_diameter"], row["bars"], row["lay"],
+            row["on_top"],
+        )
+        for row in json.loads(path.read_text(encoding="utf-8"))
+    )  # fmt: skip
+
+
+def score_bundles(found: tuple[Bundle, ...], true: tuple[TrueBundle, ...]) -> BundleErrors:
+    """Pair each true free bundle with the nearest found one whose axis runs inside it."""
+    free = [t for t in true if t.on_top]
+    claimed = [b for b in found if b.on_top]
+    pairs, used = [], set()
+    for t in free:
+        near = [(abs(_offset(b, t)[0]), k) for k, b in enumerate(claimed) if k not in used and _inside(b, t)]
+        if near:
+            used.add(min(near)[1])
+            pairs.append((claimed[min(near)[1]], t))
+    errors: dict[str, list[float]] = {}
+    sigmas: dict[str, list[float]] = {}
+    for b, t in pairs:
+        for name, (error, sigma) in _errors(b, t).items():
+            errors.setdefault(name, []).append(error)
+            sigmas.setdefault(name, []).append(sigma)
+    counted = [(b.bars, t.bars) for b, t in pairs if b.bars > 0]
+    return BundleErrors(
+        errors={name: np.array(values) for name, values in errors.items()},
+        sigmas={name: np.array(values) for name, values in sigmas.items()},
+        free=len(free),
+        found=len(pairs),
+        claimed=len(claimed),
+        wrong=len(claimed) - len(used),
+        said_count=len(counted),
+        right_count=sum(said == is_ for said, is_ in counted),
+        confidence=np.array([b.confidence for b in claimed]),
+        is_right=np.array([float(k in used) for k in range(len(claimed))]),
+    )
+
+
+def joined(parts: list[BundleErrors]) -> BundleErrors:
+    """Several yards as one."""
+    names = sorted({name for part in parts for name in part.errors})
+    none = np.empty(0)
+
+    def stack(tables: list[dict[str, Float64]]) -> dict[str, Float64]:
+        return {name: np.concatenate([table.get(name, none) for table in tables]) for name in names}
+
+    return BundleErrors(
+        errors=stack([p.errors for p in parts]),
+        sigmas=stack([p.sigmas for p in parts]),
+        free=sum(p.free for p in parts),
+        found=sum(p.found for p in parts),
+        claimed=sum(p.claimed for p in parts),
+        wrong=sum(p.wrong for p in parts),
+        said_count=sum(p.said_count for p in parts),
+        right_count=sum(p.right_count for p in parts),
+        confidence=np.concatenate([p.confidence for p in parts]),
+        is_right=np.concatenate([p.is_right for p in parts]),
+    )
+
+
+def figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
+    """By figure: count, bias, median and P95 of the size (mm; yaw in degrees), share in the 95 % interval."""
+    out = {}
+    for name, error in scores.errors.items():
+        sigma = scores.sigmas[name]
+        known = np.isfinite(error)
+        if not known.any():
+            continue
+        unit = np.degrees(1.0) if name == "yaw" else 1e3
+        size = np.abs(error[known])
+        out[name] = {
+            "samples": float(known.sum()),
+            "bias": float(error[known].mean() * unit),
+            "median": float(np.median(size) * unit),
+            "p95": float(np.percentile(size, 95) * unit),
+            "max": float(size.max() * unit),
+            "within_95_pct": float(100 * np.mean(size <= _INSIDE * sigma[known])),
+        }
+    return out
+
+
+@dataclass(frozen=True)
+class BundleReport:
+    """What a benchmark of bundles says, for a file. cpu_seconds: per yard, none for a measured folder."""
+
+    provenance: Provenance
+    counts: dict[str, int]
+    figures: dict[str, dict[str, float]]
+    cpu_seconds: tuple[float, ...]
+
+
+def bundle_report(scores: BundleErrors, cpu_seconds: tuple[float, ...]) -> BundleReport:
+    """Counts and figures with commit and machine."""
+    counts = {name: int(getattr(scores, name)) for name in _COUNTS}
+    return BundleReport(provenance(), counts, figures(scores), cpu_seconds)
+
+
+def bundle_table(scores: BundleErrors) -> Table:
+    """The figures for people; lengths in mm, yaw in degrees."""
+    title = (
+        f"{scores.found} of {scores.free} free bundles found, {scores.wrong} of {scores.claimed} false; "
+        f"bars counted right in {scores.right_count} of {scores.said_count}"
+    )
+    table = Table("figure", title=title, box=SIMPLE_HEAD)
+    for head in ("n", "bias", "median", "P95", "max", "in 95 %"):
+        table.add_column(head, justify="right")
+    for name, row in figures(scores).items():
+        digits = 3 if name == "yaw" else 1
+        numbers = (f"{row[key]:.{digits}f}" for key in ("bias", "median", "p95", "max"))
+        table.add_row(name, f"{row['samples']:.0f}", *numbers, f"{row['within_95_pct']:.1f}")
+    return table
+
+
+def reliability(scores: BundleErrors) -> str:
+    """Stated confidence of the bundles said to be free against the share that is right."""
+    out = []
+    for name, part in (("0.9 or more", scores.confidence >= 0.9), ("less", scores.confidence < 0.9)):
+        if part.any():
+            stated, right = scores.confidence[part].mean(), scores.is_right[part].mean()
+            out.append(f"{name}: {part.sum()} bundles, stated {stated:.2f}, right {right:.2f}")
+    return f"confidence {'; '.join(out) or '-'}"
+
+
+def _axes(true: TrueBundle) -> tuple[Float64, Float64]:
+    c, s = np.cos(true.yaw_rad), np.sin(true.yaw_rad)
+    return np.array([c, s, 0.0]), np.array([-s, c, 0.0])
+
+
+def _offset(found: Bundle, true: TrueBundle) -> tuple[float, float]:
+    """Sideways of the true axis at the found middle, and along it."""
+    across, along = _axes(true)
+    step = found.centre_m - true.centre_m
+    return float(step @ across), float(step @ along)
+
+
+def _inside(found: Bundle, true: TrueBundle) -> bool:
+    across, along = _offset(found, true)
+    turned = abs((found.yaw_rad - true.yaw_rad + np.pi / 2) % np.pi - np.pi / 2)
+    level = abs(found.top_z_m - true.top_z_m) < true.width_m / 2
+    return abs(across) < true.width_m / 2 and abs(along) < true.length_m / 2 and turned < 0.2 and level
+
+
+def _errors(found: Bundle, true: TrueBundle) -> dict[str, tuple[float, float]]:
+    sigma = found.sigma
+    along = _axes(true)[1]
+    turned = (found.yaw_rad - true.yaw_rad + np.pi / 2) % np.pi - np.pi / 2
+    flip = 1 if np.cos(found.yaw_rad - true.yaw_rad) > 0 else -1
+    out = {
+        "lateral": (_offset(found, true)[0], sigma.lateral_m),
+        "yaw": (float(turned), sigma.yaw_rad),
+        "top": (found.top_z_m - true.top_z_m, sigma.top_z_m),
+        "width": (found.width_m - true.width_m, sigma.width_m),
+        "diameter": (found.bar_diameter_m - true.bar_diameter_m, sigma.bar_diameter_m),
+    }
+    if found.bars != true.bars:
+        out["diameter"] = (float("nan"), float("nan"))
+    for k, name in enumerate(("low end", "high end")):
+        side = (-1, 1)[k] * flip
+        error = float((found.ends_m[k] - true.centre_m) @ along) - side * true.length_m / 2
+        out[name] = (
+            (float("nan"), float("nan")) if found.ends_open[k] else (side * error, found.ends_sigma_m[k])
+        )
+    return out

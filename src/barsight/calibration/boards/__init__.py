@@ -1,0 +1,1 @@
+"""Calibration boards, their detection and their warp."""

@@ -1,0 +1,109 @@
+"""AprilGrid and ChArUco boards: markers carry numbers, so a half-seen board counts."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.calibration.boards.board import Board
+from barsight.calibration.boards.board_views import Corners
+from barsight.core.arrays import Float64, Int64, UInt8
+from barsight.core.errors import ConfigError, Failed
+
+FEWEST_TAGS = 4
+FEWEST_CORNERS = 8
+BORDER_BITS = (2, 1)
+"""Kalibr prints its tags with a black border of two cells, others with one."""
+
+
+def detect_charuco(board: Board, image: UInt8) -> Corners | Failed:
+    """The inner corners of a ChArUco board, new or legacy pattern. Failed `no-board`."""
+    dictionary = _dictionary(board.dictionary)
+    size = (board.columns, board.rows)
+    best: tuple[Int64, Float64] | None = None
+    for legacy in (False, True):
+        pattern = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary)
+        pattern.setLegacyPattern(legacy)
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(image)
+        if ids is not None and (best is None or len(ids) > best[0].size):
+            best = ids.ravel().astype(np.int64), pixels.reshape(-1, 2).astype(np.float64)
+    if best is None or best[0].size < FEWEST_CORNERS:
+        count = 0 if best is None else best[0].size
+        return Failed("no-board", f"no ChArUco board found ({count} corners, {FEWEST_CORNERS} are needed)")
+    ids, pixels = best
+    points = board.points_m[ids, :2]
+    if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-9) < 2:
+        return Failed("no-board", "the board's corners in sight lie on one line")
+    return Corners(ids, pixels)
+
+
+def detect_aprilgrid(board: Board, image: UInt8) -> Corners | Failed:
+    """The tags' corners of an AprilGrid (36h11). Failed `no-board` with fewer than four tags not in a row.
+
+    How each tag is turned on its place differs between printers, so it is taken from the places of the tags'
+    centres, not from the tags.
+    """
+    found = max((_tags(image, bits) for bits in BORDER_BITS), key=lambda tags: len(tags[0]))
+    numbers, quads = found
+    known = numbers < board.columns * board.rows
+    strange = int((~known).sum())
+    numbers, quads = numbers[known], quads[known]
+    if numbers.size < FEWEST_TAGS:
+        note = f", {strange} of another board" if strange else ""
+        return Failed("no-board", f"no AprilGrid found ({numbers.size} tags{note}; {FEWEST_TAGS} are needed)")
+    corners = board.points_m.reshape(-1, 4, 3)[numbers, :, :2]
+    turned = _turn(corners, quads)
+    if isinstance(turned, Failed):
+        return turned
+    ids = (4 * numbers[:, None] + np.arange(4)).ravel()
+    pixels = _refine(image, turned)
+    return Corners(ids, pixels.reshape(-1, 2))
+
+
+def _tags(image: UInt8, border_bits: int) -> tuple[Int64, Float64]:
+    """numbers (N,), quads (N, 4, 2); a number seen twice is dropped."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border_bits
+    parameters.minMarkerPerimeterRate = 0.01
+    parameters.adaptiveThreshWinSizeMax = 43
+    detector = cv2.aruco.ArucoDetector(_dictionary("DICT_APRILTAG_36H11"), parameters)
+    quads, ids, _ = detector.detectMarkers(image)
+    if ids is None:
+        return np.empty(0, np.int64), np.empty((0, 4, 2))
+    numbers, counts = np.unique(ids.ravel(), return_counts=True)
+    once = np.isin(ids.ravel(), numbers[counts == 1])
+    kept = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[once]
+    order = np.argsort(ids.ravel()[once])
+    return ids.ravel()[once][order].astype(np.int64), kept[order]
+
+
+def _turn(corners: Float64, quads: Float64) -> Float64 | Failed:
+    """quads (N, 4, 2) with each tag's corners in the order of the board's `corners` (N, 4, 2)."""
+    homography, _ = cv2.findHomography(corners.mean(axis=1), quads.mean(axis=1), cv2.RANSAC, 5.0)
+    if homography is None or abs(np.linalg.det(homography)) < 1e-12:
+        return Failed("no-board", "the tags in sight lie on one line")
+    flat = np.column_stack([corners.reshape(-1, 2), np.ones(corners.size // 2)]) @ homography.T
+    expected = (flat[:, :2] / flat[:, 2:]).reshape(-1, 4, 2)
+    orders = [np.roll(q, -k, axis=1) for q in (quads, quads[:, ::-1]) for k in range(4)]
+    errors = [float(np.median(np.linalg.norm(order - expected, axis=2))) for order in orders]
+    side = float(np.median(np.linalg.norm(quads[:, 0] - quads[:, 1], axis=1)))
+    if min(errors) > 0.25 * side:
+        return Failed("no-board", "the tags don't lie as on this AprilGrid (another board or another size)")
+    return orders[int(np.argmin(errors))]
+
+
+def _refine(image: UInt8, quads: Float64) -> Float64:
+    side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min()
+    half = int(np.clip(0.1 * side, 1, 5))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    start = quads.reshape(-1, 1, 2).astype(np.float32)
+    refined = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), criteria)
+    near = np.linalg.norm(refined - start, axis=2) < half + 1
+    return np.where(near[:, :, None], refined, start).astype(np.float64).reshape(quads.shape)
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    spelt = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
+    if name.upper() not in spelt:
+        raise ConfigError(f"{name!r} is no marker dictionary; known are {', '.join(sorted(spelt))}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spelt[name.upper()]))

@@ -1,0 +1,1 @@
+"""IMU noise and camera-IMU calibration on a continuous-time spline."""

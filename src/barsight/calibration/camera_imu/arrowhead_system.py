@@ -1,0 +1,223 @@
+"""Least squares whose unknowns form a chain in time plus a few common ones: banded, with an arrow's head.
+
+Every sample has ROWS whitened residuals that depend on the unknowns of ORDER neighbouring control points and
+on the common parameters. The chain is eliminated by a banded Cholesky factor; what is left, the Schur
+complement, is the information of the common parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.calibration.camera_imu.pose_spline import STATE
+from barsight.calibration.camera_imu.spline_kernels import ORDER
+from barsight.core.arrays import Float64, Int64, kernel
+from barsight.core.linalg import skyline
+from barsight.core.linalg.skyline import Band
+
+ROWS = 6
+LOCAL = STATE * ORDER
+RIDGE = 1e-12
+"""Share of the usual information that even a control point which nothing was seen of is given."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """K samples' whitened rows: residual (K, ROWS), measured minus predicted; first (K,) control point;
+    by_chain (K, ROWS, LOCAL) and by_common (K, ROWS, P) the prediction's derivatives."""
+
+    first: Int64
+    residual: Float64
+    by_chain: Float64
+    by_common: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Walks:
+    """The prior on the biases: neighbouring control points differ by `sigma` (6,), gyro then accelerometer.
+
+    difference: (M - 1, 6) the next control point's biases minus this one's.
+    """
+
+    difference: Float64
+    sigma: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class ArrowSystem:
+    """The normal equations. chain: (N, LOCAL) the lower band as `skyline.even`; border (N, P); common (P, P);
+    chain_gradient (N,), common_gradient (P,), both downhill."""
+
+    chain: Float64
+    border: Float64
+    common: Float64
+    chain_gradient: Float64
+    common_gradient: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """The chain's factor; what it takes off: through (N, P) = chain^-1 border;
+    information (P, P)."""
+
+    factor: Band
+    through: Float64
+    information: Float64
+
+    def chain_solve(self, right: Float64) -> Float64:
+        """chain^-1 right, (N,)."""
+        solved = right.reshape(-1, 1).copy()
+        skyline.solve_forward(self.factor, solved)
+        skyline.solve_back(self.factor, solved)
+        return solved[:, 0]
+
+
+def assemble(samples: Samples, walks: Walks, control_points: int) -> ArrowSystem:
+    """The normal equations of all samples and the walks."""
+    count, width = control_points * STATE, samples.by_common.shape[2]
+    chain, border = np.zeros((count, LOCAL)), np.zeros((count, width))
+    gradient, common, common_gradient = np.zeros(count), np.zeros((width, width)), np.zeros(width)
+    _add(
+        samples.first, samples.residual, samples.by_chain, samples.by_common, chain, border, gradient, common,
+        common_gradient,
+    )  # fmt: skip
+    information = 1 / walks.sigma**2
+    whole = chain.reshape(control_points, STATE, LOCAL)
+    bias = np.arange(6, STATE)
+    whole[:-1, bias, LOCAL - 1] += information
+    whole[1:, bias, LOCAL - 1] += information
+    whole[1:, bias, LOCAL - 1 - STATE] -= information
+    pull = walks.difference * information
+    slope = gradient.reshape(control_points, STATE)
+    slope[:-1, 6:] += pull
+    slope[1:, 6:] -= pull
+    return ArrowSystem(chain, border, common, gradient, common_gradient)
+
+
+def eliminate(system: ArrowSystem, damping: float = 0.0) -> Eliminated:
+    """Take the chain out, its diagonal and the common one's raised by the share `damping`.
+
+    Raises LinAlgError where the chain is not determined.
+    """
+    chain = system.chain.copy()
+    diagonal = system.chain[:, -1].reshape(-1, STATE)
+    chain[:, -1] += (damping * diagonal + RIDGE * np.median(diagonal, axis=0)).ravel()
+    factor = skyline.even(chain)
+    if not skyline.factorise(factor):
+        raise np.linalg.LinAlgError("the chain is not determined")
+    through = system.border.copy()
+    skyline.solve_forward(factor, through)
+    skyline.solve_back(factor, through)
+    common = system.common + damping * np.diag(np.diag(system.common))
+    return Eliminated(factor, through, common - np.einsum("np,nq->pq", system.border, through))
+
+
+def step(system: ArrowSystem, eliminated: Eliminated) -> tuple[Float64, Float64]:
+    """The Newton step: chain (N,) and common (P,)."""
+    alone = eliminated.chain_solve(system.chain_gradient)
+    target = system.common_gradient - np.einsum("np,n->p", system.border, alone)
+    scale = 1 / np.sqrt(np.maximum(np.diag(eliminated.information), 1e-300))
+    unit = eliminated.information * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(unit)
+    values = np.maximum(values, 1e-12 * values[-1])
+    common = scale * (vectors @ ((vectors.T @ (scale * target)) / values))
+    return alone - np.einsum("np,p->n", eliminated.through, common), common
+
+
+def projected(samples: Samples, through: Float64) -> Float64:
+    """(K, ROWS, P): derivatives by the common parameters with the chain following as it is pulled along."""
+    out = samples.by_common.copy()
+    _project(samples.first, samples.by_chain, through, out)
+    return out
+
+
+def predicted(samples: Samples, chain: Float64, common: Float64) -> Float64:
+    """(K, ROWS): how a step of the unknowns changes the predictions."""
+    change: Float64 = np.einsum("krp,p->kr", samples.by_common, common)
+    _predict(samples.first, samples.by_chain, chain, change)
+    return change
+
+
+def pulled(samples: Samples, residual: Float64, count: int) -> tuple[Float64, Float64]:
+    """The gradient, chain (count,) and common (P,), that other whitened residuals (K, ROWS) would give."""
+    gradient = np.zeros(count)
+    _pull(samples.first, samples.by_chain, residual, gradient)
+    return gradient, np.einsum("krp,kr->p", samples.by_common, residual)
+
+
+@kernel(fastmath=True)
+def _add(
+    first: Int64, residual: Float64, by_chain: Float64, by_common: Float64, chain: Float64, border: Float64,
+    gradient: Float64, common: Float64, common_gradient: Float64,
+) -> None:  # fmt: skip
+    width = by_common.shape[2]
+    live = np.empty(LOCAL, np.int64)
+    columns = np.empty((LOCAL, ROWS))
+    for k in range(first.size):
+        base = first[k] * STATE
+        used = 0
+        for a in range(LOCAL):
+            size = 0.0
+            for r in range(ROWS):
+                columns[used, r] = by_chain[k, r, a]
+                size += abs(columns[used, r])
+            if size > 0:
+                live[used] = a
+                used += 1
+        for m in range(used):
+            j = base + live[m]
+            total = 0.0
+            for r in range(ROWS):
+                total += columns[m, r] * residual[k, r]
+            gradient[j] += total
+            for n in range(m, used):
+                total = 0.0
+                for r in range(ROWS):
+                    total += columns[m, r] * columns[n, r]
+                chain[base + live[n], LOCAL - 1 - live[n] + live[m]] += total
+            for p in range(width):
+                total = 0.0
+                for r in range(ROWS):
+                    total += columns[m, r] * by_common[k, r, p]
+                border[j, p] += total
+        for r in range(ROWS):
+            for p in range(width):
+                value = by_common[k, r, p]
+                if value != 0.0:
+                    common_gradient[p] += value * residual[k, r]
+                    for q in range(width):
+                        common[p, q] += value * by_common[k, r, q]
+
+
+@kernel(fastmath=True)
+def _project(first: Int64, by_chain: Float64, through: Float64, out: Float64) -> None:
+    for k in range(first.size):
+        base = first[k] * STATE
+        for r in range(ROWS):
+            for a in range(LOCAL):
+                value = by_chain[k, r, a]
+                if value != 0.0:
+                    for p in range(out.shape[2]):
+                        out[k, r, p] -= value * through[base + a, p]
+
+
+@kernel(fastmath=True)
+def _predict(first: Int64, by_chain: Float64, chain: Float64, out: Float64) -> None:
+    for k in range(first.size):
+        base = first[k] * STATE
+        for r in range(ROWS):
+            total = 0.0
+            for a in range(LOCAL):
+                total += by_chain[k, r, a] * chain[base + a]
+            out[k, r] += total
+
+
+@kernel(fastmath=True)
+def _pull(first: Int64, by_chain: Float64, residual: Float64, gradient: Float64) -> None:
+    for k in range(first.size):
+        base = first[k] * STATE
+        for r in range(ROWS):
+            for a in range(LOCAL):
+                gradient[base + a] += by_chain[k, r, a] * residual[k, r]

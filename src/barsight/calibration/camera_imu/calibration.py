@@ -1,0 +1,206 @@
+"""Calibrating cameras against an IMU from a recording in front of a board [Furgale 2013; paper Eq. 8-10].
+
+Corners, gyro and accelerometer are weighted by their own scatter: the corners of one picture share errors
+(board, lens, blur), so a picture is given the weight by which whole pictures scatter, not single corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.boards.board import Board
+from barsight.calibration.boards.board_views import BoardView
+from barsight.calibration.camera_imu.problem import MOUNT, Problem, Sightings, State
+from barsight.calibration.camera_imu.setup import prepare
+from barsight.calibration.camera_imu.solver import Solution, Spread, sensor_spreads, solve
+from barsight.calibration.camera_imu.uncertainty import Uncertainty, uncertainty
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.arrays import Float64
+from barsight.core.errors import CalibrationError
+from barsight.core.pose import Pose
+from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import ImuSamples
+
+HUBER = 3.0
+CORNER_SIGMAS = 4.5
+KNOCK_SAMPLES, KNOCK_FACTOR = 15, 2.0
+WEIGHT_ROUNDS = 5
+SETTLED = 0.03
+LEAST_INFLATION = 1.02
+
+
+@dataclass(frozen=True, eq=False)
+class CameraImuCalibration:
+    """A calibrated rig, whose body is the IMU, and how well it is known.
+
+    problem: what was used, its sigmas as found; stated: the IMU's noise as it was given. solution: the way
+    of the body and the residuals. corner_px: single corners' noise; problem.sigmas.corner_px is by how much
+    whole pictures scatter. spreads: corners, gyro, accelerometer against the sigmas.
+    removed_corners: how many outliers.
+    """
+
+    source: Path
+    board: Board
+    rig: StereoRig
+    stated: ImuNoise
+    problem: Problem
+    solution: Solution
+    spreads: tuple[Spread, Spread, Spread]
+    uncertainty: Uncertainty
+    corner_px: float
+    removed_corners: int
+    notes: tuple[str, ...]
+
+    @property
+    def sigma(self) -> Float64:
+        """(P,) one standard deviation of each common parameter, all causes together."""
+        return np.sqrt(np.diag(self.uncertainty.covariance))
+
+    @property
+    def baseline_sigma_m(self) -> float:
+        """One standard deviation of the distance between the cameras."""
+        first, second = self.solution.state.mounts
+        direction = (second.place_m - first.place_m) / np.linalg.norm(second.place_m - first.place_m)
+        row = np.zeros(self.sigma.size)
+        row[3:6], row[MOUNT + 3 : MOUNT + 6] = -direction, direction
+        return float(np.sqrt(row @ self.uncertainty.covariance @ row))
+
+
+def calibrate_camera_imu(
+    views: Sequence[BoardView], imu: ImuSamples, rig: StereoRig, board: Board, noise: ImuNoise, source: Path,
+    *, scales: bool = False,
+) -> CameraImuCalibration:  # fmt: skip
+    """Calibrate from detections. Only the lenses are taken from `rig`; a view's name is its stamp in ns.
+
+    scales: solve for the IMU's scales and misalignments too. Raises CalibrationError with the remedy.
+    """
+    setup = prepare(views, imu, rig, board, noise, source)
+    problem = replace(setup.problem, scales=scales)
+    try:
+        solution = solve(problem, setup.start, HUBER)
+        problem, corner_px, removed = _without_outliers(problem, solution)
+        problem, knocks = _without_knocks(problem, solution)
+        problem, solution, spreads = _weighted(problem, solution.state, corner_px)
+        known = uncertainty(problem, solution)
+        solved = _rig(rig, solution.state)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(
+            source, "the body's way can't be determined from this recording",
+            "keep the board in sight of both cameras while the rig moves",
+        ) from None  # fmt: skip
+    except ValueError as error:
+        raise CalibrationError(source, str(error), "check that the cameras aren't exchanged") from None
+    if not solution.converged:
+        raise CalibrationError(
+            source, "the calibration doesn't converge", "record again with the board in sight throughout"
+        )
+    return CameraImuCalibration(
+        source,
+        board,
+        solved,
+        noise,
+        problem,
+        solution,
+        spreads,
+        known,
+        corner_px,
+        removed,
+        (*setup.notes, *knocks),
+    )
+
+
+def _without_outliers(problem: Problem, solution: Solution) -> tuple[Problem, float, int]:
+    """Without the corners beyond 4.5 robust sigma; that sigma (px) and how many they were."""
+    lengths = [np.linalg.norm(residual, axis=1) for residual in solution.linearised.residuals_px]
+    sigma = float(np.median(np.concatenate(lengths)) / np.sqrt(2 * np.log(2)))
+    kept, removed = [], 0
+    for sightings, length in zip(problem.sightings, lengths, strict=True):
+        good = length <= CORNER_SIGMAS * sigma
+        removed += int((~good).sum())
+        kept.append(_chosen(sightings, good))
+    sigmas = replace(problem.sigmas, corner_px=sigma)
+    return replace(problem, sightings=tuple(kept), sigmas=sigmas), sigma, removed
+
+
+def _without_knocks(problem: Problem, solution: Solution) -> tuple[Problem, tuple[str, ...]]:
+    """With the IMU's readings loosened where they scatter twice as much as usual; a sentence on where."""
+    track = problem.imu
+    rows = solution.linearised.samples.residual[-track.time_s.size :]
+    window = np.ones(KNOCK_SAMPLES) / KNOCK_SAMPLES
+    factors = []
+    for own in (slice(0, 3), slice(3, 6)):
+        scatter = np.sqrt(np.convolve((rows[:, own] ** 2).mean(axis=1), window, mode="same"))
+        ratio = scatter / np.median(scatter)
+        factors.append(np.where(ratio > KNOCK_FACTOR, ratio, 1.0))
+    problem = replace(problem, imu=replace(track, gyro_loose=factors[0], accel_loose=factors[1]))
+    shaken = np.maximum(*factors) > 1
+    if not shaken.any():
+        return problem, ()
+    seconds = sorted({int(time) for time in track.time_s[shaken]})
+    places = ", ".join(f"{second} s" for second in seconds[:6]) + (" ..." if len(seconds) > 6 else "")
+    note = f"knocks or vibration near {places}: {int(shaken.sum())} readings of the IMU count less"
+    return problem, (note,)
+
+
+def _chosen(sightings: Sightings, good: np.typing.NDArray[np.bool_]) -> Sightings:
+    return replace(
+        sightings, frame=sightings.frame[good], ids=sightings.ids[good], points_m=sightings.points_m[good],
+        pixels=sightings.pixels[good],
+    )  # fmt: skip
+
+
+def _weighted(
+    problem: Problem, state: State, corner_px: float
+) -> tuple[Problem, Solution, tuple[Spread, Spread, Spread]]:
+    """Solve with each sensor's sigma set to what its residuals show, until these agree.
+
+    The IMU's are only ever raised above what was stated, and no picture counts more than its corners' noise.
+    """
+    stated = problem.sigmas
+    for _ in range(WEIGHT_ROUNDS):
+        solution = solve(problem, state, None)
+        spreads = sensor_spreads(problem, solution)
+        sigmas = problem.sigmas
+        wanted = replace(
+            sigmas,
+            corner_px=max(corner_px, sigmas.corner_px * spreads[0].factor),
+            gyro_radps=_raised(stated.gyro_radps, sigmas.gyro_radps * spreads[1].factor),
+            accel_mps2=_raised(stated.accel_mps2, sigmas.accel_mps2 * spreads[2].factor),
+        )
+        pairs = (
+            (wanted.corner_px, sigmas.corner_px), (wanted.gyro_radps, sigmas.gyro_radps),
+            (wanted.accel_mps2, sigmas.accel_mps2),
+        )  # fmt: skip
+        if all(abs(new / old - 1) < SETTLED for new, old in pairs):
+            break
+        problem, state = replace(problem, sigmas=wanted), solution.state
+    return problem, solution, spreads
+
+
+def _raised(stated: float, shown: float) -> float:
+    """The stated noise, unless the residuals clearly show more."""
+    return shown if shown > LEAST_INFLATION * stated else stated
+
+
+def _rig(rig: StereoRig, state: State) -> StereoRig:
+    first, second = state.mounts
+    poses = [
+        Pose("body", name, mount.rotation, mount.place_m)
+        for name, mount in (("cam0", first), ("cam1", second))
+    ]
+    return StereoRig(rig.cam0, rig.cam1, poses[0], poses[1], seconds_to_ns(first.shift_s))
+
+
+def mount_differences(state: State, other: State) -> Float64:
+    """(14,) `state`'s mountings minus `other`'s, as the common parameters count them."""
+    parts: list[Float64] = []
+    for own, their in zip(state.mounts, other.mounts, strict=True):
+        turn = Rotation.from_matrix(own.rotation @ their.rotation.T).as_rotvec()
+        parts += [turn, own.place_m - their.place_m, np.array([own.shift_s - their.shift_s])]
+    return np.concatenate(parts)

@@ -1,0 +1,150 @@
+"""A body's way in continuous time: a cumulative B-spline of its pose, and piecewise linear IMU biases.
+
+Furgale et al. 2013 with the rotation on SO(3) instead of as a rotation vector. Times are seconds since the
+spline's `start_ns`, on the IMU's clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.camera_imu.spline_kernels import (
+    BLENDING,
+    CUMULATIVE,
+    DEGREE,
+    ORDER,
+    place_at,
+    rotation_at,
+    weights,
+)
+from barsight.core.arrays import Float64, Int64, kernel
+
+STATE = 12
+"""Unknowns of a control point: small turn (from the right), place, gyro bias, accelerometer bias."""
+BIAS_AT = (ORDER - 2) // 2
+"""The control point of a segment that holds the biases at its start; the next holds those at its end."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSpline:
+    """start_ns: the first segment's begin. step_s: the knots' distance. M control points, M - 5 segments.
+
+    rotations: (M, 3, 3) and places_m: (M, 3) of world_from_body. gyro_bias_radps, accel_bias_mps2: (M, 3).
+    """
+
+    start_ns: int
+    step_s: float
+    rotations: Float64
+    places_m: Float64
+    gyro_bias_radps: Float64
+    accel_bias_mps2: Float64
+
+    @property
+    def segments(self) -> int:
+        """How many steps of time the spline covers."""
+        return len(self.places_m) - DEGREE
+
+    def turned_steps(self) -> tuple[Float64, Float64]:
+        """(M - 1, 3) the control points' turns d_j, and (M - 1, 3, 3) their inverse right Jacobians."""
+        steps = Rotation.from_matrix(self.rotations[:-1].transpose(0, 2, 1) @ self.rotations[1:]).as_rotvec()
+        return steps, inverse_right_jacobian(steps)
+
+    def moved(self, step: Float64) -> PoseSpline:
+        """After a step (M, STATE) of the unknowns."""
+        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+        return replace(
+            self, rotations=self.rotations @ turn, places_m=self.places_m + step[:, 3:6],
+            gyro_bias_radps=self.gyro_bias_radps + step[:, 6:9],
+            accel_bias_mps2=self.accel_bias_mps2 + step[:, 9:],
+        )  # fmt: skip
+
+    def at(self, times_s: Float64) -> Motion:
+        """The motion at times within the spline (those outside are moved to its ends)."""
+        steps, inverse = self.turned_steps()
+        segment, u = locate(times_s, self.step_s, self.segments)
+        rotation, rate, place = _evaluate(
+            segment, u, self.step_s, self.rotations, self.places_m, steps, inverse
+        )
+        k, share = segment + BIAS_AT, u[:, None]
+        biases = [
+            (1 - share) * bias[k] + share * bias[k + 1]
+            for bias in (self.gyro_bias_radps, self.accel_bias_mps2)
+        ]
+        return Motion(rotation, rate, place[:, 0], place[:, 1], place[:, 2], biases[0], biases[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """At N times: rotation (N, 3, 3) world_from_body, rate_radps (N, 3) in body axes; place_m, velocity_mps,
+    acceleration_mps2 (N, 3) in the world; gyro_bias_radps, accel_bias_mps2 (N, 3)."""
+
+    rotation: Float64
+    rate_radps: Float64
+    place_m: Float64
+    velocity_mps: Float64
+    acceleration_mps2: Float64
+    gyro_bias_radps: Float64
+    accel_bias_mps2: Float64
+
+
+def spline_through(
+    start_ns: int, end_s: float, step_s: float, times_s: Float64, rotations: Float64, places_m: Float64
+) -> PoseSpline:
+    """A spline from time 0 to end_s near poses given at increasing times; biases are zero.
+
+    Control points take the pose interpolated at their own times (the middle of where they weigh most); the
+    spline then cuts corners as a B-spline does, which a least squares that starts here mends.
+    """
+    count = int(np.ceil(end_s / step_s)) + DEGREE
+    own = (np.arange(count) - (ORDER - 2) / 2) * step_s
+    own = np.clip(own, times_s[0], times_s[-1])
+    after = np.clip(np.searchsorted(times_s, own), 1, times_s.size - 1)
+    share = (own - times_s[after - 1]) / (times_s[after] - times_s[after - 1])
+    between = Rotation.from_matrix(rotations[after - 1].transpose(0, 2, 1) @ rotations[after]).as_rotvec()
+    turned = rotations[after - 1] @ Rotation.from_rotvec(between * share[:, None]).as_matrix()
+    placed = np.column_stack([np.interp(own, times_s, places_m[:, i]) for i in range(3)])
+    return PoseSpline(start_ns, step_s, turned, placed, np.zeros((count, 3)), np.zeros((count, 3)))
+
+
+def locate(times_s: Float64, step_s: float, segments: int) -> tuple[Int64, Float64]:
+    """(N,) segments and (N,) places u in them, in [0, 1]; times outside are moved to the ends."""
+    scaled = np.clip(times_s / step_s, 0.0, segments)
+    segment = np.minimum(scaled.astype(np.int64), segments - 1)
+    return segment, scaled - segment
+
+
+def inverse_right_jacobian(turns: Float64) -> Float64:
+    """(N, 3, 3) of rotation vectors (N, 3) shorter than pi."""
+    square = (turns**2).sum(axis=1)
+    angle = np.sqrt(np.maximum(square, 1e-12))
+    factor = np.where(square < 1e-8, 1 / 12, 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle)))
+    cross = np.zeros((len(turns), 3, 3))
+    x, y, z = turns.T
+    cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = x, y, z
+    cross -= cross.transpose(0, 2, 1)
+    inverse: Float64 = np.eye(3) + cross / 2 + factor[:, None, None] * (cross @ cross)
+    return inverse
+
+
+@kernel()
+def _evaluate(
+    segment: Int64, u: Float64, step_s: float, rotations: Float64, places: Float64, steps: Float64,
+    inverse: Float64,
+) -> tuple[Float64, Float64, Float64]:  # fmt: skip
+    count = segment.size
+    rotation, rate, place = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3, 3))
+    weight, share = np.empty((3, ORDER)), np.empty((3, ORDER))
+    turn_by, rate_by = np.empty((3, 3 * ORDER)), np.empty((3, 3 * ORDER))
+    for n in range(count):
+        i = segment[n]
+        weights(u[n], step_s, BLENDING, weight)
+        weights(u[n], step_s, CUMULATIVE, share)
+        rotation_at(
+            rotations[i], steps[i : i + DEGREE], inverse[i : i + DEGREE], share, rotation[n], rate[n],
+            turn_by, rate_by,
+        )  # fmt: skip
+        place_at(places[i : i + ORDER], weight, place[n])
+    return rotation, rate, place

@@ -1,0 +1,229 @@
+"""The residuals of a camera-IMU calibration and their derivatives [Furgale 2013; paper Eq. 8].
+
+Unknown are the body's way as a spline, the IMU's biases, and the common parameters: per camera where it is
+mounted and its time shift, the direction of gravity in the board's frame, and if asked for the IMU's scales
+and misalignments. A picture's corners all share one pose, so they are condensed to six whitened rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.camera_imu.arrowhead_system import Samples, Walks
+from barsight.calibration.camera_imu.pose_spline import PoseSpline, locate
+from barsight.calibration.camera_imu.residual_kernels import frame_rows, imu_rows, sum_corners
+from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.projection import Lens, project
+from barsight.core.arrays import Float64, Int64
+
+NEAREST_Z_M = 1e-3
+MOUNT = 7
+"""Parameters of a camera: turn (rad) and shift (m) of body_from_cam in body axes, time shift (s)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """One camera's corners. stamp_s: (F,) on the camera's clock, since the spline's start. frame: (N,) into
+    it, rising. ids: (N,). points_m: (N, 3) on the board. pixels: (N, 2)."""
+
+    camera: Camera
+    stamp_s: Float64
+    frame: Int64
+    ids: Int64
+    points_m: Float64
+    pixels: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class ImuTrack:
+    """time_s: (S,) since the spline's start. gyro_radps, accel_mps2: (S, 3) as measured.
+
+    gyro_loose, accel_loose: (S,) factors on the sigmas of readings that shake more than the spline follows.
+    """
+
+    time_s: Float64
+    gyro_radps: Float64
+    accel_mps2: Float64
+    gyro_loose: Float64
+    accel_loose: Float64
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """One standard deviation of one corner coordinate, of one gyro and accelerometer reading per axis, and of
+    what their biases walk in one second."""
+
+    corner_px: float
+    gyro_radps: float
+    accel_mps2: float
+    gyro_walk: float
+    accel_walk: float
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """A camera on the body. rotation (3, 3), place_m (3,): body_from_cam. shift_s: t_imu = t_cam + shift."""
+
+    rotation: Float64
+    place_m: Float64
+    shift_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """mounts: per camera. gravity_mps2: (3,) in the board's frame, pointing down. gyro_matrix, accel_matrix:
+    (3, 3) what is read = matrix @ truth + bias."""
+
+    spline: PoseSpline
+    mounts: tuple[Mount, ...]
+    gravity_mps2: Float64
+    gyro_matrix: Float64
+    accel_matrix: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What was measured. scales, lenses: whether the IMU's scales and misalignments, and the cameras' lenses
+    are unknown too."""
+
+    sightings: tuple[Sightings, ...]
+    imu: ImuTrack
+    sigmas: Sigmas
+    scales: bool = False
+    lenses: bool = False
+
+    @property
+    def lens_at(self) -> tuple[int, ...]:
+        """Where each camera's lens begins among the common parameters."""
+        begin = MOUNT * len(self.sightings) + 2 + (15 if self.scales else 0)
+        sizes = [len(lens_of(sightings.camera)[1]) for sightings in self.sightings]
+        return tuple(begin + sum(sizes[:n]) for n in range(len(sizes)))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The common parameters in order."""
+        parts = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m", "timeshift_s")
+        names = [f"body_from_cam{c}.{part}" for c in range(len(self.sightings)) for part in parts]
+        names += ["gravity.a_rad", "gravity.b_rad"]
+        if self.scales:
+            names += [f"accel.m{i}{j}" for i, j in LOWER]
+            names += [f"gyro.m{i}{j}" for i in range(3) for j in range(3)]
+        if self.lenses:
+            for c, sightings in enumerate(self.sightings):
+                names += [f"cam{c}.{name}" for name in lens_of(sightings.camera)[0].parameter_names]
+        return tuple(names)
+
+
+LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+"""The accelerometer's scales and misalignments: its axes define the body's, so the matrix is triangular."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """residuals_px: per camera (N, 2). samples: each camera's frames, then the IMU's. cost: robust."""
+
+    residuals_px: tuple[Float64, ...]
+    samples: Samples
+    walks: Walks
+    cost: float
+
+
+def linearise(problem: Problem, state: State, huber: float | None) -> Linearised:
+    """Residuals and derivatives at a state. huber: the length in sigmas from which a corner counts less."""
+    spline, sigmas = state.spline, problem.sigmas
+    width = len(problem.parameter_names)
+    steps, inverse = spline.turned_steps()
+    chain = (spline.step_s, spline.rotations, spline.places_m, steps, inverse)
+    parts, residuals = [], []
+    cost = 0.0
+    for number, (sightings, mount) in enumerate(zip(problem.sightings, state.mounts, strict=True)):
+        points, residual = corner_residuals(sightings, mount, spline)
+        lens, parameters = lens_of(sightings.camera)
+        seen = project(lens, parameters, points)
+        by_lens = seen.by_lens if problem.lenses else seen.by_lens[:, :, :0]
+        length = np.linalg.norm(residual, axis=1) / sigmas.corner_px
+        weight = np.ones_like(length) if huber is None else np.minimum(1, huber / np.maximum(length, 1e-9))
+        outer = 0.0 if huber is None else float((huber * (2 * length - huber))[length > huber].sum())
+        inner = length if huber is None else length[length <= huber]
+        cost += float((inner**2).sum()) + outer
+        frames = sightings.stamp_s.size
+        whole, pull = sum_corners(
+            sightings.frame, points, seen.by_point, by_lens, residual, weight / sigmas.corner_px**2, frames
+        )
+        segment, u = locate(sightings.stamp_s + mount.shift_s, spline.step_s, spline.segments)
+        parts.append(frame_rows(
+            segment, u, *chain, whole, pull, mount.rotation, mount.place_m, number * MOUNT,
+            problem.lens_at[number], width,
+        ))  # fmt: skip
+        residuals.append(residual)
+    segment, u = locate(problem.imu.time_s, spline.step_s, spline.segments)
+    gravity_at = MOUNT * len(problem.sightings)
+    rows = imu_rows(
+        segment, u, *chain, spline.gyro_bias_radps, spline.accel_bias_mps2, problem.imu.gyro_radps,
+        problem.imu.accel_mps2, state.gravity_mps2, tangent(state.gravity_mps2), state.gyro_matrix,
+        state.accel_matrix, sigmas.gyro_radps * problem.imu.gyro_loose,
+        sigmas.accel_mps2 * problem.imu.accel_loose, gravity_at, problem.scales, width,
+    )  # fmt: skip
+    parts.append(rows)
+    samples = Samples(*(np.concatenate([part[k] for part in parts]) for k in range(4)))
+    bias = np.hstack([spline.gyro_bias_radps, spline.accel_bias_mps2])
+    walk = np.repeat([sigmas.gyro_walk, sigmas.accel_walk], 3) * np.sqrt(spline.step_s)
+    walks = Walks(np.diff(bias, axis=0), walk)
+    cost += float((rows[1] ** 2).sum()) + float(((walks.difference / walk) ** 2).sum())
+    return Linearised(tuple(residuals), samples, walks, cost)
+
+
+def corner_residuals(sightings: Sightings, mount: Mount, spline: PoseSpline) -> tuple[Float64, Float64]:
+    """(N, 3) the corners in the camera's frame, and (N, 2) px: seen minus projected."""
+    motion = spline.at(sightings.stamp_s + mount.shift_s)
+    body = np.einsum(
+        "nji,nj->ni", motion.rotation[sightings.frame], sightings.points_m - motion.place_m[sightings.frame]
+    )
+    points = (body - mount.place_m) @ mount.rotation
+    points[:, 2] = np.maximum(points[:, 2], NEAREST_Z_M)
+    lens, parameters = lens_of(sightings.camera)
+    return points, sightings.pixels - project(lens, parameters, points).pixels
+
+
+def moved(state: State, chain: Float64, common: Float64) -> State:
+    """`state` after a step: chain (M, 12) and common (P,)."""
+    mounts = []
+    for number, mount in enumerate(state.mounts):
+        own = common[number * MOUNT : (number + 1) * MOUNT]
+        turn = Rotation.from_rotvec(own[:3]).as_matrix()
+        mounts.append(Mount(turn @ mount.rotation, mount.place_m + own[3:6], mount.shift_s + float(own[6])))
+    rest = common[MOUNT * len(mounts) :]
+    turn = Rotation.from_rotvec(tangent(state.gravity_mps2) @ rest[:2]).as_matrix()
+    state = replace(
+        state, spline=state.spline.moved(chain), mounts=tuple(mounts), gravity_mps2=turn @ state.gravity_mps2
+    )
+    if rest.size > 2:
+        accel = state.accel_matrix.copy()
+        for k, (i, j) in enumerate(LOWER):
+            accel[i, j] += rest[2 + k]
+        gyro = state.gyro_matrix + rest[8:17].reshape(3, 3)
+        state = replace(state, accel_matrix=accel, gyro_matrix=gyro)
+    return state
+
+
+def tangent(direction: Float64) -> Float64:
+    """(3, 2) two axes square to a direction, about which it can turn."""
+    least = np.eye(3)[int(np.abs(direction).argmin())]
+    first = np.cross(direction, least)
+    first /= np.linalg.norm(first)
+    second = np.cross(direction, first)
+    return np.column_stack([first, second / np.linalg.norm(second)])
+
+
+def lens_of(camera: Camera) -> tuple[Lens, Float64]:
+    """The lens model of a camera and its parameters, as `project` takes them."""
+    coefficients = camera.coefficients or (0.0,) * 4
+    lens = (
+        Lens.EQUIDISTANT
+        if camera.distortion is Distortion.EQUIDISTANT
+        else Lens(f"radtan{len(coefficients)}")
+    )
+    return lens, np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *coefficients])

@@ -1,0 +1,152 @@
+"""Solving a camera-IMU calibration, and what the solution says of its own uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from barsight.calibration.camera_imu.arrowhead_system import (
+    ROWS,
+    ArrowSystem,
+    Eliminated,
+    Samples,
+    assemble,
+    eliminate,
+    predicted,
+    pulled,
+    step,
+)
+from barsight.calibration.camera_imu.pose_spline import STATE
+from barsight.calibration.camera_imu.problem import Linearised, Problem, State, linearise, moved
+from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg.levenberg_marquardt import Options, minimise
+
+OPTIONS = Options(max_steps=60, min_gain_ratio=1e-8, first_damping=1e-6, min_damping=1e-9, max_damping=1e8)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """state; linearised and eliminated there, without damping and without robust weights; steps taken."""
+
+    state: State
+    linearised: Linearised
+    eliminated: Eliminated
+    steps: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How far each sensor's residuals scatter against what was assumed, and what the fit takes up of them.
+
+    factor: on the assumed sigma. absorbed: the share of the sensor's numbers that the unknowns take up.
+    after: (LAGS,) the residuals' autocorrelation, after_expected: the same of white noise after the same fit.
+    """
+
+    factor: float
+    absorbed: float
+    after: Float64
+    after_expected: Float64
+
+
+LAGS = 4
+PROBES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    """A state and, made on use, what is linear there."""
+
+    problem: Problem
+    huber: float | None
+    state: State
+
+    @cached_property
+    def here(self) -> Linearised:
+        return linearise(self.problem, self.state, self.huber)
+
+    @cached_property
+    def system(self) -> ArrowSystem:
+        return assemble(self.here.samples, self.here.walks, len(self.state.spline.places_m))
+
+    @property
+    def cost(self) -> float:
+        return self.here.cost
+
+    def step(self, damping: float) -> _Iterate:
+        chain, common = step(self.system, eliminate(self.system, damping))
+        return replace(self, state=moved(self.state, chain.reshape(-1, STATE), common))
+
+
+def solve(problem: Problem, start: State, huber: float | None) -> Solution:
+    """Levenberg-Marquardt from `start`; huber as in `linearise`. Raises LinAlgError where the way of the body
+    is not determined."""
+    found = minimise(_Iterate(problem, huber, start), OPTIONS)
+    state, here = found.best.state, found.best.here
+    if huber is not None:
+        here = linearise(problem, state, None)
+    eliminated = eliminate(assemble(here.samples, here.walks, len(state.spline.places_m)))
+    return Solution(state, here, eliminated, found.steps, found.converged)
+
+
+def sensor_spreads(problem: Problem, solution: Solution, seed: int = 0) -> tuple[Spread, Spread, Spread]:
+    """Pictures, gyro, accelerometer: the scatter of their residuals, freed of what the fit takes up.
+
+    A picture's residuals are its six whitened rows: what all its corners together say of the pose.
+
+    White noise put through the same fit says how much of each sensor's numbers the unknowns absorb (the trace
+    of the hat matrix [Hutchinson 1989]) and how that colours the residuals.
+    """
+    samples = solution.linearised.samples
+    rng = np.random.default_rng(seed)
+    first = samples.residual.shape[0] - problem.imu.time_s.size
+    noise = rng.normal(size=(PROBES, *samples.residual.shape))
+    fitted = np.array([_fitted(samples, solution, draw) for draw in noise])
+    parts = (
+        (slice(0, first), slice(0, ROWS)), (slice(first, None), slice(0, 3)),
+        (slice(first, None), slice(3, 6)),
+    )  # fmt: skip
+    out = []
+    for part in parts:
+        residual, drawn, taken = samples.residual[part], noise[:, *part], fitted[:, *part]
+        absorbed = float((drawn * taken).sum() / PROBES)
+        factor = float(np.sqrt((residual**2).sum() / max(residual.size - absorbed, 1.0)))
+        expected = np.mean([autocorrelation(one) for one in drawn - taken], axis=0)
+        out.append(Spread(factor, absorbed / residual.size, autocorrelation(residual), expected))
+    return out[0], out[1], out[2]
+
+
+def autocorrelation(series: Float64) -> Float64:
+    """(LAGS,) of a series (S, A), its axes together."""
+    power = float((series**2).sum())
+    return np.array([float((series[k:] * series[:-k]).sum()) / power for k in range(1, LAGS + 1)])
+
+
+def _fitted(samples: Samples, solution: Solution, residual: Float64) -> Float64:
+    """(K, ROWS) what the fit makes of other whitened residuals."""
+    eliminated = solution.eliminated
+    chain, common = pulled(samples, residual, eliminated.through.shape[0])
+    alone = eliminated.chain_solve(chain)
+    moved_common = np.linalg.pinv(eliminated.information, hermitian=True) @ (
+        common - np.einsum("np,n->p", eliminated.through, chain)
+    )
+    return predicted(samples, alone - np.einsum("np,p->n", eliminated.through, moved_common), moved_common)
+
+
+def block_scores(samples: Samples, by_common: Float64, block: Int64, blocks: int) -> tuple[Float64, Float64]:
+    """Each block of time's pull (B, P) on the common parameters and its information (B, P, P).
+
+    by_common: (K, ROWS, P) as `projected` gives; block: (K,) the samples' block.
+    """
+    width = by_common.shape[2]
+    score, information = np.zeros((blocks, width)), np.zeros((blocks, width, width))
+    order = np.argsort(block, kind="stable")
+    edges = np.searchsorted(block[order], np.arange(blocks + 1))
+    for number in range(blocks):
+        rows = order[edges[number] : edges[number + 1]]
+        flat = by_common[rows].reshape(-1, width)
+        score[number] = np.einsum("np,n->p", flat, samples.residual[rows].ravel())
+        information[number] = np.einsum("np,nq->pq", flat, flat)
+    return score, information

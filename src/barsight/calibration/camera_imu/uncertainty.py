@@ -1,0 +1,131 @@
+"""How well a camera-IMU calibration is known: noise, what hangs together in time, and what was held fixed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.calibration.camera_imu.arrowhead_system import Eliminated, assemble, eliminate, projected
+from barsight.calibration.camera_imu.problem import MOUNT, Problem, linearise
+from barsight.calibration.camera_imu.solver import Solution, block_scores
+from barsight.calibration.stereo.covariance_inflation import widened
+from barsight.core.arrays import Float64
+
+BLOCK_S = 1.0
+FLOOR = 1e-8
+NEEDED = {"rad": np.radians(0.1), "m": 3e-3, "s": 2e-4, "": 1e-3}
+"""What a yard needs: 0.1 degrees, 3 mm, 0.2 ms, a scale to 0.1 %. Directions are judged in these units."""
+UNDETERMINED = 10.0
+SHIFT_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class HeldFixed:
+    """Something that was not solved for. chi: how much the residuals would fall by freeing it, per parameter,
+    against what noise would give (1: nothing to gain). changes: (name, change) of its own parameters that
+    stand out. matters: whether the mounting's change by it was counted as uncertainty."""
+
+    name: str
+    chi: float
+    changes: tuple[tuple[str, float], ...]
+    matters: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """covariance: (P, P) of the common parameters, all causes together; noise_sigma: (P,) the corners'
+    and IMU's independent noise alone. correlation: the factor on the variances by which seconds disagree more
+    than that. singular_values: (P,) of the information in units of what is needed, falling; undetermined: the
+    directions known worse than ten times the need, in words. fixed: what was held fixed."""
+
+    covariance: Float64
+    noise_sigma: Float64
+    correlation: float
+    singular_values: Float64
+    undetermined: tuple[str, ...]
+    fixed: tuple[HeldFixed, ...]
+
+
+def uncertainty(problem: Problem, solution: Solution) -> Uncertainty:
+    """From the Schur complement of the common parameters, widened by how seconds disagree and by how far the
+    mounting would move if lenses and IMU scales, held fixed, were free and the residuals gain by it."""
+    names = problem.parameter_names
+    unit = needed_units(names)
+    scaled = solution.eliminated.information * unit[:, None] * unit
+    values, vectors = np.linalg.eigh(scaled)
+    weak = [n for n in range(values.size) if values[n] < UNDETERMINED**-2]
+    undetermined = tuple(_direction(names, vectors[:, n]) for n in weak)
+    # A direction that nothing was seen of gets a huge sigma, not an error.
+    solid = np.maximum(values, FLOOR)
+    inverse = (vectors / solid) @ vectors.T * unit[:, None] * unit
+    covariance, correlation = widened(inverse, 1.0, *_blocks(problem, solution))
+    fixed = []
+    for group, shift in _freed(problem, solution, inverse, correlation):
+        fixed.append(group)
+        if group.matters:
+            covariance = covariance + np.outer(shift, shift)
+    return Uncertainty(
+        covariance, np.sqrt(np.diag(inverse)), correlation, values[::-1], undetermined, tuple(fixed)
+    )
+
+
+def needed_units(names: Sequence[str]) -> Float64:
+    """(P,) what each parameter must be known to, by the unit its name ends with."""
+    ends = [name.rsplit("_", 1)[-1] if "_" in name.rsplit(".", 1)[-1] else "" for name in names]
+    return np.array([NEEDED.get(end, NEEDED[""]) for end in ends])
+
+
+def _blocks(problem: Problem, solution: Solution) -> tuple[Float64, Float64]:
+    times = [
+        sightings.stamp_s + mount.shift_s
+        for sightings, mount in zip(problem.sightings, solution.state.mounts, strict=True)
+    ]
+    block = (np.concatenate([*times, problem.imu.time_s]) / BLOCK_S).astype(np.int64)
+    block = np.clip(block, 0, None)
+    samples = solution.linearised.samples
+    by_common = projected(samples, solution.eliminated.through)
+    return block_scores(samples, by_common, block, int(block.max()) + 1)
+
+
+def _freed(
+    problem: Problem, solution: Solution, inverse: Float64, correlation: float
+) -> list[tuple[HeldFixed, Float64]]:
+    """What freeing the lenses, and the IMU's scales, would change: one Newton step from the solution."""
+    freed = replace(problem, scales=True, lenses=True)
+    here = linearise(freed, solution.state, None)
+    system = assemble(here.samples, here.walks, len(solution.state.spline.places_m))
+    whole: Eliminated = eliminate(system)
+    gradient = system.common_gradient - np.einsum("np,n->p", whole.through, system.chain_gradient)
+    names = list(freed.parameter_names)
+    own = [names.index(name) for name in problem.parameter_names]
+    groups = {"lenses": range(freed.lens_at[0], len(names))}
+    if not problem.scales:
+        groups["IMU scales and misalignments"] = range(
+            own[MOUNT * len(problem.sightings)] + 2, freed.lens_at[0]
+        )
+    out = []
+    for name, columns in groups.items():
+        extra = list(columns)
+        mixed = whole.information[np.ix_(own, extra)]
+        left = whole.information[np.ix_(extra, extra)] - mixed.T @ inverse @ mixed
+        scale = 1 / np.sqrt(np.maximum(np.diag(left), 1e-300))
+        values, vectors = np.linalg.eigh(left * scale[:, None] * scale)
+        values = np.maximum(values, 1e-9 * values[-1])
+        pulled = vectors.T @ (scale * (gradient[extra] - mixed.T @ inverse @ gradient[own]))
+        change = scale * (vectors @ (pulled / values))
+        chi = float((pulled**2 / values).sum()) / len(extra)
+        limit = correlation * (1 + SHIFT_SIGMAS * np.sqrt(2 / len(extra)))
+        sigma = scale * np.sqrt(((vectors**2) / values).sum(axis=1) * correlation)
+        strong = [k for k in np.argsort(-np.abs(change) / sigma)[:4] if abs(change[k]) > 3 * sigma[k]]
+        changes = tuple((names[extra[k]], float(change[k])) for k in strong)
+        out.append((HeldFixed(name, chi / correlation, changes, chi > limit), -inverse @ mixed @ change))
+    return out
+
+
+def _direction(names: Sequence[str], vector: Float64) -> str:
+    """A direction's largest parts, in words."""
+    order = np.argsort(-np.abs(vector))
+    kept = [k for k in order[:4] if abs(vector[k]) > 0.3 * abs(vector[order[0]])]
+    return " with ".join(names[k].rsplit("_", 1)[0].replace(".", " ") for k in kept)

@@ -1,0 +1,1 @@
+"""Rig and IMU files: Barsight's own, Kalibr's, OpenCV's, EuRoC's."""

@@ -1,0 +1,119 @@
+"""Our own rig file: YAML, versioned, with the covariance of what was calibrated.
+
+docs/reference/rig-file.md describes the keys. Readers accept every version up to their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.boards.board import Board
+from barsight.calibration.boards.board_warp import bent
+from barsight.calibration.files.euroc import build_rig, read_camera
+from barsight.calibration.files.yaml_document import Document, read_document, write_document
+from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.calibration.stereo.calibration import StereoCalibration
+from barsight.core.arrays import Float64
+from barsight.core.errors import CalibrationError
+from barsight.core.pose import Pose
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+
+VERSION_KEY = "barsight_rig"
+VERSION = 1
+
+
+def write_rig_file(
+    path: Path, rig: StereoRig, calibration: StereoCalibration | None = None,
+    section: Mapping[str, object] | None = None,
+) -> None:  # fmt: skip
+    """Write a rig, with its sigmas and covariance where a calibration is given; reads back bit for bit.
+
+    section: the key `calibration` of another kind of calibration than stereo.
+    """
+    values: dict[str, object] = {
+        VERSION_KEY: VERSION,
+        "cam0": _camera(rig.cam0, rig.body_from_cam0),
+        "cam1": _camera(rig.cam1, rig.body_from_cam1),
+        "timeshift_cam_imu_s": rig.timeshift_cam_imu_ns / NS_PER_S,
+        "baseline_m": rig.baseline_m,
+    }
+    if calibration is not None:
+        sigmas = np.sqrt(np.diag(calibration.covariance))
+        values["calibration"] = {
+            "board": str(calibration.board),
+            "lens": str(calibration.lens),
+            "views": len(calibration.views),
+            "rms_px": calibration.rms_px,
+            "corner_sigma_px": calibration.sigma_px,
+            "baseline_sigma_m": calibration.baseline_sigma_m,
+            "board_shape": {
+                name: {"value": float(value), "sigma": float(sigma)}
+                for name, value, sigma in zip(
+                    calibration.shape.names, calibration.shape.values, calibration.shape.sigma, strict=True
+                )
+            },
+            "parameters": list(calibration.parameter_names),
+            "sigmas": [float(value) for value in sigmas],
+            "covariance": [[float(value) for value in row] for row in calibration.covariance],
+        }
+    elif section is not None:
+        values["calibration"] = dict(section)
+    write_document(path, values)
+
+
+def read_own_rig(document: Document) -> StereoRig:
+    """The rig of a document with the key `barsight_rig`. Raises `CalibrationError`."""
+    version = document.number(VERSION_KEY)
+    if not 1 <= version <= VERSION:
+        raise document.error(
+            VERSION_KEY, f"version {version:g} is not known", f"this release reads 1 to {VERSION}"
+        )
+    cameras, mounts = [], []
+    for name in ("cam0", "cam1"):
+        section = document.section(name)
+        cameras.append(read_camera(section, "distortion_coefficients"))
+        mounts.append(section.pose("body_from_cam", "body", name))
+    shift = seconds_to_ns(document.number("timeshift_cam_imu_s", 0.0))
+    return build_rig(document.path, cameras[0], cameras[1], mounts[0], mounts[1], shift)
+
+
+def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
+    """(parameter names (C,), covariance (C, C)) of a rig file, None where it carries none."""
+    document = read_document(path)
+    if document.values.get("calibration") is None:
+        return None
+    section = document.section("calibration")
+    names = tuple(str(name) for name in section.get("parameters"))
+    rows = section.get("covariance")
+    if not isinstance(rows, list) or len(rows) != len(names):
+        raise section.error("covariance", f"is not {len(names)}x{len(names)}", "take the original file")
+    matrix = np.array([section.numbers_in("covariance", row) for row in rows], dtype=np.float64)
+    if matrix.shape != (len(names), len(names)):
+        raise section.error("covariance", f"is not {len(names)}x{len(names)}", "take the original file")
+    return names, matrix
+
+
+def read_board(path: Path, board: Board) -> Board:
+    """`board` with the shape that `calibrate stereo` found of it, where the rig file comes from the same."""
+    section = read_document(path).values.get("calibration")
+    if not isinstance(section, dict) or section.get("board") != str(board):
+        return board
+    try:
+        return bent(board, {name: float(entry["value"]) for name, entry in section["board_shape"].items()})
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise CalibrationError(path, "board_shape can't be read", "take the original file") from None
+
+
+def _camera(camera: Camera, body_from_cam: Pose) -> dict[str, object]:
+    return {
+        "camera_model": "pinhole",
+        "resolution": [camera.width, camera.height],
+        "intrinsics": [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px],
+        "distortion_model": str(camera.distortion),
+        "distortion_coefficients": list(camera.coefficients),
+        "body_from_cam": [[float(value) for value in row] for row in body_from_cam.matrix],
+    }

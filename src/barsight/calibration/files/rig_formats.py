@@ -1,0 +1,95 @@
+"""One door for every file that holds a rig: ours, Kalibr's camchain, OpenCV's, an EuRoC folder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.files.euroc import read_rig, write_rig
+from barsight.calibration.files.kalibr import read_camchain, write_camchain
+from barsight.calibration.files.opencv import read_opencv_rig, write_opencv_rig
+from barsight.calibration.files.rig_file import VERSION_KEY, read_own_rig, write_rig_file
+from barsight.calibration.files.yaml_document import read_document
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.errors import CalibrationError
+from barsight.core.files import atomic_directory, atomic_path
+
+OPENCV_MARK = "!!opencv-matrix"
+TOPICS = ("/cam0/image_raw", "/cam1/image_raw")
+KNOWN = "a rig.yaml of barsight, Kalibr's camchain, OpenCV's YAML or XML, or an EuRoC folder"
+
+
+class RigFormat(StrEnum):
+    """What a rig can be written as. EUROC is a folder, the others are files."""
+
+    BARSIGHT = "barsight"
+    KALIBR = "kalibr"
+    OPENCV = "opencv"
+    EUROC = "euroc"
+
+
+def read_rig_file(path: Path) -> StereoRig:
+    """The rig at `path`, of whichever format. Raises `CalibrationError`."""
+    if path.is_dir():
+        return read_rig(path / "mav0" if (path / "mav0").is_dir() else path)
+    if path.suffix.lower() == ".xml" or _is_opencv(path):
+        return read_opencv_rig(path)
+    document = read_document(path)
+    if VERSION_KEY in document.values:
+        return read_own_rig(document)
+    if "cam0" in document.values:
+        return read_camchain(path).rig
+    raise CalibrationError(path, "holds no stereo rig", f"give {KNOWN}")
+
+
+def holds_own_rig(path: Path) -> bool:
+    """Whether a rig file is of our own format, the one with a covariance."""
+    if path.is_dir() or path.suffix.lower() == ".xml" or _is_opencv(path):
+        return False
+    return VERSION_KEY in read_document(path).values
+
+
+def chosen_rig(path: Path | None, own: StereoRig) -> StereoRig:
+    """The rig of a file that the user names, or the recording's `own` where none is named.
+
+    A calibration of two cameras alone says nothing of the body: `own` says where cam0 sits, and the clocks.
+    """
+    if path is None:
+        return own
+    rig = read_rig_file(path)
+    if not body_is_cam0(rig):
+        return rig
+    return replace(
+        rig, body_from_cam0=own.body_from_cam0, body_from_cam1=own.body_from_cam0 @ rig.cam0_from_cam1,
+        timeshift_cam_imu_ns=own.timeshift_cam_imu_ns,
+    )  # fmt: skip
+
+
+def body_is_cam0(rig: StereoRig) -> bool:
+    """Whether the rig's body is its left camera: nobody said where an IMU sits."""
+    return bool(np.array_equal(rig.body_from_cam0.matrix, np.eye(4)))
+
+
+def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> None:
+    """Write a rig whole or not at all; an OpenCV file's suffix says YAML or XML."""
+    if form is RigFormat.EUROC:
+        with atomic_directory(path) as folder:
+            write_rig(folder / "mav0", rig, 0.0)
+        return
+    with atomic_path(path) as temporary:
+        if form is RigFormat.KALIBR:
+            write_camchain(temporary, rig, TOPICS)
+        elif form is RigFormat.OPENCV:
+            write_opencv_rig(temporary, rig, xml=path.suffix.lower() == ".xml")
+        else:
+            write_rig_file(temporary, rig)
+
+
+def _is_opencv(path: Path) -> bool:
+    try:
+        return OPENCV_MARK in path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError):
+        return False

@@ -1,0 +1,1 @@
+"""Stereo calibration: bundle adjustment, outliers, uncertainty, verdict."""

@@ -1,0 +1,259 @@
+"""The least squares of a calibration: lenses, the rig, the board's shape and every view's board pose at once.
+
+A board point P_W is seen as P_L = R_L P_W + T_L by cam0 and as P_R = R P_L + T by cam1 [paper Eq. 1-3]; the
+residuals are its pixels. Board poses only meet the common parameters, so the normal equations are solved by
+their Schur complement, and the same complement's inverse is the common parameters' covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.boards.board_views import BoardView
+from barsight.calibration.geometry.projection import Lens, project
+from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg.levenberg_marquardt import Options, minimise
+from barsight.core.pose import skew
+
+OPTIONS = Options(
+    max_steps=100, min_gain_ratio=1e-12, first_damping=1e-3, min_damping=1e-12, max_damping=1e10
+)
+NEAREST_Z_M = 1e-3
+SHAPE_PX = 0.2
+"""The corner noise at which the board's shape is expected as `shape_basis` says."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """One camera's corners, sorted by view. view, ids: (N,). points_m: (N, 3). pixels: (N, 2).
+
+    by_shape: (N, 3, S) how the points move with the board's shape.
+    """
+
+    view: Int64
+    ids: Int64
+    points_m: Float64
+    pixels: Float64
+    by_shape: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """lenses: a parameter vector per camera. cam1_from_cam0, cam0_from_board: rotations and translations.
+
+    rotation (3, 3), translation_m (3,) of the rig; board_rotation (V, 3, 3), board_translation_m (V, 3).
+    shape: (S,) steps of the board's shape, none for a flat one.
+    """
+
+    lenses: tuple[Float64, ...]
+    rotation: Float64
+    translation_m: Float64
+    board_rotation: Float64
+    board_translation_m: Float64
+    shape: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """state; residuals_px: (N, 2) per camera, seen minus projected; reduced: (C, C) Schur complement of the
+    common parameters at unit weights; scores: (V, C) each view's share of the common gradient; steps taken;
+    converged."""
+
+    state: State
+    residuals_px: tuple[Float64, ...]
+    reduced: Float64
+    view_reduced: Float64
+    scores: Float64
+    steps: int
+    converged: bool
+
+    @property
+    def rig_information(self) -> Float64:
+        """`reduced` of lenses and rig alone, the board's shape eliminated."""
+        own = self.reduced.shape[0] - self.state.shape.size
+        mixed = self.reduced[:own, own:]
+        return self.reduced[:own, :own] - mixed @ np.linalg.solve(self.reduced[own:, own:], mixed.T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    cost: float
+    residuals: tuple[Float64, ...]
+    common: Float64
+    gradient: Float64
+    mixed: Float64
+    boards: Float64
+    board_gradient: Float64
+    view_common: Float64
+    view_gradient: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    """A state and, made on use, its normal equations."""
+
+    lens: Lens
+    seen: tuple[Observed, ...]
+    huber_px: float | None
+    state: State
+
+    @cached_property
+    def normal(self) -> _Normal:
+        return _linearise(self.lens, self.seen, self.state, self.huber_px)
+
+    @property
+    def cost(self) -> float:
+        return self.normal.cost
+
+    def step(self, damping: float) -> _Iterate:
+        return replace(self, state=_move(self.state, self.normal, damping))
+
+
+def observe(
+    views: Sequence[BoardView], board_points_m: Float64, basis: Float64, cameras: int
+) -> tuple[Observed, ...]:
+    """The corners of all views as flat arrays, for the first `cameras` cameras; basis: of `shape_basis`."""
+    gathered = []
+    for camera in range(cameras):
+        seen = [(number, view.cameras[camera]) for number, view in enumerate(views)]
+        known = [(number, corners) for number, corners in seen if corners is not None]
+        index = [np.full(corners.ids.size, number) for number, corners in known]
+        ids = np.concatenate([corners.ids for _, corners in known]).astype(np.int64)
+        pixels = np.concatenate([corners.pixels for _, corners in known])
+        gathered.append(Observed(np.concatenate(index), ids, board_points_m[ids], pixels, basis[ids]))
+    return tuple(gathered)
+
+
+def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float | None) -> Solved:
+    """Levenberg-Marquardt from `start`; huber_px is where a residual's weight begins to fall, None for never.
+
+    One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one.
+    `converged` is False where the steps ran out.
+    """
+    found = minimise(_Iterate(lens, seen, huber_px, start), OPTIONS)
+    state = found.best.state
+    plain = _linearise(lens, seen, state, None)
+    inverse = np.linalg.pinv(plain.boards, hermitian=True)
+    lost = np.einsum("vci,vij,vdj->vcd", plain.mixed, inverse, plain.mixed)
+    scores = plain.view_gradient - np.einsum("vci,vij,vj->vc", plain.mixed, inverse, plain.board_gradient)
+    view_reduced = plain.view_common - lost
+    return Solved(
+        state, plain.residuals, plain.common - lost.sum(axis=0), view_reduced, scores, found.steps,
+        found.converged,
+    )  # fmt: skip
+
+
+def _linearise(lens: Lens, seen: tuple[Observed, ...], state: State, huber_px: float | None) -> _Normal:
+    width = len(lens.parameter_names)
+    count = state.board_rotation.shape[0]
+    shape = state.shape.size
+    size = width * len(seen) + (6 if len(seen) == 2 else 0) + shape
+    common, gradient = np.zeros((count, size, size)), np.zeros((count, size))
+    mixed = np.zeros((count, size, 6))
+    boards, board_gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
+    cost, residuals = SHAPE_PX**2 * float(state.shape @ state.shape), []
+    for camera, observed in enumerate(seen):
+        residual, by_common, by_board = _derivatives(lens, observed, state, camera)
+        length = np.linalg.norm(residual, axis=1)
+        weight = np.ones_like(length)
+        if huber_px is not None:
+            weight = np.minimum(1.0, huber_px / np.maximum(length, 1e-12))
+            cost += float(np.where(length > huber_px, huber_px * (2 * length - huber_px), length**2).sum())
+        else:
+            cost += float((length**2).sum())
+        columns = np.arange(width) + camera * width
+        if camera == 1:
+            columns = np.concatenate([columns, 2 * width + np.arange(6)])
+        columns = np.concatenate([columns, size - shape + np.arange(shape)])
+        starts = np.flatnonzero(np.diff(observed.view, prepend=-1))
+        ends = np.append(starts[1:], observed.view.size)
+        for first, last in zip(starts, ends, strict=True):
+            view, part = observed.view[first], slice(first, last)
+            a = by_common[part].reshape(-1, columns.size)
+            b = by_board[part].reshape(-1, 6)
+            r = residual[part].ravel()
+            w = np.repeat(weight[part], 2)[:, None]
+            wa, wb = w * a, w * b
+            common[view][np.ix_(columns, columns)] += a.T @ wa
+            mixed[view][columns] += wa.T @ b
+            boards[view] += b.T @ wb
+            gradient[view][columns] += wa.T @ r
+            board_gradient[view] += wb.T @ r
+        residuals.append(residual)
+    whole, pull = common.sum(axis=0), gradient.sum(axis=0)
+    own = np.arange(size - shape, size)
+    whole[own, own] += SHAPE_PX**2
+    pull[own] -= SHAPE_PX**2 * state.shape
+    return _Normal(
+        cost, tuple(residuals), whole, pull, mixed, boards,
+        board_gradient, common, gradient,
+    )  # fmt: skip
+
+
+def _derivatives(
+    lens: Lens, observed: Observed, state: State, camera: int
+) -> tuple[Float64, Float64, Float64]:
+    """Residuals (N, 2) and the projection's derivatives by the common (N, 2, C) and board (N, 2, 6) steps."""
+    rotation = state.board_rotation[observed.view]
+    turned = np.einsum("nij,nj->ni", rotation, observed.points_m + observed.by_shape @ state.shape)
+    by_shape = rotation @ observed.by_shape
+    point = turned + state.board_translation_m[observed.view]
+    by_board = np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
+    if camera == 1:
+        rig_turned = point @ state.rotation.T
+        point = rig_turned + state.translation_m
+        by_board, by_shape = state.rotation @ by_board, state.rotation @ by_shape
+    point = np.column_stack([point[:, :2], np.maximum(point[:, 2], NEAREST_Z_M)])
+    projected = project(lens, state.lenses[camera], point)
+    by_common = projected.by_lens
+    if camera == 1:
+        by_rig = np.concatenate([-skew(rig_turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
+        by_common = np.concatenate([by_common, projected.by_point @ by_rig], axis=2)
+    by_common = np.concatenate([by_common, projected.by_point @ by_shape], axis=2)
+    return observed.pixels - projected.pixels, by_common, projected.by_point @ by_board
+
+
+def _move(state: State, normal: _Normal, damping: float) -> State:
+    """Take one damped step. Raises LinAlgError where the equations have no solution."""
+    boards = normal.boards + damping * normal.boards * np.eye(6) + 1e-12 * np.eye(6)
+    common = normal.common + damping * np.diag(np.diag(normal.common))
+    inverse = np.linalg.inv(boards)
+    through = normal.mixed @ inverse
+    reduced = common - np.einsum("vci,vdi->cd", through, normal.mixed)
+    target = normal.gradient - np.einsum("vci,vi->c", through, normal.board_gradient)
+    step = np.linalg.solve(reduced, target)
+    rest = normal.board_gradient - np.einsum("vci,c->vi", normal.mixed, step)
+    return move(state, step, np.einsum("vij,vj->vi", inverse, rest))
+
+
+def move(state: State, common: Float64, boards: Float64 | None = None) -> State:
+    """`state` after a step (C,) of the common parameters and (V, 6) of the boards, turned from the left.
+
+    A step without the board's shape leaves it as it is.
+    """
+    width = state.lenses[0].size
+    lenses = tuple(
+        lens + common[camera * width : (camera + 1) * width] for camera, lens in enumerate(state.lenses)
+    )
+    moved = replace(state, lenses=lenses)
+    if len(lenses) == 2:
+        turn = Rotation.from_rotvec(common[2 * width : 2 * width + 3]).as_matrix()
+        moved = replace(
+            moved, rotation=turn @ state.rotation,
+            translation_m=state.translation_m + common[2 * width + 3 : 2 * width + 6],
+        )  # fmt: skip
+        if common.size > 2 * width + 6:
+            moved = replace(moved, shape=state.shape + common[2 * width + 6 :])
+    if boards is not None:
+        turns = Rotation.from_rotvec(boards[:, :3]).as_matrix()
+        moved = replace(
+            moved,
+            board_rotation=turns @ state.board_rotation,
+            board_translation_m=state.board_translation_m + boards[:, 3:],
+        )
+    return moved

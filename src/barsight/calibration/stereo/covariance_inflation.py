@@ -1,0 +1,69 @@
+"""The covariance of common parameters where residuals hang together more than independent noise would."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.calibration.stereo.bundle_adjustment import Solved
+from barsight.core.arrays import Float64
+
+WIDENED_FROM = 3.0
+"""Standard deviations of its own scatter by which the groups' correlation must stand out to widen sigmas."""
+
+
+def widened(
+    inverse: Float64, variance: float, scores: Float64, informations: Float64
+) -> tuple[Float64, float]:
+    """(covariance (C, C), correlation: the factor on the variances, 1 for none).
+
+    inverse: (C, C) of the whole information at unit weights; variance: the residuals'. scores (G, C) and
+    informations (G, C, C): each group's (a view's, a second's) share of gradient and information. A group
+    pulls the parameters by inverse @ score. Under independent noise these pulls add up to the covariance
+    variance * inverse, but for the share that the groups' own leverage takes. Where they scatter clearly
+    more, their own covariance takes its place (the sandwich estimator over groups), shrunk towards the
+    multiple of the former with the same trace [Ledoit and Wolf 2004], as groups are often fewer than
+    parameters.
+    """
+    groups, size = scores.shape
+    covariance = inverse * variance
+    scale = np.sqrt(np.diag(covariance))
+    factor = scale[:, None] * np.linalg.cholesky(covariance / scale[:, None] / scale)
+    shares = inverse @ informations
+    expected = float(np.trace(shares, axis1=1, axis2=2).sum() - np.einsum("vij,vji->", shares, shares))
+    pulls = np.linalg.solve(factor, inverse @ scores.T).T * np.sqrt(groups * size / max(expected, 1e-9))
+    spread = pulls.T @ pulls / groups
+    correlation = float(np.trace(spread)) / size
+    if correlation <= 1 + WIDENED_FROM * np.sqrt(4 / (size * groups)):
+        return covariance, 1.0
+    apart = float(((spread - correlation * np.eye(size)) ** 2).sum())
+    noise = float(((pulls**2).sum(axis=1) ** 2).sum() / groups - (spread**2).sum()) / groups
+    shrink = min(max(noise / apart, 0.0), 1.0)
+    wide = shrink * correlation * np.eye(size) + (1 - shrink) * spread
+    return factor @ wide @ factor.T, correlation
+
+
+def covariance_of(solved: Solved, corners: int, views: int) -> tuple[Float64, float, float]:
+    """(covariance (C, C), sigma_px, correlation) of the common parameters, the board's shape last.
+
+    Widened where views hang together.
+    """
+    residuals = np.concatenate(solved.residuals_px)
+    freedom = 2 * corners - solved.reduced.shape[0] - 6 * views
+    variance = float((residuals**2).sum() / max(freedom, 1))
+    inverse = scaled_inverse(solved.reduced)
+    covariance, correlation = widened(inverse, variance, solved.scores, solved.view_reduced)
+    return covariance, float(np.sqrt(variance)), correlation
+
+
+def scaled_inverse(matrix: Float64) -> Float64:
+    """The inverse of a symmetric positive matrix whose parameters have very different sizes.
+
+    Raises LinAlgError where a direction is not determined.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    unit = matrix * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(unit)
+    if values[0] < 1e-13 * values[-1]:
+        raise np.linalg.LinAlgError("undetermined")
+    inverse: Float64 = (vectors / values) @ vectors.T * scale[:, None] * scale
+    return inverse

@@ -1,0 +1,63 @@
+"""What a rig file's covariance costs in disparity: the part of a sigma that no view averages out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.files.rig_file import read_covariance
+from barsight.calibration.files.rig_formats import holds_own_rig, read_rig_file
+from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.calibration.stereo.projection_uncertainty import sample_pairs, triangulate
+from barsight.core.arrays import Float64
+from barsight.core.pose import Pose
+
+STEP_SIGMAS = 0.05
+INTRINSICS = 4
+
+
+def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
+    """One standard deviation (px, median over the picture) that the calibration causes at `range_m`; None
+    where no file is given or it carries no covariance. Raises `CalibrationError` for one that can't be.
+    """
+    if path is None or not holds_own_rig(path) or (known := read_covariance(path)) is None:
+        return None
+    rig = read_rig_file(path)
+    names, covariance = known
+    _, left, right = sample_pairs(rig, [range_m])
+    if len(left) == 0:
+        return None
+    steps = STEP_SIGMAS * np.sqrt(np.diag(covariance))
+    columns = []
+    for number, step in enumerate(steps):
+        ends = [triangulate(_moved(rig, names, number, sign * step), left, right) for sign in (1, -1)]
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    by = np.column_stack(columns)
+    sigma_m = float(np.median(np.sqrt(np.einsum("nc,cd,nd->n", by, covariance, by))))
+    return sigma_m * rig.cam0.fx_px * rig.baseline_m / range_m**2
+
+
+def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> StereoRig:
+    """The rig with one named parameter changed."""
+    owner, _, name = names[number].partition(".")
+    if owner in ("cam0", "cam1"):
+        first = names.index(next(other for other in names if other.startswith(f"{owner}.")))
+        camera: Camera = getattr(rig, owner)
+        intrinsics = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+        values: Float64 = np.array([*intrinsics, *camera.coefficients])
+        values[number - first] += step
+        fx, fy, cx, cy = (float(value) for value in values[:INTRINSICS])
+        changed = replace(
+            camera, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(values[INTRINSICS:].tolist())
+        )
+        return replace(rig, cam0=changed) if owner == "cam0" else replace(rig, cam1=changed)
+    change = np.zeros(6)
+    change[("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m").index(name)] = step
+    old = rig.cam0_from_cam1.inverse()
+    turned = Rotation.from_rotvec(change[:3]).as_matrix() @ old.rotation
+    cam1_from_cam0 = Pose("cam1", "cam0", turned, old.translation + change[3:])
+    return replace(rig, body_from_cam1=rig.body_from_cam0 @ cam1_from_cam0.inverse())

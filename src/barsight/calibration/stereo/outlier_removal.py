@@ -1,0 +1,171 @@
+"""What a stereo calibration leaves out, and why: blurred pictures, views of another board, odd corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.calibration.boards.board_views import BoardView, Corners, Removed
+from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.stereo.bundle_adjustment import Observed, Solved, State
+from barsight.calibration.stereo.initialization import board_pose
+from barsight.core.arrays import Float64
+
+FEWEST_VIEWS = 3
+FEWEST_CORNERS = 8
+BLUR_FACTOR, BLUR_MARGIN_PX = 1.6, 1.0
+MISFIT_FACTOR, MISFIT_MARGIN_PX = 3.0, 0.3
+CORNER_SIGMAS = 4.5
+MOST_CORNERS_OUT = 0.3
+MOST_ALONE_PX = 2.0
+SAME_TURN_RAD, SAME_SHIFT = 0.05, 0.15
+
+
+def drop_small(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
+    """Without the pictures that show fewer than eight corners."""
+    kept, removed = [], []
+    for view in views:
+        for camera, corners in enumerate(view.cameras):
+            if corners is not None and corners.ids.size < FEWEST_CORNERS:
+                reason = f"{corners.ids.size} corners in sight, {FEWEST_CORNERS} are needed"
+                removed.append(Removed(view.name, f"cam{camera}", reason))
+                view = _without(view, camera)
+        if view.cam0 is not None or view.cam1 is not None:
+            kept.append(view)
+    return kept, removed
+
+
+def drop_blurred(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
+    """Without the pictures whose edges are much wider than the same camera's median."""
+    kept, removed = list(views), []
+    for camera in (0, 1):
+        widths = np.array([np.nan if c is None else c.edge_px for c in (v.cameras[camera] for v in kept)])
+        if not np.isfinite(widths).any():
+            continue
+        usual = float(np.nanmedian(widths))
+        for number, width in enumerate(widths):
+            if width > BLUR_FACTOR * usual and width > usual + BLUR_MARGIN_PX:
+                reason = f"blurred: its edges are {width:.1f} px wide, the other pictures' {usual:.1f} px"
+                removed.append(Removed(kept[number].name, f"cam{camera}", reason))
+                kept[number] = _without(kept[number], camera)
+    return [view for view in kept if view.cam0 is not None or view.cam1 is not None], removed
+
+
+def drop_misfits(
+    views: Sequence[BoardView], observed: tuple[Observed, ...], solved: Solved, start: State,
+    cameras: tuple[Camera, Camera], points_m: Float64,
+) -> tuple[list[BoardView], list[Removed]]:  # fmt: skip
+    """Without the worst views, where their residuals are far above the others'.
+
+    start: the rig before this solve, which the bad views haven't pulled, for naming the cause.
+    """
+    errors = view_rms(observed, solved.residuals_px, len(views))
+    usual = float(np.median(errors))
+    limit = max(MISFIT_FACTOR * usual, usual + MISFIT_MARGIN_PX)
+    worst = float(errors.max())
+    out = {int(n) for n in np.flatnonzero((errors > limit) & (errors > 0.4 * worst))}
+    if len(out) > len(views) // 2:
+        out = set()
+    removed = []
+    for number in sorted(out):
+        cause = _cause(views[number], start, cameras, points_m)
+        reason = f"{cause}: its corners lie {errors[number]:.1f} px off, the other views' {usual:.2f} px"
+        removed.append(Removed(views[number].name, "both", reason))
+    return [view for number, view in enumerate(views) if number not in out], removed
+
+
+def drop_corners(
+    views: Sequence[BoardView], observed: tuple[Observed, ...], solved: Solved
+) -> tuple[list[BoardView], list[Removed], float | None]:
+    """Without the corners beyond 4.5 robust sigma, and the pictures that lose a third of theirs.
+
+    The third is the limit (px), None where every corner lies within. See `corner_notes` for the reasons.
+    """
+    lengths = [np.linalg.norm(residual, axis=1) for residual in solved.residuals_px]
+    sigma = float(np.median(np.concatenate(lengths))) / np.sqrt(2 * np.log(2))
+    limit = CORNER_SIGMAS * max(sigma, 1e-3)
+    kept, removed, clean = list(views), [], True
+    for camera, (seen, length) in enumerate(zip(observed, lengths, strict=True)):
+        for number in np.unique(seen.view[length > limit]):
+            corners = kept[number].cameras[camera]
+            if corners is None:
+                continue
+            clean = False
+            bad = length[seen.view == number] > limit
+            if bad.mean() > MOST_CORNERS_OUT or (~bad).sum() < FEWEST_CORNERS:
+                reason = f"{bad.sum()} of {bad.size} corners lie more than {limit:.2f} px off"
+                removed.append(Removed(views[number].name, f"cam{camera}", reason))
+                kept[number] = _without(kept[number], camera)
+            else:
+                kept[number] = _with(kept[number], camera, corners.keep(~bad))
+    kept = [view for view in kept if view.cam0 is not None or view.cam1 is not None]
+    return kept, removed, None if clean else limit
+
+
+def corner_notes(before: dict[str, BoardView], after: Sequence[BoardView]) -> list[Removed]:
+    """What was taken out of pictures that are still used."""
+    notes = []
+    for view in after:
+        for camera, corners in enumerate(view.cameras):
+            whole = before[view.name].cameras[camera]
+            if corners is None or whole is None or whole.ids.size == corners.ids.size:
+                continue
+            count = whole.ids.size - corners.ids.size
+            reason = f"{count} of {whole.ids.size} corners lie more than {CORNER_SIGMAS:g} sigma off"
+            notes.append(Removed(view.name, f"cam{camera}", reason))
+    return notes
+
+
+def view_rms(observed: tuple[Observed, ...], residuals: tuple[Float64, ...], views: int) -> Float64:
+    """(V,) root mean square residual (px) of each view, over both cameras."""
+    squares, counts = np.zeros(views), np.zeros(views)
+    for seen, residual in zip(observed, residuals, strict=True):
+        squares += np.bincount(seen.view, (residual**2).sum(axis=1), views)
+        counts += np.bincount(seen.view, minlength=views)
+    rms: Float64 = np.sqrt(squares / np.maximum(counts, 1))
+    return rms
+
+
+def _cause(view: BoardView, state: State, cameras: tuple[Camera, Camera], points_m: Float64) -> str:
+    """What is wrong with a view, as far as the rig it implies by itself tells."""
+    if view.cam0 is None or view.cam1 is None:
+        return "the board is another one, or bent or badly found"
+    turn, shift, fit = _implied(view.cam0, view.cam1, cameras, points_m)
+    if fit > MOST_ALONE_PX:
+        return "shows another board, or was taken by another camera"
+    exchanged = _implied(view.cam1, view.cam0, cameras, points_m)
+    length = float(np.linalg.norm(state.translation_m))
+    if _near(exchanged[0], state.rotation) and np.linalg.norm(exchanged[1] - state.translation_m) < (
+        SAME_SHIFT * length
+    ):
+        return "left and right pictures are exchanged"
+    size = float(np.linalg.norm(shift))
+    aligned = size > 0 and np.linalg.norm(shift / size - state.translation_m / length) < SAME_SHIFT
+    if _near(turn, state.rotation) and aligned and abs(length / size - 1) > 0.02:
+        return f"shows another board, about {length / size:.1f} times as large"
+    if not _near(turn, state.rotation) or np.linalg.norm(shift - state.translation_m) > SAME_SHIFT * length:
+        return "left and right don't show the same board at the same moment"
+    return "doesn't fit (board bent, moving, or badly found)"
+
+
+def _implied(
+    left: Corners, right: Corners, cameras: tuple[Camera, Camera], points_m: Float64
+) -> tuple[Float64, Float64, float]:
+    """cam1_from_cam0 by one view alone (rotation, translation) and the worse camera's RMS (px)."""
+    first, second = board_pose(cameras[0], left, points_m), board_pose(cameras[1], right, points_m)
+    turn = second[0] @ first[0].T
+    return turn, second[1] - turn @ first[1], max(first[2], second[2])
+
+
+def _near(a: Float64, b: Float64) -> bool:
+    return bool(np.linalg.norm(a - b) < SAME_TURN_RAD * np.sqrt(2))
+
+
+def _without(view: BoardView, camera: int) -> BoardView:
+    return replace(view, cam0=None) if camera == 0 else replace(view, cam1=None)
+
+
+def _with(view: BoardView, camera: int, corners: Corners) -> BoardView:
+    return replace(view, cam0=corners) if camera == 0 else replace(view, cam1=corners)

@@ -1,0 +1,1 @@
+"""`barsight bench NAME ...`: one module per group of benchmarks."""

@@ -1,0 +1,1 @@
+"""`barsight calibrate KIND ...`: one module per kind."""

@@ -1,0 +1,86 @@
+"""`barsight calibrate check RECORDING [-o check.json]`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.core.files import expect_output
+from barsight.motion.batch.fusion import FusionSettings
+from barsight.motion.rig_check.drift_check import CheckSettings, RigCheck, State, check_rig
+from barsight.recording.base import RecordingSettings
+from barsight.recording.open import open_recording
+from barsight.report.calibration.rig_check_page import write_rig_check_report
+
+COLOURS = {
+    State.GOOD: "green",
+    State.RECALIBRATE: "red",
+    State.CONTRADICTION: "red",
+    State.NOT_SEEN: "yellow",
+}
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and check."""
+
+    def command(
+        recording: tyro.conf.Positional[Path],
+        out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
+        settings: Annotated[CheckSettings, tyro.conf.arg(name="")] = CheckSettings(),  # noqa: B008
+        reading: Annotated[RecordingSettings, tyro.conf.arg(name="recording")] = RecordingSettings(),  # noqa: B008
+        fusion: FusionSettings = FusionSettings(),  # noqa: B008
+    ) -> None:
+        """Has the rig drifted since its calibration? Ordinary crane travel over any scene shows it.
+
+        Rows of matches show pitch, roll and focal ratio between the cameras; the encoders' travel shows the
+        yaw, which costs most, and the baseline. A drift is no error: the exit code stays 0.
+
+        Args:
+            recording: The recording, with encoders for yaw and baseline.
+            out: A .json file for the figures, the report (.html) goes beside it; nothing is written where it
+                is not given.
+            settings: When a drift matters.
+            reading: How to read the recording; --recording.rig checks another calibration.
+            fusion: The estimate's settings.
+        """
+        if out is not None:
+            expect_output(out, ".json")
+        source = open_recording(recording, reading)
+        total, done = len(source.index.stamps_ns), 0
+        with stages(Console(stderr=True)) as advance:
+
+            def count() -> None:
+                nonlocal done
+                done += 1
+                advance("travel", done, total)
+
+            check = check_rig(source, fusion, settings, count)
+        if out is not None:
+            write_rig_check_report(check, str(recording), out.with_suffix(".html"), out)
+        _print(check, Console())
+
+    call(command, "calibrate check", arguments)
+
+
+def _print(check: RigCheck, console: Console) -> None:
+    table = Table("drift", "value", "costs", "", title=None if math.isnan(check.range_m) else (
+        f"Drift since calibration; costs at {check.range_m:.1f} m"
+    ))  # fmt: skip
+    for line in check.lines:
+        digits = 3 if line.unit == "%" else 4
+        value = "-" if math.isnan(line.value) else (
+            f"{line.value:+.{digits}f} ± {line.sigma:.{digits}f} {line.unit}"
+        )  # fmt: skip
+        cost = "" if math.isnan(line.cost_mm) else f"{line.cost_mm:+.1f} mm"
+        state = f"[{COLOURS[line.state]}]{line.state}[/{COLOURS[line.state]}]: {line.reason}"
+        table.add_row(line.name, value, cost, state)
+    console.print(table)
+    console.print(f"[{COLOURS[check.state]}]{check.state}[/{COLOURS[check.state]}]")

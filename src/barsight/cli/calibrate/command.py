@@ -1,0 +1,33 @@
+"""`barsight calibrate KIND ...`: finds the calibration asked for."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from barsight.core.errors import ConfigError
+
+KINDS = {
+    "board": "Draw a board to print in its true size, or how to hold it before the cameras",
+    "stereo": "Calibrate two cameras from pictures of a board: rig.yaml and a report that judges it",
+    "camera-imu": "Where the cameras sit on the IMU and the clocks' offset, from a recording with a board",
+    "check": "Has the rig drifted? Ordinary crane travel shows it, with sigma and cost in mm",
+    "export": "Write a rig in another format: ours, Kalibr, OpenCV, EuRoC",
+    "yard": "Where the world lies in the yard, from surveyed targets or crane moves in two axes",
+    "imu-noise": "Noise densities and random walks of an IMU from a log at rest: imu.yaml",
+}
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Pass the rest of the line on to the calibration named first."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        lines = "\n".join(f"  {name:<11}{summary}" for name, summary in KINDS.items())
+        sys.stdout.write(f"usage: barsight calibrate KIND ...\n\nkinds:\n{lines}\n\n")
+        if not arguments:
+            raise ConfigError(f"barsight calibrate needs a kind: {', '.join(KINDS)}")
+        return
+    kind, rest = arguments[0], arguments[1:]
+    if kind not in KINDS:
+        raise ConfigError(f"there is no calibration {kind!r}; known are {', '.join(KINDS)}")
+    importlib.import_module(f"barsight.cli.calibrate.{kind.replace('-', '_')}").run(rest)

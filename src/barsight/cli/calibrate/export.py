@@ -1,0 +1,39 @@
+"""`barsight calibrate export RIG -o FILE --to FORMAT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from barsight.calibration.files.rig_formats import RigFormat, read_rig_file, write_any_rig
+from barsight.cli.arguments import call
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and write."""
+
+    def command(
+        rig: tyro.conf.Positional[Path],
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        to: tyro.conf.EnumChoicesFromValues[RigFormat],
+    ) -> None:
+        """Write a stereo rig in another format.
+
+        Args:
+            rig: The rig to read: ours, Kalibr's camchain, OpenCV's YAML or XML, or an EuRoC folder.
+            out: The file to write (the folder, for euroc).
+            to: The format to write. OpenCV's files lose where the rig sits on its body, and all but ours the
+                covariance.
+        """
+        read = read_rig_file(rig)
+        write_any_rig(out, read, to)
+        Console(stderr=True).print(
+            f"{escape(str(out))}: baseline {read.baseline_m * 1e3:.2f} mm", soft_wrap=True, highlight=False
+        )
+
+    call(command, "calibrate export", arguments)

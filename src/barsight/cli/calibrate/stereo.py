@@ -1,0 +1,97 @@
+"""`barsight calibrate stereo PICTURES --board BOARD -o rig.yaml`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from barsight.board_views import views_from_detections, views_from_pictures
+from barsight.calibration.boards.board import parse_board
+from barsight.calibration.boards.detection_files import has_detections
+from barsight.calibration.files.rig_file import write_rig_file
+from barsight.calibration.geometry.projection import Lens
+from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
+from barsight.calibration.stereo.verdict import Verdict, assess, summary_sentence
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.core.errors import ConfigError
+from barsight.core.files import atomic_path, expect_output
+from barsight.report.calibration.stereo_page import write_calibration_report
+
+COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.REDO: "red"}
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and calibrate."""
+
+    def command(
+        pictures: tyro.conf.Positional[Path],
+        board: str,
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        lens: tyro.conf.EnumChoicesFromValues[Lens] = Lens.RADTAN4,
+        range_m: float = 7.0,
+        most_views: int = 150,
+        resolution: str | None = None,
+    ) -> None:
+        """Calibrate two cameras from pictures of a board that both see.
+
+        Args:
+            pictures: Folder of pictures in pairs (left and right inside, or left01.png and right01.png), an
+                EuRoC recording, a bag, or a folder of detections (cam0_detections.npz, cam1_detections.npz).
+            board: checkerboard:9x6:0.025 (inner corners, square in m), charuco:11x8:0.03:0.022[:DICTIONARY]
+                (squares, square and marker in m) or aprilgrid:6x6:0.088:0.3 (tags, tag in m, gap per tag).
+            out: The rig file to write (.yaml); its report goes beside it (.html and .json).
+            lens: The lens model. More coefficients need corners near the pictures' corners.
+            range_m: The range at which the rig will measure; the verdict judges the depth there.
+            most_views: Films are thinned to so many views, evenly.
+            resolution: WIDTHxHEIGHT of the cameras, for detections, which don't carry it.
+        """
+        _expect(out, range_m, most_views)
+        console = Console(stderr=True)
+        target = parse_board(board)
+        if pictures.is_dir() and has_detections(pictures):
+            views, sizes, left_out = views_from_detections(pictures, target, most_views, resolution)
+        else:
+            with stages(console) as advance:
+                views, sizes, left_out = views_from_pictures(pictures, target, most_views, advance)
+        calibration = calibrate_stereo(views, target, lens, sizes, pictures, left_out)
+        assessment = assess(calibration, range_m)
+        html, data = out.with_suffix(".html"), out.with_suffix(".json")
+        with atomic_path(out) as path:
+            write_rig_file(path, calibration.rig, calibration)
+        write_calibration_report(calibration, assessment, html, data)
+        _print(console, calibration, out, html)
+        colour = COLOURS[assessment.verdict]
+        console.print(f"[{colour}]{assessment.verdict}[/{colour}]: {summary_sentence(assessment.lines)}")
+        for sentence in assessment.advice:
+            console.print(f"  {sentence}", highlight=False)
+
+    call(command, "calibrate stereo", arguments)
+
+
+def _expect(out: Path, range_m: float, most_views: int) -> None:
+    expect_output(out, ".yaml", ".yml")
+    if not 0.05 <= range_m <= 1000:
+        raise ConfigError(f"--range-m {range_m:g} can't be; give the working distance in metres")
+    if most_views < 6:
+        raise ConfigError(f"--most-views {most_views} is too few; give 6 or more")
+
+
+def _print(console: Console, calibration: StereoCalibration, out: Path, html: Path) -> None:
+    for entry in calibration.removed[:20]:
+        line = escape(f"{entry.view} {entry.camera}: {entry.reason}")
+        console.print(f"[yellow]{line}[/yellow]", soft_wrap=True, highlight=False)
+    if len(calibration.removed) > 20:
+        console.print(f"[yellow]... and {len(calibration.removed) - 20} more, all in the report[/yellow]")
+    console.print(
+        f"{escape(str(out))}: {len(calibration.views)} views, {calibration.rms_px:.3f} px RMS, baseline "
+        f"{calibration.rig.baseline_m * 1e3:.2f} ± {calibration.baseline_sigma_m * 1e3:.2f} mm; report "
+        f"{escape(str(html))}",
+        soft_wrap=True, highlight=False,
+    )  # fmt: skip
+    console.print(f"board: {calibration.shape}", soft_wrap=True, highlight=False)

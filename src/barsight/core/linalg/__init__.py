@@ -1,0 +1,1 @@
+"""Linear algebra: skyline Cholesky and the Levenberg-Marquardt loop."""

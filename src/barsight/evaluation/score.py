@@ -1,0 +1,108 @@
+"""A measured folder against the truth of its (simulated) recording: evaluation only, never measuring."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import tifffile
+
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import InputError
+from barsight.core.types import Source
+from barsight.mapping.agreement import smooth_places
+
+_SPACING_M = 0.01
+
+Figures = dict[str, float]
+
+
+def score(recording: Path, out: Path) -> dict[str, Figures]:
+    """Contours and heights in mm against `truth/height.npz` of the recording.
+
+    `smooth` places have no step over 30 mm within two samples, in the height map along x and along y;
+    `seen by two` are those that at least two frames see in both cameras. coverage is the share of those that
+    vision claims; within_95 the share of smooth errors
+    inside 1.96 stated sigma. Raises InputError where either side has no such file.
+    """
+    truth_file = recording / "truth" / "height.npz"
+    for file in (truth_file, out / "contour.csv", out / "height.tif"):
+        if not file.exists():
+            raise InputError(file, "no such file", "give a simulated recording and its measured folder")
+    with np.load(truth_file) as truth:
+        content = {name: truth[name] for name in truth.files}
+    return {**_score_contours(content, out), **_score_height(content, out)}
+
+
+def _score_contours(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
+    x_true = truth["profile_x"]
+    heights: dict[int, Float64] = {}
+    with (out / "contour.csv").open(encoding="ascii") as file:
+        for row in csv.DictReader(file):
+            profile = int(row["profile"])
+            if f"profile_y{profile}" not in truth:
+                continue
+            measured = heights.setdefault(profile, np.full((2, x_true.size), np.nan))
+            k = round((float(row["x_m"]) - x_true[0]) / _SPACING_M)
+            if int(row["source"]) == Source.VISION and 0 <= k < x_true.size:
+                measured[:, k] = float(row["z_m"]), float(row["sigma_m"])
+    errors, sigmas, smooth, covered = [], [], [], []
+    for profile, (z, sigma) in heights.items():
+        z_true = truth[f"profile_y{profile}"].astype(np.float64)
+        level = smooth_places(z_true)
+        seen = truth[f"profile_visible{profile}"] >= 2
+        errors.append(z - z_true)
+        sigmas.append(sigma)
+        smooth.append(level)
+        covered.append(np.isfinite(z)[seen & level])
+    if not errors:
+        return {}
+    error, sigma, level = np.concatenate(errors), np.concatenate(sigmas), np.concatenate(smooth)
+    return {
+        "contour, smooth places": _figures(error[level], sigma[level], np.concatenate(covered)),
+        "contour, everywhere": _figures(error, sigma, None),
+    }
+
+
+def _score_height(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
+    with tifffile.TiffFile(out / "height.tif") as file:
+        z, sigma, _, source = file.asarray()
+        tags = file.pages[0].tags  # type: ignore[union-attr]
+        cell = tags["ModelPixelScaleTag"].value[0]
+        left, top = tags["ModelTiepointTag"].value[3:5]
+    z_true = truth["z"].astype(np.float64)
+    x, y = np.meshgrid(truth["x"], truth["y"], indexing="ij")
+    column, row = np.floor((x - left) / cell).astype(int), np.floor((top - y) / cell).astype(int)
+    inside = (column >= 0) & (row >= 0) & (column < z.shape[1]) & (row < z.shape[0])
+    column, row = column * inside, row * inside
+    seen = inside & (source[row, column] == Source.VISION)
+    error = np.where(seen, z[row, column] - z_true, np.nan)
+    spread = np.where(seen, sigma[row, column], np.nan)
+    level = smooth_places(z_true) & smooth_places(z_true.T).T
+    visible = truth["visible"] >= 2
+    stack = level & (z_true > 0.2)
+    return {
+        "height, smooth stack": _figures(error[stack], spread[stack], seen[stack & visible]),
+        "height, seen by two": _figures(error[visible], spread[visible], seen[visible]),
+    }
+
+
+def _figures(error_m: Float64, sigma_m: Float64, claimed: Bool | None) -> Figures:
+    known = np.isfinite(error_m)
+    error = error_m[known] * 1e3
+    if error.size == 0:
+        return {"samples": 0.0}
+    size = np.abs(error)
+    figures = {
+        "samples": float(error.size),
+        "bias_mm": error.mean(),
+        "median_mm": np.median(size),
+        "mae_mm": size.mean(),
+        "p95_mm": np.percentile(size, 95),
+        "max_mm": size.max(),
+        "within_95_pct": 100 * np.mean(size <= 1.96e3 * sigma_m[known]),
+    }
+    if claimed is not None and claimed.size:
+        figures["coverage_pct"] = 100 * claimed.mean()
+    return {name: round(float(value), 3) for name, value in figures.items()}

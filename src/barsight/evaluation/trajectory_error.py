@@ -1,0 +1,145 @@
+"""A trajectory against the true one: evaluation only, never measuring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.pose import nearest_rotation
+from barsight.core.stamps import NS_PER_S, interpolate_at
+from barsight.core.types import PosedFrame, Trajectory
+from barsight.recording.formats.ground_truth import GroundTruth
+
+
+@dataclass(frozen=True)
+class Drift:
+    """frames: compared. aligned_*: after the best rigid motion. reference_*: as they stand, NaN in `world`.
+
+    drift_percent: translation error over all stretches of `least_way_m` and more, relative to their length
+    [Geiger 2012]; NaN where the way is shorter. nees_*: squared error per degree of freedom in terms of the
+    stated covariance, 1 where it is right; NaN in `world`, which truth knows up to a rigid motion only.
+    """
+
+    frames: int
+    aligned_rmse_mm: float
+    aligned_rmse_deg: float
+    reference_rmse_mm: float
+    reference_rmse_deg: float
+    drift_percent: float
+    least_way_m: float
+    nees_position: float
+    nees_attitude: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameErrors:
+    """Estimate minus truth of the frames that truth covers. stamp_ns: (N,). place_m, turn_rad: (N, 3),
+    reference axes; in `world` after the best rigid motion.
+    """
+
+    stamp_ns: Int64
+    place_m: Float64
+    turn_rad: Float64
+
+
+def frame_errors(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> FrameErrors | None:
+    """shift_ns: truth's clock minus the frames'. None where fewer than 3 overlap."""
+    met = _met(trajectory, truth, shift_ns)
+    if met is None:
+        return None
+    place, true_place = met.place, met.true_place
+    off = met.turn * met.true_turn.inv()
+    if trajectory.reference != "yard":
+        place, off = align(place, true_place), off.mean().inv() * off
+    stamps = np.array([frame.stamp_ns for frame in met.frames], np.int64)
+    return FrameErrors(stamps, place - true_place, off.as_rotvec())
+
+
+@dataclass(frozen=True, eq=False)
+class _Met:
+    """The frames that truth covers, and truth at their stamps."""
+
+    frames: list[PosedFrame]
+    place: Float64
+    turn: Rotation
+    true_place: Float64
+    true_turn: Rotation
+
+
+def _met(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> _Met | None:
+    stamps = trajectory.stamp_ns + shift_ns
+    inside = (stamps >= truth.stamp_ns[0]) & (stamps <= truth.stamp_ns[-1])
+    if inside.sum() < 3:
+        return None
+    frames = [frame for frame, kept in zip(trajectory.frames, inside, strict=True) if kept]
+    place = np.array([frame.reference_from_body.translation for frame in frames])
+    turn = Rotation.from_matrix(np.array([frame.reference_from_body.rotation for frame in frames]))
+    places = np.array([pose.translation for pose in truth.poses])
+    true_place = interpolate_at(stamps[inside], truth.stamp_ns, places)
+    seconds = (truth.stamp_ns - truth.stamp_ns[0]) / NS_PER_S
+    turns = Rotation.from_matrix(np.array([pose.rotation for pose in truth.poses]))
+    true_turn = Slerp(seconds, turns)((stamps[inside] - truth.stamp_ns[0]) / NS_PER_S)
+    return _Met(frames, place, turn, true_place, true_turn)
+
+
+def compare(
+    trajectory: Trajectory, truth: GroundTruth, shift_ns: int, least_way_m: float = 10.0
+) -> Drift | None:
+    """shift_ns: truth's clock minus the frames' (`timeshift_cam_imu`). None where fewer than 3 overlap."""
+    met = _met(trajectory, truth, shift_ns)
+    if met is None:
+        return None
+    frames, place, turn = met.frames, met.place, met.turn
+    true_place, true_turn = met.true_place, met.true_turn
+    aligned = align(place, true_place)
+    off = turn * true_turn.inv()
+    spread = (off.mean().inv() * off).magnitude()
+    nan = float("nan")
+    in_yard = trajectory.reference == "yard"
+    error, angle = place - true_place, off.as_rotvec()
+    covariance = np.array([frame.covariance for frame in frames])
+    return Drift(
+        len(frames),
+        _rms(aligned - true_place) * 1e3,
+        float(np.degrees(np.sqrt((spread**2).mean()))),
+        _rms(error) * 1e3 if in_yard else nan,
+        float(np.degrees(_rms(angle))) if in_yard else nan,
+        _drift(place, turn, true_place, true_turn, least_way_m),
+        least_way_m,
+        _nees(error, covariance[:, 3:, 3:]) if in_yard else nan,
+        _nees(angle, covariance[:, :3, :3]) if in_yard else nan,
+    )
+
+
+def align(place: Float64, target: Float64) -> Float64:
+    """(N, 3) places moved rigidly to fit the target best [Umeyama 1991], without scale."""
+    centred, wanted = place - place.mean(axis=0), target - target.mean(axis=0)
+    aligned: Float64 = centred @ nearest_rotation(wanted.T @ centred).T + target.mean(axis=0)
+    return aligned
+
+
+def _rms(vectors: Float64) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+
+
+def _nees(error: Float64, covariance: Float64) -> float:
+    scaled = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
+    return float((error * scaled).sum(axis=1).mean() / error.shape[1])
+
+
+def _drift(
+    place: Float64, turn: Rotation, true_place: Float64, true_turn: Rotation, least_way_m: float
+) -> float:
+    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true_place, axis=0), axis=1))])
+    shares: list[float] = []
+    for first in range(len(way)):
+        last = np.flatnonzero(way - way[first] >= least_way_m)
+        if last.size == 0:
+            break
+        moved = turn[first].inv().apply(place[last] - place[first])
+        truly = true_turn[first].inv().apply(true_place[last] - true_place[first])
+        shares += (np.linalg.norm(moved - truly, axis=1) / (way[last] - way[first])).tolist()
+    return 100 * float(np.mean(shares)) if shares else float("nan")

@@ -1,0 +1,256 @@
+"""The election of the surface: of a cell's heights the highest that those who must see it do see.
+
+A wrong height hangs in the air, most often beside an edge, where matching stretches the nearer surface by a
+few pixels. Every view that looks through it to what lies behind speaks against it. So a height's votes are
+held against the number of views whose two cameras have a free line of sight to it, over the surface as the
+votes alone would have it. A height that fewer than `min_views` views can see at all is an error of matching.
+
+Where the pictures' border cuts off a high surface, cameras still see beneath its overhang from the side. What
+they see there is no surface to lift from, since the high one may go on above it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedCamera
+from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface.visibility import STRIDE, density, free, inside, may_be_covered
+from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
+
+_ALONG = 30
+_ALIKE_CELLS = 3.0
+_BORDER_PX = 3.0
+_NOTHING = np.float32(-1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """Where K views were taken from: rect0_from_reference as rotation (K, 3, 3) and translation (K, 3), and
+    the places of both cameras (K, 2, 3) in the reference frame. spacing_rad: angle between points."""
+
+    camera: RectifiedCamera
+    spacing_rad: float
+    rotation: Float64
+    translation: Float64
+    eyes: Float64
+
+    @classmethod
+    def of(cls, poses: Sequence[Pose], camera: RectifiedCamera, points_per_pixel: int = 1) -> Sights:
+        """From the views' reference_from_rect0."""
+        inverses = [pose.inverse() for pose in poses]
+        both = np.array([[0.0, 0.0, 0.0], [camera.baseline_m, 0.0, 0.0]])
+        return cls(
+            camera,
+            1 / (camera.focal_px * points_per_pixel),
+            np.array([pose.rotation for pose in inverses]).reshape(-1, 3, 3),
+            np.array([pose.translation for pose in inverses]).reshape(-1, 3),
+            np.array([pose.apply(both) for pose in poses]).reshape(-1, 2, 3),
+        )
+
+    @property
+    def height_m(self) -> float:
+        """The cameras' median height."""
+        return float(np.median(self.eyes[..., 2]))
+
+    def pixel_m(self, z_m: Float32, height_m: float) -> Float32:
+        """The width of a pixel on the ground at heights z_m, m, seen from height_m."""
+        above = np.abs(np.float32(height_m) - z_m)
+        return np.asarray(above / np.float32(self.camera.focal_px), np.float32)
+
+    def planes(self) -> Float64:
+        """(6, 4, K) a x + b y + c z + d of the planes that bound what both pictures of a view hold, less
+        `_BORDER_PX` all around: 0 or more on their inner side."""
+        camera = self.camera
+        rays = np.concatenate([self.rotation, self.translation[:, :, None]], axis=2)
+        x, y, depth = np.moveaxis(rays, 1, 0)
+        left = camera.focal_px * x + camera.cx_px * depth
+        right = left + camera.doffs_px * depth - camera.focal_px * camera.baseline_m * np.eye(4)[3]
+        row = camera.focal_px * y + camera.cy_px * depth
+        sides = ((left, camera.width), (right, camera.width), (row, camera.height))
+        low = [place - _BORDER_PX * depth for place, _ in sides]
+        high = [(size - 1 - _BORDER_PX) * depth - place for place, size in sides]
+        return np.ascontiguousarray(np.moveaxis(np.array(low + high), 1, 2))
+
+    def touching(self, low_m: Float64, high_m: Float64) -> Bool:
+        """(K,) whether a view's left picture may hold something of the box from low_m to high_m (3,)."""
+        corners = np.array(list(product(*zip(low_m, high_m, strict=True))))
+        x, y, depth = np.moveaxis(corners @ self.rotation.mT + self.translation[:, None], -1, 0)
+        camera = self.camera
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = camera.focal_px * x / depth + camera.cx_px, camera.focal_px * y / depth + camera.cy_px
+        touched = (u.max(1) >= 0) & (u.min(1) <= camera.width) & (v.max(1) >= 0) & (v.min(1) <= camera.height)
+        chosen: Bool = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
+        return chosen
+
+    def near(self, low_m: Float64, high_m: Float64) -> Sights:
+        """Those views alone that are `touching` the box."""
+        chosen = self.touching(low_m, high_m)
+        return replace(
+            self,
+            rotation=self.rotation[chosen],
+            translation=self.translation[chosen],
+            eyes=self.eyes[chosen],
+        )
+
+
+@kernel()
+def first_heights(tile: Float32, min_views: int, top_share: float) -> Float32:
+    """(rows, columns) what votes alone elect: the highest with top_share of the best-seen one's views; NaN
+    where none has enough views."""
+    rows, columns = tile.shape[:2]
+    highest = np.full((rows, columns), np.nan, np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            most = np.float32(0)
+            for s in range(SLOTS):
+                most = max(most, tile[i, j, s, VIEWS])
+            needed = max(np.float32(min_views), np.float32(top_share) * most)
+            for s in range(SLOTS):
+                if tile[i, j, s, VIEWS] >= needed and not highest[i, j] >= tile[i, j, s, Z]:
+                    highest[i, j] = tile[i, j, s, Z]
+    return highest
+
+
+def elect(
+    tile: Float32,
+    key: TileKey,
+    around: Float32,
+    sights: Sights,
+    cell_m: float,
+    min_views: int,
+    settings: MapSettings,
+) -> Int8:
+    """Which of each cell's heights is the surface, (rows, columns), -1 where none is.
+
+    around: (3 * TILE_CELLS, 3 * TILE_CELLS) `first_heights` of the tile and its eight neighbours.
+    """
+    known = np.isfinite(around)
+    ceiling = float(around[known].max()) if known.any() else 0.0
+    box = supported_box(tile, key, cell_m, min_views)
+    if box is None:
+        return np.full(tile.shape[:2], -1, np.int8)
+    corner = np.array(key, np.float64) * TILE_CELLS
+    sights = sights.near(*box)
+    around = np.where(known, around, _NOTHING)
+    roof = np.asarray(cv2.dilate(around, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)), np.float32)
+    share, expected = _supported(
+        tile, corner, around, roof, ceiling, sights.planes(), sights.eyes, cell_m, float(min_views),
+        cell_m / sights.spacing_rad,
+    )  # fmt: skip
+    return _elected(tile, share, expected, cell_m, float(min_views), settings.own_share, settings.along_share)
+
+
+def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) -> Float64 | None:
+    """(2, 3) m, the lowest and the highest corner of the heights that min_views support; None without any."""
+    held = tile[..., Z][tile[..., VIEWS] >= min_views]
+    if held.size == 0:
+        return None
+    corner = np.array(key, np.float64) * TILE_CELLS
+    low, high = held.min() / cell_m, held.max() / cell_m
+    box: Float64 = np.array([[*corner, low], [*(corner + TILE_CELLS), high]]) * cell_m
+    return box
+
+
+@kernel()
+def _supported(
+    tile: Float32,
+    corner: Float64,
+    around: Float32,
+    roof: Float32,
+    ceiling: float,
+    planes: Float64,
+    eyes: Float64,
+    cell_m: float,
+    min_views: float,
+    one_point_m: float,
+) -> tuple[Float32, Float32]:
+    """Two arrays (rows, columns, SLOTS): the share of the votes that a height can expect which it has, -1
+    where fewer than min_views see or can see it or something may lie above; and how many it can expect.
+
+    A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
+    further apart than cells: at ranges over one_point_m, and where it looks along the ground.
+    """
+    rows, columns = tile.shape[:2]
+    share = np.full((rows, columns, SLOTS), -1, np.float32)
+    expected = np.zeros((rows, columns, SLOTS), np.float32)
+    point, margin = np.empty(3), np.empty(eyes.shape[0])
+    for i in range(rows):
+        for j in range(columns):
+            for s in range(SLOTS):
+                if tile[i, j, s, VIEWS] < min_views:
+                    continue
+                z = float(tile[i, j, s, Z])
+                point[0], point[1], point[2] = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z
+                able, votes = 0, 0.0
+                inside(point[0], point[1], z, planes, margin)
+                for k in range(margin.size):
+                    if margin[k] >= 0:
+                        seen = free(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
+                        if seen and free(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
+                            able += 1
+                            votes += density(point, eyes[k, 0], one_point_m)
+                covered = able >= min_views and may_be_covered(
+                    point, i, j, around, ceiling, planes, margin, cell_m, min_views
+                )
+                if able >= min_views and not covered:
+                    share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
+                    expected[i, j, s] = votes
+    return share, expected
+
+
+@kernel()
+def _elected(
+    tile: Float32,
+    share: Float32,
+    expected: Float32,
+    cell_m: float,
+    min_views: float,
+    own_share: float,
+    along_share: float,
+) -> Int8:
+    rows, columns = tile.shape[:2]
+    winner = np.full((rows, columns), -1, np.int8)
+    for i in range(rows):
+        for j in range(columns):
+            best = -1
+            for s in range(SLOTS):
+                z = float(tile[i, j, s, Z])
+                if share[i, j, s] < 0 or (best >= 0 and z <= tile[i, j, best, Z]):
+                    continue
+                # Where views expect less than min_views points a cell, an empty neighbour says nothing.
+                needed = along_share if expected[i, j, s] < min_views else own_share
+                if share[i, j, s] >= needed or _share_along(tile, share, i, j, z, cell_m) >= along_share:
+                    best = s
+            winner[i, j] = best
+    return winner
+
+
+@kernel()
+def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
+    """The mean share of a height and its like within `_ALONG` cells (every third is read), along that of four
+    directions in which most of the tile's cells have one: the bar's own, or the edge's."""
+    most, result = -1, 0.0
+    for direction in range(4):
+        di, dj = (0, 1, 1, 1)[direction], (1, 0, 1, -1)[direction]
+        alike, inside, total = 0, 0, 0.0
+        for n in range(-_ALONG, _ALONG + 1, 3):
+            i, j = row + n * di, column + n * dj
+            if i < 0 or j < 0 or i >= tile.shape[0] or j >= tile.shape[1]:
+                continue
+            inside += 1
+            for s in range(SLOTS):
+                if share[i, j, s] >= 0 and abs(tile[i, j, s, Z] - z) <= _ALIKE_CELLS * cell_m:
+                    alike += 1
+                    total += share[i, j, s]
+                    break
+        if alike > most:
+            most, result = alike, total / inside
+    return result

@@ -1,0 +1,252 @@
+"""The election of a whole surface, tile by tile: what hasn't changed since the last one is kept."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, Int64
+from barsight.core.parallel import ordered_map
+from barsight.core.types import Source
+from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface.cloud import CloudPart, cloud_file, read_part
+from barsight.mapping.surface.directional_filter import blur_sigma, lengthways, sharpened, valleys
+from barsight.mapping.surface.height_selection import Sights, elect, first_heights, supported_box
+from barsight.mapping.surface.surface import (
+    Layers,
+    Surface,
+    elected_layers,
+    fill_gaps,
+    paste,
+    read_tile,
+    tile_file,
+    write_tile,
+)
+from barsight.mapping.tiles import TILE_CELLS, TileKey, TileStore
+
+_HALO = 19
+"""Cells around a tile that it depends on: 12 along a bar, as far as six cells beside it, one for the bend."""
+_KEPT_HEIGHT_M = 0.05
+"""A snapshot sharpens tiles anew once the cameras' median height has changed by so much."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Figures:
+    """A finished tile in figures. columns, rows: first and last known cell of the map, None without any."""
+
+    seen: int
+    filled: int
+    sigmas_m: Float32
+    columns: tuple[int, int] | None
+    rows: tuple[int, int] | None
+
+
+class SurfaceElection:
+    """Elects the surface of the tiles in `store`; `folder` takes its files and those of the surfaces.
+
+    Poses that were given once stay: the next `Sights` begin with the same views. Nothing in `store` changes
+    but by `finish`.
+    """
+
+    def __init__(self, store: TileStore, folder: Path, cell_m: float, settings: MapSettings) -> None:
+        self._store, self._folder, self._cell_m, self._settings = store, folder, cell_m, settings
+        work = Path(tempfile.mkdtemp(prefix="election_", dir=folder))
+        self._first, self._elected, self._finished = (
+            work / name for name in ("first", "elected", "finished")
+        )
+        for made in (self._first, self._elected, self._finished):
+            made.mkdir()
+        self._work = work
+        self._boxes: dict[TileKey, tuple[tuple[int, int], Float64 | None]] = {}
+        self._winners: dict[TileKey, tuple[tuple[object, ...], int]] = {}
+        self._figures: dict[TileKey, tuple[tuple[object, ...], _Figures]] = {}
+        self._height_m = np.inf
+
+    def snapshot(self, min_views: int, sights: Sights) -> Surface:
+        """The surface as it stands, of its own from now on; only tiles that changed are elected anew.
+
+        A tile that lies beside one that changed waits for its own next change, or for `finish`.
+        """
+        if not abs(sights.height_m - self._height_m) <= _KEPT_HEIGHT_M:
+            self._height_m = sights.height_m
+        return self._surface(min_views, sights, beside=False)
+
+    def finish(self, min_views: int, sights: Sights) -> Surface:
+        """The surface at the end; the tiles in `store` are given up."""
+        self._height_m = sights.height_m
+        surface = self._surface(min_views, sights, beside=True)
+        self._store.clear()
+        shutil.rmtree(self._work)
+        return surface
+
+    def _surface(self, min_views: int, sights: Sights, *, beside: bool) -> Surface:
+        """beside: whether tiles count as changed for what lies beside them too."""
+        keys = self._store.keys()
+        read_tile.cache_clear()
+        _read_first.cache_clear()
+        self._look(keys, min_views)
+        self._elect(keys, min_views, sights, beside)
+        self._finish(keys, sights, beside)
+        folder = self._linked(keys)
+        figures = [self._figures[key][1] for key in keys]
+        columns = [column for one in figures if one.columns for column in one.columns]
+        rows = [row for one in figures if one.rows for row in one.rows]
+        sigmas = np.concatenate([one.sigmas_m for one in figures]) if figures else np.empty(0)
+        surface = Surface(
+            folder=folder,
+            cell_m=self._cell_m,
+            columns=(min(columns), max(columns) + 1) if columns else (0, 0),
+            rows=(min(rows), max(rows) + 1) if rows else (0, 0),
+            seen=sum(one.seen for one in figures),
+            filled=sum(one.filled for one in figures),
+            median_sigma_m=float(np.median(sigmas)) if sigmas.size else float("nan"),
+            tiles=frozenset(keys),
+        )
+        weakref.finalize(surface, shutil.rmtree, folder, ignore_errors=True)
+        return surface
+
+    def _look(self, keys: list[TileKey], min_views: int) -> None:
+        """Write the changed tiles' first heights."""
+
+        def look(item: tuple[TileKey, Float32]) -> tuple[TileKey, Float64 | None]:
+            key, tile = item
+            np.save(_first_file(self._first, key), first_heights(tile, min_views, self._settings.top_share))
+            return key, supported_box(tile, key, self._cell_m, min_views)
+
+        states = {key: (self._store.version(key), min_views) for key in keys}
+        changed = [key for key in keys if key not in self._boxes or self._boxes[key][0] != states[key]]
+        for key, box in ordered_map(look, ((key, self._store.read(key)) for key in changed)):
+            self._boxes[key] = states[key], box
+
+    def _elect(self, keys: list[TileKey], min_views: int, sights: Sights, beside: bool) -> None:
+        """Elect tiles that changed; if `beside`, also those round which one did or that new views look at."""
+        known = frozenset(keys)
+
+        def state(key: TileKey) -> tuple[object, ...]:
+            box = self._boxes[key][1]
+            views: Int64 = np.flatnonzero(sights.touching(*box)) if box is not None else np.empty(0, np.int64)
+            around = tuple(self._boxes.get(other, (None,))[0] for other in _around(key))
+            return self._boxes[key][0], views.tobytes(), around
+
+        def elect_tile(item: tuple[TileKey, Float32]) -> TileKey:
+            key, tile = item
+            around = _first_around(self._first, key, known)
+            winner = elect(tile, key, around, sights, self._cell_m, min_views, self._settings)
+            write_tile(self._elected, key, elected_layers(tile, winner))
+            CloudPart.of(tile, winner, key, self._cell_m, min_views).write(self._elected, key)
+            return key
+
+        states = {key: state(key) for key in keys}
+        changed = _changed(states, self._winners, beside)
+        for key in ordered_map(elect_tile, ((key, self._store.read(key)) for key in changed)):
+            self._winners[key] = states[key], (self._winners[key][1] if key in self._winners else 0) + 1
+
+    def _finish(self, keys: list[TileKey], sights: Sights, beside: bool) -> None:
+        """Average, sharpen and fill tiles that were elected anew; if `beside`, also those round them."""
+        known = frozenset(keys)
+
+        def finish_tile(key: TileKey) -> tuple[TileKey, _Figures]:
+            layers, blur = self._filled(key, known, sights)
+            write_tile(self._finished, key, layers)
+            part = read_part(self._elected, key).finished(layers.z_m, layers.sigma_m, blur)
+            part.write(self._finished, key)
+            return key, _figures(key, layers)
+
+        turns = {key: turn for key, (_, turn) in self._winners.items()}
+        states: dict[TileKey, tuple[object, ...]] = {
+            key: ((turns[key], self._height_m), tuple(turns.get(other, 0) for other in _around(key)))
+            for key in keys
+        }
+        changed = _changed(states, self._figures, beside)
+        for key, figures in ordered_map(finish_tile, changed):
+            self._figures[key] = states[key], figures
+
+    def _filled(self, key: TileKey, keys: frozenset[TileKey], sights: Sights) -> tuple[Layers, Float32]:
+        """The tile averaged lengthways, sharpened, its narrow gaps filled, looking at most the halo around
+        it; and what blur and gloss leave on bars, 1 sigma."""
+        settings, cell_m = self._settings, self._cell_m
+        along, reach = (min(round(way_m / cell_m), _HALO) for way_m in (settings.along_m, settings.fill_m))
+        side = TILE_CELLS + 2 * _HALO
+        around = Layers.unknown(side, side)
+        column, row = key[0] * TILE_CELLS - _HALO, key[1] * TILE_CELLS - _HALO
+        for neighbour in _around(key):
+            if neighbour in keys:
+                paste(read_tile(self._elected, neighbour), neighbour, around, column, row)
+        blur = np.zeros((side, side), np.float32)
+        if along > 0:
+            weight = np.nan_to_num(around.sigma_m**-2)
+            z, direction = lengthways(around.z_m, weight, settings.least_gate_m, along)
+            pixel_m = sights.pixel_m(z, self._height_m)
+            sharp = sharpened(z, direction, settings.sharpen_px * pixel_m / cell_m)
+            blur = blur_sigma(sharp - z, valleys(sharp, direction))
+            around = replace(around, z_m=sharp, sigma_m=np.hypot(around.sigma_m, blur))
+        if reach > 0:
+            fill_gaps(around, reach)
+        inner = slice(_HALO, _HALO + TILE_CELLS)
+        layers = Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
+        return layers, blur[inner, inner]
+
+    def _linked(self, keys: list[TileKey]) -> Path:
+        """A folder of its own with links to the finished tiles, which are never written to again."""
+        folder = Path(tempfile.mkdtemp(prefix="surface_", dir=self._folder))
+        for key in keys:
+            for name in (tile_file, cloud_file):
+                os.link(name(self._finished, key), name(folder, key))
+        return folder
+
+
+def _changed(
+    states: dict[TileKey, tuple[object, ...]],
+    done: Mapping[TileKey, tuple[tuple[object, ...], object]],
+    beside: bool,
+) -> list[TileKey]:
+    """Tiles that weren't done in the state they are in: its first part is their own, the rest is of what lies
+    round them."""
+    part = slice(None) if beside else slice(1)
+    return [key for key, state in states.items() if key not in done or done[key][0][part] != state[part]]
+
+
+def _around(key: TileKey) -> list[TileKey]:
+    """A tile and its eight neighbours."""
+    return [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+
+
+def _first_around(folder: Path, key: TileKey, keys: frozenset[TileKey]) -> Float32:
+    """The first heights of a tile and its eight neighbours, (3 * TILE_CELLS, 3 * TILE_CELLS)."""
+    around = np.full((3 * TILE_CELLS, 3 * TILE_CELLS), np.nan, np.float32)
+    for neighbour in _around(key):
+        if neighbour in keys:
+            row, column = ((neighbour[i] - key[i] + 1) * TILE_CELLS for i in (1, 0))
+            around[row : row + TILE_CELLS, column : column + TILE_CELLS] = _read_first(folder, neighbour)
+    return around
+
+
+@lru_cache(maxsize=64)
+def _read_first(folder: Path, key: TileKey) -> Float32:
+    heights: Float32 = np.load(_first_file(folder, key))
+    return heights
+
+
+def _first_file(folder: Path, key: TileKey) -> Path:
+    return folder / f"first_{key[0]}_{key[1]}.npy"
+
+
+def _figures(key: TileKey, layers: Layers) -> _Figures:
+    there = layers.source != Source.UNKNOWN
+    seen, filled = ((layers.source == code).sum() for code in (Source.VISION, Source.FILLED))
+    sigmas = layers.sigma_m[layers.source == Source.VISION][::17] if there.any() else np.empty(0, np.float32)
+    spans = [_span(there.any(axis=axis), key[axis] * TILE_CELLS) for axis in (0, 1)]
+    return _Figures(int(seen), int(filled), sigmas, *spans)
+
+
+def _span(occupied: Bool, first: int) -> tuple[int, int] | None:
+    index = np.flatnonzero(occupied)
+    return (first + int(index[0]), first + int(index[-1])) if index.size else None

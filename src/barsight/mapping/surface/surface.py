@@ -1,0 +1,141 @@
+"""The height surface: finished tiles on disk, windows of it read back as layers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Int8, UInt8
+from barsight.core.types import Source
+from barsight.mapping.fusion import height_sigma
+from barsight.mapping.surface.cloud import CloudPart, read_part
+from barsight.mapping.surface.hole_filling import bridged
+from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, Z
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """A rectangle of the surface, [y, x] with y rising: z_m, sigma_m (NaN where unknown), views, source.
+
+    intensity: mean grey level of the views that make the height, NaN where no view does.
+    """
+
+    z_m: Float32
+    sigma_m: Float32
+    views: Float32
+    source: UInt8
+    intensity: Float32
+
+    @classmethod
+    def unknown(cls, rows: int, columns: int) -> Layers:
+        """A rectangle of which nothing is known."""
+        nan = np.full((rows, columns), np.nan, np.float32)
+        none = np.zeros((rows, columns), np.float32)
+        return cls(nan, nan.copy(), none, none.astype(np.uint8), nan.copy())
+
+
+def grey_levels(intensity: Float32) -> UInt8:
+    """Whole grey levels from 1, 0 where no view saw the cell."""
+    return np.where(np.isfinite(intensity), np.rint(intensity).clip(1, 255), 0).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A finished height surface whose tiles lie in `folder`.
+
+    Cell (column, row) has its centre at (column * cell_m, row * cell_m). columns, rows: first and one past
+    the last cell that is known. Counts are cells by source.
+    """
+
+    folder: Path
+    cell_m: float
+    columns: tuple[int, int]
+    rows: tuple[int, int]
+    seen: int
+    filled: int
+    median_sigma_m: float
+    tiles: frozenset[TileKey]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the rectangle that holds everything known."""
+        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+
+    def window(self, column: int, row: int, columns: int, rows: int) -> Layers:
+        """The rectangle from cell (column, row) on; unknown where there is no tile."""
+        layers = Layers.unknown(rows, columns)
+        for tile_row in range(row // TILE_CELLS, (row + rows - 1) // TILE_CELLS + 1):
+            for tile_column in range(column // TILE_CELLS, (column + columns - 1) // TILE_CELLS + 1):
+                if (tile_column, tile_row) in self.tiles:
+                    tile = read_tile(self.folder, (tile_column, tile_row))
+                    paste(tile, (tile_column, tile_row), layers, column, row)
+        return layers
+
+    def cloud(self) -> Iterator[CloudPart]:
+        """Every height that enough views support, sides and lower surfaces included, tile by tile; those
+        that are the surface are as it has them."""
+        for key in sorted(self.tiles):
+            yield read_part(self.folder, key)
+
+
+def elected_layers(tile: Float32, winner: Int8) -> Layers:
+    """Take from a tile's heights those that `elect` chose."""
+    layers = Layers.unknown(TILE_CELLS, TILE_CELLS)
+    row, column = np.nonzero(winner >= 0)
+    won = tile[row, column, winner[row, column]]
+    layers.z_m[row, column] = won[:, Z]
+    layers.sigma_m[row, column] = height_sigma(won)
+    layers.views[row, column] = won[:, VIEWS]
+    layers.source[row, column] = Source.VISION
+    layers.intensity[row, column] = won[:, GREY]
+    return layers
+
+
+def fill_gaps(layers: Layers, reach: int) -> None:
+    """Fill, in place, unknown cells that have seen ones within `reach` on opposite sides, along x or along y.
+
+    The height is interpolated between the two (the nearer pair wins), its sigma is half their difference at
+    the least, and its source says FILLED.
+    """
+    filled = bridged(layers.z_m, layers.sigma_m, layers.source == Source.VISION, reach)
+    layers.source[filled] = Source.FILLED
+
+
+def tile_file(folder: Path, key: TileKey) -> Path:
+    """Name the file of a tile's layers."""
+    return folder / f"surface_{key[0]}_{key[1]}.npy"
+
+
+def write_tile(folder: Path, key: TileKey, layers: Layers) -> None:
+    """Write a tile's layers as a new file: links to an older one keep what they show."""
+    stacked = np.stack([getattr(layers, field.name).astype(np.float32) for field in fields(Layers)])
+    path = tile_file(folder, key)
+    path.unlink(missing_ok=True)
+    np.save(path, stacked)
+
+
+@lru_cache(maxsize=48)
+def read_tile(folder: Path, key: TileKey) -> Layers:
+    """Read a tile's layers; they are not to be written to."""
+    z, sigma, views, source, intensity = np.load(tile_file(folder, key))
+    return Layers(z, sigma, views, source.astype(np.uint8), intensity)
+
+
+def paste(tile: Layers, key: TileKey, into: Layers, column: int, row: int) -> None:
+    """Copy the part of the tile that overlaps the rectangle whose first cell is (column, row)."""
+    rows, columns = into.z_m.shape
+    left, top = key[0] * TILE_CELLS - column, key[1] * TILE_CELLS - row
+    target = (
+        slice(max(top, 0), min(top + TILE_CELLS, rows)),
+        slice(max(left, 0), min(left + TILE_CELLS, columns)),
+    )
+    source = (
+        slice(target[0].start - top, target[0].stop - top),
+        slice(target[1].start - left, target[1].stop - left),
+    )
+    for field in fields(Layers):
+        getattr(into, field.name)[target] = getattr(tile, field.name)[source]

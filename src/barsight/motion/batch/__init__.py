@@ -1,0 +1,1 @@
+"""The batch estimator: full bundle adjustment over cameras, IMU and encoders."""

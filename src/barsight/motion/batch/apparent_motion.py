@@ -1,0 +1,110 @@
+"""What seems to slide as it is passed, and what seems to lie deeper or higher than it does: ribs and gloss.
+
+A ribbed bar is a screw: seen from further on, the side that faces the camera shows other ribs, which seem to
+have slid along the bar; what highlights do to mill scale is alike. In the picture such a point turns about
+the camera's axis, by 4e-4 rad where ribs are: a tenth of a pixel over 250 px of way. Points of a bundle slide
+alike, which can't be told from a heading that is off; so slides are unknowns, each point's about its piece's
+of the yard. How far they go is learnt from the recording: floors don't slide, and lead.
+
+A highlight on a round bar is the image of a lamp that lies behind the bar, so gloss also falsifies the
+disparity, by 0.01 px on the pieces of a stack and by nothing on floors. The way that encoders and gyro know
+places a point without it: what a piece's disparity is off by is an unknown too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.core.arrays import Bool
+from barsight.motion.linear.schur_complement import substitute
+from barsight.motion.problem.gauss_newton import State, guess_of, optimise, rig_of, sights_of
+from barsight.motion.problem.gtsam_factors import factors
+from barsight.motion.problem.marginals import piece_variances
+from barsight.motion.problem.normal_equations import System
+from barsight.motion.problem.problem import Pieces, Problem
+
+LENGTH_SHARE = 0.2
+HEIGHT_SHARE = 0.07
+"""A piece is this long along the way, and this high, in terms of the points' distance."""
+FIRST_SIGMA_RAD = 2e-4
+LEAST_SIGMA_RAD = 5e-6
+FIRST_SIGMA_PX = 0.005
+LEAST_PIECES = 4
+LEAST_SEEN = 4
+"""A point seen less often says nothing of how it slides."""
+PRIOR_POINTS = 5
+"""How many points' worth all pieces' scatter counts in that of one."""
+PRIOR_PIECES = 2
+"""How many pieces' worth the first sigma of disparities counts."""
+ROUNDS = 3
+STEPS = 2
+"""Gauss-Newton's, in a round: each begins where the one before ended."""
+
+
+def pieces_of(problem: Problem, state: State, used: Bool) -> Pieces | None:
+    """Strips across the way, apart in height; None where there are too few of them, or fewer points than
+    pieces that say how they slide."""
+    seen = problem.sightings
+    if seen is None or not problem.has_latency:
+        return None
+    camera = seen.camera
+    disparity = float(np.median(seen.stereo[:, 0] - seen.stereo[:, 2] + camera.doffs_px))
+    range_m = camera.focal_px * camera.baseline_m / disparity
+    place = np.array([pose.translation for pose in problem.start])
+    _, _, axes = np.linalg.svd(place - place.mean(axis=0), full_matrices=False)
+    along = np.floor(state.points[:, :3] @ axes[0] / (LENGTH_SHARE * range_m))
+    up = np.floor(state.points[:, 2] / (HEIGHT_SHARE * range_m) + 0.5)
+    names, piece = np.unique(np.column_stack([along, up]), axis=0, return_inverse=True)
+    telling = int((np.bincount(seen.track[used]) >= LEAST_SEEN).sum())
+    if len(names) < LEAST_PIECES or telling < len(names):
+        return None
+    return Pieces(piece.ravel().astype(np.int64), np.full(len(names), FIRST_SIGMA_RAD), 0.5, FIRST_SIGMA_PX)
+
+
+def with_slides(
+    problem: Problem, state: State, used: Bool, rounds: int = ROUNDS
+) -> tuple[Problem, State, System]:
+    """Solved with what pieces share as unknowns, and how far they go as they show it [EM: Dempster 1977; of
+    disparities MacKay 1992, faster where there is little to find].
+    """
+    pieces = problem.pieces or pieces_of(problem, state, used)
+    graph = factors(problem)
+    if pieces is None:
+        return problem, *optimise(problem, graph, state, used)
+    if not len(state.pieces):
+        state = replace(state, pieces=np.zeros(2 * pieces.count))
+    for left in reversed(range(rounds)):
+        problem = replace(problem, pieces=pieces)
+        state, system = optimise(problem, graph, state, used, most=STEPS)
+        pieces = _learnt(problem, state, system, pieces, used)
+        if left:
+            del system
+    return problem, state, system
+
+
+def _learnt(problem: Problem, state: State, system: System, pieces: Pieces, used: Bool) -> Pieces:
+    seen = problem.sightings
+    assert seen is not None
+    variance = np.zeros(len(state.points))
+    still, guess = np.zeros((len(problem.kept), 6)), guess_of(problem, state)
+    none, points = np.zeros(2 * pieces.count + 2), state.points.copy()
+    substitute(rig_of(seen), sights_of(problem, used), guess, still, none, points, variance)
+    counts = np.bincount(seen.track[used], minlength=len(variance))
+    good = counts >= LEAST_SEEN
+    slides, disparities = np.split(state.pieces, 2)
+    square = (points[:, 3] - slides[pieces.piece]) ** 2 + variance
+    everywhere = square[good].mean()
+    total = np.bincount(pieces.piece[good], square[good], pieces.count) + PRIOR_POINTS * everywhere
+    own = np.sqrt(total / (np.bincount(pieces.piece[good], minlength=pieces.count) + PRIOR_POINTS))
+    own = np.maximum(own, LEAST_SIGMA_RAD)
+    spread, in_all = piece_variances(system, np.concatenate([1 / own, np.zeros(pieces.count)]))
+    unit = replace(pieces, own_sigma_rad=own, share=1.0)
+    scatter = (spread[: pieces.count] / own**2).sum() - in_all / (pieces.count + 1)
+    slid = unit.cost(np.concatenate([slides, np.zeros(pieces.count)])) + scatter
+    share = float(np.sqrt(2 * slid / pieces.count))
+    known = spread[pieces.count :] / pieces.disparity_sigma_px**2
+    square = disparities @ disparities + PRIOR_PIECES * FIRST_SIGMA_PX**2
+    sigma = float(np.sqrt(square / ((1 - known).sum() + PRIOR_PIECES)))
+    return Pieces(pieces.piece, own, share, sigma)

@@ -1,0 +1,216 @@
+"""Sensors that contradict themselves or each other before anything is estimated from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import Failed
+from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.motion.crane.encoder_jumps import find_jumps
+from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.motion.crane.sway import turned_angle
+from barsight.motion.frontend.tracking import Sighting
+
+LEAST_FROZEN = 5
+SIDE, SPEED_WINDOW_S = 8, 0.3
+"""The speed before a freeze is taken over so many readings, or so long where that is more."""
+MIN_HELD_M, HELD_SIGMAS = 0.01, 8.0
+"""A crane that froze would have gone further than this, and than so many sigma of a reading."""
+MAX_BRAKING_MPS2 = 1.0
+MOST_FRAMES_OFF = 2
+MANY_STEPS = 8
+"""Recordings that leave fewer steps are looked at for one frame off only."""
+LEAST_STEPS = 2
+"""Five frames. They tell seven times in ten, seven frames always (docs/explanation/motion.md)."""
+WINDOW_S = 0.35
+TURN_SIGMA_RAD = 5e-4
+WAY_SIGMA_M = 0.005
+CLEARLY_BETTER = 0.1
+DEGREES = 180 / np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedCrane:
+    """The readings that can be used, and sentences on what was left out."""
+
+    samples: CraneSamples
+    warnings: tuple[str, ...]
+
+
+def check_crane(crane: CraneSamples) -> CheckedCrane:
+    """Leaves out readings that stand still while the crane must be moving, and those beyond a jump.
+
+    Which side of a jump is right can't be told from the encoders: the longer one stays.
+    """
+    samples, warnings = crane, []
+    for first, last in _frozen(crane):
+        seconds = [(crane.stamp_ns[k] - crane.stamp_ns[0]) / NS_PER_S for k in (first, last)]
+        warnings.append(
+            f"the encoders were frozen from {seconds[0]:.1f} s to {seconds[1]:.1f} s while the crane moved"
+        )
+        away = (samples.stamp_ns >= crane.stamp_ns[first]) & (samples.stamp_ns <= crane.stamp_ns[last])
+        samples = _chosen(samples, ~away)
+    jumps = find_jumps(samples)
+    if jumps:
+        bounds = [0, *(k for k, _ in jumps), len(samples.stamp_ns)]
+        longest = int(np.argmax(np.diff(bounds)))
+        for k, size in jumps:
+            at = (samples.stamp_ns[k] - crane.stamp_ns[0]) / NS_PER_S
+            warnings.append(
+                f"the encoders jump by {1e3 * size:.0f} mm at {at:.1f} s; only the longest stretch "
+                "without a jump is used"
+            )
+        index = np.arange(len(samples.stamp_ns))
+        samples = _chosen(samples, (index >= bounds[longest]) & (index < bounds[longest + 1]))
+    return CheckedCrane(samples, tuple(warnings))
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What pictures and other sensors say of the same K steps between frames.
+
+    turn: (K, 3) rotation vector old body from new body and way: (K,) m by the pictures. gyro: (K, 3) and
+    travel: (K,) by IMU and encoders, NaN where they don't cover it. seconds: (K,).
+    """
+
+    turn: Float64
+    way: Float64
+    gyro: Float64
+    travel: Float64
+    seconds: Float64
+
+
+def compare_steps(
+    sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
+    rectifier: Rectifier, shift_ns: int, offs: tuple[int, ...] = (0,),
+) -> tuple[Steps, ...]:  # fmt: skip
+    """For each of `offs` the steps with the other sensors taken that many frames further on; the same steps
+    for all, those of the outer frames left out.
+    """
+    count, ends = len(sightings), max(abs(off) for off in offs)
+    steps = [k for k in range(1 + ends, count - ends) if sightings[k].motion is not None]
+    stamps = np.array([s.stamp_ns for s in sightings]) + shift_ns
+    turn, way = _seen(sightings, steps, rectifier)
+    angle, place = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+    if imu is not None:
+        angle = interpolate_at(stamps, imu.stamp_ns, turned_angle(imu))
+    if crane is not None:
+        # A fit, since single readings may be wild.
+        for k, stamp in enumerate(stamps.tolist()):
+            fit = fit_position(crane, stamp, seconds_to_ns(WINDOW_S))
+            place[k] = np.nan if isinstance(fit, Failed) else fit.position_m
+    found = []
+    for off in offs:
+        old, new = [k + off - 1 for k in steps], [k + off for k in steps]
+        travel = np.linalg.norm(place[new] - place[old], axis=1)
+        found.append(
+            Steps(turn, way, angle[new] - angle[old], travel, (stamps[new] - stamps[old]) / NS_PER_S)
+        )
+    return tuple(found)
+
+
+def frames_off(
+    sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
+    rectifier: Rectifier, shift_ns: int,
+) -> int:  # fmt: skip
+    """By how many frames the cameras' stamps are late against gyro and encoders; 0 where that isn't clear.
+
+    The turns and ways that pictures show between neighbouring frames are held against those of the other
+    sensors between the stamps of neighbours further on or back. The gyro's bias is fitted each time.
+    """
+    most = MOST_FRAMES_OFF if len(sightings) > 2 * MOST_FRAMES_OFF + MANY_STEPS else 1
+    offs = tuple(range(-most, most + 1))
+    cost = {}
+    for off, steps in zip(offs, compare_steps(sightings, imu, crane, rectifier, shift_ns, offs), strict=True):
+        turned = _gyro_residual(steps)
+        travelled = np.isfinite(steps.travel)
+        terms = []
+        if len(turned) >= LEAST_STEPS:
+            terms.append(float((turned**2).mean()) / TURN_SIGMA_RAD**2)
+        if travelled.sum() >= LEAST_STEPS:
+            wrong = (steps.travel - steps.way)[travelled]
+            terms.append(float((wrong**2).mean()) / WAY_SIGMA_M**2)
+        cost[off] = float(np.mean(terms)) if terms else 0.0
+    best = min(cost, key=lambda off: cost[off])
+    clear = cost[best] < CLEARLY_BETTER * cost[0] and cost[0] > 1 / CLEARLY_BETTER
+    return -best if clear else 0
+
+
+def gyro_in_degrees(
+    sightings: tuple[Sighting, ...], imu: ImuSamples, rectifier: Rectifier, shift_ns: int
+) -> bool:
+    """Whether the gyro turns some 57 times as far as the pictures, step by step."""
+    (steps,) = compare_steps(sightings, imu, None, rectifier, shift_ns)
+    radians, degrees = _gyro_residual(steps), _gyro_residual(steps, DEGREES)
+    if len(radians) < LEAST_STEPS:
+        return False
+    spread = float((radians**2).mean())
+    return (
+        float((degrees**2).mean()) < CLEARLY_BETTER * spread and spread > TURN_SIGMA_RAD**2 / CLEARLY_BETTER
+    )
+
+
+def _gyro_residual(steps: Steps, per_turn: float = 1.0) -> Float64:
+    """(K, 3) gyro minus `per_turn` times the pictures' turn, without the constant rate that fits best."""
+    known = np.isfinite(steps.gyro).all(axis=1)
+    time = steps.seconds[known, None]
+    off = steps.gyro[known] - per_turn * steps.turn[known]
+    residual: Float64 = off - time * (time * off).sum(axis=0) / max(float((time**2).sum()), 1e-12)
+    return residual
+
+
+def _seen(sightings: tuple[Sighting, ...], steps: list[int], rectifier: Rectifier) -> tuple[Float64, Float64]:
+    """(K, 3) turn old body from new body, and (K,) length of the way, by the pictures."""
+    mount = rectifier.body_from_rect0
+    turns, ways = [], []
+    for k in steps:
+        motion = sightings[k].motion
+        assert motion is not None
+        old_from_new = motion.rotation.T
+        rotation = mount.rotation @ old_from_new @ mount.rotation.T
+        move = mount.rotation @ (-old_from_new @ motion.translation)
+        move = move + mount.translation - rotation @ mount.translation
+        turns.append(Rotation.from_matrix(rotation).as_rotvec())
+        ways.append(np.linalg.norm(move))
+    return np.array(turns).reshape(-1, 3), np.array(ways)
+
+
+def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
+    return replace(crane, stamp_ns=crane.stamp_ns[kept], position_m=crane.position_m[kept])
+
+
+def _frozen(crane: CraneSamples) -> list[tuple[int, int]]:
+    """Find stretches (first, last) of equal readings that a moving crane runs into or comes out of elsewhere.
+
+    A crane that turns gives equal readings too, of coarse encoders most of all, but stays near them.
+    """
+    place, time = crane.position_m, (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
+    same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
+    edges = np.flatnonzero(np.diff(same.astype(int)))
+    least = max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
+    found = []
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        if last - first + 1 < LEAST_FROZEN or first < SIDE // 2:
+            continue
+        after = place[last + 1 : last + 4]
+        away = float(np.linalg.norm(np.median(after, axis=0) - place[last])) if len(after) == 3 else 0.0
+        speed = _speed_before(place, time, int(first))
+        braked = min(float(time[last] - time[first]), speed / MAX_BRAKING_MPS2)
+        if max(away, (speed - MAX_BRAKING_MPS2 * braked / 2) * braked) > least:
+            found.append((int(first), int(last)))
+    return found
+
+
+def _speed_before(place: Float64, time: Float64, first: int) -> float:
+    """Median speed (m/s) over the readings before one, by those half a window apart."""
+    begin = min(int(np.searchsorted(time, time[first] - SPEED_WINDOW_S)), max(0, first - SIDE))
+    half = (first - begin + 1) // 2
+    old, new = slice(begin, first + 1 - half), slice(begin + half, first + 1)
+    rates = (place[new] - place[old]) / (time[new] - time[old])[:, None]
+    return float(np.linalg.norm(np.median(rates, axis=0)))

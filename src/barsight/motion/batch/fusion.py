@@ -1,0 +1,291 @@
+"""One estimate from cameras, IMU and encoders, whichever there are: the trajectory of a whole recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Int64
+from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
+from barsight.core.motion_detail import Inertial, InSigmas, MotionDetail, Relative
+from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
+from barsight.inertial.model import ORDINARY_NOISE, without_saturation
+from barsight.motion.batch.fault_detection import check_crane, frames_off, gyro_in_degrees
+from barsight.motion.crane.encoder_trajectory import (
+    CraneSettings,
+    CraneTrajectory,
+    fit_position,
+    with_seen_noise,
+)
+from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
+from barsight.motion.frontend.board_corners import follow_corners
+from barsight.motion.frontend.motion_prediction import CranePredictor
+from barsight.motion.frontend.tracking import FrontEndSettings, Sighting, follow, innovations
+from barsight.motion.gravity import Level, level_attitude
+from barsight.motion.problem.nodes import Nodes, make_nodes, start_poses, tied_by_imu
+from barsight.recording.base import Recording
+from barsight.recording.formats.board_corners import CornerRecording
+
+if TYPE_CHECKING:
+    from barsight.motion.batch.bundle_adjustment import Estimate
+
+SENSORS = ("stereo", "imu", "crane")
+PLACE_SPACING_S = 0.4
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """The estimate from all sensors together."""
+
+    use: str = "stereo,imu,crane"
+    """Sensors to use where the recording has them: any of stereo, imu, crane, with commas."""
+    front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
+    calibration_sigma_px: float = 0.1
+    """How far a yaw between the cameras may move the disparity (1 sigma); the yaw is estimated too. 0 takes
+    the calibration as exact."""
+    scale_sigma: float = 5e-4
+    """By which share baseline and encoders may disagree (1 sigma); that is estimated too."""
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.sensors if name not in SENSORS]
+        if unknown or not ({"stereo", "crane"} & set(self.sensors)):
+            raise ConfigError(f"use is {self.use!r}; name stereo or crane, and imu if wanted, with commas")
+        if self.calibration_sigma_px < 0:
+            raise ConfigError("calibration_sigma_px can't be negative")
+        if not 0 < self.scale_sigma <= 0.1:
+            raise ConfigError(f"scale_sigma must lie over 0 and up to 0.1, not {self.scale_sigma}")
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors named."""
+        return tuple(name.strip() for name in self.use.split(",") if name.strip())
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    crane: CraneSamples | None
+    imu: ImuSamples | None
+    sightings: tuple[Sighting, ...]
+    refused: tuple[RefusedFrame, ...]
+    level: Level | None
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FusedTrajectory:
+    """`TrajectoryEstimator` for any recording; the reference is `yard` with encoders, else `world`."""
+
+    settings: FusionSettings
+    crane: CraneSettings
+
+    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
+        """Frames that neither pictures nor encoders place are refused. Raises MeasurementError where no
+        sensor that places the body is left to use.
+        """
+        inputs = self._gather(recording, rectifier, advance)
+        shift = recording.rig.timeshift_cam_imu_ns
+        frames = np.array([s.stamp_ns for s in inputs.sightings], np.int64)
+        refused = list(inputs.refused)
+        if inputs.crane is not None:
+            frames, gone = _placed_frames(recording, inputs.crane, frames, shift)
+            left = set(frames.tolist())
+            refused = gone + [r for r in refused if r.stamp_ns not in left]
+            refused = list({r.stamp_ns: r for r in refused}.values())
+        if len(frames) < 2:
+            return self._simple(recording, rectifier, inputs)
+        nodes = make_nodes(frames + shift, inputs.imu)
+        try:
+            estimate, seen, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
+        except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
+            simple = self._simple(recording, rectifier, inputs)
+            reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
+            told = dict.fromkeys((*simple.warnings, *inputs.warnings, f"{reason}: estimated one by one"))
+            return replace(simple, warnings=tuple(told))
+        placed = tuple(
+            PosedFrame(int(stamp), estimate.poses[k], covariance)
+            for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
+        )
+        names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
+        sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
+        return Trajectory(
+            self._reference(inputs), placed, tuple(refused), sensors, inputs.warnings + seen, estimate.drift,
+            _detail(estimate, inputs.sightings, nodes, encoders, shift),
+        )  # fmt: skip
+
+    def _simple(self, recording: Recording, rectifier: Rectifier, inputs: _Inputs) -> Trajectory:
+        """Without a graph: the encoders' trajectory, or frame to frame."""
+        if inputs.crane is not None:
+            return CraneTrajectory(self.crane)(recording, rectifier, _silent)
+        return StereoOdometry(self.settings.front_end.rough)(recording, rectifier, _silent)
+
+    def _reference(self, inputs: _Inputs) -> str:
+        return "world" if inputs.crane is None else "yard"
+
+    def _gather(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> _Inputs:
+        use = self.settings.sensors
+        stated = recording.crane() if "crane" in use else None
+        checked = None if stated is None else check_crane(with_seen_noise(stated))
+        crane = None if checked is None else checked.samples
+        imu, spoiled = recording.imu() if "imu" in use else None, 0
+        if imu is not None:
+            imu, spoiled = without_saturation(imu)
+        if crane is None and "stereo" not in use:
+            raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
+        sightings: tuple[Sighting, ...] = ()
+        refused: tuple[RefusedFrame, ...] = ()
+        if "stereo" in use:
+            shift = recording.rig.timeshift_cam_imu_ns
+            bias = np.zeros(3) if imu is None else imu.gyro_radps.mean(axis=0)
+            predictor = CranePredictor(crane, imu, bias, rectifier, shift) if crane else lambda a, b: None
+            if isinstance(recording, CornerRecording):
+                rough = self.settings.front_end.rough
+                sightings, refused = follow_corners(recording, rectifier, rough, advance)
+            else:
+                sightings, refused = follow(recording, rectifier, predictor, self.settings.front_end, advance)
+        else:
+            for _ in recording.index.stamps_ns:
+                advance()
+        self._refuse_wrong_sensors(recording, rectifier, sightings, imu, crane)
+        level = None if crane else level_attitude(recording)
+        warnings = (level.warnings if level else ()) + (checked.warnings if checked else ())
+        if spoiled:
+            warnings += (f"{spoiled} IMU samples are at the end of their scale and were left out",)
+        if "stereo" in use and crane is not None:
+            warnings += _untied(sightings, refused)
+        return _Inputs(crane, imu, sightings, refused, level, warnings)
+
+    def _refuse_wrong_sensors(
+        self, recording: Recording, rectifier: Rectifier, sightings: tuple[Sighting, ...],
+        imu: ImuSamples | None, crane: CraneSamples | None,
+    ) -> None:  # fmt: skip
+        """Raises InputError where the pictures show that a sensor's unit or the cameras' stamps are wrong."""
+        shift = recording.rig.timeshift_cam_imu_ns
+        if imu is not None and gyro_in_degrees(sightings, imu, rectifier, shift):
+            raise InputError(
+                recording.path, "the gyro turns 57 times as far as the pictures, so it is in degrees/s",
+                "multiply it by pi / 180",
+            )  # fmt: skip
+        late = frames_off(sightings, imu, crane, rectifier, shift)
+        if late:
+            raise InputError(
+                recording.path,
+                f"the cameras' stamps are {abs(late)} frame(s) {'late' if late > 0 else 'early'} "
+                "against gyro and encoders",
+                "repair the stamps, or use the pictures alone (--use stereo)",
+            )
+
+    def _solve(
+        self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
+    ) -> tuple[Estimate, tuple[str, ...], InSigmas | None]:
+        # GTSAM is loaded where it is needed: its import takes a quarter of a second.
+        from barsight.motion.batch.bundle_adjustment import solve
+        from barsight.motion.problem.encoder_factors import encoder_warnings, places
+        from barsight.motion.problem.problem import Attitude, Placed, Problem, StereoSightings
+        from barsight.motion.problem.residuals import encoders_in_sigmas
+
+        start = start_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
+        noise = recording.imu_noise() or ORDINARY_NOISE
+        if inputs.crane is not None:
+            known = int(inputs.crane.stamp_ns[0]), int(inputs.crane.stamp_ns[-1])
+        else:
+            known = inputs.sightings[0].stamp_ns + shift, inputs.sightings[-1].stamp_ns + shift
+        ties = tied_by_imu(nodes, start, known, inputs.imu, noise)
+        placed: tuple[Placed, ...] = ()
+        attitudes: list[Attitude] = []
+        if inputs.crane is not None:
+            chosen = _apart(nodes.stamp_ns, seconds_to_ns(PLACE_SPACING_S))
+            placed = places(inputs.crane, nodes.stamp_ns, chosen)
+            nominal = inputs.crane.yard_from_body_nominal
+            still = [k for k in chosen if k in ties.still]
+            for k in chosen:
+                # Sway turns round within a second or so: nodes nearer than that aren't independent.
+                sigma = self.crane.attitude_std_deg * 1.6
+                if k in still:
+                    sigma = self.crane.sway_std_deg * len(still) ** 0.5
+                attitudes.append(Attitude(k, nominal, np.full(3, np.deg2rad(sigma))))
+        seen = None
+        if inputs.sightings:
+            at = {int(nodes.stamp_ns[k]) - shift: int(k) for k in nodes.frame}
+            seen = StereoSightings.of(
+                inputs.sightings, [at[s.stamp_ns] for s in inputs.sightings], rectifier.camera,
+                rectifier.body_from_rect0,
+            )  # fmt: skip
+        problem = Problem(
+            start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, placed,
+            tuple(attitudes), ties.still, ties.bias,
+            offset_prior_px=self.settings.calibration_sigma_px, scale_prior=self.settings.scale_sigma,
+            crane=inputs.crane, has_latency=bool(placed),
+            has_imu=any(part is not None for part in ties.preintegrated),
+        )  # fmt: skip
+        estimate = solve(problem, nodes.frame)
+        warnings = encoder_warnings(
+            estimate.encoders, nodes.stamp_ns, estimate.placed, estimate.encoder_off_m, estimate.encoder_used
+        )
+        encoders = encoders_in_sigmas(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
+        return estimate, warnings, encoders
+
+
+def _detail(
+    estimate: Estimate, sightings: tuple[Sighting, ...], nodes: Nodes, encoders: InSigmas | None, shift: int
+) -> MotionDetail:
+    """By cam0's clock; of the frames alone where it is of the nodes."""
+    inertial = estimate.inertial
+    if inertial is not None:
+        values = {f.name: getattr(inertial, f.name)[nodes.frame] for f in fields(inertial)}
+        inertial = Inertial(**{**values, "stamp_ns": values["stamp_ns"] - shift})
+    seen = {sighting.stamp_ns: sighting.ambiguous for sighting in sightings}
+    shown = np.flatnonzero(estimate.points)
+    ambiguous = [seen.get(int(stamp) - shift, 0) for stamp in nodes.stamp_ns[shown]]
+    points = np.column_stack([estimate.points[shown], np.array(ambiguous, np.int64)])
+    by_frames = [
+        None if part is None else replace(part, stamp_ns=part.stamp_ns - shift)
+        for part in (estimate.pictures, estimate.imu, encoders)
+    ]
+    return MotionDetail(
+        inertial, by_frames[0], by_frames[1], by_frames[2], points, Relative(estimate.relative),
+        innovations(sightings),
+    )  # fmt: skip
+
+
+def _silent() -> None:
+    """The frames were told already."""
+
+
+def _untied(sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]) -> tuple[str, ...]:
+    """The warning that pictures don't follow from each other, though encoders place their frames."""
+    count = len(refused) + sum(sighting.motion is None for sighting in sightings[1:])
+    if count == 0:
+        return ()
+    total = len(sightings) + len(refused)
+    why = ": too little texture, or left and right pictures of different times" if 2 * count > total else ""
+    return (f"the pictures of {count} of {total} frames can't be tied to those before{why}",)
+
+
+def _placed_frames(
+    recording: Recording, crane: CraneSamples, sighted: Int64, shift: int
+) -> tuple[Int64, list[RefusedFrame]]:
+    """Stamps of all frames that the encoders or the pictures place, and the refused ones."""
+    known = set(sighted.tolist())
+    frames: list[int] = []
+    refused: list[RefusedFrame] = []
+    for stamp in recording.index.stamps_ns:
+        fit = fit_position(crane, stamp + shift, seconds_to_ns(0.35))
+        if isinstance(fit, Failed) and stamp not in known:
+            refused.append(RefusedFrame(stamp, fit.reason))
+        else:
+            frames.append(stamp)
+    return np.array(frames, np.int64), refused
+
+
+def _apart(stamp_ns: Int64, least_ns: int) -> list[int]:
+    """Indices of stamps at least so far apart, from the first on."""
+    chosen = [0]
+    for k in range(1, len(stamp_ns)):
+        if stamp_ns[k] - stamp_ns[chosen[-1]] >= 0.97 * least_ns:
+            chosen.append(k)
+    return chosen

@@ -1,0 +1,147 @@
+"""The trajectory from the crane's encoders and the body's nominal attitude, with the gyro's sway about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.pose import Pose
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples, PosedFrame, RefusedFrame, Trajectory
+from barsight.motion.crane.robust_parabola import fit_parabola
+from barsight.motion.crane.sway import sway_at, turned_angle
+from barsight.recording.base import Recording
+
+CAUCHY_SIGMAS = 3.0
+LEAST_FOR_NOISE = 100
+
+
+@dataclass(frozen=True)
+class CraneSettings:
+    """Encoders and nominal attitude."""
+
+    window_s: float = 0.35
+    """Readings up to this far before and after a frame are fitted with a parabola."""
+    attitude_std_deg: float = 0.15
+    """How far the body may sway from its nominal attitude (1 sigma, each axis), where no IMU measures it."""
+    sway_window_s: float = 8.0
+    """The gyro's mean and trend this long before and after a frame are taken off: what is left is sway."""
+    sway_std_deg: float = 0.02
+    """The attitude's error where the gyro measures the sway (1 sigma, each axis)."""
+
+    def __post_init__(self) -> None:
+        if self.window_s <= 0 or self.sway_window_s <= 0:
+            raise ConfigError("window_s and sway_window_s must be positive")
+        if self.attitude_std_deg < 0 or self.sway_std_deg < 0:
+            raise ConfigError("attitude_std_deg and sway_std_deg can't be negative")
+
+
+@dataclass(frozen=True)
+class CraneTrajectory:
+    """`TrajectoryEstimator` for recordings with encoders; the reference is `yard`."""
+
+    settings: CraneSettings
+
+    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
+        """Raises MeasurementError where the recording has no encoders. No image is read."""
+        crane = recording.crane()
+        if crane is None:
+            raise MeasurementError(
+                f"{recording.path}: no crane encoders; measure without them (--use stereo)"
+            )
+        settings = self.settings
+        shift = recording.rig.timeshift_cam_imu_ns
+        imu = recording.imu()
+        angle = turned_angle(imu) if imu is not None else np.empty((0, 3))
+        placed: list[PosedFrame] = []
+        refused: list[RefusedFrame] = []
+        without_sway = 0
+        for stamp in recording.index.stamps_ns:
+            advance()
+            fit = fit_position(crane, stamp + shift, seconds_to_ns(settings.window_s))
+            if isinstance(fit, Failed):
+                refused.append(RefusedFrame(stamp, fit.reason))
+                continue
+            attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
+            if imu is not None:
+                sway = sway_at(imu, angle, stamp + shift, settings.sway_window_s)
+                if isinstance(sway, Failed):
+                    without_sway += 1
+                else:
+                    attitude = attitude @ Rotation.from_rotvec(sway).as_matrix()
+                    attitude_std_deg = settings.sway_std_deg
+            covariance = np.zeros((6, 6))
+            covariance[:3, :3] = np.eye(3) * np.deg2rad(attitude_std_deg) ** 2
+            covariance[3:, 3:] = fit.covariance
+            pose = Pose("yard", "body", attitude, fit.position_m + crane.crane_to_body_m)
+            placed.append(PosedFrame(stamp, pose, covariance))
+        sensors = ("crane",) if imu is None or without_sway == len(placed) else ("crane", "imu")
+        warnings = (f"the IMU doesn't cover {without_sway} frames: nominal attitude",) if without_sway else ()
+        return Trajectory("yard", tuple(placed), tuple(refused), sensors, warnings)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPlace:
+    """The crane point near a stamp: position_m, velocity_mps, acceleration_mps2 (3,) in `yard`; covariance
+    (3, 3) of the position.
+    """
+
+    position_m: Float64
+    velocity_mps: Float64
+    acceleration_mps2: Float64
+    covariance: Float64
+
+
+def fit_position(
+    crane: CraneSamples, stamp_ns: int, window_ns: int, acceleration_mps2: Float64 | None = None
+) -> FittedPlace | Failed:
+    """The crane point at `stamp_ns` by the readings around it.
+
+    A parabola through the readings within the window (a line where they are fewer than six), by least
+    squares with Cauchy's weights, so that single wild readings don't pull however far off they are. Where
+    the acceleration (3,) is known, it takes a line, whose middle has 4/9 of the variance. Failed
+    `no-encoder` where the readings don't enclose the stamp.
+    """
+    first, last = np.searchsorted(crane.stamp_ns, (stamp_ns - window_ns, stamp_ns + window_ns))
+    stamps: Int64 = crane.stamp_ns[first:last]
+    if stamps.size < 4 or stamps[0] > stamp_ns or stamps[-1] < stamp_ns:
+        away = np.abs(crane.stamp_ns - stamp_ns).min(initial=np.iinfo(np.int64).max) / NS_PER_S
+        return Failed(
+            "no-encoder", f"{stamps.size} encoder readings around the frame (the nearest {away:.2f} s away)"
+        )
+    time = (stamps - stamp_ns) / window_ns
+    window_s = window_ns / NS_PER_S
+    degree = 2 if stamps.size >= 6 and acceleration_mps2 is None else 1
+    bend = np.zeros(3) if acceleration_mps2 is None else acceleration_mps2
+    places = crane.position_m[first:last] - (time[:, None] * window_s) ** 2 / 2 * bend
+    fitted = np.empty((degree + 1, 4))
+    length = CAUCHY_SIGMAS * 3**0.5 * crane.position_std_m
+    fit_parabola(time, places, length, fitted)
+    coefficients, variance = fitted[:, :3], fitted[0, 3] * crane.position_std_m**2
+    if degree == 2:
+        bend = 2 * coefficients[2] / window_s**2
+    return FittedPlace(coefficients[0], coefficients[1] / window_s, bend, np.eye(3) * variance)
+
+
+def with_seen_noise(crane: CraneSamples) -> CraneSamples:
+    """The readings with the sigma that they show themselves, within a factor of two of the stated one.
+
+    From fourth differences, which no smooth motion passes; their median, so that wild ones don't count. (Each
+    wild reading is in five of them, so the far ones leave before the median.)
+    """
+    if len(crane.stamp_ns) < LEAST_FOR_NOISE:
+        return crane
+    fourth = np.abs(np.diff(crane.position_m, n=4, axis=0))
+    kept = fourth
+    for _ in range(3):
+        spread = 1.4826 * float(np.median(kept))
+        kept = fourth[fourth <= 4 * spread]
+    seen = spread / 70**0.5
+    stated = crane.position_std_m
+    return replace(crane, position_std_m=float(np.clip(seen, stated / 2, stated * 2)))

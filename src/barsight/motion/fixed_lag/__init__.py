@@ -1,0 +1,1 @@
+"""The fixed-lag smoother: poses while the crane travels."""

@@ -1,0 +1,30 @@
+"""Encoders and IMU as far as they have come."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.core.types import CraneSamples, ImuSamples
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Encoders and IMU as they have come by now, and how the IMU's noise is."""
+
+    crane: CraneSamples | None
+    imu: ImuSamples | None
+    noise: ImuNoise
+
+    def between(self, first_ns: int, last_ns: int) -> Readings:
+        """Those within the stamps."""
+        crane, imu = self.crane, self.imu
+        if crane is not None:
+            part = slice(*np.searchsorted(crane.stamp_ns, (first_ns, last_ns)))
+            crane = replace(crane, stamp_ns=crane.stamp_ns[part], position_m=crane.position_m[part])
+        if imu is not None:
+            part = slice(*np.searchsorted(imu.stamp_ns, (first_ns, last_ns)))
+            imu = ImuSamples(imu.stamp_ns[part], imu.gyro_radps[part], imu.accel_mps2[part])
+        return Readings(crane, imu, self.noise)

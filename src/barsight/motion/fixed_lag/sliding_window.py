@@ -1,0 +1,138 @@
+"""The last few frames' unknowns and what binds them, as a problem of their own; what leaves stays as a prior.
+
+A point begins anew after as many frames as the window holds, each at another frame than its neighbours. So
+every point that was seen at a frame which leaves has ended and is taken out whole, each sighting used once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedCamera
+from barsight.inertial.model import BodyState, ImuBias
+from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.fixed_lag.window_equations import Newest
+from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.problem.gauss_newton import State
+from barsight.motion.problem.problem import LEAST_SIGMA_PX, Problem, StereoSightings
+from barsight.motion.problem.stereo_factors import start_points
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """problem: of the nodes held, numbered from 0, and what their frames saw, sigma as stated. state: the
+    unknowns, points named by `names` (T,), NaN as long as they were seen once. slide: a turn of all pictures
+    about the camera's axis, rad. frames: how many there were yet; frame_nodes: those held. noise:
+    sightings' sigma as they show it over the stated one. newest: the last node's covariance; drift_covariance
+    (2, 2) of the rig's drift. seen_ns, placed_ns: stamps of the last node that pictures saw and of the last
+    that encoders placed; stood: whether the attitude at rest has been told.
+    """
+
+    problem: Problem
+    state: State
+    names: Int64
+    slide: float = 0.0
+    frames: int = 0
+    noise: float | None = None
+    drift_covariance: Float64 | None = None
+    frame_nodes: tuple[int, ...] = ()
+    newest: Newest | None = None
+    seen_ns: int | None = None
+    placed_ns: int | None = None
+    stood: bool = False
+
+    def pose(self, node: int) -> Pose:
+        """reference_from_body."""
+        pose = self.state.values.atPose3(X(node))
+        target = self.problem.start[0].target
+        return Pose(target, "body", pose.rotation().matrix(), np.asarray(pose.translation()))
+
+    @property
+    def body(self) -> BodyState:
+        """The last node's, with an IMU."""
+        last = len(self.problem.start) - 1
+        pose = self.pose(last)
+        return BodyState(pose.rotation, pose.translation, np.asarray(self.state.values.atVector(V(last))))
+
+    @property
+    def bias(self) -> ImuBias:
+        """The last node's."""
+        if not self.problem.has_imu:
+            return ImuBias.none()
+        found = self.state.values.atConstantBias(B(len(self.problem.start) - 1))
+        return ImuBias(np.array(found.gyroscope()), np.array(found.accelerometer()))
+
+    @property
+    def covariance(self) -> Float64:
+        """(6, 6) of the last node's pose, rotation then translation in the reference's axes."""
+        assert self.newest is not None
+        turned = np.kron(np.eye(2), self.pose(len(self.problem.start) - 1).rotation)
+        shared = np.zeros((2, 2)) if self.drift_covariance is None else self.drift_covariance
+        swing = self.newest.swing[:6]
+        result: Float64 = turned @ (self.newest.covariance[:6, :6] + swing @ shared @ swing.T) @ turned.T
+        return result
+
+
+def grown(
+    window: Window, stamp_ns: list[int], poses: list[Pose], velocity_mps: list[Float64],
+    parts: tuple[Preintegrated | None, ...],
+) -> Window:  # fmt: skip
+    """With nodes at later stamps (IMU's clock), started at the given poses and velocities; parts: the motion
+    to each from the node before.
+    """
+    values, problem = gtsam.Values(window.state.values), window.problem
+    bias = gtsam.imuBias.ConstantBias(window.bias.accel_mps2, window.bias.gyro_radps)
+    for k, (pose, velocity) in enumerate(zip(poses, velocity_mps, strict=True), start=len(problem.start)):
+        values.insert(X(k), gtsam.Pose3(gtsam.Rot3(pose.rotation), pose.translation))
+        if problem.has_imu:
+            values.insert(V(k), velocity)
+            values.insert(B(k), bias)
+    problem = replace(
+        problem, start=(*problem.start, *poses), stamp_ns=np.append(problem.stamp_ns, stamp_ns),
+        preintegrated=(*problem.preintegrated, *parts),
+    )  # fmt: skip
+    return replace(window, problem=problem, state=replace(window.state, values=values))
+
+
+def with_frame(
+    window: Window, sighting: Sighting | None, camera: RectifiedCamera, body_from_rect0: Pose, held: int
+) -> Window:
+    """The last node is a frame that shows `sighting`; points begin anew every `held` frames."""
+    node, count = len(window.problem.start) - 1, window.frames
+    grew = replace(window, frames=count + 1, frame_nodes=(*window.frame_nodes, node))
+    if sighting is None:
+        return grew
+    grew = replace(grew, seen_ns=int(window.problem.stamp_ns[-1]))
+    name = sighting.track * 1_000_000 + (count + sighting.track) // held
+    nodes, sigma = np.full(len(name), node), np.hypot(sighting.sigma_px, LEAST_SIGMA_PX)
+    stereo, mount = sighting.stereo, body_from_rect0
+    old = window.problem.sightings
+    if old is not None:
+        name, nodes = np.append(window.names[old.track], name), np.append(old.node, nodes)
+        stereo, sigma = np.vstack([old.stereo, stereo]), np.append(old.sigma_px, sigma)
+        mount = old.body_from_rect0
+    order = np.argsort(name, kind="stable")
+    first = np.diff(name[order], prepend=-1) > 0
+    names = name[order][first]
+    seen = StereoSightings(nodes[order], np.cumsum(first) - 1, stereo[order], sigma[order], camera, mount)
+    points = np.full((len(names), 4), np.nan)
+    points[np.searchsorted(names, window.names)] = _placed(window)
+    return replace(
+        grew, problem=replace(window.problem, sightings=seen), names=names,
+        state=replace(window.state, points=points),
+    )  # fmt: skip
+
+
+def _placed(window: Window) -> Float64:
+    """(T, 4) the points, those seen once where that sighting has them."""
+    points = window.state.points.copy()
+    new = np.flatnonzero(np.isnan(points[:, 0]))
+    if len(new):
+        points[new] = start_points(window.problem, window.state.poses, new)
+    return points

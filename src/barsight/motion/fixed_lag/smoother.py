@@ -1,0 +1,242 @@
+"""Takes frames as they come: new nodes, what binds them, the window's solution, and what leaves it.
+
+Sensors are read no further than they would have come; the encoders' place of a node joins as soon as the
+readings after it do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.core.pose import Pose
+from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import PosedFrame, RefusedFrame
+from barsight.features.guided_matching import PredictedMotion
+from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, with_seen_noise
+from barsight.motion.fixed_lag.sensor_buffer import Readings
+from barsight.motion.fixed_lag.sliding_window import Window, grown, with_frame
+from barsight.motion.fixed_lag.window_update import solved, without
+from barsight.motion.frontend.motion_prediction import CranePredictor, moved_by_imu
+from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.gravity import Level
+from barsight.motion.problem.gauss_newton import State
+from barsight.motion.problem.gtsam_factors import start_values
+from barsight.motion.problem.nodes import (
+    MOST_STILL_M,
+    divided,
+    make_nodes,
+    preintegrated,
+    quiet_at,
+    start_poses,
+    tied_by_imu,
+)
+from barsight.motion.problem.problem import Attitude, Placed, Problem
+
+SENSOR_DELAY_S = 0.06
+"""A frame is computed once readings this much later are there."""
+LOOK_BACK_S = 6.0
+"""What is held of IMU and encoders before the first node held."""
+FIT_S = PLACE_SPACING_S / 2 + 0.01
+
+
+class LiveEstimator:
+    """Takes frame after frame and holds `held` of them; `window` is all that it knows."""
+
+    def __init__(
+        self, settings: FusionSettings, crane: CraneSettings, held: int, rectifier: Rectifier, shift_ns: int,
+        readings: Readings, level: Level | None,
+    ) -> None:  # fmt: skip
+        self._settings, self._crane, self._held = settings, crane, held
+        self._rectifier, self._shift_ns = rectifier, shift_ns
+        self._readings, self._level = readings, level
+        self.window: Window | None = None
+        self._failed = False
+
+    def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
+        """A `Predictor`: by the IMU from the last estimate, else by encoders; None without either."""
+        window, now = self.window, self._now(new_ns)
+        if window is None or window.newest is None:
+            return None
+        at = np.flatnonzero(window.problem.stamp_ns == old_ns + self._shift_ns)
+        if now.imu is not None and at.size:
+            stamps = np.array([window.problem.stamp_ns[-1], new_ns + self._shift_ns])
+            part = preintegrated(stamps, now.imu, now.noise, window.bias)[0]
+            if part is not None:
+                return moved_by_imu(
+                    window.pose(int(at[0])), window.body, part, window.bias, window.newest.covariance,
+                    self._rectifier.body_from_rect0,
+                )  # fmt: skip
+        if now.crane is None:
+            return None
+        bias = window.bias.gyro_radps
+        return CranePredictor(now.crane, now.imu, bias, self._rectifier, self._shift_ns)(old_ns, new_ns)
+
+    def take(self, seen: Sighting | RefusedFrame) -> PosedFrame | RefusedFrame:
+        """The frame's pose, or why it has none."""
+        stamp = seen.stamp_ns + self._shift_ns
+        sighting = seen if isinstance(seen, Sighting) else None
+        now = self._now(seen.stamp_ns)
+        covered = now.crane is not None and not isinstance(
+            fit_position(now.crane, stamp, seconds_to_ns(self._crane.window_s)), Failed
+        )
+        if sighting is None and not covered:
+            assert isinstance(seen, RefusedFrame)
+            return seen
+        window = (
+            self._begun(stamp, sighting, now) if self.window is None else self._grown(stamp, sighting, now)
+        )
+        if isinstance(window, Failed):
+            return RefusedFrame(seen.stamp_ns, window.reason)
+        rectifier = self._rectifier
+        window = with_frame(window, sighting, rectifier.camera, rectifier.body_from_rect0, self._held)
+        window = self._bound(window, sighting, now, stamp)
+        try:
+            window, leaving = solved(window, self._held)
+        except np.linalg.LinAlgError:
+            if self._failed and now.crane is not None:
+                self.window = None  # what is held may be the cause, and encoders know where to begin anew
+            self._failed = True
+            return RefusedFrame(seen.stamp_ns, "the sensors together have no solution here")
+        self._failed = False
+        pose = window.pose(len(window.problem.start) - 1)
+        covariance = window.covariance
+        self.window = without(window, leaving) if leaving else window
+        return PosedFrame(seen.stamp_ns, pose, covariance)
+
+    def _now(self, stamp_ns: int) -> Readings:
+        """What has come when the frame of a stamp is computed, back to before the nodes held."""
+        last = stamp_ns + self._shift_ns + seconds_to_ns(SENSOR_DELAY_S)
+        begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
+        return self._readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
+
+    def _begun(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
+        # Without encoders the first frame is the origin: a node before it would be, and move against it.
+        nodes = make_nodes(np.array([stamp]), None if now.crane is None else now.imu)
+        if now.crane is None:
+            assert sighting is not None
+        elif isinstance(fit_position(now.crane, stamp, seconds_to_ns(0.35)), Failed):
+            return Failed("no-encoder", "the encoders don't cover the first frame")
+        sightings = () if sighting is None else (sighting,)
+        start = start_poses(nodes, now.crane, sightings, self._shift_ns, self._rectifier, self._level)
+        known = (stamp, stamp) if now.crane is None else (int(now.crane.stamp_ns[0]), stamp)
+        ties = tied_by_imu(nodes, start, known, now.imu, now.noise)
+        settings = self._settings
+        problem = Problem(
+            start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
+            offset_prior_px=settings.calibration_sigma_px, scale_prior=settings.scale_sigma,
+            has_latency=now.crane is not None, has_imu=now.imu is not None,
+        )  # fmt: skip
+        state = State(start_values(problem), np.empty((0, 4)), np.zeros(2))
+        window = Window(problem, state, np.empty(0, np.int64))
+        return self._with_attitudes(window, 0, now)
+
+    def _grown(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
+        window = self.window
+        assert window is not None
+        first = len(window.problem.start)
+        last_ns = int(window.problem.stamp_ns[-1])
+        stamps = divided(last_ns, stamp) if now.imu is not None else [stamp]
+        parts: tuple[Preintegrated | None, ...] = (None,) * len(stamps)
+        if now.imu is not None:
+            parts = preintegrated(np.array([last_ns, *stamps]), now.imu, now.noise, window.bias)
+        poses, speeds = self._started(window, stamps, parts, sighting, now)
+        grew = grown(window, stamps, poses, speeds, parts)
+        if now.imu is not None and self._stays(window, stamp, sighting, now):
+            quiet = quiet_at(grew.problem.stamp_ns[first:], now.imu, now.noise)
+            still = (*grew.problem.still, *(first + int(k) for k in np.flatnonzero(quiet)))
+            grew = replace(grew, problem=replace(grew.problem, still=still))
+        return self._with_attitudes(grew, first, now)
+
+    def _started(
+        self, window: Window, stamps: list[int], parts: tuple[Preintegrated | None, ...],
+        sighting: Sighting | None, now: Readings,
+    ) -> tuple[list[Pose], list[Float64]]:  # fmt: skip
+        """Where new nodes begin: by the IMU, else on the line to where pictures or encoders see the last."""
+        old = window.pose(len(window.problem.start) - 1)
+        if all(part is not None for part in parts):
+            poses, speeds, state = [], [], window.body
+            for part in parts:
+                assert part is not None
+                state = part.predict(state, window.bias)
+                poses.append(Pose(old.target, "body", state.rotation, state.position_m))
+                speeds.append(state.velocity_mps)
+            return poses, speeds
+        end = old
+        at = np.flatnonzero(window.problem.stamp_ns == window.seen_ns)
+        if sighting is not None and sighting.motion is not None and at.size:
+            mount, motion = self._rectifier.body_from_rect0, sighting.motion
+            moved = Pose("rect0", "rect0", motion.rotation, motion.translation).inverse()
+            end = window.pose(int(at[0])) @ mount @ moved @ mount.inverse()
+        elif now.crane is not None:
+            fit = fit_position(now.crane, stamps[-1], seconds_to_ns(0.35))
+            if not isinstance(fit, Failed):
+                place = fit.position_m + now.crane.crane_to_body_m
+                end = Pose(old.target, "body", old.rotation, place)
+        seconds = (stamps[-1] - int(window.problem.stamp_ns[-1])) / 1e9
+        way = end.translation - old.translation
+        share = [(k + 1) / len(stamps) for k in range(len(stamps))]
+        poses = [Pose(old.target, "body", end.rotation, old.translation + s * way) for s in share]
+        return poses, [way / seconds] * len(stamps)
+
+    def _stays(self, window: Window, stamp: int, sighting: Sighting | None, now: Readings) -> bool:
+        """Whether encoders, else pictures, see no way since the last node. (An IMU sees none at any constant
+        speed.)
+        """
+        last_ns = int(window.problem.stamp_ns[-1])
+        if now.crane is not None:
+            window_ns = seconds_to_ns(FIT_S)
+            fits = [fit_position(now.crane, ns, window_ns) for ns in (last_ns, stamp)]
+            places = [fit.position_m for fit in fits if not isinstance(fit, Failed)]
+            return len(places) == 2 and float(np.linalg.norm(places[1] - places[0])) < MOST_STILL_M
+        if sighting is None or sighting.motion is None or window.seen_ns != last_ns:
+            return False
+        return float(np.linalg.norm(sighting.motion.translation)) < MOST_STILL_M
+
+    def _with_attitudes(self, window: Window, first: int, now: Readings) -> Window:
+        """The nominal attitude at the nodes from `first` on: loose under way; standing still it is told once,
+        since its error is the same each time.
+        """
+        if now.crane is None:
+            return window
+        crane, problem, stood, added = self._crane, window.problem, window.stood, []
+        for k in range(first, len(problem.start)):
+            sigma = crane.attitude_std_deg * 1.6
+            if k in problem.still:
+                if stood:
+                    continue
+                sigma, stood = crane.sway_std_deg, True
+            added.append(Attitude(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
+        told = replace(problem, attitudes=problem.attitudes + tuple(added))
+        return replace(window, problem=told, stood=stood)
+
+    def _bound(self, window: Window, sighting: Sighting | None, now: Readings, stamp: int) -> Window:
+        """With the encoders' places of nodes whose fit has come to be complete, 0.4 s apart; at once where
+        nothing else ties the last node to the one before.
+        """
+        if now.crane is None:
+            return window
+        crane, placed, problem = with_seen_noise(now.crane), list(window.problem.placed), window.problem
+        placed_ns = window.placed_ns
+        complete, last = stamp + seconds_to_ns(SENSOR_DELAY_S - FIT_S), len(problem.start) - 1
+        by_imu = last > 0 and problem.preintegrated[-1] is not None
+        loose = not by_imu and (sighting is None or sighting.motion is None)
+        for k, node_ns in enumerate(problem.stamp_ns.tolist()):
+            at_once = loose and k == last
+            near = placed_ns is not None and node_ns - placed_ns < 0.97 * seconds_to_ns(PLACE_SPACING_S)
+            if not at_once and (near or node_ns > complete):
+                continue
+            fit = fit_position(crane, node_ns, seconds_to_ns(self._crane.window_s if at_once else FIT_S))
+            if isinstance(fit, Failed):
+                continue
+            place = fit.position_m + crane.crane_to_body_m
+            sigma = float(np.sqrt(fit.covariance[0, 0]))
+            placed.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
+            placed_ns = node_ns
+        return replace(window, problem=replace(problem, placed=tuple(placed)), placed_ns=placed_ns)

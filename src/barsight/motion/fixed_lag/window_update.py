@@ -1,0 +1,184 @@
+"""A window solved by one step, and what then leaves it.
+
+The frames before were solved, so the newest is placed by the points that are known, and outliers leave,
+beforehand. What leaves is linearised once, with the rest, and stays as a prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, E, V, X
+
+from barsight.core.arrays import Bool, Float64
+from barsight.core.pose import Pose
+from barsight.motion.batch.bundle_adjustment import FARTHEST_OUTLIER_SIGMAS, LEAST_AGREEING, LEAST_FACTOR
+from barsight.motion.fixed_lag.sliding_window import Window
+from barsight.motion.fixed_lag.window_equations import (
+    Equations,
+    border_of,
+    gathered,
+    of_prior,
+    prior_of,
+    slid_on,
+    step_of,
+)
+from barsight.motion.linear.motion_only_kernel import frame_equations
+from barsight.motion.linear.schur_complement import substitute
+from barsight.motion.problem.encoder_factors import agreeing
+from barsight.motion.problem.gauss_newton import State, guess_of, rig_of, sighting_residuals, sights_of
+from barsight.motion.problem.problem import Prior, Problem
+from barsight.motion.problem.stereo_factors import nearness, often, persistence, taken_up
+
+NOISE_SHARE = 0.2
+"""By how much one window's noise moves the running one."""
+LEAST_POINTS = 30
+"""So many of the known points seen anew place a frame before all is solved."""
+STEPS = 2
+"""Gauss-Newton's, of the newest frame alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leaving:
+    """The first `nodes` nodes and the points `ended` (T,), what they say and the step that was made since."""
+
+    nodes: int
+    ended: Bool
+    equations: Equations
+    step: Float64
+
+
+def solved(window: Window, held: int) -> tuple[Window, Leaving | None]:
+    """With the unknowns as they fit best, and what is to leave so that `held` frames are left. Raises
+    LinAlgError where the measurements leave an unknown undetermined.
+    """
+    problem = replace(window.problem, asked=np.array(window.frame_nodes))
+    state, noise, stated = window.state, window.noise, problem.sightings
+    used = np.zeros(0, np.bool_)
+    if stated is not None:
+        problem = replace(problem, sightings=replace(stated, sigma_px=(noise or 1.0) * stated.sigma_px))
+        used = often(stated, np.ones(len(stated.node), np.bool_))
+    if stated is not None and used.any():
+        state = _placed_by_points(problem, state, used)
+        residual = sighting_residuals(problem, state, used)
+        share = np.abs(residual) / stated.sigma_px[:, None]
+        factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])) * taken_up(stated, used))
+        used = often(stated, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+        shown = replace(stated, sigma_px=factor * stated.sigma_px)
+        now = factor * persistence(residual, shown, used) * nearness(residual, shown, used)
+        noise = now if noise is None else (1 - NOISE_SHARE) * noise + NOISE_SHARE * now
+        problem = replace(problem, sightings=replace(stated, sigma_px=noise * stated.sigma_px))
+    count = window.frame_nodes[-held] if len(window.frame_nodes) > held else 0
+    ended = np.zeros(len(window.names), np.bool_)
+    equations = of_prior(problem, state, window.slide)
+    leaving: Leaving | None = None
+    goes = np.zeros_like(used)
+    if count:
+        if stated is not None:
+            ended[stated.track[stated.node < count]] = True
+            goes = ended[stated.track]
+        equations = left = equations + gathered(problem, state, used & goes, 0, count)
+    equations = equations + gathered(problem, state, used & ~goes, count, len(problem.start))
+    found = step_of(problem, state, window.slide, used, equations)
+    if count:
+        leaving = Leaving(count, ended, left, found.step)
+    fits = agreeing(found.state.values, problem)
+    kept = tuple(place for place, fit in zip(problem.placed, fits, strict=True) if fit)
+    if len(kept) <= LEAST_AGREEING * len(problem.placed):
+        kept = problem.placed
+    if stated is not None:
+        turned = _about_axis(stated.body_from_rect0, found.slide - window.slide)
+        stated = replace(stated, body_from_rect0=turned)
+    result = replace(
+        window, problem=replace(window.problem, placed=kept, sightings=stated), state=found.state,
+        slide=found.slide, noise=noise, drift_covariance=found.drift_covariance, newest=found.newest,
+    )  # fmt: skip
+    return result, leaving
+
+
+def _about_axis(body_from_rect0: Pose, angle: float) -> Pose:
+    """The camera turned about its own axis."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return replace(body_from_rect0, rotation=body_from_rect0.rotation @ turn)
+
+
+def _placed_by_points(problem: Problem, state: State, used: Bool) -> State:
+    """The newest frame where the known points have it, then its points where all frames have them."""
+    seen, node = problem.sightings, len(problem.start) - 1
+    assert seen is not None
+    rig, sights = rig_of(seen), sights_of(problem, used)
+    if (seen.node[used] == node).sum() >= LEAST_POINTS:
+        values = gtsam.Values(state.values)
+        for _ in range(STEPS):
+            normal, gradient = np.zeros((6, 6)), np.zeros(6)
+            frame_equations(rig, sights, guess_of(problem, state), len(problem.kept) - 1, normal, gradient)
+            values.update(X(node), values.atPose3(X(node)).retract(-np.linalg.solve(normal, gradient)))
+            state = replace(state, values=values)
+    points, still = state.points.copy(), np.zeros((len(problem.kept), 6))
+    shown = np.zeros(len(points), np.bool_)
+    shown[seen.track[seen.node == node]] = True
+    sights = sights._replace(used=used & shown[seen.track])
+    substitute(rig, sights, guess_of(problem, state), still, np.zeros(2), points, np.empty(len(points)))
+    return replace(state, points=points)
+
+
+def without(window: Window, leaving: Leaving) -> Window:
+    """Without what leaves."""
+    problem, count = window.problem, leaving.nodes
+    stayed = np.array([k - count for k in window.frame_nodes if k >= count])
+    gone = len(window.frame_nodes) - len(stayed)
+    matrix, gradient = prior_of(leaving.equations, leaving.step, gone * problem.width)
+    if problem.has_latency:
+        way = window.state.poses[count, :3, 3] - window.state.poses[0, :3, 3]
+        matrix, gradient = slid_on(matrix, gradient, window.slide, float(np.linalg.norm(way)))
+    values, border = _renumbered(window.state, problem, count), border_of(problem, window.state, window.slide)
+    prior = Prior(stayed, values, border, matrix, gradient)
+    seen, names, points = problem.sightings, window.names, window.state.points
+    if seen is not None:
+        stays, place = ~leaving.ended[seen.track], np.cumsum(~leaving.ended) - 1
+        seen = replace(
+            seen, node=seen.node[stays] - count, track=place[seen.track[stays]], stereo=seen.stereo[stays],
+            sigma_px=seen.sigma_px[stays],
+        )  # fmt: skip
+        names, points = names[~leaving.ended], points[~leaving.ended]
+    left = replace(
+        problem, start=problem.start[count:], stamp_ns=problem.stamp_ns[count:],
+        preintegrated=problem.preintegrated[count:], prior=prior, sightings=seen,
+        placed=tuple(replace(p, node=p.node - count) for p in problem.placed if p.node >= count),
+        attitudes=tuple(replace(a, node=a.node - count) for a in problem.attitudes if a.node >= count),
+        still=tuple(k - count for k in problem.still if k >= count),
+    )  # fmt: skip
+    return replace(
+        window, problem=left, state=replace(window.state, values=values, points=points), names=names,
+        frame_nodes=tuple(stayed.tolist()),
+    )  # fmt: skip
+
+
+def _renumbered(state: State, problem: Problem, count: int) -> gtsam.Values:
+    nodes = range(count, len(problem.start))
+    values = gtsam.Values()
+    if problem.has_imu:
+        biases = gtsam.VectorValues()
+        for k in nodes:
+            biases.insert(B(k - count), state.values.atConstantBias(B(k)).vector())
+        values = _no_biases(len(nodes)).retract(biases)
+    for k in nodes:
+        values.insert(X(k - count), state.values.atPose3(X(k)))
+        if problem.has_imu:
+            values.insert(V(k - count), state.values.atVector(V(k)))
+    if problem.has_latency:
+        values.insert(E(0), state.values.atVector(E(0)))
+    return values
+
+
+@cache
+def _no_biases(count: int) -> gtsam.Values:
+    """To add vectors to: to insert a bias itself takes thirty times as long."""
+    values = gtsam.Values()
+    for k in range(count):
+        values.insert(B(k), gtsam.imuBias.ConstantBias())
+    return values

@@ -1,0 +1,139 @@
+"""One step of stereo odometry: metric PnP with RANSAC, refined on both pictures, and how steps add up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import Failed
+from barsight.core.pose import skew
+from barsight.core.types import RectifiedCamera
+from barsight.features.guided_matching import match_across, triangulated_by
+from barsight.features.matching import match_mutual
+from barsight.features.patch_alignment import locate
+from barsight.motion.frontend.relative_pose_kernel import MOST_SIGMAS, step_equations
+from barsight.motion.frontend.stereo_features import OdometrySettings, View
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """new_from_old: pose of the old `rect0` in the new one, and its covariance (6, 6).
+
+    scale_sigma: relative error of the step's length that the calibration may cause; it doesn't average out.
+    kept: (N,) which points agree.
+    """
+
+    rotation: Float64
+    translation: Float64
+    covariance: Float64
+    scale_sigma: float
+    kept: Bool
+
+
+def move(old: View, new: View, settings: OdometrySettings) -> Step | Failed:
+    """The motion between two views by the features that match mutually."""
+    camera = new.pair.pair.camera
+    pairs = match_mutual(old.features, new.features)
+    if len(pairs) < settings.least_inliers:
+        return Failed("no-matches", f"only {len(pairs)} features match the frame before")
+    points = old.points(pairs[:, 0], settings)
+    known = np.isfinite(points[:, 2])
+    pairs, points = pairs[known], points[known]
+    places = old.features.pixels[pairs[:, 0]].astype(np.float64)
+    guesses = new.features.pixels[pairs[:, 1]].astype(np.float64)
+    about = new.about_px[pairs[:, 1]].astype(np.float64)
+    grown = points[:, 2] * (about + camera.doffs_px) / (camera.focal_px * camera.baseline_m)
+    again = locate(old.pair.left, new.pair.left, places, guesses, grown=grown)
+    right = match_across(new.pair, again.pixels, about)
+    kept = again.found & right.found
+    points, target = points[kept], np.column_stack([again.pixels, right.pixels[:, 0]])[kept]
+    if len(points) < settings.least_inliers:
+        return Failed("no-matches", f"only {len(points)} features can be followed from the frame before")
+    start = ransac(points, target[:, :2], camera, settings)
+    if isinstance(start, Failed):
+        return start
+    rotation, translation = start
+    return refine(points, target, rotation, translation, camera, settings)
+
+
+def ransac(
+    points: Float64,
+    pixels: Float64,
+    camera: RectifiedCamera,
+    settings: OdometrySettings,
+) -> tuple[Float64, Float64] | Failed:
+    matrix = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
+    cv2.setRNGSeed(1)
+    good, turn, shift, inliers = cv2.solvePnPRansac(
+        points,
+        np.ascontiguousarray(pixels),
+        matrix,
+        None,
+        iterationsCount=500,
+        reprojectionError=settings.ransac_px,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    count = 0 if inliers is None else len(inliers)
+    if not good or count < settings.least_inliers:
+        return Failed("no-consensus", f"only {count} of {len(points)} matches agree on one motion")
+    return Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel()
+
+
+def refine(
+    points: Float64,
+    target: Float64,
+    rotation: Float64,
+    translation: Float64,
+    camera: RectifiedCamera,
+    settings: OdometrySettings,
+) -> Step | Failed:
+    """Gauss-Newton on u, v and u_right of the new pair, each residual whitened by its own covariance.
+
+    The noise of the three places that the old point was triangulated from, most of it along its ray, is
+    projected into the new pair and widens the residual's covariance. Huber's weights; outliers beyond 5
+    sigma leave. The step's covariance is that of a small motion that follows it, in the new frame's axes.
+    """
+    base = camera.focal_px * camera.baseline_m
+    lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, base, camera.doffs_px])
+    by_old_places, target = triangulated_by(points, camera), np.ascontiguousarray(target)
+    kept: Bool = np.ones(len(points), dtype=np.bool_)
+    distance, normal, gradient = np.empty(len(points)), np.empty((6, 6)), np.empty(6)
+    for _ in range(10):
+        step_equations(
+            points, by_old_places, target, rotation, translation, lens, settings.pixel_sigma_px**2, distance,
+            normal, gradient,
+        )  # fmt: skip
+        kept = distance < MOST_SIGMAS
+        if kept.sum() < settings.least_inliers:
+            return Failed("no-consensus", f"only {int(kept.sum())} of {len(points)} points agree in 3D")
+        update = np.linalg.solve(normal, gradient)
+        rotation = Rotation.from_rotvec(update[:3]).as_matrix() @ rotation
+        translation = Rotation.from_rotvec(update[:3]).as_matrix() @ translation + update[3:]
+        if np.abs(update).max() < 1e-9:
+            break
+    depth = float(np.median(points[kept, 2]))
+    scale_sigma = settings.calibration_sigma_px * depth / base
+    return Step(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
+
+
+def carried(covariance: Float64, way: Float64) -> Float64:
+    """(6, 6) of a pose, rotation then translation in the reference's axes, for a point `way` (m) further on
+    that is fixed to it: what the attitude is off by swings the point.
+    """
+    further = np.eye(6)
+    further[3:, :3] = -skew(way)
+    result: Float64 = further @ covariance @ further.T
+    return result
+
+
+def in_world(covariance: Float64, rotation: Float64) -> Float64:
+    """(6, 6) of a pose, turned by (3, 3) to other axes."""
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = rotation
+    result: Float64 = turned @ covariance @ turned.T
+    return result

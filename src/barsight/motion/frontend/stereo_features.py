@@ -1,0 +1,110 @@
+"""Pictures one by one as stereo odometry looks at them: features with a depth, or why there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float32, Float64, Int64
+from barsight.core.errors import ConfigError, Failed
+from barsight.core.types import RefusedFrame
+from barsight.features.guided_matching import match_across, triangulate
+from barsight.features.orb import Features, detect_orb
+from barsight.features.patch_alignment import PatchPair, patch_pair
+from barsight.recording.base import Recording
+from barsight.stereo.search_range import coarse_disparity
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """Stereo visual odometry."""
+
+    features: int = 3000
+    """Features a picture."""
+    nearest_m: float = 0.5
+    """Points nearer than this aren't used."""
+    farthest_baselines: float = 60.0
+    """Points further than this many baselines aren't used for motion."""
+    least_inliers: int = 25
+    """A frame with fewer agreeing points is refused."""
+    pixel_sigma_px: float = 0.3
+    """The noise of a feature's place (1 sigma)."""
+    calibration_sigma_px: float = 0.1
+    """Disparity error common to all features: it makes every step too long or too short alike (1 sigma)."""
+    ransac_px: float = 1.0
+    """Points further off than this are outliers."""
+
+    def __post_init__(self) -> None:
+        if not 100 <= self.features <= 100_000 or self.least_inliers < 6:
+            raise ConfigError("features must lie in 100...100000, least_inliers be at least 6")
+        if min(self.nearest_m, self.farthest_baselines, self.pixel_sigma_px, self.ransac_px) <= 0:
+            raise ConfigError("the odometry's distances and tolerances must be positive")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One frame's features. about_px: (N,) their coarse disparities; coarse: (h, w) the pair's, NaN unknown;
+    both in px of the full picture.
+    """
+
+    pair: PatchPair
+    features: Features
+    about_px: Float32
+    coarse: Float32
+
+    @property
+    def stamp_ns(self) -> int:
+        """The frame's."""
+        return self.pair.pair.stamp_ns
+
+    def points(self, index: Int64, settings: OdometrySettings) -> Float64:
+        """(M, 3) in `rect0` of the features of an index (M,), NaN where the right picture shows none at a
+        useful depth.
+        """
+        camera = self.pair.pair.camera
+        places = self.features.pixels[index].astype(np.float64)
+        right = match_across(self.pair, places, self.about_px[index].astype(np.float64))
+        points = triangulate(np.column_stack([places, right.pixels[:, 0]]), camera)
+        with np.errstate(invalid="ignore"):
+            kept = right.found & (points[:, 2] > settings.nearest_m)
+            kept &= points[:, 2] < settings.farthest_baselines * camera.baseline_m
+        return np.where(kept[:, None], points, np.nan)
+
+
+def views(
+    recording: Recording, rectifier: Rectifier, settings: OdometrySettings, advance: Callable[[], None]
+) -> Iterator[View | RefusedFrame]:
+    """Of each frame its ORB features, or why it shows none. `advance` is called once a frame."""
+    for frame in recording.frames():
+        advance()
+        if isinstance(frame, RefusedFrame):
+            yield frame
+            continue
+        pair = rectifier(frame)
+        if isinstance(pair, Failed):
+            yield RefusedFrame(frame.stamp_ns, pair.reason)
+            continue
+        view = look(patch_pair(pair), detect_orb(pair.left, settings.features), settings)
+        yield RefusedFrame(frame.stamp_ns, view.reason) if isinstance(view, Failed) else view
+
+
+def look(
+    pair: PatchPair, features: Features, settings: OdometrySettings,
+    span: tuple[float, float] | None = None,
+) -> View | Failed:  # fmt: skip
+    """A pair's left features that have a coarse disparity; Failed `no-features` where too few do.
+
+    span: the lowest and highest disparity to expect, px, where that is known.
+    """
+    camera = pair.pair.camera
+    coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px, known=span, both_ways=False)
+    row = (features.pixels[:, 1] * coarse.shape[0] / camera.height).astype(int)
+    column = (features.pixels[:, 0] * coarse.shape[1] / camera.width).astype(int)
+    about = coarse[row, column]
+    known = np.isfinite(about)
+    if known.sum() < settings.least_inliers:
+        return Failed("no-features", f"only {int(known.sum())} features have a depth")
+    return View(pair, features.chosen(known), about[known], coarse)

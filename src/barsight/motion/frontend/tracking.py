@@ -1,0 +1,267 @@
+"""The front end: points followed through a recording's pairs, each frame's motion checked by consensus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.errors import Failed
+from barsight.core.motion_detail import InSigmas
+from barsight.core.parallel import ordered_map, read_ahead
+from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame
+from barsight.features.guided_matching import GuidedMatches, PredictedMotion, predict_places, triangulate
+from barsight.features.orb import describe_upright
+from barsight.features.patch_alignment import PatchPair, patch_pair
+from barsight.features.self_similarity import repeat_px
+from barsight.features.tracks import Tracks, TrackSettings, carry_on, detect_corners, find_again
+from barsight.motion.frontend.relative_pose import Step, move, ransac, refine
+from barsight.motion.frontend.stereo_features import OdometrySettings, View, look
+from barsight.recording.base import Recording
+from barsight.stereo.search_range import coarse_disparity
+
+PREPARED = 1
+"""Pairs that are rectified ahead while the one before is followed."""
+LEAST_SHARE = 0.45
+"""One bar off, a twentieth of the points find one alike and agree, on dull bars a third; at the true place
+most do (six in ten from a car, eight over a yard)."""
+LEAST_KNOWN = 200
+SPAN = 1.6
+"""New points are sought up to this much nearer and further than the known ones."""
+
+Predictor = Callable[[int, int], PredictedMotion | None]
+"""From two frames' stamps to the motion of `rect0` between them as the other sensors know it, or None."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What one frame shows. track: (N,) names of points; stereo: (N, 3) u, v and right u, px; sigma_px: (N,)
+    of each as the patches show it.
+
+    motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
+    one before. ambiguous: how many points were refused since the prediction was too coarse for the bars.
+    innovation: (6,) turn and way of `motion` minus the predicted ones in sigma, None without a prediction.
+    """
+
+    stamp_ns: int
+    track: Int64
+    stereo: Float64
+    sigma_px: Float64
+    motion: PredictedMotion | None
+    ambiguous: int
+    innovation: Float64 | None = None
+
+
+@dataclass(frozen=True)
+class FrontEndSettings:
+    """How points are followed."""
+
+    tracks: TrackSettings = field(default_factory=TrackSettings)
+    rough: OdometrySettings = field(default_factory=lambda: OdometrySettings(features=900))
+    """The motion from corners' descriptors where no other sensor predicts it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """tracks: None to begin anew with unused names from next_track on."""
+
+    tracks: Tracks | None
+    next_track: int
+    stamp_ns: int
+    view: View | None
+
+
+def follow(
+    recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
+    advance: Callable[[], None],
+) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:  # fmt: skip
+    """Sightings of all frames that show enough; the others are refused with a reason."""
+    seen = list(follow_live(recording, rectifier, predictor, settings, advance))
+    return (
+        tuple(s for s in seen if isinstance(s, Sighting)),
+        tuple(s for s in seen if isinstance(s, RefusedFrame)),
+    )
+
+
+def follow_live(
+    recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
+    advance: Callable[[], None],
+) -> Iterator[Sighting | RefusedFrame]:  # fmt: skip
+    """One frame after the other; only the last few views are held. `predictor` is asked when a frame's turn
+    comes, so it may know what was made of the frames before.
+    """
+    state: _State | None = None
+
+    def prepare(frame: StereoFrame | RefusedFrame) -> PatchPair | RefusedFrame:
+        if isinstance(frame, RefusedFrame):
+            return frame
+        rectified = rectifier(frame)
+        if isinstance(rectified, Failed):
+            return RefusedFrame(frame.stamp_ns, rectified.reason)
+        return patch_pair(rectified)
+
+    for pair in ordered_map(prepare, read_ahead(recording.frames()), PREPARED):
+        advance()
+        if isinstance(pair, RefusedFrame):
+            yield pair
+            continue
+        stamp_ns = pair.pair.stamp_ns
+        prediction = predictor(state.stamp_ns, stamp_ns) if state else None
+        result = _see(state, pair, prediction, settings)
+        if isinstance(result, Failed) and state is not None and prediction is not None:
+            # The other sensors tie the frame to the ones before; pictures begin anew.
+            result = _see(replace(state, tracks=None), pair, prediction, settings)
+        if isinstance(result, Failed):
+            yield RefusedFrame(stamp_ns, result.reason)
+            continue
+        state, sighting = result
+        yield sighting
+
+
+def _see(
+    state: _State | None, pair: PatchPair, prediction: PredictedMotion | None, settings: FrontEndSettings
+) -> tuple[_State, Sighting] | Failed:
+    view: View | None = None
+    if state is None or state.tracks is None:
+        kept = np.zeros(0, np.bool_)
+        matches = GuidedMatches(np.empty((0, 3)), np.empty(0), kept, kept)
+        tracks = Tracks(next_track=0 if state is None else state.next_track)
+        motion, innovation = None, None
+    else:
+        tracks, predicted = state.tracks, prediction
+        found = None if prediction is None else consensus(tracks, pair, prediction, settings)
+        if found is None or isinstance(found, Failed):
+            rough_motion = _rough(state, tracks, pair, settings)
+            if isinstance(rough_motion, Failed):
+                return rough_motion
+            step, view = rough_motion
+            prediction = PredictedMotion(step.rotation, step.translation, 4 * step.covariance)
+            found = consensus(tracks, pair, prediction, settings)
+            if isinstance(found, Failed):
+                return found
+        kept, matches, motion = found
+        innovation = None if predicted is None else _innovation(predicted, motion)
+    camera = pair.pair.camera
+    if view is None:
+        span = _span(matches.stereo[kept], camera)
+        left, right = pair.pair.left, pair.pair.right
+        coarse = coarse_disparity(left, right, camera.doffs_px, known=span, both_ways=False)
+    else:
+        coarse = view.coarse
+    tracks = carry_on(tracks, pair, matches, kept, coarse, settings.tracks)
+    if len(tracks.track) < settings.rough.least_inliers:
+        return Failed("no-features", f"only {len(tracks.track)} points have a depth")
+    ambiguous = int(matches.ambiguous.sum())
+    sighting = Sighting(
+        pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous, innovation
+    )
+    return _State(tracks, tracks.next_track, pair.pair.stamp_ns, view), sighting
+
+
+def _innovation(predicted: PredictedMotion, found: PredictedMotion) -> Float64:
+    """(6,) turn and way of the found motion minus the predicted one, each over its sigma."""
+    turn = Rotation.from_matrix(found.rotation @ predicted.rotation.T)
+    way = found.translation - turn.as_matrix() @ predicted.translation
+    sigma = np.sqrt(np.diag(predicted.covariance + found.covariance))
+    return np.asarray(np.concatenate([turn.as_rotvec(), way]) / sigma, np.float64)
+
+
+def innovations(sightings: tuple[Sighting, ...]) -> InSigmas | None:
+    """Of all frames whose motion was predicted, None if there are none."""
+    told = [(s.stamp_ns, s.innovation) for s in sightings if s.innovation is not None]
+    if not told:
+        return None
+    names = tuple(f"{part} {axis}" for part in ("turn", "way") for axis in "xyz")
+    stamps = np.array([stamp for stamp, _ in told], np.int64)
+    return InSigmas(names, stamps, np.array([values for _, values in told]))
+
+
+def _span(known: Float64, camera: RectifiedCamera) -> tuple[float, float] | None:
+    """The disparities to expect, px, by those of the points that are known, (N, 3); None for too few."""
+    if len(known) < LEAST_KNOWN:
+        return None
+    low, high = np.percentile(known[:, 0] - known[:, 2] + camera.doffs_px, (1, 99))
+    return float(low / SPAN - camera.doffs_px), float(high * SPAN - camera.doffs_px)
+
+
+def _rough(
+    state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
+) -> tuple[Step, View] | Failed:
+    """The motion by both pairs' corners, without any prediction."""
+    assert tracks.last is not None
+    span = _span(tracks.stereo, pair.pair.camera)
+    old = state.view or look_at_corners(patch_pair(tracks.last), settings, span)
+    new = look_at_corners(pair, settings, span)
+    if isinstance(old, Failed):
+        return old
+    if isinstance(new, Failed):
+        return new
+    step = move(old, new, settings.rough)
+    return step if isinstance(step, Failed) else (step, new)
+
+
+def look_at_corners(
+    pair: PatchPair, settings: FrontEndSettings, span: tuple[float, float] | None = None
+) -> View | Failed:
+    """The corners of a pair, described; `look` says the rest."""
+    chosen, image = replace(settings.tracks, points=settings.rough.features), pair.pair.left
+    corners = detect_corners(image, chosen, np.empty((0, 2)))
+    return look(pair, describe_upright(image, corners), settings.rough, span)
+
+
+def consensus(
+    tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings
+) -> tuple[Bool, GuidedMatches, PredictedMotion] | Failed:
+    """Points found again in their ellipses that agree on one motion in 3D, and that motion."""
+    assert tracks.last is not None
+    repeats = repeat_px(tracks.last.left, tracks.stereo[:, :2])
+    camera = pair.pair.camera
+    predicted = predict_places(
+        triangulate(tracks.stereo, camera), settings.tracks.sigma_px, prediction, camera
+    )
+    matches = find_again(tracks, pair, predicted, settings.tracks, repeats)
+    index = np.flatnonzero(matches.found)
+    least = settings.rough.least_inliers
+    if index.size < least:
+        alike = int(matches.ambiguous.sum())
+        why = f", {alike} can't be told from the next bar's" if alike else ""
+        return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again{why}")
+    points, target = triangulate(tracks.stereo[index], camera), matches.stereo[index]
+    start = ransac(points, target[:, :2], camera, settings.rough)
+    if isinstance(start, Failed):
+        return start
+    step = refine(points, target, *start, camera, settings.rough)
+    if isinstance(step, Failed):
+        return step
+    kept = np.zeros(len(tracks.track), np.bool_)
+    kept[index[step.kept]] = True
+    share = kept.sum() / max(1, int((predicted.inside & ~matches.ambiguous).sum()))
+    if share < LEAST_SHARE:
+        return Failed(
+            "ambiguous",
+            f"only {100 * share:.0f} % of the points are found where they are expected: another bar may be",
+        )
+    motion = PredictedMotion(step.rotation, step.translation, step.covariance)
+    return *_with_ambiguous(tracks, pair, motion, matches, kept, repeats, settings), motion
+
+
+def _with_ambiguous(
+    tracks: Tracks, pair: PatchPair, motion: PredictedMotion, matches: GuidedMatches, kept: Bool,
+    repeats: Float64, settings: FrontEndSettings,
+) -> tuple[Bool, GuidedMatches]:  # fmt: skip
+    """Points too ambiguous for the prediction, looked for anew by the motion on which the others agree."""
+    left = np.flatnonzero(matches.ambiguous)
+    if left.size == 0:
+        return kept, matches
+    some, camera = tracks.chosen(matches.ambiguous), pair.pair.camera
+    places = predict_places(triangulate(some.stereo, camera), settings.tracks.sigma_px, motion, camera)
+    again = find_again(some, pair, places, settings.tracks, repeats[left])
+    stereo, sigma = matches.stereo.copy(), matches.sigma_px.copy()
+    kept, ambiguous = kept.copy(), matches.ambiguous.copy()
+    stereo[left], sigma[left], kept[left] = again.stereo, again.sigma_px, again.found
+    ambiguous[left] = again.ambiguous
+    return kept, GuidedMatches(stereo, sigma, matches.found | kept, ambiguous)

@@ -1,0 +1,1 @@
+"""Linear algebra of the estimators: skyline Cholesky, Schur complement, their kernels."""

@@ -1,0 +1,1 @@
+"""The estimation problem: states, factors, normal equations, Gauss-Newton, marginals."""

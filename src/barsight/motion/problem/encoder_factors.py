@@ -1,0 +1,168 @@
+"""The encoders in the estimate: their latency is estimated, and what contradicts the rest leaves.
+
+A reading stamped t says where the crane was at t minus the latency. That shows wherever the speed changes,
+since pictures and IMU know the way by themselves. Their scale against the baseline is the rig's drift; a
+constant offset is seen by nothing in the recording: it stays what the yard's origin is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from gtsam.symbol_shorthand import E, V
+
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.errors import Failed
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples
+from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.motion.linear.chain_elimination import Chain
+from barsight.motion.problem.problem import Placed, Problem, latency_of, poses_of
+from barsight.motion.problem.rig_drift import HUBER_SIGMAS
+
+FARTHEST_SIGMAS = 5.0
+WINDOW_S = 0.21
+"""Readings this near to a node count for it: all of them, nodes being 0.4 s apart."""
+LEAST_SIGMA_M = 0.0003
+LEAST_AGREEING_SIGMA_M = 0.001
+"""What a parabola through the readings may be off by while the crane jerks, which isn't a disagreement."""
+NOTED_LATENCY_SIGMAS = 5.0
+NOTED_LATENCY_S = 0.005
+
+
+@dataclass(frozen=True)
+class EncoderState:
+    """latency_s and its sigma: zero and the prior's where nothing shows it."""
+
+    latency_s: float
+    latency_sigma_s: float
+
+
+def places(
+    crane: CraneSamples, stamp_ns: Int64, nodes: Sequence[int], acceleration_mps2: Float64 | None = None
+) -> tuple[Placed, ...]:
+    """The body at the nodes (of stamps (M,)) by the readings around each; acceleration (M, 3) where it is
+    known, NaN elsewhere.
+    """
+    found = []
+    for k in nodes:
+        known = None if acceleration_mps2 is None else acceleration_mps2[k]
+        if known is not None and not np.isfinite(known).all():
+            known = None
+        fit = fit_position(crane, int(stamp_ns[k]), seconds_to_ns(WINDOW_S), known)
+        if not isinstance(fit, Failed):
+            place, sigma = fit.position_m + crane.crane_to_body_m, float(np.sqrt(fit.covariance[0, 0]))
+            found.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
+    return tuple(found)
+
+
+def with_known_bends(problem: Problem, values: Any) -> Problem:
+    """With places for which the estimate says how the way bends: they are 1.5 times as good."""
+    if problem.crane is None or not problem.has_imu:
+        return problem
+    velocity = np.array([values.atVector(V(k)) for k in range(len(problem.start))])
+    time = problem.stamp_ns / NS_PER_S
+    bend = np.full(velocity.shape, np.nan)
+    tied = np.array([part is not None for part in problem.preintegrated])
+    both = np.flatnonzero(tied[:-1] & tied[1:]) + 1
+    bend[both] = (velocity[both + 1] - velocity[both - 1]) / (time[both + 1] - time[both - 1])[:, None]
+    nodes = [place.node for place in problem.placed]
+    return replace(problem, placed=places(problem.crane, problem.stamp_ns, nodes, bend))
+
+
+def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Float64) -> None:
+    """Adds what the problem's places, Huber, say of the chain's nodes and of the latency. poses: (M, 4, 4);
+    latency_s: (1,).
+    """
+    if not problem.placed:
+        return
+    node = _nodes(problem.placed)
+    reading, velocity = _readings(problem.placed, float(latency_s[0]))
+    turn, error = poses[node, :3, :3], poses[node, :3, 3] - reading
+    sigma = _sigmas(problem.placed, LEAST_SIGMA_M)
+    distance = np.linalg.norm(error, axis=1) / sigma
+    weight = HUBER_SIGMAS / np.maximum(distance, HUBER_SIGMAS) / sigma**2
+    at = node[:, None] * chain.size + np.arange(3, 6)  # GTSAM's shift, in body axes
+    chain.rows[at, -1] += weight[:, None]
+    chain.gradient[at] += np.einsum("p,pij,pi->pj", weight, turn, error)
+    chain.side[at] -= np.einsum("p,pij,pi->pj", weight, turn, velocity)
+    chain.corner += float(np.einsum("p,pi,pi", weight, velocity, velocity))
+    chain.corner_gradient -= float(np.einsum("p,pi,pi", weight, velocity, error))
+
+
+def encoders_cost(values: Any, problem: Problem) -> float:
+    """Of the places, Huber's."""
+    sigma = _sigmas(problem.placed, LEAST_SIGMA_M)
+    distance = np.linalg.norm(disagreement(values, problem), axis=1) / sigma
+    near = np.minimum(distance, HUBER_SIGMAS)
+    return float((near * (distance - near / 2)).sum())
+
+
+def disagreement(values: Any, problem: Problem) -> Float64:
+    """(P, 3) m by which the encoders' places are off the poses."""
+    if not problem.placed:
+        return np.empty((0, 3))
+    reading, _ = _readings(problem.placed, float(latency_of(values)[0]))
+    off: Float64 = reading - poses_of(values)[_nodes(problem.placed), :3, 3]
+    return off
+
+
+def agreeing(values: Any, problem: Problem) -> Bool:
+    """(P,) places within 5 sigma of the poses."""
+    sigma = _sigmas(problem.placed, LEAST_AGREEING_SIGMA_M)
+    kept: Bool = np.linalg.norm(disagreement(values, problem), axis=1) < FARTHEST_SIGMAS * sigma
+    return kept
+
+
+def encoder_state(values: Any, latency_sigma_s: float) -> EncoderState:
+    """What was found of the encoders."""
+    return EncoderState(float(values.atVector(E(0))[0]), latency_sigma_s)
+
+
+def encoder_warnings(
+    state: EncoderState | None, node_stamp_ns: Int64, placed: tuple[Placed, ...], off_m: Float64, kept: Bool
+) -> tuple[str, ...]:
+    """Sentences on a latency that matters, and on stretches where encoders and the rest disagree.
+
+    off_m: (P, 3) from `disagreement`. Times are seconds since the first node.
+    """
+    sentences = []
+    if state is not None and abs(state.latency_s) > max(
+        NOTED_LATENCY_S, NOTED_LATENCY_SIGMAS * state.latency_sigma_s
+    ):
+        sentences.append(
+            f"the encoders are {1e3 * state.latency_s:.0f} ms late "
+            f"(1 sigma {1e3 * state.latency_sigma_s:.0f} ms); this was taken off"
+        )
+    begin = 0
+    for k in range(1, len(placed) + 1):
+        if k < len(placed) and kept[k] == kept[begin]:
+            continue
+        if not kept[begin]:
+            first, last = (node_stamp_ns[placed[j].node] - node_stamp_ns[0] for j in (begin, k - 1))
+            size = np.linalg.norm(off_m[begin:k], axis=1).max()
+            sentences.append(
+                f"encoders and the other sensors disagree by up to {1e3 * size:.0f} mm from "
+                f"{first / NS_PER_S:.1f} s to {last / NS_PER_S:.1f} s; the encoders were left out there"
+            )
+        begin = k
+    return tuple(sentences)
+
+
+def _readings(placed: tuple[Placed, ...], latency_s: float) -> tuple[Float64, Float64]:
+    """(P, 3) the encoders' places `latency_s` later and (P, 3) their speeds, by their parabolas."""
+    place = np.array([p.position_m for p in placed])
+    velocity = np.array([p.velocity_mps for p in placed])
+    later = velocity + np.array([p.acceleration_mps2 for p in placed]) * latency_s
+    return place + (velocity + later) / 2 * latency_s, later
+
+
+def _nodes(placed: tuple[Placed, ...]) -> Int64:
+    return np.array([p.node for p in placed], np.int64)
+
+
+def _sigmas(placed: tuple[Placed, ...], least_m: float) -> Float64:
+    return np.array([max(p.sigma_m, least_m) for p in placed], np.float64)

@@ -1,0 +1,130 @@
+"""GTSAM's factors of all but sightings and encoders: preintegrated IMU between neighbouring nodes, priors on
+attitude, biases, latency and, where the body stands still, velocity; and these linearised.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, E, V, X
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.pose import Pose
+from barsight.motion.linear import skyline
+from barsight.motion.linear.chain_elimination import Chain
+from barsight.motion.problem.problem import Problem
+
+WIDTHS = {"x": 6, "v": 3, "b": 6, "e": 1}
+OFFSETS = {"x": 0, "v": 6, "b": 9}
+"""Where a node's unknowns stand: pose, with an IMU velocity and biases."""
+
+
+def factors(problem: Problem, first: int = 0, end: int | None = None) -> Any:
+    """The graph of a problem without sightings and encoders: of what binds the nodes first...end - 1 (None:
+    all) and, by the IMU, each to the next.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    nodes = range(first, len(problem.start) if end is None else end)
+    _add_priors(graph, problem, nodes)
+    if problem.has_imu:
+        _add_imu(graph, problem, nodes)
+    return graph
+
+
+def start_values(problem: Problem) -> Any:
+    """GTSAM's values to begin from."""
+    values = gtsam.Values()
+    bias = gtsam.imuBias.ConstantBias(problem.bias.accel_mps2, problem.bias.gyro_radps)
+    place = np.array([pose.translation for pose in problem.start])
+    time_s = (problem.stamp_ns - problem.stamp_ns[0]) / 1e9
+    velocity = np.gradient(place, time_s, axis=0) if len(place) > 1 else np.zeros_like(place)
+    for k, pose in enumerate(problem.start):
+        values.insert(X(k), _gtsam_pose(pose))
+        if problem.has_imu:
+            values.insert(V(k), velocity[k])
+            values.insert(B(k), bias)
+    if problem.has_latency:
+        values.insert(E(0), np.zeros(1))
+    return values
+
+
+def chain_of(graph: Any, values: Any, width: int, nodes: int) -> Chain:
+    """A graph's normal equations: each node with the next and the latency. width: unknowns a node."""
+    size = nodes * width
+    rows, gradient, side = np.zeros((size, 2 * width)), np.zeros(size), np.zeros((1, size))
+    corner, corner_gradient = np.zeros((1, 1)), np.zeros(1)
+    first, at, found, right = _sparse_rows(graph, values, width, size)
+    skyline.add_products(first, at, found, right, rows, gradient, side, corner, corner_gradient)
+    return Chain(rows, gradient, side[0], float(corner[0, 0]), float(corner_gradient[0]))
+
+
+def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64, Int64, Float64, Float64]:
+    """GTSAM's whitened rows as `band.add_products` takes them; the latency is unknown `size`."""
+    linear = graph.linearize(values)
+    if linear.size() == 0:
+        return np.zeros(1, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)
+    row, column, value = linear.sparseJacobian_()
+    where: list[Int64] = []
+    for key in linear.keyVector():
+        kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
+        begin = size if kind == "e" else node * width + OFFSETS[kind]
+        where.append(begin + np.arange(WIDTHS[kind]))
+    unknown = np.concatenate(where)
+    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
+    right = np.zeros(int(row.max()) + 1)
+    of_right = column == len(unknown)
+    right[row[of_right]] = value[of_right]
+    row, column, value = row[~of_right], column[~of_right], value[~of_right]
+    order = np.argsort(row, kind="stable")
+    first = np.searchsorted(row[order], np.arange(len(right) + 1)).astype(np.int64)
+    return first, unknown[column[order]], np.ascontiguousarray(value[order]), right
+
+
+def _add_priors(graph: Any, problem: Problem, nodes: range) -> None:
+    begins = problem.prior is None and 0 in nodes
+    if problem.first_fixed and begins:
+        sigmas = _sigmas(1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6)
+        if problem.has_imu:
+            # Gravity turns the first attitude about level axes; its heading stays where it is.
+            up = problem.start[0].rotation.T @ np.array([0.0, 0.0, 1.0])
+            spread = np.deg2rad(1.0) ** 2 * (np.eye(3) - np.outer(up, up)) + 1e-12 * np.eye(3)
+            whole = np.diag([0.0, 0, 0, 1e-12, 1e-12, 1e-12])
+            whole[:3, :3] = spread
+            sigmas = gtsam.noiseModel.Gaussian.Covariance(whole)
+        graph.add(gtsam.PriorFactorPose3(X(0), _gtsam_pose(problem.start[0]), sigmas))
+    if problem.has_latency and begins:
+        graph.add(gtsam.PriorFactorVector(E(0), np.zeros(1), _sigmas(problem.encoder_latency_sigma_s)))
+    for attitude in problem.attitudes:
+        if attitude.node not in nodes:
+            continue
+        rotation = gtsam.Rot3(attitude.rotation)
+        graph.add(gtsam.PoseRotationPrior3D(X(attitude.node), rotation, _sigmas(*attitude.sigma_rad)))
+
+
+def _add_imu(graph: Any, problem: Problem, nodes: range) -> None:
+    bias = gtsam.imuBias.ConstantBias(problem.bias.accel_mps2, problem.bias.gyro_radps)
+    model = _sigmas(*[problem.accel_bias_sigma_mps2] * 3, *[problem.gyro_bias_sigma_radps] * 3)
+    if problem.prior is None and 0 in nodes:
+        graph.add(gtsam.PriorFactorConstantBias(B(0), bias, model))
+    for k in nodes:
+        sigma = 1e-3 if k in problem.still else 10.0
+        model = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+        graph.add(gtsam.PriorFactorVector(V(k), np.zeros(3), model))
+    gap = _sigmas(*[0.01] * 3, *[1e-3] * 3)
+    for k, part in zip(nodes, problem.preintegrated[nodes.start : nodes.stop], strict=False):
+        if part is None:
+            none = gtsam.imuBias.ConstantBias()
+            graph.add(gtsam.BetweenFactorConstantBias(B(k), B(k + 1), none, gap))
+            continue
+        factor = gtsam.CombinedImuFactor(X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), part.measurements)
+        graph.add(factor)
+
+
+def _gtsam_pose(pose: Pose) -> Any:
+    return gtsam.Pose3(gtsam.Rot3(pose.rotation), pose.translation)
+
+
+def _sigmas(*sigmas: float) -> Any:
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas, np.float64))

@@ -1,0 +1,76 @@
+"""Covariances out of a solved system: each node's own block, and what hangs on the border."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg.skyline import solve_back, solve_forward
+from barsight.motion.linear.skyline import inverse_blocks
+from barsight.motion.problem.normal_equations import System
+
+NO_PAIRS = np.empty((0, 2), np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Marginals:
+    """Of the system's K nodes. poses: (K, 6, 6) in GTSAM's order and body axes, the rig's drift taken as
+    known. latency_sigma_s: nan without encoders. swing: (K, 6, 2) how the poses move with the drift. nodes:
+    (K, n, n) of all that a node has, what the border shares taken as known too. cross: (P, 6, 6) of pairs of
+    poses, as `poses`; NaN for those too far apart for the band.
+    """
+
+    poses: Float64
+    latency_sigma_s: float
+    swing: Float64
+    nodes: Float64
+    cross: Float64
+
+
+def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
+    """Of a system at its best state. pairs: (P, 2) of these nodes, the earlier first."""
+    layout = system.layout
+    own, _ = system.schur(system.forward)
+    count, size = len(layout.node), layout.size
+    nodes = np.empty((count, size, size))
+    cross = np.empty((len(pairs), size, size))
+    inverse_blocks(system.factor, layout.node, np.empty(len(layout.first)), nodes, pairs, cross)
+    cross = cross[:, :6, :6]
+    poses = nodes[:, :6, :6]
+    by_border = -_to_border(system)[layout.poses].reshape(count, 6, -1)
+    swing, latency = by_border[:, :, -2:], float("nan")
+    if len(own) > 2:
+        variance = np.linalg.inv(own[:-2, :-2])
+        latency = float(variance[0, 0] ** 0.5)
+        to_border = by_border[:, :, :-2]
+        poses = poses + to_border @ variance @ to_border.transpose(0, 2, 1)
+        swing = swing - to_border @ variance @ own[:-2, -2:]
+        cross = cross + to_border[pairs[:, 0]] @ variance @ to_border[pairs[:, 1]].transpose(0, 2, 1)
+    return Marginals(poses, latency, swing, nodes, cross)
+
+
+def piece_variances(system: System, weights: Float64) -> tuple[Float64, float]:
+    """(2 S,) of the pieces' slides and disparities, and that of their sum with `weights` (2 S,), the rig's
+    drift taken as known.
+    """
+    at, count = system.layout.pieces, len(system.layout.first)
+    diagonal, none = np.empty(count), np.empty((0, 1, 1))
+    inverse_blocks(system.factor, NO_PAIRS[:, 0], diagonal, none, NO_PAIRS, none)
+    own, _ = system.schur(system.forward)
+    variance = np.linalg.inv(own[:-2, :-2])
+    to_border = _to_border(system)[at, :-2]
+    each = diagonal[at] + np.einsum("sb,bc,sc->s", to_border, variance, to_border)
+    whole = np.zeros((count, 1))
+    whole[at, 0] = weights
+    solve_forward(system.factor, whole)
+    of_sum = weights @ to_border
+    return each, float(whole[:, 0] @ whole[:, 0] + of_sum @ variance @ of_sum)
+
+
+def _to_border(system: System) -> Float64:
+    """(n, b) the matrix's inverse times what binds its unknowns to the border."""
+    result = system.forward[:, 1:].copy()
+    solve_back(system.factor, result)
+    return result

@@ -1,0 +1,261 @@
+"""What the batch estimate is told: sightings, encoders' places, priors and preintegrated motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, E, V, X
+
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.pose import Pose
+from barsight.core.types import CraneSamples, RectifiedCamera
+from barsight.inertial.model import ImuBias
+from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.linear.ordering import Layout, layout
+
+MOST_SIGHTINGS = 40
+LEAST_SIGMA_PX = 0.03
+"""What no patch is better than, however well it fits: rectification, splines and aliasing."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoSightings:
+    """Points seen, N sightings of T points: track (N,) 0...T-1 ascending and within each node (N,)
+    ascending; stereo (N, 3) u, v, right u, px, sigma_px (N,) of each, and how the camera is mounted.
+    """
+
+    node: Int64
+    track: Int64
+    stereo: Float64
+    sigma_px: Float64
+    camera: RectifiedCamera
+    body_from_rect0: Pose
+
+    @classmethod
+    def of(
+        cls, sightings: Sequence[Sighting], node: Sequence[int], camera: RectifiedCamera,
+        body_from_rect0: Pose,
+    ) -> StereoSightings:  # fmt: skip
+        """From the front end's, each with its node. A point that is seen at more than `MOST_SIGHTINGS`
+        frames begins anew, which bounds what is tied together.
+        """
+        nodes = np.concatenate([np.full(len(s.track), k) for s, k in zip(sightings, node, strict=True)])
+        track = np.concatenate([s.track for s in sightings])
+        order = np.lexsort((nodes, track))
+        begin = np.flatnonzero(np.diff(track[order], prepend=-1))
+        place = np.arange(len(order)) - np.repeat(begin, np.diff(begin, append=len(order)))
+        named = np.cumsum(place % MOST_SIGHTINGS == 0) - 1
+        stereo = np.vstack([s.stereo for s in sightings])[order]
+        sigma = np.hypot(np.concatenate([s.sigma_px for s in sightings])[order], LEAST_SIGMA_PX)
+        return cls(nodes[order], named, stereo, sigma, camera, body_from_rect0)
+
+    @cached_property
+    def first(self) -> Int64:
+        """(T + 1,) where each point's sightings begin, and the end."""
+        return np.searchsorted(self.track, np.arange(self.track[-1] + 2)).astype(np.int64)
+
+    @cached_property
+    def reach(self) -> Int64:
+        """(T,) nodes between a point's first and last sighting."""
+        reach: Int64 = self.node[self.first[1:] - 1] - self.node[self.first[:-1]]
+        return reach
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A node's place by the encoders: (3,) of the body in `yard`, how it moves, and the place's sigma, m."""
+
+    node: int
+    position_m: Float64
+    velocity_mps: Float64
+    acceleration_mps2: Float64
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Attitude:
+    """A prior on a node's attitude, reference_from_body (3, 3); sigma_rad (3,) in body axes."""
+
+    node: int
+    rotation: Float64
+    sigma_rad: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Pieces of the yard, and what their points have in common (`slides`). piece: (T,) 0...S-1, which one a
+    point is of. own_sigma_rad: (S,) by how much a piece's points slide apart; share: a piece as a whole
+    slides by this times that (1 sigma), half of the variance in common with all pieces. disparity_sigma_px:
+    how far off its disparity may be.
+
+    What slides have in common is an unknown itself (in terms of each piece's sigma), so that pieces are bound
+    to it and not to each other.
+    """
+
+    piece: Int64
+    own_sigma_rad: Float64
+    share: float
+    disparity_sigma_px: float
+
+    @property
+    def count(self) -> int:
+        """How many."""
+        return len(self.own_sigma_rad)
+
+    @property
+    def slide_sigma_rad(self) -> Float64:
+        """(S,) of a piece as a whole."""
+        return self.share * self.own_sigma_rad
+
+    def common(self, unknowns: Float64) -> float:
+        """What slides have in common, as `unknowns` (2 S,) show it: slides, then disparities."""
+        return float((unknowns[: self.count] / self.slide_sigma_rad).sum()) / (self.count + 1)
+
+    def cost(self, unknowns: Float64) -> float:
+        """Half the square of these in sigma."""
+        slides, disparities = np.split(unknowns, 2)
+        common = self.common(unknowns)
+        own = slides / self.slide_sigma_rad - common
+        return float(own @ own + common**2 + (disparities @ disparities) / self.disparity_sigma_px**2 / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What nodes that have left say of those that stay, to second order about `at`.
+
+    nodes: (P,) those it binds; at: GTSAM's values of these; border (b,) of what all nodes share. matrix
+    (n, n) and gradient (n,) of their unknowns, node by node, then the border.
+    """
+
+    nodes: Int64
+    at: Any
+    border: Float64
+    matrix: Float64
+    gradient: Float64
+
+    @cached_property
+    def _poses(self) -> tuple[Any, ...]:
+        return tuple(self.at.atPose3(X(k)) for k in self.nodes.tolist())
+
+    @cached_property
+    def _inertial(self) -> Float64:
+        return inertial_of(self.at, self.nodes)
+
+    def since(self, values: Any) -> Float64:
+        """How far the nodes' unknowns have moved from `at`, node by node in one row."""
+        moved = [
+            at.localCoordinates(values.atPose3(X(k)))
+            for k, at in zip(self.nodes.tolist(), self._poses, strict=True)
+        ]
+        return np.column_stack([moved, inertial_of(values, self.nodes) - self._inertial]).ravel()
+
+
+def poses_of(values: Any) -> Float64:
+    """(M, 4, 4) reference_from_body of GTSAM's values, which hold nodes 0...M - 1."""
+    flat = gtsam.utilities.extractPose3(values)
+    poses = np.zeros((len(flat), 4, 4))
+    poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:], 1.0
+    return poses
+
+
+def inertial_of(values: Any, nodes: Int64) -> Float64:
+    """(P, 9) velocities and biases of the nodes in GTSAM's values; (P, 0) without an IMU."""
+    if not values.exists(V(0)):
+        return np.empty((len(nodes), 0))
+    velocity = [values.atVector(V(k)) for k in nodes.tolist()]
+    return np.column_stack([velocity, [values.atConstantBias(B(k)).vector() for k in nodes.tolist()]])
+
+
+def latency_of(values: Any) -> Float64:
+    """(1,) the encoders' latency in GTSAM's values; (0,) without encoders."""
+    return np.asarray(values.atVector(E(0))) if values.exists(E(0)) else np.empty(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything the estimate knows. start: (M,) poses to begin from, one per node.
+
+    first_fixed: whether the first node defines the reference (no crane). preintegrated: between nodes k and
+    k + 1, None where there is no IMU or it has a gap. still: nodes at which the body doesn't move.
+    """
+
+    start: tuple[Pose, ...]
+    stamp_ns: Int64
+    first_fixed: bool
+    sightings: StereoSightings | None
+    preintegrated: tuple[Preintegrated | None, ...]
+    placed: tuple[Placed, ...]
+    attitudes: tuple[Attitude, ...]
+    still: tuple[int, ...]
+    bias: ImuBias
+    gyro_bias_sigma_radps: float = 0.02
+    accel_bias_sigma_mps2: float = 0.1
+    encoder_latency_sigma_s: float = 0.02
+    offset_prior_px: float = 0.1
+    """How far a yaw between the cameras may move the disparity (1 sigma); 0 takes it as exact."""
+    scale_prior: float = 5e-4
+    """By which share baseline and encoders may disagree (1 sigma)."""
+    prior: Prior | None = None
+    """Takes the place of what fixes the first node, the biases and the latency."""
+    crane: CraneSamples | None = None
+    """The readings that `placed` are of."""
+    pieces: Pieces | None = None
+    """What slides together; None where nothing is held to slide."""
+    asked: Int64 | None = None
+    """Nodes whose covariances are asked for, all that pictures see among them; None: all. The others are
+    taken out of the system beforehand (`chain_elimination`)."""
+    has_latency: bool = False
+    """Whether the encoders' latency is an unknown."""
+    has_imu: bool = False
+    """Whether velocities and biases are unknowns."""
+
+    @cached_property
+    def kept(self) -> Int64:
+        """(K,) the nodes of the system."""
+        return np.arange(len(self.start)) if self.asked is None else self.asked
+
+    @property
+    def width(self) -> int:
+        """Unknowns a node: a pose, with an IMU velocity and biases."""
+        return 15 if self.has_imu else 6
+
+    @cached_property
+    def places(self) -> Int64:
+        """(M,) where the system has each node; those taken out beforehand: nowhere."""
+        places = np.full(len(self.start), -1)
+        places[self.kept] = np.arange(len(self.kept))
+        return places
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the system has each unknown."""
+        begin = end = np.empty(0, np.int64)
+        if self.sightings is not None and len(self.sightings.node):
+            node, first = self.places[self.sightings.node], self.sightings.first
+            begin, end = node[first[:-1]], node[first[1:] - 1]
+        piece = None if self.pieces is None else self.pieces.piece
+        return layout(self.width, len(self.kept), begin, end, piece)
+
+    @property
+    def border(self) -> int:
+        """Unknowns that all nodes share: the encoders' latency, what pieces' slides have in common, the rig's
+        drift."""
+        return int(self.has_latency) + int(self.pieces is not None) + 2
+
+    @property
+    def free(self) -> Bool:
+        """(border,) all of these but the drift, which is sought apart."""
+        free = np.ones(self.border, np.bool_)
+        free[-2:] = False
+        return free
+
+    @property
+    def sees_scale(self) -> bool:
+        """Whether encoders say how long the way is."""
+        return self.has_latency

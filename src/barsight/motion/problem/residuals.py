@@ -1,0 +1,73 @@
+"""Velocity, biases and every sensor's residuals in sigma out of a solved problem."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V
+
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.motion_detail import Inertial, InSigmas
+from barsight.motion.problem.gauss_newton import State, sighting_residuals
+from barsight.motion.problem.gtsam_factors import factors
+from barsight.motion.problem.problem import Placed, Problem
+
+IMU_PARTS = 9
+"""Of GTSAM's residual: three of turn, of way and of speed; the biases' walk follows."""
+
+
+def inertial(problem: Problem, state: State, covariance: Float64) -> Inertial | None:
+    """Of all nodes (their own clock). covariance: (M, n, n) as `Marginals.nodes` has it.
+
+    The velocity is NaN where the IMU ties the node to neither neighbour.
+    """
+    if not problem.has_imu:
+        return None
+    count = len(problem.start)
+    sigma = np.sqrt(np.einsum("nii->ni", covariance)[:, 6:])
+    biases = [state.values.atConstantBias(B(k)) for k in range(count)]
+    velocity = np.array([state.values.atVector(V(k)) for k in range(count)])
+    tied = np.array([part is not None for part in problem.preintegrated])
+    alone = ~(np.append(tied, False) | np.append(False, tied))
+    velocity[alone] = sigma[alone, :3] = np.nan
+    return Inertial(
+        problem.stamp_ns, velocity, sigma[:, :3],
+        np.array([bias.gyroscope() for bias in biases]), sigma[:, 6:],
+        np.array([bias.accelerometer() for bias in biases]), sigma[:, 3:6],
+    )  # fmt: skip
+
+
+def pictures_in_sigmas(problem: Problem, state: State, used: Bool) -> tuple[InSigmas | None, Int64]:
+    """RMS of each node's used sightings, and how many there are (M,)."""
+    seen = problem.sightings
+    nodes = len(problem.start)
+    if seen is None or not used.any():
+        return None, np.zeros(nodes, np.int64)
+    square = (sighting_residuals(problem, state, used)[used] / seen.sigma_px[used, None]) ** 2
+    count = np.bincount(seen.node[used], minlength=nodes)
+    mean = np.column_stack([np.bincount(seen.node[used], part, nodes) for part in square.T])
+    shown = count > 0
+    values = np.sqrt(mean[shown] / count[shown, None])
+    return InSigmas(("u", "v", "right u"), problem.stamp_ns[shown], values), count
+
+
+def imu_in_sigmas(problem: Problem, state: State) -> InSigmas | None:
+    """RMS over the axes between each node and the one before, at the latter's stamp."""
+    if not problem.has_imu:
+        return None
+    graph, rows = factors(problem), []
+    for k in range(graph.size()):
+        factor = graph.at(k)
+        if isinstance(factor, gtsam.CombinedImuFactor):
+            whitened = factor.noiseModel().whiten(factor.unwhitenedError(state.values))
+            rows.append(np.sqrt((whitened[:IMU_PARTS].reshape(3, 3) ** 2).mean(axis=1)))
+    tied = [part is not None for part in problem.preintegrated]
+    return InSigmas(("turn", "way", "speed"), problem.stamp_ns[1:][tied], np.array(rows).reshape(-1, 3))
+
+
+def encoders_in_sigmas(node_ns: Int64, placed: tuple[Placed, ...], off_m: Float64) -> InSigmas | None:
+    """off_m: (P, 3) as `encoders.disagreement` has it."""
+    if not placed:
+        return None
+    sigma = np.array([place.sigma_m for place in placed])
+    return InSigmas(("x", "y", "z"), node_ns[[place.node for place in placed]], off_m / sigma[:, None])

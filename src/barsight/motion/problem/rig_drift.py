@@ -1,0 +1,93 @@
+"""The rig's drift in the batch estimate: a yaw between the cameras and a scale, unknowns like the poses.
+
+The same point seen from several places of a known way has a depth without stereo; the disparity that this
+depth asks for against the measured one shows the yaw (px nearly the same everywhere) and the scale (px in
+proportion to the disparity).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.types import RigDrift
+from barsight.motion.problem.problem import Problem, StereoSightings
+
+HUBER_SIGMAS = 2.2
+"""For the length of three whitened numbers, of which 19 % are longer; 1.345 is for one."""
+LOOSE = (0.02, 0.2)
+"""Priors (rad, share) that only keep the system solvable; the real ones are weighed in afterwards."""
+SERVICE_RAD = float(np.deg2rad(0.2))
+"""How far a camera may turn in service (1 sigma), where encoders are there to see it."""
+MATCHING_BIAS_PX = 0.015
+"""Disparity error that matching leaves everywhere alike, whatever the calibration."""
+COMMON_BIAS_PX = 0.01
+"""What of it all pieces of the yard share, where each one's own is an unknown."""
+
+
+def columns(seen: StereoSightings) -> Float64:
+    """(N, 2) px by which the right picture's columns move per rad of yaw and per share of scale."""
+    camera = seen.camera
+    x = (seen.stereo[:, 2] - camera.doffs_px - camera.cx_px) / camera.focal_px
+    disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + camera.doffs_px
+    return np.column_stack([-camera.focal_px * (1 + x**2), -disparity])
+
+
+def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
+    """The drift seen, weighed against what the calibration may be off by.
+
+    Matching has a bias of its own, and another one for what lies nearer, glossy bars say: both pass for
+    drift (`_floor`). Where pieces' disparities are unknowns, only what they share does. Without
+    encoders a yaw as large as the calibration's own does too, since what rectification leaves differs from
+    place to place, and near points lie low and far ones high.
+    """
+    seen = problem.sightings
+    assert seen is not None
+    focal, baseline = seen.camera.focal_px, seen.camera.baseline_m
+    disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
+    yaw_prior = SERVICE_RAD if problem.has_latency else problem.offset_prior_px / focal
+    prior = np.array([yaw_prior, problem.scale_prior]) ** 2
+    everywhere_px, near_px = MATCHING_BIAS_PX, MATCHING_BIAS_PX
+    if problem.pieces is not None:
+        everywhere_px, near_px = COMMON_BIAS_PX, 0.0
+    floor = _floor(disparity, focal, everywhere_px, near_px)
+    if not problem.has_latency:
+        floor[0, 0] += prior[0]
+    yaw, scale, combined = _weighed(theta, covariance + floor, np.diag(1 / prior))
+    range_m = focal * baseline / float(np.median(disparity))
+    return RigDrift(yaw, scale, combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency))
+
+
+def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
+    """The drift as it is told: by it people judge heights, which what single pieces' disparities are off by
+    falsifies too.
+    """
+    seen = problem.sightings
+    if problem.pieces is None or seen is None:
+        return drift
+    disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
+    own_px = float(np.sqrt(MATCHING_BIAS_PX**2 - COMMON_BIAS_PX**2))
+    floor = _floor(disparity, seen.camera.focal_px, own_px, MATCHING_BIAS_PX)
+    known, prior = np.linalg.inv(drift.covariance), np.diag(drift.prior_sigma**-2)
+    seen_alone = np.linalg.inv(known - prior)
+    theta = seen_alone @ known @ np.array([drift.yaw_rad, drift.scale])
+    yaw, scale, combined = _weighed(theta, seen_alone + floor, prior)
+    return replace(drift, yaw_rad=yaw, scale=scale, covariance=combined)
+
+
+def _weighed(theta: Float64, covariance: Float64, prior: Float64) -> tuple[float, float, Float64]:
+    """Yaw, scale and their covariance (2, 2), from those seen, their covariance and the prior information."""
+    information = np.linalg.inv(covariance)
+    combined = np.linalg.inv(information + prior).astype(np.float64)
+    yaw, scale = combined @ information @ theta
+    return float(yaw), float(scale), combined
+
+
+def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:
+    """(2, 2) of yaw and scale: a matching bias at the mean disparity and another over its spread."""
+    per_px = near_px / max(float(disparity.std()), 1e-3)
+    by = np.array([[-1 / focal_px, float(disparity.mean()) / focal_px], [0.0, -1.0]])
+    floor: Float64 = by @ np.diag([everywhere_px**2, per_px**2]) @ by.T
+    return floor

@@ -1,0 +1,1 @@
+"""Drift of the rig's calibration, measured from ordinary crane travel."""

@@ -1,0 +1,192 @@
+"""Has the rig drifted? Rows of matches and the crane's known travel, judged line by line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.types import RectifiedCamera, RigDrift
+from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings
+from barsight.motion.rig_check.epipolar_error import RowDrift, look_at_rows
+from barsight.motion.rig_check.self_calibration import turned_right
+from barsight.recording.base import Recording
+from barsight.recording.rig_override import Rigged
+
+
+class State(StrEnum):
+    """Good: go on. Recalibrate: it has drifted and that costs. Contradiction: two sensors disagree. Not seen:
+    this recording can't tell."""
+
+    GOOD = "good"
+    RECALIBRATE = "recalibrate"
+    CONTRADICTION = "contradiction"
+    NOT_SEEN = "not seen"
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """When a drift matters."""
+
+    range_m: float | None = None
+    """Where the rig measures; the median depth of what it saw when not given."""
+    most_mm: float = 3.0
+    """A drift that costs more depth than this, and is beyond 3 sigma, asks for a new calibration."""
+    most_off_row_px: float = 0.3
+    """Matches further off their rows than this spoil stereo matching."""
+    frames: int = 30
+    """Pairs whose rows are looked at."""
+
+    def __post_init__(self) -> None:
+        if self.range_m is not None and not 0.1 <= self.range_m <= 1000:
+            raise ConfigError(f"range_m {self.range_m:g} can't be; give the working distance in metres")
+        if min(self.most_mm, self.most_off_row_px) <= 0 or self.frames < 1:
+            raise ConfigError("most_mm, most_off_row_px and frames must be positive")
+
+
+@dataclass(frozen=True)
+class CheckLine:
+    """One drift: value and sigma in `unit`, what it costs (mm of depth at the working range, at the worst
+    place of the picture; NaN where it costs none), the state and the reason."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+    cost_mm: float
+    state: State
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class RigCheck:
+    """lines: the judged drifts. rows, drift: what was seen, or why not. range_m: the working range."""
+
+    lines: tuple[CheckLine, ...]
+    rows: RowDrift | Failed
+    drift: RigDrift | Failed
+    range_m: float
+
+    @property
+    def state(self) -> State:
+        """The worst of the lines; what one line doesn't see is no fault of the rig."""
+        found = {line.state for line in self.lines}
+        order = (State.RECALIBRATE, State.CONTRADICTION, State.GOOD)
+        return next((state for state in order if state in found), State.NOT_SEEN)
+
+
+def check_rig(
+    recording: Recording, fusion: FusionSettings, settings: CheckSettings, advance: Callable[[], None]
+) -> RigCheck:
+    """Look for drift. Raises MeasurementError where neither rows nor travel show anything."""
+    rig = recording.rig
+    rows = look_at_rows(recording, Rectifier(rig), settings.frames)
+    if not isinstance(rows, Failed):
+        # The yaw is sought on rows that match; the rows' own yaw waits for the travel's word.
+        pitch, roll = rows.values[:2]
+        rig = turned_right(rig, np.array([pitch, 0.0, roll]))
+    rectifier = Rectifier(rig)
+    drift = _by_travel(Rigged(recording, rig), rectifier, fusion, advance)
+    if isinstance(rows, Failed) and isinstance(drift, Failed):
+        raise MeasurementError(f"{recording.path}: nothing to check by: {rows.reason}; {drift.reason}")
+    range_m = settings.range_m or (drift.range_m if isinstance(drift, RigDrift) else np.nan)
+    lines = _row_lines(rows, rectifier.camera, range_m, settings)
+    lines += _travel_lines(drift, rows, rectifier.camera, range_m, settings)
+    return RigCheck(tuple(lines), rows, drift, range_m)
+
+
+def _by_travel(
+    recording: Recording, rectifier: Rectifier, fusion: FusionSettings, advance: Callable[[], None]
+) -> RigDrift | Failed:
+    if recording.crane() is None:
+        return Failed("no-encoders", "the recording has no encoders, so no travel is known")
+    trajectory = FusedTrajectory(fusion, CraneSettings())(recording, rectifier, advance)
+    if trajectory.drift is None or not trajectory.drift.by_encoders:
+        return Failed("no-travel", "pictures and encoders together place too little of the way")
+    if trajectory.length_m < recording.rig.baseline_m:
+        return Failed("no-travel", f"the crane travels only {trajectory.length_m:.2f} m")
+    return trajectory.drift
+
+
+def _row_lines(
+    rows: RowDrift | Failed, camera: RectifiedCamera, range_m: float, settings: CheckSettings
+) -> list[CheckLine]:
+    if isinstance(rows, Failed):
+        return [_unseen(name, "deg", rows.reason) for name in ("pitch", "roll", "focal ratio")]
+    f, baseline = camera.focal_px, camera.baseline_m
+    x, y = camera.width / 2 / f, camera.height / 2 / f
+    # At the picture's corner: how far rows are off (px per unit), and how far columns are (focal lengths).
+    off_row = {"pitch": f, "roll": f * x, "focal ratio": f * y}
+    off_column = {"pitch": x * y, "roll": y, "focal ratio": x}
+    lines = []
+    for name, value, sigma in zip(off_row, rows.values[:3], rows.sigmas[:3], strict=True):
+        cost = 1e3 * abs(value) * off_column[name] * range_m**2 / baseline
+        px = abs(value) * off_row[name]
+        real = abs(value) > 3 * sigma
+        bad = real and (px > settings.most_off_row_px or cost > settings.most_mm)
+        scale, unit = (1e2, "%") if name == "focal ratio" else (float(np.degrees(1)), "deg")
+        lines.append(
+            CheckLine(
+                name, scale * value, scale * sigma, unit, cost, State.RECALIBRATE if bad else State.GOOD,
+                f"rows are off by up to {px:.2f} px ({settings.most_off_row_px:g} are fine)",
+            )
+        )  # fmt: skip
+    return lines
+
+
+def _travel_lines(
+    drift: RigDrift | Failed, rows: RowDrift | Failed, camera: RectifiedCamera, range_m: float,
+    settings: CheckSettings,
+) -> list[CheckLine]:  # fmt: skip
+    if isinstance(drift, Failed):
+        return [_unseen("yaw", "deg", drift.reason), _unseen("baseline", "%", drift.reason)]
+    yaw, sigma = np.degrees([drift.yaw_rad, drift.yaw_sigma_rad])
+    cost = 1e3 * drift.depth_error_m(range_m)
+    bad = abs(yaw) > 3 * sigma and abs(cost) > settings.most_mm
+    reason = "the crane's known travel against the disparities"
+    if bad:
+        reason += "; measure --self-calibrate yaw takes it off"
+    lines = [
+        CheckLine("yaw", yaw, sigma, "deg", cost, State.RECALIBRATE if bad else State.GOOD, reason),
+        _scale_line(drift, range_m),
+    ]
+    if not isinstance(rows, Failed):
+        off = float(rows.values[3] - drift.yaw_rad)
+        spread = float(np.hypot(rows.sigmas[3], drift.yaw_sigma_rad))
+        agree = abs(off) <= 3 * spread
+        why = (
+            "rows and travel agree on the yaw" if agree
+            else "rows see another yaw than the travel: the lens has changed, or the encoders are wrong"
+        )  # fmt: skip
+        lines.append(
+            CheckLine(
+                "yaw, rows minus travel", float(np.degrees(off)), float(np.degrees(spread)), "deg", np.nan,
+                State.GOOD if agree else State.CONTRADICTION, why,
+            )
+        )  # fmt: skip
+    return lines
+
+
+def _scale_line(drift: RigDrift, range_m: float) -> CheckLine:
+    share = drift.scale_sigma / float(drift.prior_sigma[1])
+    contradicts = abs(drift.scale) > 3 * drift.scale_sigma
+    if contradicts:
+        state, reason = State.CONTRADICTION, "baseline and encoders disagree: one of them has a wrong metre"
+    elif share > 0.8:
+        state = State.NOT_SEEN
+        reason = f"not told apart from the yaw by these depths: held at ± {100 * drift.prior_sigma[1]:.2g} %"
+    else:
+        state, reason = State.GOOD, "baseline and encoders agree"
+    return CheckLine(
+        "baseline", 100 * drift.scale, 100 * drift.scale_sigma, "%", 1e3 * abs(drift.scale) * range_m, state,
+        reason,
+    )  # fmt: skip
+
+
+def _unseen(name: str, unit: str, reason: str) -> CheckLine:
+    return CheckLine(name, np.nan, np.nan, unit, np.nan, State.NOT_SEEN, reason)

@@ -1,0 +1,151 @@
+"""What the rows of matches show of the rig: pitch, roll and focal ratio between the cameras.
+
+A point of the scene lies on the same row in both pictures of a rectified pair, at any depth. Where it
+doesn't, the right camera has turned or zoomed: at x, y (right picture, in focal lengths) the row is off by
+f (pitch (1 + y^2) - roll x + ratio y - yaw x y).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
+from barsight.features.patch_alignment import locate, patch_image
+from barsight.features.tracks import TrackSettings, detect_corners
+from barsight.recording.base import Recording
+from barsight.stereo.search_range import coarse_disparity
+
+COLUMNS, ROWS = 8, 6
+LEAST_IN_CELL = 8
+LEAST_CELLS = 12
+TRIM_SIGMAS = 4.0
+MATCHING_BIAS_PX = 0.015
+"""Rows that matching leaves off everywhere alike."""
+LEAST_SIGMA_PX = 0.002
+"""What a cell's mean is not better than, however many matches it has."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowDrift:
+    """values: (4,) pitch, roll (rad), ratio of the focal lengths minus 1, yaw (rad): what cam1 has turned and
+    zoomed against its calibration, rectified axes. covariance: (4, 4). pattern_px: what they leave over the
+    picture (standard deviation, noise taken off). matches, frames: how many. rms_px: of single matches.
+    seen_px, left_px: (ROWS * COLUMNS,) means of the picture's cells, as matched and less the fit; NaN where
+    matches are few.
+    """
+
+    values: Float64
+    covariance: Float64
+    pattern_px: float
+    rms_px: float
+    matches: int
+    frames: int
+    seen_px: Float64
+    left_px: Float64
+
+    @property
+    def sigmas(self) -> Float64:
+        """(4,) standard deviations of the values."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def look_at_rows(recording: Recording, rectifier: Rectifier, most_frames: int) -> RowDrift | Failed:
+    """Fit the rows of corners matched across at most so many pairs, evenly spread over the recording."""
+    total = len(recording.index.stamps_ns)
+    chosen = set(np.linspace(0, total - 1, min(most_frames, total)).astype(int).tolist())
+    found = []
+    for number, frame in enumerate(recording.frames()):
+        if number not in chosen or isinstance(frame, RefusedFrame):
+            continue
+        pair = rectifier(frame)
+        if isinstance(pair, Failed):
+            return pair
+        found.append(match_freely(pair))
+    if not found:
+        return Failed("no-frames", "no pair can be read")
+    return fit_rows(np.vstack(found), rectifier.camera, len(found))
+
+
+def match_freely(pair: RectifiedPair) -> Float64:
+    """(N, 3) right u, right v (px) and right v minus left v of corners, wherever within a few rows."""
+    corners = detect_corners(pair.left, TrackSettings(), np.empty((0, 2))).astype(np.float64)
+    coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px)
+    row = (corners[:, 1] * coarse.shape[0] / pair.camera.height).astype(int)
+    column = (corners[:, 0] * coarse.shape[1] / pair.camera.width).astype(int)
+    guess = coarse[row, column].astype(np.float64)
+    places, guess = corners[np.isfinite(guess)], guess[np.isfinite(guess)]
+    start = places - np.column_stack([guess, np.zeros_like(guess)])
+    right = locate(patch_image(pair.left), patch_image(pair.right), places, start)
+    off = right.pixels[:, 1] - places[:, 1]
+    matches: Float64 = np.column_stack([right.pixels, off])[right.found]
+    return matches
+
+
+def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift | Failed:
+    """The drift that explains matches (N, 3) as `match_freely` gives them.
+
+    Matches are averaged over the cells of a grid first. A cell's mean has its noise and a part that more
+    matches don't average out (lens, texture), found from how far the cells scatter beyond their noise
+    [DerSimonian & Laird 1986]. Failed `few-matches`.
+    """
+    design = _design(matches, camera)
+    kept = np.ones(len(matches), np.bool_)
+    values = np.zeros(4)
+    for _ in range(5):
+        if kept.sum() < LEAST_CELLS * LEAST_IN_CELL:
+            return Failed("few-matches", f"only {int(kept.sum())} corners match between left and right")
+        values = np.linalg.lstsq(design[kept], matches[kept, 2], rcond=None)[0]
+        off = matches[:, 2] - design @ values
+        middle = float(np.median(off[kept]))
+        spread = 1.4826 * float(np.median(np.abs(off[kept] - middle)))
+        kept = np.abs(off - middle) < TRIM_SIGMAS * max(spread, 0.01)
+    cells, rows, means, variances = _cells(matches[kept], design[kept], camera)
+    if len(means) < LEAST_CELLS:
+        return Failed(
+            "few-matches", f"matches fill only {len(means)} of {COLUMNS * ROWS} parts of the picture"
+        )
+    pattern = 0.0
+    for _ in range(30):
+        weight = 1 / (variances + pattern)
+        covariance = np.asarray(np.linalg.inv((rows * weight[:, None]).T @ rows), np.float64)
+        values = covariance @ (rows.T @ (weight * means))
+        excess = float((weight * (means - rows @ values) ** 2).sum()) / (len(means) - 4)
+        if excess <= 1 and pattern == 0:
+            break
+        # The scatter that makes chi2 what its degrees of freedom ask for.
+        pattern = max(0.0, pattern + (excess - 1) / float(weight.mean()))
+    covariance[0, 0] += (MATCHING_BIAS_PX / camera.focal_px) ** 2
+    rms = float(np.sqrt(((matches[kept, 2] - design[kept] @ values) ** 2).mean()))
+    seen, left = np.full((2, COLUMNS * ROWS), np.nan)
+    seen[cells], left[cells] = means, means - rows @ values
+    return RowDrift(values, covariance, float(pattern**0.5), rms, int(kept.sum()), frames, seen, left)
+
+
+def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
+    """(N, 4) px per unit of pitch, roll, focal ratio and yaw."""
+    f = camera.focal_px
+    x = (matches[:, 0] - camera.cx_px - camera.doffs_px) / f
+    y = (matches[:, 1] - camera.cy_px) / f
+    return f * np.column_stack([1 + y**2, -x, y, -x * y])
+
+
+def _cells(
+    matches: Float64, design: Float64, camera: RectifiedCamera
+) -> tuple[list[int], Float64, Float64, Float64]:
+    """The cells that hold enough matches, their design (C, 4), mean (C,) and the mean's variance (C,)."""
+    column = np.clip(matches[:, 0] * COLUMNS / camera.width, 0, COLUMNS - 1).astype(int)
+    row = np.clip(matches[:, 1] * ROWS / camera.height, 0, ROWS - 1).astype(int)
+    cells, rows, means, variances = [], [], [], []
+    for cell in range(COLUMNS * ROWS):
+        inside = row * COLUMNS + column == cell
+        if (count := int(inside.sum())) >= LEAST_IN_CELL:
+            cells.append(cell)
+            rows.append(design[inside].mean(0))
+            means.append(matches[inside, 2].mean())
+            variances.append(matches[inside, 2].var(ddof=1) / count + LEAST_SIGMA_PX**2)
+    return cells, np.array(rows).reshape(-1, 4), np.array(means), np.array(variances)

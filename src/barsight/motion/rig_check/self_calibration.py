@@ -1,0 +1,89 @@
+"""What follows from a rig's drift: a warning where it matters, a rig turned back where that is asked, and how
+far disparities may still be off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.geometry.rectification import Rectifier, right_from_rectified
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.pose import Pose
+from barsight.core.types import RigDrift
+
+SIGNIFICANT_SIGMAS = 3.0
+WORTH_MM = 3.0
+AGREEING_SIGMAS = 1.96
+"""Travel that shows yaw and scale within this agrees with the calibration. Over rigs that are off as far as
+they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py)."""
+
+
+@dataclass(frozen=True)
+class SelfCalibrated:
+    """The rectifier to measure with, sentences where the drift needs any, and the disparity error (px, one
+    sigma) that the rig may still cause everywhere alike."""
+
+    rectifier: Rectifier
+    warnings: tuple[str, ...]
+    sigma_px: float
+
+
+def self_calibrated(
+    rig: StereoRig, rectifier: Rectifier, drift: RigDrift | None, calibration_px: float, *, correct: bool
+) -> SelfCalibrated:
+    """The rig turned by the drift's yaw if `correct`, else as it is; encoders must have shown the drift.
+
+    calibration_px: the disparity error (1 sigma) that the calibration itself admits.
+    """
+    if drift is None or not drift.by_encoders:
+        reason = "nothing is self-calibrated: the yaw shows only with encoders in the fused estimate"
+        return SelfCalibrated(rectifier, (reason,) if correct else (), calibration_px)
+    seen, sigma_px = describe(drift), left_open_px(drift, rectifier.camera.focal_px, calibration_px, correct)
+    if correct:
+        turned = turned_right(rig, np.array([0.0, drift.yaw_rad, 0.0]))
+        return SelfCalibrated(Rectifier(turned), (f"the rig is self-calibrated: {seen}",), sigma_px)
+    warnings = (f"{seen}; calibrate anew",) if is_drifted(drift) else ()
+    return SelfCalibrated(rectifier, warnings, sigma_px)
+
+
+def left_open_px(drift: RigDrift, focal_px: float, calibration_px: float, corrected: bool) -> float:
+    """The disparity error (1 sigma) that yaw and scale may cause straight ahead at the points' median depth.
+
+    Where the travel agrees with the calibration, both are believed, the calibration for the yaw. Where it
+    contradicts, the travel alone is, and what it found counts as error unless it is `corrected`.
+    """
+    found, covariance = np.array([drift.yaw_rad, drift.scale]), drift.covariance
+    by = np.array([focal_px, focal_px * drift.baseline_m / drift.range_m])
+    off = 0.0
+    if found @ np.linalg.solve(covariance, found) > AGREEING_SIGMAS**2:
+        off = float(by @ (found * [not corrected, True]))
+    elif not corrected:
+        gain = covariance[0] / (covariance[0, 0] + (calibration_px / focal_px) ** 2)
+        covariance = covariance - np.outer(gain, covariance[0])
+    return float(np.sqrt(by @ covariance @ by + off**2))
+
+
+def is_drifted(drift: RigDrift) -> bool:
+    """Whether the yaw is beyond 3 sigma and costs more than a few millimetres."""
+    significant = abs(drift.yaw_rad) > SIGNIFICANT_SIGMAS * drift.yaw_sigma_rad
+    return significant and abs(1e3 * drift.depth_error_m(drift.range_m)) > WORTH_MM
+
+
+def describe(drift: RigDrift) -> str:
+    """The yaw and its cost as a sentence."""
+    yaw, sigma = np.degrees([drift.yaw_rad, drift.yaw_sigma_rad])
+    cost = 1e3 * drift.depth_error_m(drift.range_m)
+    return (
+        f"the right camera has turned by {yaw:.4f} ± {sigma:.4f} degrees, "
+        f"which moves depths at {drift.range_m:.1f} m by {cost:+.1f} mm"
+    )
+
+
+def turned_right(rig: StereoRig, turn_rad: np.ndarray) -> StereoRig:
+    """The rig whose right camera has turned by a rotation vector (3,) in its rectified axes."""
+    cam1_from_rect1 = right_from_rectified(rig)
+    rotation = cam1_from_rect1 @ Rotation.from_rotvec(turn_rad).as_matrix() @ cam1_from_rect1.T
+    return replace(rig, body_from_cam1=rig.body_from_cam1 @ Pose("cam1", "cam1", rotation, np.zeros(3)))

@@ -1,0 +1,162 @@
+"""What a bag needs beside its messages: Kalibr's files and which topic is which sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from barsight.calibration.files.kalibr import CamChain, ImuFile, read_camchain, read_imu_file
+from barsight.calibration.files.rig_formats import body_is_cam0, chosen_rig, read_rig_file
+from barsight.core.errors import InputError
+from barsight.recording.base import RecordingSettings
+from barsight.recording.formats.bag_file import (
+    CLOUD_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    IMU_TYPE,
+    POINT_TYPE,
+    Topic,
+)
+
+CRANE_TOPIC = "/crane0/position"
+LASER_TOPIC = "/laser0/profiles"
+
+
+@dataclass(frozen=True, eq=False)
+class BagCalibration:
+    """Kalibr's files of a bag. imu is None where there is no imu.yaml. files: what was read."""
+
+    chain: CamChain
+    imu: ImuFile | None
+    files: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """The topics to read; None where the bag has no such sensor."""
+
+    cam0: str
+    cam1: str
+    imu: str | None
+    crane: str | None
+    laser: str | None
+
+
+def find_calibration(path: Path, settings: RecordingSettings) -> BagCalibration:
+    """Kalibr's files, named by the settings or found in the bag's folder, then beside it.
+
+    Raises `InputError` where there is no camchain or several that could be meant.
+    """
+    folders = [path, path.parent] if path.is_dir() else [path.parent]
+    chain_path = settings.camchain or _find(folders, ("*camchain-imucam*", "*camchain*"), ())
+    if chain_path is None and settings.rig is not None:
+        rig = read_rig_file(settings.rig)
+        return BagCalibration(CamChain(rig, (None, None), not body_is_cam0(rig)), None, (settings.rig,))
+    if chain_path is None:
+        raise InputError(
+            path,
+            "there is no calibration in or beside the bag",
+            "put Kalibr's camchain-imucam.yaml there or name it (recording.camchain)",
+        )
+    imu_path = settings.imu_yaml or _find([chain_path.parent], ("imu", "*imu*"), ("camchain", "results"))
+    imu = read_imu_file(imu_path) if imu_path else None
+    files = (chain_path, imu_path) if imu_path else (chain_path,)
+    chain = read_camchain(chain_path)
+    chain = replace(chain, rig=chosen_rig(settings.rig, chain.rig))
+    return BagCalibration(chain, imu, files if settings.rig is None else (*files, settings.rig))
+
+
+def choose_topics(
+    path: Path, topics: Sequence[Topic], calibration: BagCalibration, settings: RecordingSettings
+) -> BagTopics:
+    """Which topic is which sensor: as the settings say, else the camchain, else by the message types.
+
+    Raises `InputError` for a topic that isn't there and where several could be meant.
+    """
+    pictures = [topic for topic in topics if topic.kind in (IMAGE_TYPE, COMPRESSED_TYPE) and topic.count]
+    wanted = (settings.cam0_topic, settings.cam1_topic)
+    found = [
+        _named(path, pictures, ask, f"recording.cam{k}_topic") if ask else _stated(pictures, stated)
+        for k, (ask, stated) in enumerate(zip(wanted, calibration.chain.topics, strict=True))
+    ]
+    if None in found:
+        found = _two_cameras(path, pictures)
+    if found[0] == found[1]:
+        raise InputError(path, f"cam0 and cam1 are both {found[0]}", "name two topics")
+    present = {(topic.name, topic.kind) for topic in topics if topic.count}
+    return BagTopics(
+        str(found[0]),
+        str(found[1]),
+        _imu_topic(path, topics, calibration, settings),
+        CRANE_TOPIC if (CRANE_TOPIC, POINT_TYPE) in present else None,
+        LASER_TOPIC if (LASER_TOPIC, CLOUD_TYPE) in present else None,
+    )
+
+
+def _find(folders: Sequence[Path], patterns: tuple[str, ...], without: tuple[str, ...]) -> Path | None:
+    """The file of the nearest folder and the most exact pattern; several of one kind are refused."""
+    for folder in folders:
+        for pattern in patterns:
+            found = [
+                file
+                for suffix in (".yaml", ".yml")
+                for file in folder.glob(pattern + suffix)
+                if file.is_file() and not any(word in file.name for word in without)
+            ]
+            exact = [file for file in found if file.stem == pattern.strip("*")]
+            if len(exact or found) > 1:
+                names = ", ".join(sorted(file.name for file in found))
+                raise InputError(
+                    folder, f"holds several calibrations: {names}", "name the one to use in the settings"
+                )
+            if found:
+                return (exact or found)[0]
+    return None
+
+
+def _named(path: Path, topics: Sequence[Topic], name: str, setting: str) -> str:
+    if name not in {topic.name for topic in topics}:
+        raise InputError(
+            path, f"{setting} {name} is no topic of the bag that fits", f"choose one of {_list(topics)}"
+        )
+    return name
+
+
+def _stated(topics: Sequence[Topic], name: str | None) -> str | None:
+    """The camchain's topic, or its compressed copy; calibration is often done on another recording."""
+    names = {topic.name for topic in topics}
+    return next((n for n in (name, f"{name}/compressed") if n in names), None)
+
+
+def _two_cameras(path: Path, pictures: Sequence[Topic]) -> list[str | None]:
+    """The two picture topics of a bag that has just two, the left one first."""
+    names = {topic.name for topic in pictures}
+    bases = sorted(name for name in names if name.removesuffix("/compressed") not in names - {name})
+    if len(bases) != 2:
+        raise InputError(
+            path,
+            f"has {len(bases)} picture topics ({_list(pictures)}); the camchain's aren't among them",
+            "name both with recording.cam0_topic and recording.cam1_topic",
+        )
+    left_first = sorted(bases, key=lambda name: ("right" in name, name))
+    return [left_first[0], left_first[1]]
+
+
+def _imu_topic(
+    path: Path, topics: Sequence[Topic], calibration: BagCalibration, settings: RecordingSettings
+) -> str | None:
+    """The IMU's topic; None too where the camchain does not say where the IMU sits."""
+    imus = [topic for topic in topics if topic.kind == IMU_TYPE and topic.count]
+    if settings.imu_topic:
+        return _named(path, imus, settings.imu_topic, "recording.imu_topic")
+    if not calibration.chain.knows_imu or not imus:
+        return None
+    stated = _stated(imus, calibration.imu.topic if calibration.imu else None)
+    if stated is None and len(imus) > 1:
+        raise InputError(path, f"has several IMU topics ({_list(imus)})", "name one with recording.imu_topic")
+    return stated or imus[0].name
+
+
+def _list(topics: Sequence[Topic]) -> str:
+    return ", ".join(topic.name for topic in topics) or "none"

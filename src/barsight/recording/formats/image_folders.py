@@ -1,0 +1,52 @@
+"""What readers share whose pictures are files of their own: EuRoC's and KITTI's folders."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Sequence
+from pathlib import Path
+
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.recording.image_decoding import TornImageError
+from barsight.recording.pairing import PairedAtOpening, decode_for
+from barsight.recording.stored_images import StoredImage, merged
+
+
+class PictureFiles(PairedAtOpening):
+    """The pictures' part of a `Recording`; the reader sets what is named here.
+
+    _root: the folder below which refusals name a file. _left, _right: a file for each of the pairs' stamps.
+    """
+
+    rig: StereoRig
+    _root: Path
+    _left: Sequence[Path]
+    _right: Sequence[Path]
+
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
+        """See `Recording.frames`."""
+        pairing = self._pairs.pairing
+        for stamp, left, right in zip(self.index.stamps_ns, pairing.left, pairing.right, strict=True):
+            if wanted is None or stamp in wanted:
+                yield self._read_pair(stamp, self._left[left], self._right[right])
+
+    def stored_images(self) -> Iterator[StoredImage]:
+        """Every picture's bytes as stored, both cameras in time's order, missing files left out."""
+        for camera, stamp, path in merged(self._pairs, self._left, self._right):
+            if path.is_file():
+                yield StoredImage(camera, stamp, path.suffix.lstrip(".").lower(), path.read_bytes())
+
+    def _read_pair(self, stamp_ns: int, left: Path, right: Path) -> StereoFrame | RefusedFrame:
+        """One pair; refused, with the file's name, where either picture can't be used."""
+        images = []
+        for path, camera in ((left, self.rig.cam0), (right, self.rig.cam1)):
+            name = path.relative_to(self._root)
+            try:
+                images.append(decode_for(camera, path.read_bytes()))
+            except FileNotFoundError:
+                return RefusedFrame(stamp_ns, f"{name} is missing")
+            except OSError as error:
+                return RefusedFrame(stamp_ns, f"{name} can't be read ({error.strerror})")
+            except TornImageError as error:
+                return RefusedFrame(stamp_ns, f"{name} {error}")
+        return StereoFrame(stamp_ns, images[0], images[1])

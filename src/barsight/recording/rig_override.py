@@ -1,0 +1,19 @@
+"""A recording seen through another calibration than its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.recording.wrapper import Forwarded
+
+
+@dataclass(frozen=True, eq=False)
+class Rigged(Forwarded):
+    """`whole` with the calibration `own_rig`."""
+
+    own_rig: StereoRig
+
+    @property
+    def rig(self) -> StereoRig:
+        return self.own_rig

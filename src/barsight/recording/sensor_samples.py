@@ -1,0 +1,78 @@
+"""The slow sensors' numbers, checked the same way whichever format they came from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.files.yaml_document import Document
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import InputError
+from barsight.core.pose import Pose
+from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
+
+
+def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_from_imu: Pose) -> ImuSamples:
+    """Samples turned into `body`.
+
+    gyro (rad/s), accel (m/s^2): (N, 3) in the IMU's axes. Where the IMU sits away from the body's origin the
+    acceleration is not carried over (that takes the angular acceleration): lever arms are neglected.
+    Raises `InputError` where the accelerations look like multiples of g.
+    """
+    rotation = body_from_imu.rotation
+    if not np.array_equal(rotation, np.eye(3)):
+        gyro, accel = gyro @ rotation.T, accel @ rotation.T
+    median = float(np.median(np.linalg.norm(accel, axis=1)))
+    if 0.8 < median < 1.25:
+        raise InputError(
+            path,
+            f"the accelerations' median is {median:.2f} m/s^2, so they are probably in g",
+            "multiply them by 9.80665 so that they are in m/s^2",
+        )
+    return ImuSamples(stamp_ns, gyro, accel)
+
+
+def imu_hints(samples: ImuSamples) -> tuple[str, ...]:
+    """Sentences on what looks odd in an IMU's samples but may be right."""
+    hints = []
+    gravity = float(np.median(np.linalg.norm(samples.accel_mps2, axis=1)))
+    if not 8.0 < gravity < 12.0:
+        hints.append(f"the IMU's median acceleration is {gravity:.2f} m/s^2, gravity is 9.8: check the unit")
+    turn = float(np.percentile(np.linalg.norm(samples.gyro_radps, axis=1), 95))
+    if turn > 5.0:
+        hints.append(f"the IMU turns at {turn:.1f} rad/s: check that the gyroscope is not in degrees/s")
+    return tuple(hints)
+
+
+def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> CraneSamples:
+    """The encoders' places with the mounting of the crane's `sensor.yaml`. Raises `CalibrationError`."""
+    rotation = np.array(document.numbers("R_yard_body", 9)).reshape(3, 3)
+    try:
+        nominal = Pose("yard", "body", rotation, np.zeros(3)).rotation
+    except ValueError as error:
+        raise document.error("R_yard_body", str(error), "give a rotation, row by row") from None
+    std = document.number("position_std_m")
+    if std <= 0:
+        raise document.error(
+            "position_std_m", f"{std} must be positive", "give the encoders' sigma in metres"
+        )
+    return CraneSamples(stamp_ns, position_m, np.array(document.numbers("p_crane_body", 3)), nominal, std)
+
+
+def make_laser(profile: Int64, xyz_m: Float64, range_std_m: float) -> tuple[LaserProfile, ...]:
+    """Profiles in the order of their numbers, each sorted by x. range_std_m is NaN where nobody states it."""
+    profiles = []
+    for number in np.unique(profile):
+        rows = xyz_m[profile == number]
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        x, y, z = (np.ascontiguousarray(column) for column in rows.T)
+        profiles.append(LaserProfile(int(number), x, y, z, range_std_m))
+    return tuple(profiles)
+
+
+def laser_std(document: Document | None) -> float:
+    """The laser's range sigma (m) of its `sensor.yaml`; NaN where it isn't stated."""
+    if document is None or document.values.get("range_std_m") is None:
+        return float("nan")
+    return document.number("range_std_m")

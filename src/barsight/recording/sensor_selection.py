@@ -1,0 +1,25 @@
+"""A recording with some of its sensors left out, as `--use` asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.recording.wrapper import Forwarded
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedSensors(Forwarded):
+    """`whole` seen through `use` (`stereo`, `imu`, `crane`); what isn't used isn't even read."""
+
+    use: tuple[str, ...]
+
+    def imu(self) -> ImuSamples | None:
+        return self.whole.imu() if "imu" in self.use else None
+
+    def imu_noise(self) -> ImuNoise | None:
+        return self.whole.imu_noise() if "imu" in self.use else None
+
+    def crane(self) -> CraneSamples | None:
+        return self.whole.crane() if "crane" in self.use else None

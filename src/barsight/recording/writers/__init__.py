@@ -1,0 +1,1 @@
+"""Writers of recordings: EuRoC folders and ROS bags."""

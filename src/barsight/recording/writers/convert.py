@@ -1,0 +1,61 @@
+"""One recording format from another, without loss and without holding more than a picture at a time.
+
+Stored pictures are copied byte for byte, stamps as integers, the slow sensors' numbers as float64, and the
+rig so that it reads back bit for bit; a round trip is the same recording. Pictures that are missing or torn
+messages are left out and counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from barsight.core.errors import OutputError
+from barsight.core.files import atomic_directory
+from barsight.recording.stored_images import Source
+from barsight.recording.writers.bag import BAG_FLAVOURS, write_bag
+from barsight.recording.writers.euroc import write_euroc
+
+Target = Literal["euroc", "ros2-mcap", "ros2-sqlite3", "ros1"]
+
+
+@dataclass(frozen=True)
+class ConversionReport:
+    """out: the folder written. images: pictures copied. left_out: pictures named but missing or torn."""
+
+    out: Path
+    images: int
+    left_out: int
+
+
+def convert(
+    recording: Source,
+    out: Path,
+    target: Target,
+    progress: Callable[[int, int], None] | None = None,
+) -> ConversionReport:
+    """Write `recording` into the folder `out` in another format, whole or not at all.
+
+    progress: called with pictures done and pictures in all. Ground truth that lies with the recording is
+    copied, but never read. Raises `InputError` for what can't be read, `OutputError` for what can't be
+    written or an `out` that lies inside the recording.
+    """
+    source = recording.path.resolve()
+    if out.resolve() == source or source in out.resolve().parents:
+        raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
+    pairs = recording.camera_stamps
+    total = pairs.left_ns.size + pairs.right_ns.size
+    report = progress or _silent
+    with atomic_directory(out) as staging:
+        if target == "euroc":
+            written = write_euroc(recording, staging, lambda done: report(done, total))
+        else:
+            flavour = BAG_FLAVOURS[target]
+            written = write_bag(recording, staging, out.name, flavour, lambda done: report(done, total))
+    return ConversionReport(out, written, total - written)
+
+
+def _silent(done: int, total: int) -> None:
+    return None

@@ -1,0 +1,300 @@
+"""The result files of formats.md, each written whole or not at all; tiles stream, memory stays bounded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+
+import barsight
+from barsight.core.arrays import Float32
+from barsight.core.files import atomic_path
+from barsight.core.stamps import NS_PER_S, format_seconds
+from barsight.core.types import Contour, LaserProfile, Trajectory
+from barsight.mapping.free_space import UNPROVEN, FreeSpace
+from barsight.mapping.surface.surface import Layers, Surface
+from barsight.measurement import Measurement, Preview
+from barsight.report.orthophoto import georeference, write_orthophoto
+from barsight.yard.inventory.bundle_file import write_bundles
+from barsight.yard.lifting.lift_file import write_lifts
+
+SCHEMA_VERSION = 1
+RESULT_FILES = (
+    "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "contour.csv", "laser.csv", "bundles.json",
+    "lifts.json", "ortho.tif", "ortho.png", "preview.png", "result.json", "report.html",
+)  # fmt: skip
+"""Everything that a run may leave in its folder."""
+BANDS = ("z_m", "sigma_m", "views", "source")
+_TILE = 256
+_CLOUD_POINT = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("sigma_z", "<f4"), ("views", "<u2")]
+)
+
+
+def write_surface(surface: Surface, free: FreeSpace, folder: Path) -> None:
+    """Write what the map alone fills into an existing folder: cloud, heights, free space, orthophoto."""
+    write_height(surface, folder / "height.tif")
+    write_free(surface, free, folder / "free.tif")
+    write_orthophoto(surface, folder)
+    write_cloud(surface, folder / "cloud.ply")
+
+
+def write_results(measurement: Measurement, folder: Path) -> None:
+    """All other files that a measurement fills but result.json, into an existing folder."""
+    write_trajectory(measurement.trajectory, folder / "trajectory.tum")
+    write_contours(measurement.contours, folder / "contour.csv")
+    reference = measurement.trajectory.reference
+    write_bundles(measurement.bundles, measurement.stock, reference, folder / "bundles.json")
+    write_lifts(measurement.lifts, reference, folder / "lifts.json")
+    if measurement.laser:
+        write_laser(measurement.laser, folder / "laser.csv")
+    if measurement.preview is not None:
+        write_preview(measurement.preview, folder / "preview.png")
+
+
+def write_trajectory(trajectory: Trajectory, target: Path) -> None:
+    """TUM: seconds with nine decimals, x y z qx qy qz qw of `yard_from_body` (or `world_from_body`)."""
+    with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
+        file.write(f"# {trajectory.reference}_from_body: timestamp_s x y z qx qy qz qw\n")
+        for frame in trajectory.frames:
+            pose = frame.reference_from_body
+            numbers = (*pose.translation, *pose.quaternion_xyzw)
+            file.write(f"{format_seconds(frame.stamp_ns)} {' '.join(f'{n:.9f}' for n in numbers)}\n")
+
+
+def write_relative(trajectory: Trajectory, target: Path) -> None:
+    """CSV, a row for each frame but the first: its pose in the body's axes of the frame before, x y z (m) and
+    quaternion, and the upper triangle of its covariance row by row (rotation in rad, then translation in m,
+    of a small motion that follows it); nan where it isn't known.
+    """
+    detail = trajectory.detail
+    if detail is None or detail.relative is None:
+        return
+    upper = np.triu_indices(6)
+    names = ",".join(f"c{i}{j}" for i, j in zip(*upper, strict=True))
+    with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
+        file.write(f"#from [ns],to [ns],x [m],y [m],z [m],qx,qy,qz,qw,{names}\n")
+        pairs = zip(trajectory.frames, trajectory.frames[1:], detail.relative.covariance, strict=False)
+        for old, new, covariance in pairs:
+            moved = old.reference_from_body.inverse() @ new.reference_from_body
+            pose = ",".join(f"{n:.9f}" for n in (*moved.translation, *moved.quaternion_xyzw))
+            spread = ",".join(f"{n:.6e}" for n in covariance[upper])
+            file.write(f"{old.stamp_ns},{new.stamp_ns},{pose},{spread}\n")
+
+
+def write_cloud(surface: Surface, target: Path) -> None:
+    """Binary little-endian PLY of every height that enough views support."""
+    count = sum(len(part.views) for part in surface.cloud())
+    fields = "".join(
+        f"property {kind} {name}\n"
+        for name, kind in zip(
+            _CLOUD_POINT.names or (), ("float", "float", "float", "uchar", "float", "ushort"), strict=True
+        )
+    )
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment barsight {barsight.__version__}\n"
+        f"element vertex {count}\n{fields}end_header\n"
+    )
+    with atomic_path(target) as path, path.open("wb") as file:
+        file.write(header.encode("ascii"))
+        for part in surface.cloud():
+            points = np.empty(len(part.views), _CLOUD_POINT)
+            points["x"], points["y"], points["z"] = part.xyz_m.T
+            points["intensity"] = part.intensity
+            points["sigma_z"] = part.sigma_z_m
+            points["views"] = np.minimum(part.views, 65535)
+            file.write(points.tobytes())
+
+
+def write_height(surface: Surface, target: Path) -> None:
+    """Tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is no data."""
+    rows, columns = surface.shape
+    bands = "".join(
+        f'<Item name="DESCRIPTION" sample="{i}" role="description">{name}</Item>'
+        for i, name in enumerate(BANDS)
+    )
+    with atomic_path(target) as path:
+        tifffile.imwrite(
+            path,
+            _height_tiles(surface),
+            shape=(len(BANDS), rows, columns),
+            dtype=np.float32,
+            photometric="minisblack",
+            planarconfig="separate",
+            tile=(_TILE, _TILE),
+            compression="zlib",
+            metadata=None,
+            software=f"barsight {barsight.__version__}",
+            extratags=[
+                *georeference(surface),
+                (42112, "s", 0, f"<GDALMetadata>{bands}</GDALMetadata>", True),
+                (42113, "s", 0, "nan", True),
+            ],
+        )
+
+
+def write_free(surface: Surface, free: FreeSpace, target: Path) -> None:
+    """Write the upper bounds of what may stand in each cell (m) as a GeoTIFF on height.tif's grid."""
+
+    def tiles() -> Iterator[Float32]:
+        for row, column, height, width in _tiles_of(surface):
+            tile = np.full((_TILE, _TILE), UNPROVEN)
+            lowest = surface.rows[1] - row - height
+            part = free.window(surface.columns[0] + column, lowest, width, height)
+            tile[:height, :width] = np.round(part, 3)[::-1]
+            yield tile
+
+    with atomic_path(target) as path:
+        tifffile.imwrite(
+            path,
+            tiles(),
+            shape=surface.shape,
+            dtype=np.float32,
+            photometric="minisblack",
+            tile=(_TILE, _TILE),
+            compression="zlib",
+            metadata=None,
+            software=f"barsight {barsight.__version__}",
+            extratags=[*georeference(surface), (42113, "s", 0, "inf", True)],
+        )
+
+
+def _tiles_of(surface: Surface) -> Iterator[tuple[int, int, int, int]]:
+    """First row from the highest y, first column, height and width of each tile of a raster."""
+    rows, columns = surface.shape
+    for row in range(0, rows, _TILE):
+        for column in range(0, columns, _TILE):
+            yield row, column, min(_TILE, rows - row), min(_TILE, columns - column)
+
+
+def _height_tiles(surface: Surface) -> Iterator[Float32]:
+    for band in BANDS:
+        for row, column, height, width in _tiles_of(surface):
+            lowest = surface.rows[1] - row - height
+            window = surface.window(surface.columns[0] + column, lowest, width, height)
+            tile = np.full((_TILE, _TILE), np.nan, np.float32)
+            tile[:height, :width] = _band(window, band)[::-1]
+            yield tile
+
+
+def _band(window: Layers, band: str) -> Float32:
+    values: Float32 = getattr(window, band).astype(np.float32)
+    return values
+
+
+def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
+    """`profile,x_m,y_m,z_m,sigma_m,source`; z and sigma are empty where nothing is known."""
+    with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
+        file.write("profile,x_m,y_m,z_m,sigma_m,source\n")
+        for contour in contours:
+            for x, y, z, sigma, source in zip(
+                contour.x_m, contour.y_m, contour.z_m, contour.sigma_m, contour.source, strict=True
+            ):
+                height = f"{z:.5f},{sigma:.5f}" if np.isfinite(z) else ","
+                file.write(f"{contour.profile},{x:.4f},{y:.4f},{height},{source}\n")
+
+
+def write_laser(laser: tuple[LaserProfile, ...], target: Path) -> None:
+    """The reference profiles as they were read: `profile,x_m,y_m,z_m`."""
+    with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
+        file.write("profile,x_m,y_m,z_m\n")
+        for profile in laser:
+            for x, y, z in zip(profile.x_m, profile.y_m, profile.z_m, strict=True):
+                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f}\n")
+
+
+def write_preview(preview: Preview, target: Path) -> None:
+    """The rectified left picture beside its disparity in colours; black where there is none."""
+    known = np.isfinite(preview.disparity_px)
+    low, high = np.percentile(preview.disparity_px[known], (1, 99)) if known.any() else (0.0, 1.0)
+    scaled = (preview.disparity_px - low) / max(high - low, 1e-6) * 255
+    levels = np.where(known, np.nan_to_num(scaled).clip(0, 255), 0).astype(np.uint8)
+    colours = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
+    colours[~known] = 0
+    picture = np.hstack([cv2.cvtColor(preview.left, cv2.COLOR_GRAY2BGR), colours])
+    scale = min(1.0, 1600 / picture.shape[1])
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    encoded = cv2.imencode(".png", small)[1]
+    with atomic_path(target) as path:
+        path.write_bytes(encoded.tobytes())
+
+
+def write_summary(content: dict[str, Any], target: Path) -> None:
+    """result.json from what `summary` says."""
+    with atomic_path(target) as path:
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def summary(measurement: Measurement) -> dict[str, Any]:
+    """What result.json says; rounded for people, NaN as null."""
+    trajectory, surface = measurement.trajectory, measurement.surface
+    stamps = trajectory.stamp_ns
+    rows, columns = surface.shape
+    cell = surface.cell_m
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "software": {"name": "barsight", "version": barsight.__version__},
+        "measured_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "captured_from_ns": int(stamps[0]),
+        "captured_to_ns": int(stamps[-1]),
+        "is_simulated": measurement.is_simulated,
+        "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
+        "reference": trajectory.reference,
+        "hashes": {
+            "calibration": measurement.calibration_hash,
+            "configuration": measurement.configuration_hash,
+            "inputs": measurement.input_hashes,
+        },
+        "configuration": measurement.configuration,
+        "sensors_used": list(measurement.sensors_used),
+        "frames": {
+            "total": measurement.frames_total,
+            "used": measurement.frames_used,
+            "refused": [
+                {"stamp_ns": r.frame.stamp_ns, "stage": r.stage, "reason": r.frame.reason}
+                for r in measurement.refusals
+            ],
+        },
+        "trajectory": {
+            "length_m": trajectory.length_m,
+            "duration_s": float(stamps[-1] - stamps[0]) / NS_PER_S if stamps.size else 0.0,
+        },
+        "travel": measurement.travel.content(),
+        "stages": [asdict(stage) for stage in measurement.stages],
+        "seconds": measurement.seconds,
+        "peak_memory_mib": measurement.peak_memory_mib,
+        "map": {
+            "cell_m": cell,
+            "x_min_m": (surface.columns[0] - 0.5) * cell,
+            "x_max_m": (surface.columns[1] - 0.5) * cell,
+            "y_min_m": (surface.rows[0] - 0.5) * cell,
+            "y_max_m": (surface.rows[1] - 0.5) * cell,
+            "cells_seen": surface.seen,
+            "cells_filled": surface.filled,
+            "cells_unknown": rows * columns - surface.seen - surface.filled,
+            "median_sigma_m": surface.median_sigma_m,
+        },
+        "agreement": [asdict(agreement) for agreement in measurement.agreements],
+        "truth": None,
+        "warnings": [asdict(warning) for warning in measurement.warnings],
+        "vetoes": [{"code": v.code, "message": v.reason} for v in measurement.lifts.vetoes],
+    }
+    rounded: dict[str, Any] = _rounded(content)
+    return rounded
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    if isinstance(value, float):
+        return round(value, 6) if np.isfinite(value) else None
+    return value

@@ -1,0 +1,1 @@
+"""Published stereo methods to compare with, and the parts that only they use."""

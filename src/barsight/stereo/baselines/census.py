@@ -1,0 +1,123 @@
+"""Improved Census with outlier elimination, in the way of [Peng, Han, Tang, Shang, Yu 2017].
+
+A noise-tolerant Census against a weighted mean, aggregation over cross-shaped regions, winner takes all,
+left-right check, region voting on what fails it, filling with a weighted median, a parabola below a pixel.
+Memory: two blocks of 16 candidates, whatever their number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from barsight.core.arrays import Float32
+from barsight.core.errors import ConfigError
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.baselines.census_transform import census_codes, census_cost
+from barsight.stereo.baselines.cross_aggregation import CrossRegions, cross_filter, cross_regions
+from barsight.stereo.baselines.left_right_check import agreement, filled_from_behind, weighted_median
+from barsight.stereo.baselines.postprocessing import OutputSettings, assemble, fits, mirrored_pair, nothing
+from barsight.stereo.baselines.region_voting import region_vote
+from barsight.stereo.baselines.winner_takes_all import Winners, sweep
+from barsight.stereo.noise import has_texture
+from barsight.stereo.sgbm import image_noise
+
+_SUPPORT_RADIUS_PX = 4
+_MEDIAN_RADIUS_PX = 9
+_MEDIAN_SIGMA_PX = 9.0
+_MEDIAN_SIGMA_GRAY = 14.7
+
+
+@dataclass(frozen=True)
+class CensusSettings:
+    """Improved Census."""
+
+    tolerance_sigmas: float = 1.0
+    """Gray values this many sigmas of the image's noise apart count as equal."""
+    long_arm_px: int = 11
+    """A region's arms end here at the latest."""
+    short_arm_px: int = 5
+    """Up to here the loose limit holds."""
+    loose_gray: int = 12
+    """Gray difference that ends a short arm."""
+    tight_gray: int = 6
+    """Gray difference that ends a long arm."""
+    rounds: int = 2
+    """Rounds of aggregation."""
+    fewest_votes: int = 20
+    """An outlier's region votes when it has more reliable pixels than this."""
+    vote_share: float = 0.4
+    """The winning disparity needs more than this share of the votes."""
+    vote_rounds: int = 5
+    """Rounds of voting."""
+    output: OutputSettings = field(
+        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.26, filled_sigma_px=2.7)
+    )
+
+    def __post_init__(self) -> None:
+        if self.tolerance_sigmas < 0 or self.rounds < 1 or self.vote_rounds < 0:
+            raise ConfigError(
+                "census needs tolerance_sigmas and vote_rounds of 0 or more and one round at least"
+            )
+        if not 0 < self.short_arm_px <= self.long_arm_px or self.long_arm_px > 1000:
+            raise ConfigError("census needs 0 < short_arm_px <= long_arm_px <= 1000")
+        if self.loose_gray < 0 or self.tight_gray < 0 or not 0 <= self.vote_share <= 1:
+            raise ConfigError("census's gray limits can't be negative, vote_share must lie in 0...1")
+
+
+@dataclass(frozen=True)
+class Census:
+    """`StereoMethod`: improved Census over cross-shaped regions."""
+
+    settings: CensusSettings
+
+    def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        """See `StereoMethod`."""
+        settings = self.settings
+        if not has_texture(pair) or not fits(candidates, pair.left.shape[1]):
+            return nothing(pair)
+        tolerance = settings.tolerance_sigmas * image_noise(pair.left)
+        regions = _regions(pair, settings)
+        winners = census_winners(pair, regions, candidates, tolerance, settings.rounds)
+        mirror = mirrored_pair(pair)
+        mirrored = census_winners(mirror, _regions(mirror, settings), candidates, tolerance, settings.rounds)
+        right = np.ascontiguousarray(mirrored.candidate_px[:, ::-1])
+        matched = agreement(winners.candidate_px, right, tolerance_px=1)
+        voted, reliable = region_vote(
+            winners.candidate_px,
+            matched,
+            regions,
+            settings.fewest_votes,
+            settings.vote_share,
+            settings.vote_rounds,
+        )
+        chosen = weighted_median(
+            filled_from_behind(voted, reliable),
+            pair.left,
+            ~reliable,
+            _MEDIAN_RADIUS_PX,
+            _MEDIAN_SIGMA_PX,
+            _MEDIAN_SIGMA_GRAY,
+        )
+        return assemble(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+
+
+def census_winners(
+    pair: RectifiedPair, regions: CrossRegions, candidates: DisparityRange, tolerance: float, rounds: int
+) -> Winners:
+    """The left image's winners; tolerance in gray levels."""
+    left, right = census_codes(pair.left, tolerance), census_codes(pair.right, tolerance)
+    aggregate = cross_filter(regions, rounds)
+
+    def fill(lowest_px: int, slices: Float32) -> None:
+        census_cost(left, right, pair.left_valid, pair.right_valid, lowest_px, slices)
+        aggregate(slices)
+
+    return sweep(pair.left.shape, candidates, fill)
+
+
+def _regions(pair: RectifiedPair, settings: CensusSettings) -> CrossRegions:
+    return cross_regions(
+        pair.left, settings.long_arm_px, settings.short_arm_px, settings.loose_gray, settings.tight_gray
+    )

@@ -1,0 +1,203 @@
+"""Cross-scale cost aggregation [Zhang, Fang, Min, Sun, Yang, Yan, Tian, CVPR 2014].
+
+Costs are aggregated at each scale of a pyramid on their own, then tied: the costs z_s of one place at the
+scales s minimise sum_s |z_s - a_s|^2 + lambda sum_s |z_s - z_(s-1)|^2, a tridiagonal system; the first row of
+its inverse gives the finest scale's cost as a weighted sum over the scales' aggregated costs a_s. Then winner
+takes all, left-right check, a weighted median where it fails, a parabola where it doesn't. Aggregation is by
+the guided filter, in colour where the pair has it, or over the spanning tree of `nonlocal`.
+
+Memory: the scales above the finest are kept, a seventh of the volume together (float32); the finest passes
+in blocks of 16 candidates (the tree needs as much again).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import cv2
+import numba
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, UInt8, kernel
+from barsight.core.errors import ConfigError
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.baselines.gradient_cost import (
+    CostImages,
+    GradientCostSettings,
+    cost_images,
+    gradient_cost,
+)
+from barsight.stereo.baselines.guided_filter import colour_guided_filter, guided_filter
+from barsight.stereo.baselines.left_right_check import agreement, filled_from_behind, weighted_median
+from barsight.stereo.baselines.postprocessing import OutputSettings, assemble, fits, mirrored_pair, nothing
+from barsight.stereo.baselines.spanning_tree import spanning_tree, tree_filter
+from barsight.stereo.baselines.winner_takes_all import Winners, sweep
+from barsight.stereo.noise import has_texture
+
+_FEWEST_CANDIDATES = 5
+_SUPPORT_RADIUS_PX = 4
+
+
+@dataclass(frozen=True)
+class CscaSettings:
+    """Cross-scale cost aggregation."""
+
+    aggregation: Literal["guided", "tree"] = "guided"
+    """How each scale's costs are aggregated."""
+    cost: GradientCostSettings = field(default_factory=GradientCostSettings)
+    regulariser: float = 0.3
+    """How strongly the scales are tied (the authors' lambda); 0 leaves the finest scale alone."""
+    scales: int = 5
+    """Scales at most; a scale of fewer than five candidates is left out."""
+    radius_px: int = 9
+    """Radius of the guided filter's window, at every scale."""
+    epsilon: float = 6.5
+    """The guided filter's regulariser in gray levels squared."""
+    tree_sigma_gray: float = 25.5
+    """How fast support falls along the tree, in gray levels."""
+    median_radius_px: int = 9
+    """Radius of the weighted median over the pixels that fail the left-right check."""
+    median_sigma_px: float = 9.0
+    """How fast its weights fall with the distance."""
+    median_sigma_gray: float = 14.7
+    """How fast its weights fall with the gray difference (the authors' 0.1 over three colours)."""
+    output: OutputSettings = field(
+        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.27, filled_sigma_px=1.0)
+    )
+
+    def __post_init__(self) -> None:
+        if self.regulariser < 0 or self.scales < 1:
+            raise ConfigError("csca needs a regulariser of 0 or more and at least one scale")
+        if self.radius_px < 1 or self.epsilon <= 0 or self.tree_sigma_gray <= 0:
+            raise ConfigError("csca's radius_px, epsilon and tree_sigma_gray must be positive")
+        if self.median_radius_px < 1 or self.median_sigma_px <= 0 or self.median_sigma_gray <= 0:
+            raise ConfigError("csca's median_radius_px and its sigmas must be positive")
+
+
+@dataclass(frozen=True)
+class Csca:
+    """`StereoMethod`: cross-scale cost aggregation."""
+
+    settings: CscaSettings
+
+    def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        """See `StereoMethod`."""
+        settings = self.settings
+        if not has_texture(pair) or not fits(candidates, pair.left.shape[1]):
+            return nothing(pair)
+        winners = cross_scale_winners(pair, candidates, settings)
+        mirrored = cross_scale_winners(mirrored_pair(pair), candidates, settings)
+        right = np.ascontiguousarray(mirrored.candidate_px[:, ::-1])
+        matched = agreement(winners.candidate_px, right)
+        chosen = weighted_median(
+            filled_from_behind(winners.candidate_px, matched),
+            pair.left,
+            ~matched,
+            settings.median_radius_px,
+            settings.median_sigma_px,
+            settings.median_sigma_gray,
+        )
+        return assemble(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+
+
+def scale_weights(scales: int, regulariser: float) -> Float64:
+    """(scales,) the weight of each scale's cost in the finest's: the inverse's first row [Zhang, Eq. 12]."""
+    system = np.eye(scales)
+    for scale in range(scales - 1):
+        system[scale : scale + 2, scale : scale + 2] += regulariser * np.array([[1, -1], [-1, 1]])
+    weights: Float64 = np.linalg.inv(system)[0]
+    return weights
+
+
+def cross_scale_winners(pair: RectifiedPair, candidates: DisparityRange, settings: CscaSettings) -> Winners:
+    """The left image's winners on the tied costs."""
+    pyramid = _pyramid(pair, candidates, settings.scales)
+    weights = scale_weights(len(pyramid), settings.regulariser).astype(np.float32)
+    tied: _Scale | None = None
+    for scale, weight in zip(reversed(pyramid[1:]), reversed(weights[1:]), strict=True):
+        costs = np.empty((scale.candidates.count, *scale.images.left.shape), dtype=np.float32)
+        gradient_cost(scale.images, scale.candidates.lowest_px, settings.cost, costs)
+        _aggregation(scale, settings)(costs)
+        _tie(costs, weight, scale.candidates.lowest_px, tied)
+        tied = replace(scale, costs=costs)
+    finest = pyramid[0].images
+    aggregate = _aggregation(pyramid[0], settings)
+
+    def fill(lowest_px: int, slices: Float32) -> None:
+        gradient_cost(finest, lowest_px, settings.cost, slices)
+        aggregate(slices)
+        _tie(slices, weights[0], lowest_px, tied)
+
+    return sweep(finest.left.shape, candidates, fill)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scale:
+    """guide: (H, W) gray or (H, W, 3) colour. costs: (K, H, W)."""
+
+    images: CostImages
+    guide: Float32
+    candidates: DisparityRange
+    costs: Float32
+
+
+def _pyramid(pair: RectifiedPair, candidates: DisparityRange, scales: int) -> list[_Scale]:
+    """The finest first, without costs."""
+    images = cost_images(
+        pair.left.astype(np.float32), pair.right.astype(np.float32), pair.left_valid, pair.right_valid
+    )
+    guide = images.left if pair.left_colour is None else pair.left_colour.astype(np.float32)
+    no_costs = np.empty((0, 0, 0), dtype=np.float32)
+    pyramid = [_Scale(images, guide, candidates, no_costs)]
+    while len(pyramid) < scales:
+        held = pyramid[-1].candidates
+        coarser = DisparityRange(held.lowest_px // 2, held.highest_px // 2 + 1)
+        if coarser.count < _FEWEST_CANDIDATES or min(images.left.shape) < 2:
+            break
+        masks = [np.ascontiguousarray(mask[::2, ::2]) for mask in (images.left_valid, images.right_valid)]
+        images = cost_images(cv2.pyrDown(images.left), cv2.pyrDown(images.right), *masks)
+        guide = cv2.pyrDown(guide)
+        pyramid.append(_Scale(images, guide, coarser, no_costs))
+    return pyramid
+
+
+def _aggregation(scale: _Scale, settings: CscaSettings) -> Callable[[Float32], Float32]:
+    if settings.aggregation == "guided":
+        by_guide = guided_filter if scale.guide.ndim == 2 else colour_guided_filter
+        return by_guide(scale.guide, settings.radius_px, settings.epsilon)
+    guide: UInt8 = np.rint(scale.images.left).clip(0, 255).astype(np.uint8)
+    return tree_filter(spanning_tree(guide), settings.tree_sigma_gray)
+
+
+def _tie(slices: Float32, weight: float, lowest_px: int, coarser: _Scale | None) -> None:
+    """slices = weight * slices + the coarser scale's tied costs at half the place and half the candidate.
+
+    An odd candidate takes the mean of its two neighbours there. The authors' program rounds it up instead,
+    which moves all disparities below a pixel by about -0.12 px.
+    """
+    if coarser is None:
+        slices *= np.float32(weight)
+    else:
+        _tie_slices(slices, np.float32(weight), lowest_px, coarser.costs, coarser.candidates.lowest_px)
+
+
+@kernel(parallel=True)
+def _tie_slices(
+    slices: Float32, weight: np.float32, lowest: int, coarse: Float32, coarse_lowest: int
+) -> None:
+    count, height, width = slices.shape
+    half = np.float32(0.5)
+    for row in numba.prange(height):
+        for index in range(count):
+            fine = slices[index, row]
+            lower = coarse[(lowest + index) // 2 - coarse_lowest, row // 2]
+            upper = coarse[(lowest + index + 1) // 2 - coarse_lowest, row // 2]
+            for x in range(width // 2):
+                above = half * (lower[x] + upper[x])
+                fine[2 * x] = weight * fine[2 * x] + above
+                fine[2 * x + 1] = weight * fine[2 * x + 1] + above
+            if width % 2:
+                above = half * (lower[width // 2] + upper[width // 2])
+                fine[width - 1] = weight * fine[width - 1] + above

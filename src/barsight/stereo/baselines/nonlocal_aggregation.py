@@ -1,0 +1,117 @@
+"""Non-local cost aggregation [Yang, "A non-local cost aggregation method for stereo matching", CVPR 2012].
+
+Costs are aggregated over the minimum spanning tree of the image, exactly. Where left and right agree, a
+second cost |d - D| holds the disparity D found; everywhere else it is zero, and aggregated over the same tree
+with half the sigma it carries the disparities that are certain to the pixels that have none (his non-local
+refinement). Memory: two blocks of 16 candidates, whatever their number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numba
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Int32, kernel
+from barsight.core.errors import ConfigError
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.baselines.gradient_cost import GradientCostSettings, cost_images, gradient_cost
+from barsight.stereo.baselines.left_right_check import agreement
+from barsight.stereo.baselines.postprocessing import OutputSettings, assemble, fits, mirrored_pair, nothing
+from barsight.stereo.baselines.spanning_tree import SpanningTree, spanning_tree, tree_filter
+from barsight.stereo.baselines.winner_takes_all import Winners, sweep
+from barsight.stereo.noise import has_texture
+
+_SUPPORT_RADIUS_PX = 4
+_MEDIAN_PX = 5
+
+
+@dataclass(frozen=True)
+class NonlocalSettings:
+    """Non-local aggregation on the spanning tree."""
+
+    cost: GradientCostSettings = field(
+        default_factory=lambda: GradientCostSettings(gray_share=0.2, gray_limit=7.0, gradient_limit=4.0)
+    )
+    """The author's: 0.11 and 0.89, the gradient being half the difference of the next and previous pixel."""
+    sigma: float = 0.1
+    """How fast support falls along the tree, as a share of 255 gray levels; the refinement takes half."""
+    output: OutputSettings = field(
+        default_factory=lambda: OutputSettings(subpixel_sigma_px=0.32, filled_sigma_px=1.6)
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 < self.sigma <= 10:
+            raise ConfigError(f"nonlocal's sigma must lie above 0 and at most be 10, not {self.sigma}")
+
+
+@dataclass(frozen=True)
+class Nonlocal:
+    """`StereoMethod`: non-local aggregation and refinement."""
+
+    settings: NonlocalSettings
+
+    def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        """See `StereoMethod`."""
+        settings = self.settings
+        if not has_texture(pair) or not fits(candidates, pair.left.shape[1]):
+            return nothing(pair)
+        tree = spanning_tree(pair.left)
+        winners = tree_winners(pair, tree, candidates, settings)
+        mirror = mirrored_pair(pair)
+        mirrored = tree_winners(mirror, spanning_tree(mirror.left), candidates, settings)
+        smooth = _median(winners.candidate_px)
+        right = _median(np.ascontiguousarray(mirrored.candidate_px[:, ::-1]))
+        matched = agreement(smooth, right)
+        chosen = _median(refined(smooth, matched, tree, candidates, settings.sigma * 255 / 2))
+        # A pixel is as sure as a match only where refinement has left what both images agreed on.
+        matched &= chosen == smooth
+        return assemble(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+
+
+def tree_winners(
+    pair: RectifiedPair, tree: SpanningTree, candidates: DisparityRange, settings: NonlocalSettings
+) -> Winners:
+    """The left image's winners on the aggregated costs."""
+    images = cost_images(
+        pair.left.astype(np.float32), pair.right.astype(np.float32), pair.left_valid, pair.right_valid
+    )
+    aggregate = tree_filter(tree, settings.sigma * 255)
+
+    def fill(lowest_px: int, slices: Float32) -> None:
+        gradient_cost(images, lowest_px, settings.cost, slices)
+        aggregate(slices)
+
+    return sweep(pair.left.shape, candidates, fill)
+
+
+def refined(
+    values: Int32, matched: Bool, tree: SpanningTree, candidates: DisparityRange, sigma_gray: float
+) -> Int32:
+    """The non-local refinement: each pixel's weighted median of the matched values over the tree, whole."""
+    aggregate = tree_filter(tree, sigma_gray)
+
+    def fill(lowest_px: int, slices: Float32) -> None:
+        _distance(values, matched, lowest_px, slices)
+        aggregate(slices)
+
+    return sweep(values.shape, candidates, fill).candidate_px
+
+
+def _median(values: Int32) -> Int32:
+    """Of 5x5 pixels; OpenCV's takes up to 32 bits of float there."""
+    median: Int32 = np.rint(cv2.medianBlur(values.astype(np.float32), _MEDIAN_PX)).astype(np.int32)
+    return median
+
+
+@kernel(parallel=True)
+def _distance(values: Int32, matched: Bool, lowest: int, slices: Float32) -> None:
+    count, height, width = slices.shape
+    for row in numba.prange(height):
+        for index in range(count):
+            shift = np.int32(lowest + index)
+            costs, found, certain = slices[index, row], values[row], matched[row]
+            for x in range(width):
+                costs[x] = np.float32(abs(found[x] - shift)) if certain[x] else np.float32(0)

@@ -1,0 +1,105 @@
+"""The paper's method, literally [paper Figure 2, Eq. 4, Eq. 5; the loop is Yang, CVPR 2007].
+
+An initial disparity D makes a cost space C(d) = min(eta L, (d - D)^2); the cost space is filtered
+bilaterally, guided by the image; the winner takes all and the parabola through its neighbours gives a new D,
+which is fed back until it settles. The cost space is never built: see `bilateral_update`. No evidence comes
+from the images after the start, so that the loop smooths D and can't undo its bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from barsight.core.arrays import Float32
+from barsight.core.errors import ConfigError
+from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.baselines.bilateral_filter import bilateral_update
+from barsight.stereo.baselines.census import Census, CensusSettings
+from barsight.stereo.baselines.postprocessing import OutputSettings, fits, nothing
+from barsight.stereo.noise import has_texture, noise_sigma
+from barsight.stereo.sgbm import Sgbm, SgbmSettings
+
+_SUPPORT_RADIUS_PX = 4
+_SETTLED_SHARE = 0.95
+_NARROWEST_PX = 16  # OpenCV rounds the candidates up to so many.
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """The paper's loop."""
+
+    initial: Literal["sgbm", "census"] = "sgbm"
+    """What makes the first disparity."""
+    sgbm: SgbmSettings = field(default_factory=lambda: SgbmSettings(mode="5path"))
+    census: CensusSettings = field(default_factory=CensusSettings)
+    eta: float = 0.1
+    """The cost is cut off at eta times the number of candidates, px squared."""
+    radius_px: int = 5
+    """Radius of the bilateral window."""
+    sigma_px: float = 3.0
+    """How fast its weights fall with the distance."""
+    sigma_gray: float = 10.0
+    """How fast its weights fall with the gray difference."""
+    most_rounds: int = 3
+    """The loop ends after this many rounds at the latest."""
+    settled_px: float = 0.05
+    """It has settled when 95 % of the disparities change by less than this."""
+    output: OutputSettings = field(
+        default_factory=lambda: OutputSettings(fill=False, subpixel_sigma_px=0.28, filled_sigma_px=9.0)
+    )
+    """The loop doesn't know what lies behind an edge: it fills what is hidden with what is near."""
+
+    def __post_init__(self) -> None:
+        if self.eta <= 0 or self.sigma_px <= 0 or self.sigma_gray <= 0 or self.settled_px <= 0:
+            raise ConfigError("the paper's eta, sigmas and settled_px must be positive")
+        if self.radius_px < 1 or self.most_rounds < 1:
+            raise ConfigError("the paper's loop needs a radius_px and most_rounds of 1 or more")
+
+
+@dataclass(frozen=True)
+class Paper:
+    """`StereoMethod`: the paper's loop from an initial disparity."""
+
+    settings: PaperSettings
+
+    def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
+        """See `StereoMethod`. Without `output.fill`, NaN where the initial disparity has none."""
+        settings = self.settings
+        width = pair.left.shape[1]
+        too_narrow = width + min(candidates.lowest_px, 0) <= _NARROWEST_PX
+        if not has_texture(pair) or not fits(candidates, width) or too_narrow:
+            return nothing(pair)
+        start: Sgbm | Census = Sgbm(settings.sgbm) if settings.initial == "sgbm" else Census(settings.census)
+        initial = start(pair, candidates)
+        values = settle(pair, initial.disparity_px, candidates, settings)
+        matched = np.isfinite(initial.disparity_px)
+        output = settings.output
+        sigma = np.hypot(noise_sigma(pair.left, _SUPPORT_RADIUS_PX), np.float32(output.subpixel_sigma_px))
+        sigma = np.where(matched, sigma, np.float32(output.filled_sigma_px)).astype(np.float32)
+        missing = ~pair.left_valid | np.isnan(values)
+        if not output.fill:
+            missing |= ~matched
+        values[missing] = np.nan
+        sigma[missing] = np.nan
+        return Disparity(values, sigma)
+
+
+def settle(
+    pair: RectifiedPair, initial_px: Float32, candidates: DisparityRange, settings: PaperSettings
+) -> Float32:
+    """(H, W) float32: rounds of `bilateral_update` until few disparities move or `most_rounds` are done."""
+    limit = settings.eta * candidates.count
+    values = initial_px
+    for _ in range(settings.most_rounds):
+        before = values
+        values = bilateral_update(
+            values, pair.left, candidates, limit, settings.radius_px, settings.sigma_px, settings.sigma_gray
+        )
+        known = np.isfinite(before)
+        still = np.abs(values[known] - before[known]) < settings.settled_px
+        if np.count_nonzero(still) >= _SETTLED_SHARE * still.size:
+            break
+    return values

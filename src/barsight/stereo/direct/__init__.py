@@ -1,0 +1,1 @@
+"""Barsight's own stereo method: semi-global start, direct refinement along the bars."""

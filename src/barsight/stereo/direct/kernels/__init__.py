@@ -1,0 +1,1 @@
+"""Compiled image operations of the direct method: splines, box sums, pyramids."""

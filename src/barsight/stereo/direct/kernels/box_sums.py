@@ -1,0 +1,152 @@
+"""Sums over square windows, with nothing but the result written: what several box filters would do in turn.
+
+Beyond the image's ends it goes on mirrored at the last pixel, as OpenCV's filters have it. A band's rows roll
+by: each column's sum over a window's rows takes in the row ahead and lets go of the one behind (`roll_*`),
+and `slide` adds the columns up. The loops stay this short, with one array written in each, because the
+compiler makes vectors of no others.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from barsight.core.arrays import Float32, Float64, kernel
+from barsight.core.parallel import in_bands
+from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
+
+BAND_ROWS = 128
+
+
+def window_means(images: Float32, weight: Float32, side: int, every: int) -> Float32:
+    """(K, N, M) means of weight times each of the images (K, H, W) over windows of side x side pixels whose
+    middles are every so-manieth row and column, from the first on.
+    """
+    _, height, width = images.shape
+    sums = np.empty((len(images), -(-height // every), -(-width // every)), dtype=np.float32)
+
+    def add(first: int, end: int) -> None:
+        _window_means(images, weight, side // 2, every, sums, first, end)
+
+    in_bands(add, sums.shape[1], 8)
+    return sums
+
+
+@kernel()
+def mirrored(place: int, count: int) -> int:
+    """The place inside 0...count - 1 that `place` is a mirror image of."""
+    while count > 1 and (place < 0 or place >= count):
+        place = -place if place < 0 else 2 * (count - 1) - place
+    return place if count > 1 else 0
+
+
+@kernel()
+def fresh_columns(count: int, width: int, reach: int) -> Float64:
+    """Columns' sums (count, ...) to begin with, one row for each of the roll_* below."""
+    return np.zeros((count, width + 2 * reach + 2 * FLOAT_LANES))
+
+
+@kernel()
+def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> None:
+    """column: see `fresh_columns`; a row ahead comes in, one behind goes."""
+    for x in range(ahead.shape[0]):
+        column[reach + x] += np.float64(ahead[x]) - np.float64(behind[x])
+
+
+@kernel()
+def roll_product(
+    column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
+) -> None:
+    """The same of products."""
+    for x in range(ahead.shape[0]):
+        column[reach + x] += np.float64(ahead[x] * ahead_other[x]) - np.float64(behind[x] * behind_other[x])
+
+
+@kernel()
+def roll_square(
+    column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
+) -> None:
+    """The same of the first times the square of the other."""
+    for x in range(ahead.shape[0]):
+        coming = ahead[x] * ahead_other[x] * ahead_other[x]
+        column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _add_columns(_: Any, column: Any, threes: Any, side: Any, mean: Any, chunks: Any, scale: Any) -> Any:
+    """Sums of `side` columns, times `scale`, for so many chunks of 16 windows. threes: for use inside."""
+    signature = types.void(column, threes, side, mean, chunks, scale)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        side, chunks = arguments[2], arguments[4]
+        index, wide = side.type, ir.VectorType(ir.DoubleType(), FLOAT_LANES)
+        whole = builder.sdiv(side, index(3))
+
+        def columns(at: Any) -> Any:
+            return v.load(v.data(0), at, wide)
+
+        beyond = builder.add(builder.sdiv(side, index(FLOAT_LANES)), index(1))
+        with cgutils.for_range(builder, builder.add(chunks, beyond)) as loop:
+            at = builder.mul(loop.index, index(FLOAT_LANES))
+            one, two, three = (columns(builder.add(at, index(step))) for step in range(3))
+            v.store(builder.fptrunc(v.sum(v.sum(one, two), three), v.floats), v.data(1), at)
+        with cgutils.for_range(builder, chunks) as loop:
+            at = builder.mul(loop.index, index(FLOAT_LANES))
+            (total,) = v.zeros(1)
+            with cgutils.for_range(builder, whole) as inner:
+                v.add_to(
+                    total, v.load(v.data(1), builder.add(at, builder.mul(inner.index, index(3))), v.floats)
+                )
+            with cgutils.for_range(builder, builder.srem(side, index(3))) as inner:
+                last = builder.sub(builder.add(at, side), builder.add(inner.index, index(1)))
+                v.add_to(total, builder.fptrunc(columns(last), v.floats))
+            v.store(v.product(builder.load(total), v.all(arguments[5], v.floats)), v.data(3), at)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@kernel()
+def slide(column: Float64, reach: int, mean: Float32) -> None:
+    """The means (W,) over windows of 2 reach + 1 columns, whose sums are column[reach : reach + W]."""
+    width, side = mean.shape[0], 2 * reach + 1
+    for step in range(1, reach + 1):
+        column[reach - step] = column[reach + mirrored(-step, width)]
+        column[reach + width - 1 + step] = column[reach + mirrored(width - 1 + step, width)]
+    scale, chunks = 1.0 / (side * side), width // FLOAT_LANES
+    threes = np.empty(len(column), dtype=np.float32)
+    _add_columns(column, threes, side, mean, chunks, np.float32(scale))
+    for x in range(chunks * FLOAT_LANES, width):
+        total = 0.0
+        for step in range(side):
+            total += column[x + step]
+        mean[x] = total * scale
+
+
+@kernel(fastmath=True)
+def _window_means(
+    images: Float32, weight: Float32, reach: int, every: int, sums: Float32, first: int, end: int
+) -> None:
+    count, height, width = images.shape
+    scale = np.float32(1.0 / (2 * reach + 1) ** 2)
+    columns = np.empty((count, width), dtype=np.float32)
+    for i in range(first, end):
+        columns[:] = 0
+        for step in range(-reach, reach + 1):
+            y = mirrored(i * every + step, height)
+            for part in range(count):
+                row = columns[part]
+                for x in range(width):
+                    row[x] += weight[y, x] * images[part, y, x]
+        for j in range(sums.shape[2]):
+            for part in range(count):
+                total = np.float32(0)
+                for step in range(-reach, reach + 1):
+                    total += columns[part, mirrored(j * every + step, width)]
+                sums[part, i, j] = scale * total

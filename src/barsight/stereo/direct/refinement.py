@@ -1,0 +1,256 @@
+"""Direct refinement: the disparity that makes both images agree, to a few hundredths of a pixel.
+
+Each step warps the right image with the current disparity and asks every pixel how far it should move
+(Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
+offset of the images are taken off in a window. The first step may see the images at half the size. All but
+the last see them softer and use the mean gradient of both [Malis 2004], which carries them further; the last
+one uses the left gradient alone: an interpolated image's noise falls with the fraction of the disparity, and
+its own gradient turns that into pixel locking.
+
+Gloss: a highlight is constant along a bar but lies behind its surface, so what is constant along the axis
+bends the match. Residual and gradient are therefore split into their mean along the axis and the detail; the
+mean counts only as far as it agrees with the detail: in the ratio of the residual that noise explains to the
+residual that is there. The mean is taken over places alike in grey: a strap or a shadow across the bars would
+turn the highlights beside it into detail.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.errors import ConfigError
+from barsight.stereo.direct.disparity_update import Fit, blend, settle, variances
+from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
+from barsight.stereo.direct.kernels.pyramid import carried_up, halved
+from barsight.stereo.direct.photometric_residuals import compare, lengthen, noise_power, weigh
+from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
+from barsight.stereo.direct.support_regions import MARGIN, axis_means, empty_frame, inside, tile_axes
+from barsight.stereo.sgbm import image_noise
+
+Image = UInt8 | Float32
+
+_BLUR_PX = 0.5
+_FIRST_BLUR_PX = 0.7
+_LONG_STEP_PX = 5
+_SHORT_STEP_PX = 3
+_HALF_STEP_PX = 3
+_HALF_ACROSS = 0.75
+_HALF_HOLD = 4
+"""A pixel at half the size stands for four."""
+_LONGEST_HALF_STEP_PX = 0.4
+"""In pixels of half the size: a longer step takes places beside depth edges to the other side."""
+_LEAST_HALVED_PX = 128
+_ALIKE_BLUR_PX = 1.5
+_HOLD = 0.1
+_HOLD_UNMATCHED = 0.02
+_MOST_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
+"""What steps fall short of counts as noise up to here, measured on rendered planes. Beyond, a sixth of it is
+taken off again, measured on rendered bars: a step that is short by half damps its own noise."""
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """Direct refinement on both images."""
+
+    steps: int = 3
+    """Gauss-Newton steps."""
+    first_at_half_size: bool = False
+    """Whether the first step goes at half the size: a quarter of its work, errors a little larger."""
+    along_px: float = 16.0
+    """The long support along the axis, one sigma."""
+    across_px: float = 1.5
+    """The long support across the axis, one sigma; a bar's curvature limits it."""
+    short_px: float = 3.0
+    """The short support along the axis, for surfaces that the long one can't follow; 0 does without."""
+    short_across_px: float = 2.0
+    """The short support across the axis."""
+    gloss_px: float = 10.0
+    """Length along the axis over which what is constant counts as gloss, one sigma; 0 trusts everything."""
+    alike_grey: float = 20.0
+    """Places along the axis whose grey values differ by this are not one highlight: a strap, a shadow."""
+    gloss_trust: float = 0.02
+    """Weight of the evidence that is constant along the axis, where noise explains its residual."""
+    outlier_grey: float = 8.0
+    """Residual at which a pixel's weight is halved, grey levels."""
+    same_surface_px: float = 1.0
+    """Disparities further apart belong to different surfaces."""
+    window_px: int = 21
+    """Window in which gain and offset are taken off, odd."""
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise ConfigError(f"refinement steps can't be negative, {self.steps} is")
+        if min(self.along_px, self.across_px, self.outlier_grey, self.same_surface_px, self.alike_grey) <= 0:
+            raise ConfigError(
+                "the long support, outlier_grey, same_surface_px and alike_grey must be positive"
+            )
+        if min(self.short_px, self.gloss_px, self.gloss_trust) < 0 or self.short_across_px <= 0:
+            raise ConfigError("the short support and the gloss settings can't be negative")
+        if self.window_px < 3 or self.window_px % 2 == 0:
+            raise ConfigError(f"window_px must be odd and at least 3, not {self.window_px}")
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """disparity_px: (H, W), no NaN. variance_px2: (H, W), what the residual in each support explains."""
+
+    disparity_px: Float32
+    variance_px2: Float32
+
+
+def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
+    """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
+    at_half_size = settings.first_at_half_size and min(left.shape) >= _LEAST_HALVED_PX and settings.steps > 1
+    if at_half_size:
+        start = _after_half_size_step(left, right, start, matched, settings)
+    work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
+    noise = _noise(left, right)
+    variance = np.full_like(start, np.inf)
+    for step in range(int(at_half_size), settings.steps):
+        remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
+        blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
+        variance = work.step(left, right, blur_px, noise * _slope_gain(blur_px), remaining == 0)
+    return Refined(inside(work.disparity, start.shape).copy(), variance)
+
+
+def _after_half_size_step(
+    left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
+) -> Float32:
+    """`start` after a step at half the size with the long support: a quarter of the work, and softer images
+    carry further."""
+    half = replace(
+        settings,
+        along_px=settings.along_px / 2,
+        across_px=settings.across_px * _HALF_ACROSS,
+        gloss_px=settings.gloss_px / 2,
+        same_surface_px=settings.same_surface_px / 2,
+        window_px=max(settings.window_px // 4 * 2 + 1, 3),
+    )
+    small_left, small_right = (halved(image.astype(np.float32)) for image in (left, right))
+    started = np.float32(0.5) * halved(start)
+    work = _Work.of(small_left, started, halved(matched.astype(np.float32)), half, _HALF_HOLD * _HOLD)
+    slope_noise = _noise(small_left, small_right) * _slope_gain(_BLUR_PX)
+    work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
+    fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
+    moved = np.clip(fitted - started, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
+    return carried_up(started, moved, start, settings.same_surface_px)
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What the steps share. usable, its mean over windows, hold: (H, W). The rest are frames."""
+
+    settings: RefinementSettings
+    axes: Float32
+    usable: Float32
+    mean_usable: Float32
+    hold: Float32
+    disparity: Float32
+    residual: Float32
+    slope: Float32
+    trust: Float32
+    alike: Float32
+    weight: Float32
+    pull: Float32
+
+    @classmethod
+    def of(
+        cls, left: Float32, start: Float32, usable: Float32, settings: RefinementSettings, hold: float = _HOLD
+    ) -> _Work:
+        mean_usable = cv2.boxFilter(usable, -1, (settings.window_px, settings.window_px))
+        frames = [empty_frame(start.shape) for _ in range(7)]
+        inside(frames[0], start.shape)[:] = start
+        hold_each = np.float32(hold) * (usable + np.float32(_HOLD_UNMATCHED))
+        return cls(settings, tile_axes(left), usable, mean_usable, hold_each, *frames)
+
+    def step(self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool) -> Float32:
+        """One step of the disparity; its variance. slope_noise: variance of the left image's slope."""
+        shape, side = self.usable.shape, self.settings.window_px
+        short_of, mean_weight = self.pulls(left, right, blur_px, slope_noise, is_last)
+        power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
+        power *= np.minimum(short_of, _MOST_NOISIER - (short_of - _MOST_NOISIER) / _DAMPED)
+        fitted, variance = self._fit(power)
+        before = inside(self.disparity, shape).copy()
+        settle(fitted, self.axes, self.disparity, variance)
+        if is_last:
+            self._complete(before, short_of)
+        return variance
+
+    def pulls(
+        self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool
+    ) -> tuple[Float32, Float32]:
+        """Weights and pulls of this step, weights with the hold. What a step falls short by, and the
+        weights' means over windows, (H, W)."""
+        settings, shape = self.settings, self.usable.shape
+        left_grey = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
+        warped, right_slope = value_and_slope(row_coefficients(right, blur_px), self.disparity, MARGIN)
+        slope = inside(self.slope, shape)
+        slope[:] = row_slope(left, blur_px)
+        if not is_last:
+            slope += right_slope
+            slope *= np.float32(0.5)
+            slope_noise *= 0.5
+        side = settings.window_px
+        compare(left_grey, warped, self.usable, side, settings.outlier_grey, self.residual, self.trust)
+        gloss = settings.gloss_px, settings.gloss_trust
+        evidence = self.residual, self.slope, self.trust
+        weigh(*evidence, self._along(left_grey), side, *gloss, self.weight, self.pull)
+        mean_weight = np.empty(shape, dtype=np.float32)
+        short_of = lengthen(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
+        weight = inside(self.weight, shape)
+        weight += self.hold
+        return short_of, mean_weight
+
+    def _complete(self, before: Float32, short_of: Float32) -> None:
+        """Go the rest of a step that fell short, in the mean over a window: a start that gloss has bent is
+        off as a whole, while each pixel's own rest is mostly noise."""
+        now, side = inside(self.disparity, before.shape), self.settings.window_px
+        moved = cv2.boxFilter(self.usable * (now - before), -1, (side, side))
+        now += (short_of - 1) * moved / (self.mean_usable + np.float32(1e-6))
+
+    def _along(self, grey: Float32) -> tuple[Float32, Float32]:
+        """Means of residual and slope along the axis, (H, W)."""
+        settings, shape = self.settings, grey.shape
+        means = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+        if settings.gloss_px > 0:
+            blurred = cv2.GaussianBlur(grey, (0, 0), _ALIKE_BLUR_PX)
+            np.multiply(blurred, np.float32(1 / settings.alike_grey), out=inside(self.alike, shape))
+            images = self.residual, self.slope, self.trust, self.alike
+            axis_means(*images, self.axes, settings.gloss_px, means)
+        return means
+
+    def _fit(self, power: Float32) -> tuple[Float32, Float32]:
+        settings = self.settings
+        long = self.planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX))
+        if settings.short_px == 0:
+            return long[0], variances(power, long[1])
+        short = self.planes(SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX))
+        return blend(long, short, power, self.usable)
+
+    def planes(self, support: SupportShape) -> Fit:
+        found = np.empty_like(self.usable), np.empty_like(self.usable)
+        # What the weights and pulls were made of isn't needed any more.
+        room = self.residual, self.trust
+        fit_planes(
+            self.disparity, self.weight, self.pull, self.axes, support, self.settings.same_surface_px, room,
+            *found,
+        )  # fmt: skip
+        return found
+
+
+def _noise(left: Image, right: Image) -> float:
+    """Mean variance of both images' noise."""
+    return 0.5 * (image_noise(left) ** 2 + image_noise(right) ** 2)
+
+
+@lru_cache
+def _slope_gain(blur_px: float) -> float:
+    """Variance of `row_slope` per variance of a white noise in the image."""
+    impulse = np.zeros((33, 33), dtype=np.uint8)
+    impulse[16, 16] = 100
+    return float(np.square(row_slope(impulse, blur_px) / 100).sum())

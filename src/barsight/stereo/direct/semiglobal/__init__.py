@@ -1,0 +1,1 @@
+"""Semi-global matching in bytes: the direct method's start."""

@@ -1,0 +1,149 @@
+"""The paths of semi-global matching [Hirschmueller 2008], four at once, in bytes.
+
+A path's values stay below its least value plus the dearest jump, and each step takes the least off, so a byte
+holds them. Candidates are filled up to whole vectors with places that no path takes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from barsight.core.arrays import UInt8, kernel
+from barsight.stereo.direct.kernels.vectors import HALF_LANES, LANES, Vectors, bytes_of, shorts_of
+
+UInt16 = NDArray[np.uint16]
+
+_EDGE_GREY = 8
+_PATHS = 4
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _extend_paths(
+    _: Any, cost: Any, at: Any, paths: Any, before: Any, after: Any, least: Any, ceiling: Any, small: Any,
+    sums: Any, at_sums: Any, places: Any,
+) -> Any:  # fmt: skip
+    """One pixel further along four paths [Hirschmueller 2008, Eq. 13]; returns the least value of each.
+
+    before, after: where each path's values at the pixels before and here begin in `paths`, with one place
+    before the first. least, ceiling: each path's least value before, the same with the dearest jump. The sum
+    of the four is written to `sums`. All arrays are flat.
+    """
+    four = types.Tuple((types.uint8,) * _PATHS)
+    signature = four(cost, at, paths, before, after, least, ceiling, small, sums, at_sums, places)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        starts, ends = v.members(3), v.members(4)
+        lowest = {
+            lanes: [cgutils.alloca_once_value(builder, v.all(255, bytes_of(lanes))) for _ in range(_PATHS)]
+            for lanes in (LANES, HALF_LANES)
+        }
+
+        def extend(offset: Any, lanes: int) -> None:
+            kind = bytes_of(lanes)
+            base, ceilings = [v.all(b, kind) for b in v.members(5)], [v.all(c, kind) for c in v.members(6)]
+            own = v.load(v.data(0), builder.add(arguments[1], offset), kind)
+            total, step = v.all(0, shorts_of(lanes)), v.all(arguments[7], kind)
+            for k in range(_PATHS):
+                below = builder.add(starts[k], offset)
+                same, above = (builder.add(below, below.type(i)) for i in (1, 2))
+                beside = v.least(v.load(v.data(2), below, kind), v.load(v.data(2), above, kind))
+                best = v.least(v.load(v.data(2), same, kind), builder.add(beside, step))
+                value = builder.add(builder.sub(v.least(best, ceilings[k]), base[k]), own)
+                place = builder.add(ends[k], offset)
+                v.store(value, v.data(2), builder.add(place, place.type(1)))
+                builder.store(v.least(builder.load(lowest[lanes][k]), value), lowest[lanes][k])
+                total = builder.add(total, builder.zext(value, total.type))
+            v.store(total, v.data(8), builder.add(arguments[9], offset))
+
+        v.by_chunks(arguments[10], extend)
+        found = [
+            v.least(*(v.least_of(builder.load(lowest[lanes][k])) for lanes in (LANES, HALF_LANES)))
+            for k in range(_PATHS)
+        ]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    return signature, generate
+
+
+@kernel()
+def jump_costs(large: int, least: int) -> UInt8:
+    """(256,) the penalty of a larger change by the grey levels that the image changes there."""
+    jumps = np.empty(256, dtype=np.uint8)
+    for contrast in range(256):
+        jumps[contrast] = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least)
+    return jumps
+
+
+@kernel()
+def fresh_paths(width: int, places: int, small: int) -> UInt8:
+    """Room for the values of `extend_row`: three paths in two rows, one path in two pixels, and zeros for
+    where a path begins; each with a place to either side that no path takes."""
+    side = places + 2
+    paths = np.full((6 * width + 3) * side, 255 - small, dtype=np.uint8)
+    paths[(6 * width + 2) * side :] = 0
+    return paths
+
+
+@kernel()
+def extend_row(
+    cost: UInt8,
+    grey: UInt8,
+    grey_before: UInt8,
+    small: int,
+    jumps: UInt8,
+    is_first: bool,
+    is_odd: bool,
+    backwards: bool,
+    paths: UInt8,
+    leasts: UInt8,
+    sums: UInt16,
+) -> None:
+    """Four paths through one row: along it and from the three neighbours in the row before.
+
+    cost, sums: (W, places). paths, leasts (2, W, 3): kept from row to row.
+    """
+    width, places = cost.shape
+    side = places + 2
+    costs, totals = cost.reshape(-1), sums.reshape(-1)
+    new, old = (1, 0) if is_odd else (0, 1)
+    along, begin = 6 * width * side, (6 * width + 2) * side
+    zero = np.uint8(0)
+    least_along, dearest = zero, jumps[0]
+    for j in range(width):
+        x = width - 1 - j if backwards else j
+        here, at = np.int32(grey[x]), x * places
+        start_a, base_a, top_a = begin, zero, dearest
+        if j > 0:
+            start_a, base_a = along + (1 - (j & 1)) * side, least_along
+            top_a = np.uint8(base_a + jumps[abs(here - np.int32(grey[x + 1 if backwards else x - 1]))])
+        start_l, base_l, top_l = begin, zero, dearest
+        if not is_first and x > 0:
+            start_l, base_l = ((old * 3) * width + x - 1) * side, leasts[old, x - 1, 0]
+            top_l = np.uint8(base_l + jumps[abs(here - np.int32(grey_before[x - 1]))])
+        start_m, base_m, top_m = begin, zero, dearest
+        if not is_first:
+            start_m, base_m = ((old * 3 + 1) * width + x) * side, leasts[old, x, 1]
+            top_m = np.uint8(base_m + jumps[abs(here - np.int32(grey_before[x]))])
+        start_r, base_r, top_r = begin, zero, dearest
+        if not is_first and x < width - 1:
+            start_r, base_r = ((old * 3 + 2) * width + x + 1) * side, leasts[old, x + 1, 2]
+            top_r = np.uint8(base_r + jumps[abs(here - np.int32(grey_before[x + 1]))])
+        found = _extend_paths(
+            costs, at, paths,
+            (start_a, start_l, start_m, start_r),
+            (
+                along + (j & 1) * side, (new * 3 * width + x) * side,
+                ((new * 3 + 1) * width + x) * side, ((new * 3 + 2) * width + x) * side,
+            ),
+            (base_a, base_l, base_m, base_r), (top_a, top_l, top_m, top_r), np.uint8(small), totals, at,
+            places,
+        )  # fmt: skip
+        least_along = found[0]
+        leasts[new, x, 0], leasts[new, x, 1], leasts[new, x, 2] = found[1], found[2], found[3]

@@ -1,0 +1,169 @@
+"""Supports that follow a bar: tiles with an axis, and means along it.
+
+The image is cut into tiles; each has one axis, the direction in which the image changes least. A support is
+a fixed pattern of whole-pixel offsets turned to that axis, so the innermost loop runs along a row of the tile
+and the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`empty_frame`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from barsight.core.arrays import Float32, Int64, kernel
+from barsight.core.parallel import in_bands
+from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
+
+TILE_ROWS = 16
+TILE_COLUMNS = 32
+MARGIN = 48
+_LINE_FLOATS = 16
+BAND_TILES = 16
+"""Rows of tiles that are worked through column by column: what their supports read fits into the cache."""
+_LEAST_COHERENCE = 0.35
+
+
+def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
+    """(tile rows, tile columns, 2) unit vector (x, y) along which the image changes least around each tile.
+
+    From the structure tensor [Foerstner 1987] averaged over scale_px. Where no direction stands out it is the
+    column's, across the baseline: there a mean along the axis costs the match least.
+    """
+    # Half the size is fine enough for a direction, and a quarter of the work.
+    smooth = cv2.resize(
+        cv2.GaussianBlur(image, (0, 0), 1.2), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
+    )
+    slope_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
+    slope_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
+    height, width = image.shape
+    rows = np.minimum(np.arange(-(-height // TILE_ROWS)) * TILE_ROWS + TILE_ROWS // 2, height - 2)
+    columns = np.minimum(np.arange(-(-width // TILE_COLUMNS)) * TILE_COLUMNS + TILE_COLUMNS // 2, width - 2)
+    xx, xy, yy = (
+        cv2.GaussianBlur(product, (0, 0), scale_px / 2)[np.ix_(rows // 2, columns // 2)]
+        for product in (slope_x * slope_x, slope_x * slope_y, slope_y * slope_y)
+    )
+    across = 0.5 * np.arctan2(2 * xy, xx - yy)
+    coherence = np.hypot(xx - yy, 2 * xy) / (xx + yy + np.float32(1e-3))
+    axes = np.stack([-np.sin(across), np.cos(across)], axis=-1).astype(np.float32)
+    axes[coherence < _LEAST_COHERENCE] = (0, 1)
+    return axes
+
+
+def empty_frame(shape: tuple[int, ...]) -> Float32:
+    """Room for an image, with a margin of zeros that every support offset stays within.
+
+    Rows begin with a cache line and take an odd number of them: with most even ones a column's rows compete
+    for a few of the nearest cache's places.
+    """
+    height, width = shape
+    lines = -(-(width + 2 * MARGIN + TILE_COLUMNS) // _LINE_FLOATS) | 1
+    rows, columns = height + 2 * MARGIN + TILE_ROWS, lines * _LINE_FLOATS
+    room = np.zeros(rows * columns + _LINE_FLOATS, dtype=np.float32)
+    first = -room.ctypes.data // room.itemsize % _LINE_FLOATS
+    return room[first : first + rows * columns].reshape(rows, columns)
+
+
+def inside(frame: Float32, shape: tuple[int, ...]) -> Float32:
+    """View of the image in a frame."""
+    return frame[MARGIN : MARGIN + shape[0], MARGIN : MARGIN + shape[1]]
+
+
+def axis_means(
+    first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, sigma_px: float,
+    means: tuple[Float32, Float32],
+) -> None:  # fmt: skip
+    """Weighted Gaussian means of two images along each tile's axis. Frames in, no NaN; (H, W) each out.
+
+    alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at 1), so that
+    a strap or a shadow across the bars has a mean of its own.
+    """
+    steps = np.arange(1, min(int(2.5 * sigma_px), MARGIN - 1) + 1)
+    shares = np.exp(-0.5 * (steps / sigma_px) ** 2).astype(np.float32)
+
+    def work(first_tile: int, end_tile: int) -> None:
+        _axis_means(first, second, weight, alike, axes, steps, shares, *means, first_tile, end_tile)
+
+    in_bands(work, len(axes), BAND_TILES)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _take_means(
+    _: Any, theres: Any, firsts: Any, seconds: Any, weights: Any, middle: Any, offsets: Any, shares: Any,
+    first_mean: Any, second_mean: Any, at: Any,
+) -> Any:  # fmt: skip
+    """The means of the first and of the second image for 16 pixels from `middle` on, written from `at` on.
+    offsets: from a pixel to its support's points on one side; the other side's are mirror images. All arrays
+    are flat."""
+    signature = types.void(
+        theres, firsts, seconds, weights, middle, offsets, shares, first_mean, second_mean, at
+    )
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        v = Vectors(context, builder, signature, arguments)
+        middle = arguments[4]
+        centre, own = v.load(v.data(0), middle, v.floats), v.load(v.data(3), middle, v.floats)
+        totals = v.zeros(3)
+        builder.store(own, totals[0])
+        for total, image in zip(totals[1:], (1, 2), strict=True):
+            builder.store(v.product(own, v.load(v.data(image), middle, v.floats)), total)
+        with cgutils.for_range(builder, v.length(5)) as loop:
+            offset = builder.load(builder.gep(v.data(5), [loop.index]))
+            sides = builder.add(middle, offset), builder.sub(middle, offset)
+            both = [
+                v.product(
+                    v.biweight(v.difference(v.load(v.data(0), there, v.floats), centre)),
+                    v.load(v.data(3), there, v.floats),
+                )
+                for there in sides
+            ]
+            share = v.number(6, loop.index, v.floats)
+            v.add_to(totals[0], v.product(share, v.sum(*both)))
+            for total, image in zip(totals[1:], (1, 2), strict=True):
+                one, other = (
+                    v.product(weight, v.load(v.data(image), there, v.floats))
+                    for weight, there in zip(both, sides, strict=True)
+                )
+                v.add_to(total, v.product(share, v.sum(one, other)))
+        whole = v.sum(builder.load(totals[0]), v.all(1e-6, v.floats))
+        for total, place in zip(totals[1:], (7, 8), strict=True):
+            v.store(v.quotient(builder.load(total), whole), v.data(place), arguments[9])
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@kernel()
+def _axis_means(
+    first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, steps: Int64,
+    shares: Float32, first_mean: Float32, second_mean: Float32, first_tile: int, end_tile: int,
+) -> None:  # fmt: skip
+    height, width = first_mean.shape
+    framed_width = first.shape[1]
+    firsts, seconds, weights, theres = (
+        first.reshape(-1), second.reshape(-1), weight.reshape(-1), alike.reshape(-1),
+    )  # fmt: skip
+    found = np.empty((2, TILE_COLUMNS), dtype=np.float32)
+    one, two = found[0], found[1]
+    offsets = np.empty(len(steps), dtype=np.int64)
+    for tile_x in range(axes.shape[1]):
+        for tile_y in range(first_tile, end_tile):
+            axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
+            for j in range(len(steps)):
+                offsets[j] = round(steps[j] * axis_y) * framed_width + round(steps[j] * axis_x)
+            x0 = tile_x * TILE_COLUMNS
+            count = min(TILE_COLUMNS, width - x0)
+            for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+                middle = (y + MARGIN) * framed_width + x0 + MARGIN
+                for part in range(0, count, FLOAT_LANES):
+                    _take_means(
+                        theres, firsts, seconds, weights, middle + part, offsets, shares, one, two, part
+                    )
+                for i in range(count):
+                    first_mean[y, x0 + i] = one[i]
+                for i in range(count):
+                    second_mean[y, x0 + i] = two[i]

@@ -1,0 +1,1 @@
+"""Bundle detection: headings, layers, crossings, and the best set of fitted outlines."""

@@ -1,0 +1,80 @@
+"""Kinds of bundles: neighbours mostly hold the same bars, so some settle what others leave open."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64
+from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
+
+_ALIKE_LOG = 0.08
+"""Standard deviation of the logarithm of diameters read for one kind of bar."""
+_SHARPNESS = 12.0
+_BONUS = 0.5
+_PRIOR_SHARE = 0.015
+"""How much bars of one kind differ, as a share of the diameter."""
+_LEAST_MEMBERS = 3
+_SAME_WIDTH = 0.2
+_AS_WELL, _AS_WELL_SINGLE, _AS_WELL_THIN = 0.95, 0.85, 0.6
+
+
+def with_company(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64) -> Float64:
+    """Weights, raised by up to a half the more places hold bundles of the same rings and diameter.
+
+    overlaps: (chosen, N) share of the chosen reading's place that each reading wants. A place speaks for
+    every kind that explains it nearly as well as the best does.
+    """
+    if chosen.size == 0:
+        return weights
+    rings = np.array([fit.rings for fit in fits])
+    diameter = np.log([fit.values[DIAMETER] for fit in fits])
+    raised = weights.copy()
+    speaks = np.where((overlaps > 0.5) & (weights > 0), np.maximum(weights, 0), 0.0)
+    speaks = (speaks / speaks.max(axis=1, keepdims=True)) ** _SHARPNESS
+    for k in range(len(fits)):
+        alike = np.exp(-0.5 * ((diameter - diameter[k]) / _ALIKE_LOG) ** 2) * (rings == rings[k])
+        company = float((speaks * alike).max(axis=1).mean())
+        raised[k] *= 1 + _BONUS * company if weights[k] > 0 else 1
+    return raised
+
+
+def other_packings(
+    fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64, resolved_m: float
+) -> list[int | None]:
+    """For each chosen reading the rings of another packing that explains the places of its kind as well.
+
+    weights: as explained, without company. As well: not 5 % less over all those places together; a single
+    bar must lead by 15 %, and bars thinner than resolved_m by 40 %, since a smoothed map flatters them.
+    """
+    rings = np.array([fit.rings for fit in fits])
+    width = np.array([fit.width_m for fit in fits])
+    own = weights[chosen]
+    best = np.zeros((chosen.size, int(rings.max(initial=0)) + 1))
+    for row, k in enumerate(chosen):
+        alike = (overlaps[row] > 0.5) & (np.abs(width - width[k]) < _SAME_WIDTH * width[k])
+        for other in np.unique(rings[alike]):
+            best[row, other] = max(weights[alike & (rings == other)].max(), 0.0)
+    out: list[int | None] = []
+    for k in chosen:
+        same = np.array([_alike(fits[k], fits[j]) for j in chosen])
+        share = best[same].sum(axis=0) / own[same].sum()
+        share[rings[k]] = 0.0
+        thin = fits[k].values[DIAMETER] < resolved_m
+        limit = _AS_WELL_THIN if thin else _AS_WELL_SINGLE if rings[k] == 0 else _AS_WELL
+        out.append(int(share.argmax()) if share.max() > limit else None)
+    return out
+
+
+def _alike(fit: Fit, other: Fit) -> bool:
+    step = np.log(other.values[DIAMETER] / fit.values[DIAMETER])
+    return other.rings == fit.rings and abs(step) < 2.5 * _ALIKE_LOG
+
+
+def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
+    """Median diameter of the bundles of the fit's kind and its sigma; None for fewer than three."""
+    alike = [other.values[DIAMETER] for other in others if _alike(fit, other)]
+    if len(alike) < _LEAST_MEMBERS:
+        return None
+    spread = 1.25 * np.std(alike) / np.sqrt(len(alike))
+    middle = float(np.median(alike))
+    return middle, float(np.hypot(_PRIOR_SHARE * middle, spread))

@@ -1,0 +1,1 @@
+"""Fits of one bundle: outline templates, Gauss-Newton on heights, ends, bars."""

@@ -1,0 +1,79 @@
+"""Single bars: which of a bundle's bars are seen from above, and where each of them lies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64
+from barsight.yard.bundles.fitting.outline import STEP_M, highest_bars, turned_hexagon
+from barsight.yard.bundles.fitting.outline_fit import (
+    AGREES,
+    DIAMETER,
+    ROLL,
+    SLOPE_U,
+    SLOPE_Z,
+    Fit,
+    Found,
+    U,
+    Z,
+)
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.types import Bar
+
+_SEEN_SHARE = 0.3
+_RESOLVED_CELLS = 3.0
+_LOOSE_M = 0.001
+"""How far a bar lies from its place in the packing."""
+
+
+def visible_bars(fit: Fit) -> Int64:
+    """Numbers of the packing's bars of which at least 30 % of the diameter is seen from straight above."""
+    diameter = float(fit.values[DIAMETER])
+    axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
+    highest, _ = highest_bars(axes, diameter / 2, np.arange(-fit.width_m / 2, fit.width_m / 2, STEP_M))
+    counts = np.bincount(highest[highest >= 0], minlength=len(axes))
+    return np.flatnonzero(counts * STEP_M >= _SEEN_SHARE * diameter)
+
+
+def fit_bars(found: Found, settings: BundleSettings) -> tuple[Bar, ...]:
+    """A cylinder for each bar seen from above; none where neither heights nor pictures resolve them.
+
+    The bundle's fit is one of all its cylinders at once: a bar's figures and their covariance follow from the
+    bundle's place, slopes, roll and diameter. Fitted one by one, smoothed heights move bars by 4 mm.
+    """
+    sheet, fit = found.sheet, found.fit
+    diameter = float(fit.values[DIAMETER])
+    if diameter < _RESOLVED_CELLS * sheet.cell_m and found.shades is None:
+        return ()
+    rows = np.flatnonzero(fit.state == AGREES)
+    rows = rows[(rows >= fit.first) & (rows <= fit.last)]
+    if rows.size == 0:
+        return ()
+    ends = sheet.v0_m + sheet.cell_m * rows[[0, -1]]
+    middle = float(ends.mean())
+    u, z = fit.at(middle)
+    axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
+    flat = sheet.to_map(np.array([[fit.values[SLOPE_U], 1.0]]))[0]
+    direction = np.append(flat, fit.values[SLOPE_Z])
+    direction = direction / np.linalg.norm(direction) * (1.0 if flat[1] >= 0 else -1.0)
+    return tuple(
+        Bar(
+            centre_m=np.append(sheet.to_map(np.array([[u + side, middle]]))[0], z + up),
+            direction=direction,
+            diameter_m=diameter,
+            length_m=float(np.ptp(ends)),
+            covariance=_covariance(fit, middle - fit.v_m, side, up, settings),
+        )
+        for side, up in axes[visible_bars(fit)]
+    )
+
+
+def _covariance(fit: Fit, along: float, side: float, up: float, settings: BundleSettings) -> Float64:
+    """(5, 5) of a bar's place across, height, yaw, pitch and diameter."""
+    change = np.zeros((5, 6))
+    change[0, [U, SLOPE_U, ROLL, DIAMETER]] = 1.0, along, -up, side / fit.values[DIAMETER]
+    change[1, [Z, SLOPE_Z, ROLL, DIAMETER]] = 1.0, along, side, up / fit.values[DIAMETER]
+    change[2, SLOPE_U] = change[3, SLOPE_Z] = change[4, DIAMETER] = 1.0
+    own = [settings.shared_lateral_m**2 + _LOOSE_M**2, settings.shared_height_m**2 + _LOOSE_M**2, 0, 0, 0]
+    covariance: Float64 = change @ fit.covariance @ change.T + np.diag(own)
+    return covariance

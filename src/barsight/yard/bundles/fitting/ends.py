@@ -1,0 +1,107 @@
+"""Where a bundle ends, and whether that was seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64
+from barsight.yard.bundles.fitting.bars import visible_bars
+from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
+from barsight.yard.bundles.fitting.outline_fit import DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit
+from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.settings import BundleSettings
+
+_LOOK_M = 1.3
+_PROOF_M = 0.1
+_RAGGED_M = 0.2
+_SOME, _MOST = 0.3, 0.6
+_GROWTH_CELLS = 1.5
+"""A map grows over ends by about one and a half cells."""
+_SEEN_SIGMA_M = 0.012
+"""What is left where all bars end alike: a cell of growth, straps and shadows."""
+_UNEVEN_M = (-0.15, 0.2)
+_ENDS_M = 0.03
+
+
+@dataclass(frozen=True)
+class End:
+    """An end of a bundle at v_m; sigma_m is NaN where the end is open, and `why` says why it is."""
+
+    v_m: float
+    sigma_m: float
+    is_open: bool
+    why: str = ""
+
+
+def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End:
+    """The end at the fit's first (step -1) or last row (step 1).
+
+    It is seen where, over most of the bundle's width and for 0.1 m, the surface beyond lies lower than half
+    the bundle's height. The bars end unevenly, so the end is put a quarter of the way from the last row that
+    agrees to the last that lies little lower, less what a map grows over ends.
+    """
+    row = fit.first if step < 0 else fit.last
+    known, misfit = _beyond(sheet, fit, row, step, settings)
+    cell = sheet.cell_m
+    v = sheet.v0_m + cell * (row + step / 2)
+    deep = -0.5 * fit.width_m
+    ragged = lower = 0
+    for k in range(known.size):
+        if known[k] < _SOME:
+            continue
+        if misfit[k] > 2 * settings.agreement_m:
+            return End(v, float("nan"), True, "something higher lies there")
+        if misfit[k] > deep:
+            ragged = k + 1
+            if ragged * cell > _RAGGED_M:
+                return End(v, float("nan"), True, "the surface goes on at about its height")
+        elif known[k] >= _MOST:
+            lower += 1
+            if lower * cell >= _PROOF_M:
+                spread = ragged * cell
+                end = v + step * (spread / 4 - _GROWTH_CELLS * cell)
+                uneven = _unevenness(sheet, fit, row, step, settings)
+                return End(end, float(np.linalg.norm([_SEEN_SIGMA_M, spread / 6, uneven])), False)
+    return End(v, float("nan"), True, "the map doesn't show what lies beyond")
+
+
+def _unevenness(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
+    """How sure the middle of the visible bars' ends is (m), from how far apart they are."""
+    first, last = (round(reach / sheet.cell_m) for reach in _UNEVEN_M)
+    rows = row + step * np.arange(first, last + 1)
+    rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
+    follows = np.abs(_over(sheet, fit, rows, settings)) < _ENDS_M
+    ends = rows.size - 1 - follows[::-1].argmax(axis=0)[follows.any(axis=0)]
+    if ends.size == 0:
+        return _RAGGED_M
+    spread = sheet.cell_m * float(np.subtract(*np.percentile(ends, [84, 16]))) / 2
+    return float(1.25 * spread / np.sqrt(max(len(visible_bars(fit)), 1)))
+
+
+def _beyond(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSettings) -> tuple[Float64, Float64]:
+    """For each row beyond: the share of the outline that is known, and the median height over it."""
+    rows = row + step * np.arange(1, int(_LOOK_M / sheet.cell_m) + 1)
+    rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
+    over = _over(sheet, fit, rows, settings)
+    known = np.isfinite(over).mean(axis=1)
+    misfit = np.full(rows.size, np.nan)
+    misfit[known > 0] = np.nanmedian(over[known > 0], axis=1)
+    return known, misfit
+
+
+def _over(sheet: Sheet, fit: Fit, rows: Int64, settings: BundleSettings) -> Float64:
+    """(rows, N) measured heights over the outline across most of its width; NaN where unknown."""
+    outline = make_outline(
+        fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
+    )
+    across = np.arange(-0.4 * fit.width_m, 0.4 * fit.width_m, sheet.cell_m)
+    height = outline.seen_m[np.rint((across + outline.reach_m) / STEP_M).astype(int).clip(0, None)]
+    along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+    u = fit.values[0] + fit.values[SLOPE_U] * along[:, None] + across
+    columns = np.rint((u - sheet.u0_m) / sheet.cell_m).astype(int)
+    inside = (columns >= 0) & (columns < sheet.z_m.shape[1])
+    z = np.where(inside, sheet.z_m[rows[:, None], columns.clip(0, sheet.z_m.shape[1] - 1)], np.nan)
+    over: Float64 = z - (fit.values[2] + fit.values[SLOPE_Z] * along)[:, None] - height
+    return over

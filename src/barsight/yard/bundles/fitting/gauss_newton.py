@@ -1,0 +1,170 @@
+"""The inner part of a bundle's fit: Gauss-Newton over the heights under its outline, compiled."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, kernel
+from barsight.yard.bundles.fitting.outline import STEP_M, trace_with_changes
+
+_ROLL, _DIAMETER = 4, 5
+_RIM_M = 0.008
+_STEEPEST = 4.0
+_LEAST_HEIGHTS = 30
+_STILL_M = 1e-5
+_LEAST_SCATTER = 0.04
+"""Of the stated variance."""
+
+
+class Heights(NamedTuple):
+    """The sheet's heights and sigmas, and the rows that count: first, last, stride, the middle's place."""
+
+    z_m: Float32
+    sigma_m: Float32
+    u0_m: float
+    v0_m: float
+    cell_m: float
+    first: int
+    last: int
+    stride: int
+    v_m: float
+
+
+class Rules(NamedTuple):
+    """packing: (bars, 2), see `hexagon`. free: (6,) figures that are sought. widths_m: least, most allowed.
+
+    alike: heights that err as one. common_m: diameter known from elsewhere and its sigma, which
+    is infinite where none is known.
+    """
+
+    packing: Float64
+    width_share: float
+    free: Bool
+    steps: int
+    gate_m: float
+    placing_m: float
+    smoothing_m: float
+    alike: float
+    common_m: tuple[float, float]
+    widths_m: tuple[float, float]
+
+
+@kernel()
+def fit_outline(
+    heights: Heights, start: Float64, rules: Rules
+) -> tuple[bool, Float64, Float64, Float64, float]:
+    """Whether it held, the figures (6,), J'WJ with priors (6, 6), (count, sum w, chi squared), heights alike.
+
+    It does not hold where fewer than 30 heights are left or the width leaves its bounds.
+    """
+    values, alike = start.copy(), rules.alike
+    normal, moments = np.eye(6), np.zeros(3)
+    half = (heights.last - heights.first) * heights.cell_m / 2
+    for _ in range(rules.steps):
+        tables = trace_with_changes(rules.packing, values[_DIAMETER], values[_ROLL], rules.smoothing_m)
+        normal, right, moments = _normal_equations(heights, values, tables, rules.gate_m, rules.placing_m)
+        if moments[0] < _LEAST_HEIGHTS:
+            return False, values, normal, moments, alike
+        # A height's sigma holds what all heights share, too: only what really scatters averages out.
+        alike = rules.alike * max(_LEAST_SCATTER, moments[2] / moments[0])
+        weight = alike / rules.common_m[1] ** 2
+        normal[_DIAMETER, _DIAMETER] += weight
+        right[_DIAMETER] += weight * (rules.common_m[0] - values[_DIAMETER])
+        _hold(normal, values[_DIAMETER], half)
+        change = _step(normal, right, rules.free)
+        change[_ROLL] = min(max(change[_ROLL], -0.1), 0.1)
+        if rules.free[_DIAMETER]:
+            most = 0.05 * values[_DIAMETER]
+            change[_DIAMETER] = min(max(change[_DIAMETER], -most), most + 1e-3)
+        values += change
+        width = values[_DIAMETER] * rules.width_share
+        if not rules.widths_m[0] < width < rules.widths_m[1]:
+            return False, values, normal, moments, alike
+        if max(abs(change[0]), abs(change[_DIAMETER]), abs(change[1]) * half) < _STILL_M:
+            break
+    return True, values, normal, moments, alike
+
+
+@kernel()
+def _hold(normal: Float64, diameter: float, half: float) -> None:
+    """Adds what keeps a step small where the map says nothing of a figure: weak against real evidence."""
+    slope = 0.1 / max(half, 0.1)
+    sigmas = (0.05, slope, 0.05, slope, 0.3, 0.1 * diameter)
+    for k in range(6):
+        normal[k, k] += 1.0 / sigmas[k] ** 2
+
+
+@kernel()
+def _step(normal: Float64, right: Float64, free: Bool) -> Float64:
+    """The change of the free figures, 0 of the others."""
+    table, wanted = normal.copy(), right.copy()
+    for k in range(6):
+        if not free[k]:
+            table[k, :] = 0.0
+            table[:, k] = 0.0
+            table[k, k] = 1.0
+            wanted[k] = 0.0
+    change = np.empty(6)
+    change[:] = np.linalg.solve(table, wanted)
+    return change
+
+
+@kernel()
+def _normal_equations(
+    heights: Heights, values: Float64, tables: Float64, gate: float, placing: float
+) -> tuple[Float64, Float64, Float64]:
+    """J'WJ (6, 6), J'Wr (6,) and (count, sum w, chi squared) of the heights under the outline.
+
+    Along one row the two slopes' columns are the places' times the way along: four sums per row make six.
+    """
+    normal, right, moments = np.zeros((6, 6)), np.zeros(6), np.zeros(3)
+    part, side = np.zeros((4, 4)), np.zeros(4)
+    cell, columns, size = heights.cell_m, heights.z_m.shape[1], tables.shape[1]
+    cosine = 1.0 / np.sqrt(1.0 + values[1] * values[1])
+    reach = size // 2 * STEP_M
+    inner = (reach - _RIM_M) / cosine
+    for j in range(heights.first, heights.last + 1, heights.stride):
+        along = heights.v0_m + cell * j - heights.v_m
+        u = values[0] + values[1] * along - heights.u0_m
+        part[:], side[:] = 0.0, 0.0
+        for i in range(
+            max(int(np.ceil((u - inner) / cell)), 0), min(int((u + inner) / cell), columns - 1) + 1
+        ):
+            z = heights.z_m[j, i]
+            place = ((cell * i - u) * cosine + reach) / STEP_M
+            k = int(place)
+            if z != z or k < 0 or k + 1 >= size:
+                continue
+            share = place - k
+            h = tables[0, k] * (1 - share) + tables[0, k + 1] * share
+            slope = tables[1, k] * (1 - share) + tables[1, k + 1] * share
+            roll, diameter = tables[2, k], tables[3, k]
+            r = z - values[2] - values[3] * along - h
+            if not (abs(r) < gate and abs(slope) <= _STEEPEST and roll == roll and diameter == diameter):
+                continue
+            tukey = (1 - (r / gate) ** 2) ** 2
+            w = tukey / (heights.sigma_m[j, i] ** 2 + (slope * placing) ** 2)
+            row = (-slope * cosine, 1.0, roll, diameter)
+            for a in range(4):
+                side[a] += w * row[a] * r
+                for b in range(a, 4):
+                    part[a, b] += w * row[a] * row[b]
+            moments[0] += tukey
+            moments[1] += w
+            moments[2] += w * r * r
+        _add_row(normal, right, part, side, along)
+    return normal, right, moments
+
+
+@kernel()
+def _add_row(normal: Float64, right: Float64, part: Float64, side: Float64, along: float) -> None:
+    """Spreads a row's sums over place, height, roll and diameter to the figures U ... DIAMETER."""
+    source = (0, 0, 1, 1, 2, 3)
+    times = (1.0, along, 1.0, along, 1.0, 1.0)
+    for a in range(6):
+        right[a] += times[a] * side[source[a]]
+        for b in range(6):
+            p, q = min(source[a], source[b]), max(source[a], source[b])
+            normal[a, b] += times[a] * times[b] * part[p, q]

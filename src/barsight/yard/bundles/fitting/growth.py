@@ -1,0 +1,141 @@
+"""How far a fitted outline follows the map: from a short piece to the whole bundle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, UInt8, kernel
+from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
+from barsight.yard.bundles.fitting.outline_fit import (
+    ABOVE,
+    AGREES,
+    BELOW,
+    DIAMETER,
+    MIXED,
+    ROLL,
+    SLOPE_U,
+    Fit,
+    refine,
+)
+from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.settings import BundleSettings
+
+_AGREE_SHARE = 0.55
+_KNOWN_SHARE = 0.3
+_MOST_ABOVE_M = 0.8
+_MOST_BELOW_M = 0.04
+_MOST_MIXED_M = 0.2
+_MOST_UNKNOWN_M = 0.6
+
+
+def follow(sheet: Sheet, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
+    """How far the outline follows the map from the fit's rows on, at most reach_m further to either side."""
+    outline = make_outline(
+        fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
+    )
+    more = int(reach_m / sheet.cell_m)
+    bounds = max(fit.first - more, 0), min(fit.last + more, sheet.z_m.shape[0] - 1)
+    state, gain = _row_states(
+        sheet.z_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, fit.v_m, fit.values,
+        outline.seen_m, outline.slope, outline.reach_m, settings.agreement_m,
+    )  # fmt: skip
+    runs = np.array([_MOST_UNKNOWN_M, 0.0, _MOST_ABOVE_M, _MOST_BELOW_M, _MOST_MIXED_M]) / sheet.cell_m
+    agreeing = np.flatnonzero(state[fit.first : fit.last + 1] == AGREES)
+    if agreeing.size < 0.5 * (fit.last + 1 - fit.first):
+        return None
+    low = _walk(state, fit.first + int(agreeing[0]), -1, bounds[0], runs)
+    high = _walk(state, fit.first + int(agreeing[-1]), 1, bounds[1], runs)
+    gain[:low] = 0
+    gain[high + 1 :] = 0
+    return replace(fit, first=low, last=high, state=state, gain=gain)
+
+
+@kernel()
+def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int:
+    """The last agreeing row before a run of others gets too long for its kind."""
+    last = start
+    waiting = np.zeros(5)
+    row = start
+    while row != limit:
+        row += step
+        if state[row] == AGREES:
+            last = row
+            waiting[:] = 0
+            continue
+        waiting[state[row]] += 1
+        if (waiting > runs).any():
+            break
+    return last
+
+
+@kernel()
+def _row_states(
+    z: Float32, u0: float, v0: float, cell: float, first: int, last: int, v_middle: float, values: Float64,
+    seen: Float64, slope: Float64, reach: float, agreement: float,
+) -> tuple[UInt8, Float32]:  # fmt: skip
+    """Each row's state and the cells it explains, over the parts of the outline that aren't steep."""
+    rows, columns = z.shape
+    state, gain = np.zeros(rows, np.uint8), np.zeros(rows, np.float32)
+    cosine = 1.0 / np.sqrt(1.0 + values[1] * values[1])
+    size = seen.size
+    for j in range(first, last + 1):
+        along = v0 + cell * j - v_middle
+        u = values[0] + values[1] * along
+        base = values[2] + values[3] * along
+        low = int(np.ceil((u - reach / cosine - u0) / cell))
+        high = int((u + reach / cosine - u0) / cell)
+        count = known = agree = above = below = 0
+        total = 0.0
+        for i in range(low, high + 1):
+            k = int(((u0 + cell * i - u) * cosine + reach) / STEP_M + 0.5)
+            if k < 0 or k >= size or seen[k] != seen[k] or not abs(slope[k]) < 2.0:
+                continue
+            count += 1
+            if i < 0 or i >= columns or z[j, i] != z[j, i]:
+                continue
+            known += 1
+            r = z[j, i] - base - seen[k]
+            total += max(1.0 - (r / agreement) ** 2, -1.0)
+            if abs(r) <= agreement:
+                agree += 1
+            elif r > 0:
+                above += 1
+            else:
+                below += 1
+        if known < _KNOWN_SHARE * count or known == 0:
+            continue
+        if agree >= _AGREE_SHARE * known:
+            state[j] = AGREES
+            gain[j] = total
+        elif above > below and above >= 0.4 * known:
+            state[j] = ABOVE
+        elif below >= 0.4 * known:
+            state[j] = BELOW
+        else:
+            state[j] = MIXED
+    return state, gain
+
+
+def grow(sheet: Sheet, seed: Fit, settings: BundleSettings) -> Fit | None:
+    """From a short piece to the whole bundle: fit, follow, fit again until both ends stand still."""
+    fit = refine(sheet, seed, settings, steps=8, gate_m=3 * settings.agreement_m)
+    if fit is None:
+        return None
+    reach = 0.4
+    limit = np.tan(np.radians(settings.max_skew_deg) * 1.5)
+    for _ in range(12):
+        longer = follow(sheet, fit, settings, reach)
+        if longer is None:
+            return None
+        settled = longer.first == fit.first and longer.last == fit.last
+        refined = refine(sheet, longer, settings, steps=6 if settled else 3)
+        if refined is None or abs(refined.values[SLOPE_U]) > limit:
+            return None
+        fit = refined
+        if settled and reach >= sheet.z_m.shape[0] * sheet.cell_m:
+            return follow(sheet, fit, settings, 0.05)
+        reach = reach * 2 if not settled else np.inf if reach > 1.5 else reach * 2
+        reach = min(reach, sheet.z_m.shape[0] * sheet.cell_m)
+    return follow(sheet, fit, settings, 0.05)

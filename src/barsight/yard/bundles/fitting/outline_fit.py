@@ -1,0 +1,137 @@
+"""A bundle's outline fitted to the map's heights along its whole length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64, UInt8
+from barsight.yard.bundles.fitting.gauss_newton import Heights, Rules, fit_outline
+from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width, hexagon, make_outline
+from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.settings import BundleSettings
+
+U, SLOPE_U, Z, SLOPE_Z, ROLL, DIAMETER = range(6)
+"""Figures of a fit: place across, its slope along, height of the axis, its slope, roll, bars' diameter."""
+UNKNOWN, AGREES, ABOVE, BELOW, MIXED = range(5)
+"""What a row of the map says of a bundle's outline."""
+_ROWS_ENOUGH = 150
+"""Neighbouring rows err alike, so more of them than this only cost time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """An outline that follows the map from row `first` to row `last` of its sheet.
+
+    values: (6,) at v_m, see U ... DIAMETER; covariance: (6, 6). state: (rows,) of the whole sheet. gain:
+    (rows,) cells explained, 0 where the row doesn't agree. rms_m: of the heights about the outline.
+    """
+
+    rings: int
+    v_m: float
+    values: Float64
+    covariance: Float64
+    first: int
+    last: int
+    state: UInt8
+    gain: Float32
+    rms_m: float
+    sigma_m: float
+
+    @property
+    def bars(self) -> int:
+        """Bars of the packing."""
+        return BARS_OF_RINGS[self.rings]
+
+    @property
+    def width_m(self) -> float:
+        """Diameter of the circle around all bars."""
+        return bundle_width(self.rings, self.values[DIAMETER])
+
+    def at(self, v_m: float) -> tuple[float, float]:
+        """Place across and height of the axis at v_m."""
+        along = v_m - self.v_m
+        return self.values[U] + self.values[SLOPE_U] * along, self.values[Z] + self.values[SLOPE_Z] * along
+
+
+@dataclass(frozen=True, eq=False)
+class Shades:
+    """Logarithms of grey levels (N,) at places (N,) across a bundle from its axis: medians along it."""
+
+    places_m: Float64
+    levels: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A fitted outline and the sheet that its figures belong to.
+
+    shades: what the pictures show of its bars, where they settle the packing. doubt: rings of another packing
+    that the pictures would rather have, where they don't settle it.
+    """
+
+    sheet: Sheet
+    fit: Fit
+    shades: Shades | None = None
+    doubt: int | None = None
+
+
+def refine(
+    sheet: Sheet,
+    start: Fit,
+    settings: BundleSettings,
+    steps: int = 6,
+    gate_m: float | None = None,
+    common: tuple[float, float] | None = None,
+) -> Fit | None:
+    """Gauss-Newton over the rows first ... last; None where the outline leaves the map or degenerates.
+
+    The weight of a height falls with its sigma, with the outline's slope (it may lie beside its place) and,
+    by Tukey's biweight, with its misfit over `gate_m`. common: diameter and sigma known from elsewhere.
+    """
+    rows = (max(start.first, 0), min(start.last, sheet.z_m.shape[0] - 1))
+    v_m = sheet.v0_m + sheet.cell_m * (rows[0] + rows[1]) / 2
+    values = start.values.copy()
+    values[U], values[Z] = start.at(v_m)
+    free = np.ones(6, bool)
+    free[ROLL] = start.rings > 0
+    if settings.catalogue_mm:
+        free[DIAMETER] = False
+    half = (rows[1] - rows[0]) * sheet.cell_m / 2
+    free[SLOPE_U] = free[SLOPE_Z] = half > 2 * settings.slice_m
+    stride = 1 + (rows[1] - rows[0]) // _ROWS_ENOUGH
+    alike = settings.correlated_along_m * settings.correlated_across_m / sheet.cell_m**2 / stride
+    width_share = bundle_width(start.rings, 1.0)
+    held, values, normal, moments, alike = fit_outline(
+        Heights(
+            sheet.z_m, sheet.sigma_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, rows[0], rows[1], stride, v_m
+        ),
+        values,
+        Rules(
+            hexagon(start.rings), width_share, free, steps, float(gate_m or 2 * settings.agreement_m),
+            settings.placing_m, settings.smoothing_m, alike, common or (0.0, np.inf),
+            (0.8 * settings.least_single_m, 1.2 * settings.widest_m),
+        ),
+    )  # fmt: skip
+    if not held:
+        return None
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(free, free)] = alike * np.linalg.inv(normal[np.ix_(free, free)])
+    rms, sigma = float(np.sqrt(moments[2] / moments[1])), float(np.sqrt(moments[0] / moments[1]))
+    return replace(
+        start, v_m=v_m, values=values, covariance=covariance, first=rows[0], last=rows[1], rms_m=rms,
+        sigma_m=sigma,
+    )  # fmt: skip
+
+
+def widened(fit: Fit, settings: BundleSettings) -> Fit:
+    """With the error of the width that the map's smoothing leaves: it moves the axis, not the top.
+
+    A single bar's top is half as sure: its highlight is measured as far behind as its flanks grow.
+    """
+    share = settings.packing_share if fit.rings else settings.single_share
+    top_m = float(np.nanmax(make_outline(fit.rings, fit.values[DIAMETER], fit.values[ROLL], 0.0).exact_m))
+    change = np.zeros(6)
+    change[DIAMETER], change[Z] = share * fit.values[DIAMETER], -share * top_m * (1.0 if fit.rings else 0.5)
+    return replace(fit, covariance=fit.covariance + np.outer(change, change))

@@ -1,0 +1,261 @@
+"""What the pictures say of a bundle's bars: the orthophoto is dark along the lines where bars meet.
+
+The shading across a bundle says which packing lies there, which a smoothed surface often can't. With the
+packing known, the surface says how much it smooths, and so how thick the bars are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64, UInt8, kernel
+from barsight.yard.bundles.fitting.outline import (
+    BARS_OF_RINGS,
+    STEP_M,
+    bundle_width,
+    hexagon,
+    highest_bars,
+    turned_hexagon,
+)
+from barsight.yard.bundles.fitting.outline_fit import (
+    AGREES,
+    DIAMETER,
+    ROLL,
+    SLOPE_U,
+    Fit,
+    Found,
+    Shades,
+    U,
+    refine,
+)
+from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.types import HeightMap
+
+_BIN_M = 0.002
+_LEAST_CELLS = 8
+"""A place across the bundle needs so many cells along it for its median."""
+_LEAST_PLACES = 10
+_PIXEL_M = 0.003
+"""Blur by lens and pixel, standard deviation on the surface."""
+_INSIDE = 0.46
+_WIDER = np.arange(-0.04, 0.041, 0.02)
+_SHIFTS_M = np.arange(-0.004, 0.0041, 0.002)
+_ROLLS_RAD = np.radians(np.arange(-6.0, 6.1, 3.0))
+_MOST_REST = 0.4
+"""Of the shades' variance: what the best packing may leave."""
+_MOST_DOUBTING = 0.5
+"""The same for a packing that is not sure, but speaks against the surface's."""
+_SURE = 4.5
+"""Logarithm of how much likelier the best packing must be than the next."""
+_SMOOTHINGS_M = np.array([0.004, 0.007, 0.010, 0.013, 0.016])
+_MOST_SMOOTHED = 8
+
+
+def shades_across(height_map: HeightMap, sheet: Sheet, fit: Fit) -> Shades | None:
+    """The orthophoto's shades over the rows that agree with the fit; None where too little was seen."""
+    if height_map.grey is None:
+        return None
+    rows = np.flatnonzero(fit.state == AGREES)
+    rows = rows[(rows >= fit.first) & (rows <= fit.last)]
+    cell, half = height_map.cell_m, _INSIDE * fit.width_m
+    ends = sheet.v0_m + cell * np.array([fit.first, fit.last])
+    middle = fit.values[U] + fit.values[SLOPE_U] * (ends - fit.v_m)
+    corners = sheet.to_map(
+        np.stack([np.concatenate([middle - half, middle + half]), np.concatenate([ends, ends])], axis=1)
+    )
+    place = (corners - (height_map.x0_m, height_map.y0_m)) / cell
+    low = np.floor(place.min(axis=0)).astype(int).clip(0, None)
+    high = np.ceil(place.max(axis=0)).astype(int) + 1
+    grey = height_map.grey[low[1] : high[1], low[0] : high[0]]
+    row, column = np.nonzero(grey)
+    x = height_map.x0_m + cell * (column + low[0])
+    y = height_map.y0_m + cell * (row + low[1])
+    c, s = np.cos(sheet.heading_rad), np.sin(sheet.heading_rad)
+    v = c * y - s * x
+    beside = (c * x + s * y - fit.values[U] - fit.values[SLOPE_U] * (v - fit.v_m)) / np.hypot(
+        1, fit.values[SLOPE_U]
+    )
+    number = np.rint((v - sheet.v0_m) / cell).astype(int).clip(0, fit.state.size - 1)
+    agrees = np.zeros(fit.state.size, bool)
+    agrees[rows] = True
+    wanted = agrees[number] & (np.abs(beside) < half)
+    places, levels = _medians(beside[wanted], grey[row[wanted], column[wanted]])
+    return Shades(places, levels) if places.size >= _LEAST_PLACES else None
+
+
+def _medians(beside: Float64, grey: UInt8) -> tuple[Float64, Float64]:
+    """Mean place and logarithm of the median grey level of each 2 mm that has enough cells."""
+    number = np.floor(beside / _BIN_M).astype(np.int64)
+    order = np.lexsort((grey, number))
+    first = np.flatnonzero(np.diff(number[order], prepend=np.iinfo(np.int64).min))
+    count = np.diff(first, append=order.size)
+    places = np.add.reduceat(beside[order], first) / count if order.size else np.empty(0)
+    enough = count >= _LEAST_CELLS
+    middle = grey[order][(first + count // 2)[enough]].astype(np.float64)
+    return places[enough], np.log(middle + 5.0)
+
+
+@dataclass(frozen=True)
+class Packing:
+    """What the shades say. rest: share of their variance that the packing leaves; lead: logarithm of how much
+    likelier it is than the next.
+    """
+
+    rings: int
+    diameter_m: float
+    roll_rad: float
+    rest: float
+    lead: float
+
+
+def packing_by_shades(shades: Shades, fit: Fit, cell_m: float, settings: BundleSettings) -> Packing:
+    """The packing whose shading explains most of the shades within the fit's width, place and roll.
+
+    Each visible bar counts as two independent shades: its sides.
+    """
+    tried: list[tuple[float, int, float, float]] = []
+    for rings in range(len(BARS_OF_RINGS)):
+        diameter = fit.width_m / bundle_width(rings, 1.0)
+        if settings.catalogue_mm:
+            known = 1e-3 * np.array(settings.catalogue_mm)
+            diameters = known[np.abs(known / diameter - 1) < -2 * _WIDER[0]]
+        else:
+            diameters = diameter * (1 + _WIDER)
+        rolls = fit.values[ROLL] + (_ROLLS_RAD if rings else np.zeros(1))
+        blur = float(np.hypot(cell_m / np.sqrt(12), _PIXEL_M))
+        if diameters.size:
+            rests = _rests(shades.places_m, shades.levels, hexagon(rings), diameters, rolls, _SHIFTS_M, blur)
+            k = np.unravel_index(int(rests.argmin()), rests.shape)
+            tried.append((float(rests.min()), rings, float(diameters[k[0]]), float(rolls[k[1]])))
+    tried.sort()
+    rest, rings, diameter, roll = tried[0]
+    others = tried[1][0] if len(tried) > 1 else 1.0
+    lead = _visible(rings, diameter, roll) * np.log(others / max(rest, 1e-9))
+    return Packing(rings, diameter, roll, rest, float(lead))
+
+
+@kernel()
+def _rests(
+    places: Float64, levels: Float64, packing: Float64, diameters: Float64, rolls: Float64, shifts: Float64,
+    blur: float,
+) -> Float64:  # fmt: skip
+    """(diameters, rolls) share of the shades' variance that the best shift leaves unexplained.
+
+    The model: round bars lit from above and from a side, both fading smoothly across the bundle.
+    """
+    out = np.ones((diameters.size, rolls.size))
+    spread = levels - levels.mean()
+    total = max((spread * spread).sum(), 1e-12)
+    widest = np.abs(places).max()
+    table, row = np.empty((7, 8)), np.empty(8)
+    for a in range(diameters.size):
+        for b in range(rolls.size):
+            above, aside = _shading(packing, diameters[a], rolls[b], blur)
+            middle = above.size // 2
+            for shift in shifts:
+                table[:] = 0.0
+                for n in range(places.size):
+                    x = (places[n] - shift) / STEP_M + middle
+                    k = min(max(int(x), 0), above.size - 2)
+                    t = min(max(x - k, 0.0), 1.0)
+                    q = places[n] / widest
+                    light = above[k] * (1 - t) + above[k + 1] * t
+                    row[0], row[1], row[2] = 1.0, q, q * q
+                    row[3], row[4], row[5] = light, light * q, light * q * q
+                    row[6] = aside[k] * (1 - t) + aside[k + 1] * t
+                    row[7] = spread[n]
+                    for i in range(7):
+                        for j in range(8):
+                            table[i, j] += row[i] * row[j]
+                for i in range(7):
+                    table[i, i] += 1e-6 * places.size
+                found = np.linalg.solve(table[:, :7].copy(), table[:, 7].copy())
+                rest = total - (found * table[:, 7]).sum()
+                out[a, b] = min(out[a, b], rest / total)
+    return out
+
+
+@kernel()
+def _shading(packing: Float64, diameter: float, roll: float, blur: float) -> tuple[Float64, Float64]:
+    """How much each place faces up, and how much sideways, STEP_M apart about the axis, blurred; 0 beside."""
+    c, s = np.cos(roll), np.sin(roll)
+    radius = diameter / 2
+    half = int((np.abs(packing).max() * diameter + radius) / STEP_M) + 20
+    size = 2 * half + 1
+    top, up, side = np.full(size, -np.inf), np.zeros(size), np.zeros(size)
+    for bar in range(packing.shape[0]):
+        u = diameter * (packing[bar, 0] * c - packing[bar, 1] * s)
+        z = diameter * (packing[bar, 0] * s + packing[bar, 1] * c)
+        for i in range(
+            max(int(np.ceil((u - radius) / STEP_M)) + half, 0),
+            min(int((u + radius) / STEP_M + half), size - 1) + 1,
+        ):
+            turned = (STEP_M * (i - half) - u) / radius
+            rise = np.sqrt(max(1 - turned * turned, 0.0))
+            if z + radius * rise > top[i]:
+                top[i], up[i], side[i] = z + radius * rise, rise, turned
+    reach = int(3 * blur / STEP_M)
+    above, aside = np.zeros(size), np.zeros(size)
+    total = 0.0
+    for k in range(-reach, reach + 1):
+        weight = np.exp(-0.5 * (STEP_M * k / blur) ** 2)
+        total += weight
+        for i in range(max(-k, 0), min(size - k, size)):
+            above[i] += weight * up[i + k]
+            aside[i] += weight * side[i + k]
+    return above / total, aside / total
+
+
+def as_pictured(found: Found, height_map: HeightMap, settings: BundleSettings) -> Found:
+    """The same, fitted again with the packing that the shades show, where they show one surely."""
+    shades = shades_across(height_map, found.sheet, found.fit)
+    if shades is None:
+        return found
+    fit = found.fit
+    packing = packing_by_shades(shades, fit, height_map.cell_m, settings)
+    if packing.rest > _MOST_REST or packing.lead < _SURE:
+        doubts = packing.rest < _MOST_DOUBTING and packing.rings != fit.rings
+        return replace(found, doubt=packing.rings if doubts else None)
+    if packing.rings != fit.rings:
+        values = fit.values.copy()
+        values[DIAMETER], values[ROLL] = packing.diameter_m, packing.roll_rad
+        again = refine(found.sheet, replace(fit, rings=packing.rings, values=values), settings)
+        if again is None:
+            return found
+        fit = again
+    return Found(found.sheet, fit, shades)
+
+
+def _visible(rings: int, diameter_m: float, roll_rad: float) -> int:
+    """How many bars show from above."""
+    axes = turned_hexagon(rings, diameter_m, roll_rad)
+    reach = bundle_width(rings, diameter_m) / 2
+    highest, _ = highest_bars(axes, diameter_m / 2, np.arange(-reach, reach, STEP_M))
+    return int(np.unique(highest[highest >= 0]).size)
+
+
+def seen_smoothing(found: list[Found], settings: BundleSettings) -> float:
+    """How far the map smooths across the bars (m, standard deviation): what fits best where pictures settled
+    the packing. The settings' own where they settled none.
+
+    Without the packing it can't be told: thin bars under little smoothing look like thick ones under much.
+    """
+    known = [one for one in found if one.shades is not None and one.fit.rings > 0]
+    known = known[:: 1 + len(known) // _MOST_SMOOTHED]
+    misfits = []
+    for one in known:
+        tried = [refine(one.sheet, one.fit, replace(settings, smoothing_m=s)) for s in _SMOOTHINGS_M]
+        rms = np.array([np.nan if fit is None else fit.rms_m for fit in tried])
+        misfits.append((rms / np.nanmin(rms)) ** 2)
+    if not misfits:
+        return settings.smoothing_m
+    mean = np.mean(misfits, axis=0)
+    if not np.isfinite(mean).all():
+        return settings.smoothing_m
+    k = int(np.clip(mean.argmin(), 1, mean.size - 2))
+    bend, slope, _ = np.polyfit(_SMOOTHINGS_M[k - 1 : k + 2], mean[k - 1 : k + 2], 2)
+    least = -slope / (2 * bend) if bend > 0 else _SMOOTHINGS_M[mean.argmin()]
+    return float(np.clip(least, _SMOOTHINGS_M[0], _SMOOTHINGS_M[-1]))

@@ -1,0 +1,1 @@
+"""Inventory: bundle files, the stock list and changes between measurements."""

@@ -1,0 +1,139 @@
+"""`bundles.json`: bundles as other programs read them, and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barsight.core.errors import InputError
+from barsight.core.files import atomic_path
+from barsight.core.json_values import DIGITS, json_value
+from barsight.yard.inventory.stock_list import StockMatch
+from barsight.yard.types import Bar, Bundle, BundleSigma
+
+SCHEMA_VERSION = 1
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema of bundles.json."""
+    text = resources.files("barsight.yard").joinpath("schemas/bundles.schema.json").read_text("utf-8")
+    content: dict[str, Any] = json.loads(text)
+    return content
+
+
+def write_bundles(
+    bundles: tuple[Bundle, ...], stock: StockMatch | None, reference: str, target: Path
+) -> None:
+    """bundles.json whole or not at all. reference: the frame, `yard` or `world`."""
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "reference": reference,
+        "bundles": [_record(bundle) for bundle in bundles],
+        "stock": None if stock is None else json_value(asdict(stock), DIGITS),
+    }
+    with atomic_path(target) as path:
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_bundles(path: Path) -> tuple[Bundle, ...]:
+    """Back from bundles.json. Raises InputError where the file is missing, torn or of another version."""
+    remedy = "measure the recording again"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        version = content["schema_version"]
+        if version != SCHEMA_VERSION:
+            raise InputError(path, f"has schema version {version} instead of {SCHEMA_VERSION}", remedy)
+        return tuple(_bundle(record) for record in content["bundles"])
+    except FileNotFoundError as error:
+        raise InputError(path, "no such file", remedy) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
+
+
+def _record(bundle: Bundle) -> dict[str, Any]:
+    sigma = bundle.sigma
+    record = {
+        "id": bundle.id,
+        "axis_centre_m": bundle.centre_m,
+        "direction": bundle.direction,
+        "yaw_deg": float(np.degrees(bundle.yaw_rad)),
+        "pitch_deg": float(np.degrees(bundle.pitch_rad)),
+        "length_m": bundle.length_m,
+        "ends_m": bundle.ends_m,
+        "ends_open": list(bundle.ends_open),
+        "ends_sigma_m": list(bundle.ends_sigma_m),
+        "width_m": bundle.width_m,
+        "top_z_m": bundle.top_z_m,
+        "bar_diameter_m": bundle.bar_diameter_m,
+        "visible_bars": bundle.visible_bars,
+        "bars": bundle.bars,
+        "layer": bundle.layer,
+        "on_top": bundle.on_top,
+        "neighbours": list(bundle.neighbours),
+        "sigma": {
+            "lateral_m": sigma.lateral_m,
+            "along_m": sigma.along_m,
+            "yaw_deg": float(np.degrees(sigma.yaw_rad)),
+            "length_m": sigma.length_m,
+            "width_m": sigma.width_m,
+            "top_z_m": sigma.top_z_m,
+            "bar_diameter_m": sigma.bar_diameter_m,
+        },
+        "known_share": bundle.known_share,
+        "confidence": bundle.confidence,
+        "reasons": list(bundle.reasons),
+        "bar_axes": [
+            {
+                "centre_m": bar.centre_m,
+                "direction": bar.direction,
+                "diameter_m": bar.diameter_m,
+                "length_m": bar.length_m,
+                "covariance": bar.covariance,
+            }
+            for bar in bundle.bar_axes
+        ],
+    }
+    plain: dict[str, Any] = json_value(record, DIGITS)
+    return plain
+
+
+def _bundle(record: dict[str, Any]) -> Bundle:
+    def figure(value: float | None) -> float:
+        return float("nan") if value is None else value
+
+    figures = {name: figure(value) for name, value in record["sigma"].items()}
+    yaw_rad = float(np.radians(figures.pop("yaw_deg")))
+    return Bundle(
+        id=record["id"],
+        centre_m=np.array(record["axis_centre_m"]),
+        yaw_rad=float(np.radians(record["yaw_deg"])),
+        pitch_rad=float(np.radians(record["pitch_deg"])),
+        length_m=record["length_m"],
+        ends_m=np.array(record["ends_m"]),
+        ends_open=(record["ends_open"][0], record["ends_open"][1]),
+        width_m=record["width_m"],
+        top_z_m=record["top_z_m"],
+        bar_diameter_m=record["bar_diameter_m"],
+        visible_bars=record["visible_bars"],
+        bars=record["bars"],
+        layer=record["layer"],
+        on_top=record["on_top"],
+        neighbours=tuple(record["neighbours"]),
+        sigma=BundleSigma(yaw_rad=yaw_rad, **figures),
+        known_share=record["known_share"],
+        confidence=record["confidence"],
+        reasons=tuple(record["reasons"]),
+        ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
+        bar_axes=tuple(
+            Bar(
+                np.array(bar["centre_m"]), np.array(bar["direction"]), bar["diameter_m"], bar["length_m"],
+                np.array(bar["covariance"]),
+            )
+            for bar in record["bar_axes"]
+        ),
+    )  # fmt: skip

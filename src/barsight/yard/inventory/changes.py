@@ -1,0 +1,148 @@
+"""What changed between two measured yards: bundles moved, settled, taken or added, and how sure that is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from barsight.core.arrays import Float64
+from barsight.yard.sections import part_about
+from barsight.yard.stability.stability import look_up
+from barsight.yard.types import Bundle, YardMap
+from barsight.yard.weight import Mass, mass_of
+
+Kind = Literal["same", "moved", "settled", "taken", "added", "not-seen"]
+MOST_MOVE_M = 0.5
+SAME_WIDTH = 0.15
+SIGNIFICANT = 2.576
+"""Sigmas that chance exceeds in one case of a hundred."""
+LEAST_KNOWN = 0.5
+_NO_PAIR = 1e6
+
+
+@dataclass(frozen=True)
+class Change:
+    """One bundle's change. old, new: its ids, None where it isn't there.
+
+    across_mm, along_mm, up_mm, yaw_deg: new minus old, in the old bundle's axes; sigmas: of these four, both
+    measurements'. z: the largest of across, up and yaw over its sigma (along too where both ends were seen).
+    kg, sigma_kg: what was taken (negative) or added; NaN where unknown.
+    """
+
+    kind: Kind
+    old: int | None
+    new: int | None
+    across_mm: float
+    along_mm: float
+    up_mm: float
+    yaw_deg: float
+    sigmas: tuple[float, float, float, float]
+    z: float
+    kg: float
+    sigma_kg: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance would do as much in less than one case of a hundred."""
+        return self.kind in ("taken", "added") or self.z > SIGNIFICANT
+
+
+def compare_yards(
+    old: tuple[Bundle, ...], old_heights: YardMap, new: tuple[Bundle, ...], new_heights: YardMap
+) -> tuple[Change, ...]:
+    """Match the bundles of two maps of one yard and say what changed, in the old ones' order, then the added.
+
+    A bundle that is gone is `taken` only where the new map saw its place, and a new one `added` only where
+    the old map did; else it is `not-seen`.
+    """
+    pairs = _match(old, new)
+    changes = []
+    for k, before in enumerate(old):
+        if k in pairs:
+            changes.append(_change(before, new[pairs[k]]))
+        else:
+            seen = _seen(before, new_heights)
+            changes.append(_alone("taken" if seen else "not-seen", before.id, None, mass_of(before), -1))
+    matched = set(pairs.values())
+    for k, after in enumerate(new):
+        if k not in matched:
+            seen = _seen(after, old_heights)
+            changes.append(_alone("added" if seen else "not-seen", None, after.id, mass_of(after), 1))
+    return tuple(changes)
+
+
+def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
+    """Positions in `new` by those in `old`: least way in all, no way further than MOST_MOVE_M."""
+    if not old or not new:
+        return {}
+    cost = np.full((len(old), len(new)), _NO_PAIR)
+    for i, before in enumerate(old):
+        for j, after in enumerate(new):
+            across, along, up, _ = _moved(before, after)
+            same = abs(after.width_m - before.width_m) < SAME_WIDTH * before.width_m
+            open_end = any(before.ends_open) or any(after.ends_open)
+            way = math.hypot(across, 0.0 if open_end else along, 2 * up)
+            if same and way < MOST_MOVE_M and abs(along) < before.length_m / 2:
+                cost[i, j] = way
+    rows, columns = linear_sum_assignment(cost)
+    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if cost[i, j] < _NO_PAIR}
+
+
+def _moved(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
+    """Across, along, up (m) and yaw (rad), in the old bundle's axes; up is of the top."""
+    away = after.centre_m[:2] - before.centre_m[:2]
+    cos, sin = math.cos(before.yaw_rad), math.sin(before.yaw_rad)
+    turned = (after.yaw_rad - before.yaw_rad + math.pi / 2) % math.pi - math.pi / 2
+    along = float(away @ (-sin, cos))
+    across = float(away @ (cos, sin)) + along * math.tan(turned) / 2
+    return across, along, after.top_z_m - before.top_z_m, turned
+
+
+def _change(before: Bundle, after: Bundle) -> Change:
+    across, along, up, turned = _moved(before, after)
+    a, b = before.sigma, after.sigma
+    sigmas = (
+        math.hypot(a.lateral_m, b.lateral_m), math.hypot(a.along_m, b.along_m),
+        math.hypot(a.top_z_m, b.top_z_m), math.hypot(a.yaw_rad, b.yaw_rad),
+    )  # fmt: skip
+    open_end = any(before.ends_open) or any(after.ends_open)
+    ratios = (
+        _ratio(across, sigmas[0]),
+        0.0 if open_end else _ratio(along, sigmas[1]),
+        _ratio(turned, sigmas[3]),
+    )
+    lifted = _ratio(up, sigmas[2])
+    kind: Kind = "same"
+    if max(ratios) > SIGNIFICANT or (lifted > SIGNIFICANT and up > 0):
+        kind = "moved"
+    elif lifted > SIGNIFICANT:
+        kind = "settled"
+    millimetres = (1e3 * sigmas[0], 1e3 * sigmas[1], 1e3 * sigmas[2], math.degrees(sigmas[3]))
+    return Change(
+        kind, before.id, after.id, 1e3 * across, 1e3 * along, 1e3 * up, math.degrees(turned), millimetres,
+        max(*ratios, lifted), 0.0, 0.0,
+    )  # fmt: skip
+
+
+def _ratio(value: float, sigma: float) -> float:
+    return abs(value) / sigma if sigma > 0 else 0.0
+
+
+def _alone(kind: Kind, old: int | None, new: int | None, mass: Mass, sign: int) -> Change:
+    nan = math.nan
+    return Change(kind, old, new, nan, nan, nan, nan, (nan,) * 4, nan, sign * mass.kg, mass.sigma_kg)
+
+
+def _seen(bundle: Bundle, heights: YardMap) -> bool:
+    """Whether a map saw the place where a bundle lies in the other."""
+    u = np.linspace(-0.4, 0.4, 5) * bundle.width_m
+    v = np.linspace(-0.45, 0.45, 40) * bundle.length_m
+    vv, uu = np.meshgrid(v, u)
+    cos, sin = math.cos(bundle.yaw_rad), math.sin(bundle.yaw_rad)
+    x: Float64 = bundle.centre_m[0] + uu * cos - vv * sin
+    y: Float64 = bundle.centre_m[1] + uu * sin + vv * cos
+    return bool(np.isfinite(look_up(part_about(heights, x, y), x, y)).mean() >= LEAST_KNOWN)

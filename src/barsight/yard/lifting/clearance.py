@@ -1,0 +1,124 @@
+"""Clearance of the magnet: no patch may stand above the faces' plane, and no part may be unseen.
+
+The region is that of the faces and the beam's underside, seen from above, grown by the crane's tolerance and
+by the reach of the stray field.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float64, frozen
+from barsight.yard.lifting.contact import Contact
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.stability.stability import look_up, nearest_cells
+from barsight.yard.types import HeightMap
+from barsight.yard.vetoes import Veto
+
+STEP_M = 0.01
+STRAY_FIELD_M = 0.03
+"""Steel this near to a face or the beam is drawn to it."""
+MAX_RISE_M = 0.012
+"""A patch that the map shows this much above the faces' plane obstructs, by medians over 50 mm squares."""
+MAX_NARROW_RISE_M = 0.020
+"""The same for what is too narrow for those: by medians over 30 mm squares."""
+MIN_PATCH_CELLS = 4
+"""Cells of STEP_M of the smallest patch that counts."""
+MAX_HOLE_M = 0.08
+"""An unseen place narrower than this, with its rim seen below the plane, hides nothing that stands."""
+
+
+def clearance_vetoes(place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact) -> list[Veto]:
+    """Find what obstructs the magnet at its contact plane, and unseen places that could."""
+    slack = np.array([magnet.tolerance.x_m, magnet.tolerance.y_m])
+    along_mm, across_mm = (round(1e3 * float(np.abs(axis) @ slack)) for axis in (place.along, place.across))
+    region = _region(magnet, along_mm, across_mm)
+    v, u = region.grid[..., :1], region.grid[..., 1:]
+    xy = np.array([place.x_m, place.y_m]) + v * place.along + u * place.across
+    slope = np.array([math.tan(contact.pitch_rad), math.tan(contact.roll_rad)])
+    plane = contact.centre_z_m + region.grid @ slope
+    rise = look_up(heights, xy[..., 0], xy[..., 1]) - plane
+    unseen = np.isnan(rise)
+    allowed = np.where(region.faces, MAX_RISE_M, max(magnet.beam.above_faces_m / 2, MAX_RISE_M))
+    unproven = unseen & (_free_up_to(heights, xy) - plane > allowed)
+    return [*_obstructed(np.where(unseen, -np.inf, rise), region), *_unseen(unproven, region)]
+
+
+def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
+    """Upper bounds (m) of what may stand at places (..., 2), by lines of sight; inf where there are none."""
+    if heights.free_m is None:
+        return np.full(xy.shape[:-1], np.inf)
+    column, row, inside = nearest_cells(heights, xy[..., 0], xy[..., 1])
+    return np.where(inside, heights.free_m[row, column], np.inf).astype(np.float64)
+
+
+def _obstructed(rise: Float64, region: Region) -> list[Veto]:
+    """Report the highest connected patch over the plane. rise: (V, U), -inf where unseen."""
+    known = np.maximum(rise, -1.0).astype(np.float32)
+    for side, allowed_m in ((5, MAX_RISE_M), (3, MAX_NARROW_RISE_M)):
+        smooth = cv2.medianBlur(known, side)
+        over = (region.faces | region.beam) & (smooth > allowed_m)
+        _, patch, boxes, _ = cv2.connectedComponentsWithStats(over.astype(np.uint8), connectivity=8)
+        large = np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= MIN_PATCH_CELLS) + 1
+        if large.size:
+            highest = np.where(np.isin(patch, large), smooth, -np.inf)
+            at = np.unravel_index(int(np.argmax(highest)), highest.shape)
+            along, across = region.grid[at]
+            reason = (
+                f"something stands {1e3 * highest[at]:.0f} mm above the faces' plane, {along:+.2f} m along "
+                f"and {across:+.2f} m across the beam, {1e3 * allowed_m:.0f} mm are allowed"
+            )
+            return [Veto("obstructed", reason)]
+    return []
+
+
+def _unseen(unproven: Bool, region: Region) -> list[Veto]:
+    """Report unproven places that are wide enough to hide what stands."""
+    side = round(MAX_HOLE_M / STEP_M)
+    wide = cv2.morphologyEx(unproven.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+    hidden = wide & (region.faces | region.beam)
+    if not hidden.any():
+        return []
+    along, across = region.grid[hidden].mean(axis=0)
+    reason = (
+        f"{1e4 * STEP_M**2 * hidden.sum():.0f} cm2 under the magnet or beside it were not seen, around "
+        f"{along:+.2f} m along and {across:+.2f} m across the beam: what is not known counts as an obstacle"
+    )
+    return [Veto("unknown-under-footprint", reason)]
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """grid: (V, U, 2) places along and across the beam, m. faces, beam: (V, U) cells of each, with margin."""
+
+    grid: Float64
+    faces: Bool
+    beam: Bool
+
+
+@lru_cache(maxsize=64)
+def _region(magnet: Magnet, along_mm: int, across_mm: int) -> Region:
+    """Lay the grid, a hole's width wider than the region, for a crane that may miss by so much."""
+    poles = [(pole.along_m, pole.across_m, pole.length_m / 2, pole.width_m / 2) for pole in magnet.poles]
+    beam = (0.0, 0.0, magnet.beam.length_m / 2, magnet.beam.width_m / 2)
+    long = max(abs(part[0]) + part[2] for part in (*poles, beam))
+    wide = max(abs(part[1]) + part[3] for part in (*poles, beam))
+    turned = math.radians(magnet.tolerance.yaw_deg)
+    more_v = along_mm / 1e3 + STRAY_FIELD_M + turned * wide
+    more_u = across_mm / 1e3 + STRAY_FIELD_M + turned * long
+    v = np.arange(-long - more_v - MAX_HOLE_M, long + more_v + MAX_HOLE_M, STEP_M)
+    u = np.arange(-wide - more_u - MAX_HOLE_M, wide + more_u + MAX_HOLE_M, STEP_M)
+    grid = np.stack(np.meshgrid(v, u, indexing="ij"), axis=-1)
+
+    def covered(part: tuple[float, float, float, float]) -> Bool:
+        away = np.abs(grid - part[:2])
+        return np.asarray((away[..., 0] <= part[2] + more_v) & (away[..., 1] <= part[3] + more_u))
+
+    faces = np.any([covered(pole) for pole in poles], axis=0)
+    return Region(frozen(grid), frozen(faces), frozen(covered(beam)))

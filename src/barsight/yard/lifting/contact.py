@@ -1,0 +1,148 @@
+"""How the magnet's faces lie on what is under them: contact plane, air gaps, pull.
+
+The faces are one rigid plane. Set down, it comes to rest where its middle is lowest: on three points of the
+upper envelope around the middle, or on fewer with the suspension holding it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64, kernel
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.lifting.resting_plane import ALL, POLE, SEEN, U, V, Z, profiles, settle, straighten
+from barsight.yard.types import HeightMap
+
+NEWTON_PER_KG = 9.81
+UPPER = 1.645
+"""Sigmas to a bound that holds in 95 % of cases."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoleContact:
+    """One pole's face. gap_m: mean air gap, least_gap_m: where it is nearest to steel; gap_map_m: (across,
+    along) air gaps, NaN where unknown. contact_share: of the face that lies on steel. unknown_share: of the
+    cells under it that were not seen. z_m: height of its centre. pull_n, pull_low_n: its part of the pull.
+    """
+
+    gap_m: float
+    least_gap_m: float
+    contact_share: float
+    unknown_share: float
+    pull_n: float
+    pull_low_n: float
+    z_m: float
+    gap_map_m: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """How all faces lie. centre_z_m: height of their plane at the magnet's centre, z_m: (P,) at the poles'.
+
+    pitch_rad: rise along the beam; roll_rad: rise across. rests_off_m: how far beside the middle the faces
+    rest, where the suspension's stop holds them, else 0. sigma_m: of the plane over the points.
+    pull_n, pull_low_n: the pull, and its lower bound (95 %). widest_gap_m: the least gap of the pole that is
+    furthest from steel. contact_share: of all faces; unknown_share: the worst pole's.
+    """
+
+    centre_z_m: float
+    z_m: Float64
+    pitch_rad: float
+    roll_rad: float
+    rests_off_m: float
+    sigma_m: float
+    poles: tuple[PoleContact, ...]
+
+    @property
+    def pull_n(self) -> float:
+        """The pull."""
+        return sum(pole.pull_n for pole in self.poles)
+
+    @property
+    def pull_low_n(self) -> float:
+        """Its lower bound (95 %)."""
+        return sum(pole.pull_low_n for pole in self.poles)
+
+    @property
+    def unknown_share(self) -> float:
+        """The worst pole's."""
+        return max(pole.unknown_share for pole in self.poles)
+
+    @property
+    def contact_share(self) -> float:
+        """Of all faces together."""
+        return sum(pole.contact_share for pole in self.poles) / len(self.poles)
+
+    @property
+    def widest_gap_m(self) -> float:
+        """The least gap of the pole that is furthest from steel; infinite where a pole knows none."""
+        return max(pole.least_gap_m for pole in self.poles)
+
+
+def touch(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
+    """Set the magnet down on the map; None where nothing at all is known under it.
+
+    contact_gap_m: a face nearer than this to steel lies on it.
+    """
+    poles = magnet.pole_table
+    shape, points = profiles(heights, place, poles)
+    seen = np.isfinite(points[:, Z])
+    if seen.sum() < 3:
+        return None
+    noise = straighten(points, seen)
+    most = np.tan(np.radians(magnet.limits.roll_deg))
+    u, v, z = (np.ascontiguousarray(points[seen, k]) for k in (U, V, Z))
+    height, roll, pitch, rests_off = settle(u, v, z, noise, most)
+    table, gaps = _gaps(
+        points, height, roll, pitch, noise, contact_gap_m + noise, poles,
+        np.array(magnet.pull.gap_m), np.array(magnet.pull.kilopascal),
+    )  # fmt: skip
+    faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
+    found, first = [], 0
+    for number, (columns, parts) in enumerate(shape):
+        last = first + columns * parts
+        mean, least, share, unknown, pull, pull_low = (float(figure) for figure in table[number])
+        gap_map = gaps[first:last].reshape(columns, parts)
+        face = float(faces[number])
+        found.append(PoleContact(mean, least, share, unknown, pull, pull_low, face, gap_map))
+        first = last
+    return Contact(height, faces, math.atan(pitch), math.atan(roll), rests_off, noise, tuple(found))
+
+
+@kernel()
+def _gaps(
+    points: Float64, height: float, roll: float, pitch: float, noise: float, near: float, poles: Float64,
+    gap_m: Float64, kilopascal: Float64,
+) -> tuple[Float64, Float64]:  # fmt: skip
+    """(P, 6) mean and least gap, shares of contact and unknown cells, pull and its lower bound; (N,) gaps."""
+    table, gaps = np.zeros((len(poles), 6)), np.empty(len(points))
+    counts = np.zeros((len(poles), 4))
+    table[:, 1] = np.inf
+    for k in range(len(points)):
+        own = points[k]
+        p = int(own[POLE])
+        gaps[k] = max(height + roll * own[U] + pitch * own[V] - own[Z], 0.0)
+        counts[p, 0] += 1
+        counts[p, 2] += own[SEEN]
+        counts[p, 3] += own[ALL]
+        if np.isnan(own[Z]):
+            gaps[k] = np.nan
+            continue
+        counts[p, 1] += 1
+        table[p, 0] += gaps[k]
+        table[p, 1] = min(table[p, 1], gaps[k])
+        table[p, 2] += gaps[k] <= near
+        table[p, 4] += np.interp(gaps[k], gap_m, kilopascal)
+        table[p, 5] += np.interp(gaps[k] + UPPER * noise, gap_m, kilopascal)
+    for p in range(len(poles)):
+        area = 1e3 * poles[p, 2] * poles[p, 3] / counts[p, 0]
+        table[p, 0] = table[p, 0] / counts[p, 1] if counts[p, 1] else np.nan
+        table[p, 2] /= counts[p, 0]
+        table[p, 3] = 1 - counts[p, 2] / counts[p, 3]
+        table[p, 4] *= area
+        table[p, 5] *= area
+    return table, gaps

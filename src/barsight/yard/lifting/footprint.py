@@ -1,0 +1,216 @@
+"""Which bundles lie under a magnet's poles, as an integer with its probability.
+
+Poles and bundles are rectangles seen from above; two overlap where no side of either separates them. Each
+overlap has a depth, the depth a sigma (of the bundle's place, yaw, width and ends) and a bound on how much
+the crane's tolerance can change it: the count is as sure as all depths together.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float64, kernel
+from barsight.yard.lifting.magnet import Magnet, Tolerance
+from barsight.yard.types import Bundle
+
+BEYOND_OPEN_END_M = 20.0
+LEAST_SIGMA_M = 0.001
+HEIGHT_SIGMA_M = 0.005
+"""How well a bundle's top line stands for its height under a pole, beside its own sigma."""
+MOST_TOP_SIGMA_M = 0.008
+"""Faces rest on the same map: what all places share of a top's sigma says nothing of heights between them."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the magnet's centre is set down: yard axes; yaw from +Y about Z, as a bundle's."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+    @property
+    def yaw_deg(self) -> float:
+        """The yaw for people and plants."""
+        return math.degrees(self.yaw_rad)
+
+    @property
+    def along(self) -> Float64:
+        """(2,) unit vector along the beam."""
+        return np.array([-np.sin(self.yaw_rad), np.cos(self.yaw_rad)])
+
+    @property
+    def across(self) -> Float64:
+        """(2,) unit vector across the beam."""
+        return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad)])
+
+
+@dataclass(frozen=True, eq=False)
+class BundleTable:
+    """Bundles as arrays, for all at once. Lengths in m.
+
+    centre: (B, 2). along: (B, 2) unit. half: (B, 2) half width, half length. top: (B,) at mid-length, slope:
+    (B,) rise per metre along. sigma: (B, 5) of lateral, along, yaw, half width, half length; NaN is taken as
+    `unknown_sigma`. sigma_top: (B,). open_ends: (B, 2) low-y and high-y end.
+    """
+
+    bundles: tuple[Bundle, ...]
+    centre: Float64
+    along: Float64
+    half: Float64
+    top: Float64
+    slope: Float64
+    sigma: Float64
+    sigma_top: Float64
+    open_ends: Bool
+
+    @classmethod
+    def of(cls, bundles: tuple[Bundle, ...]) -> BundleTable:
+        """A sigma that is unknown counts as 50 mm, 5 mrad: sure enough of nothing."""
+        yaw = np.array([b.yaw_rad for b in bundles])
+        sigma = np.array(
+            [
+                (
+                    b.sigma.lateral_m,
+                    b.sigma.along_m,
+                    b.sigma.yaw_rad,
+                    b.sigma.width_m / 2,
+                    b.sigma.length_m / 2,
+                )
+                for b in bundles
+            ]
+        ).reshape(-1, 5)
+        unknown = np.broadcast_to((0.05, 0.05, 0.005, 0.05, 0.05), sigma.shape)
+        sigma_top = np.array([b.sigma.top_z_m for b in bundles])
+        return cls(
+            bundles,
+            np.array([b.centre_m[:2] for b in bundles]).reshape(-1, 2),
+            np.stack([-np.sin(yaw), np.cos(yaw)], axis=1).reshape(-1, 2),
+            np.array([(b.width_m / 2, b.length_m / 2) for b in bundles]).reshape(-1, 2),
+            np.array([b.top_z_m for b in bundles]),
+            np.tan([b.pitch_rad for b in bundles]),
+            np.where(np.isfinite(sigma), sigma, unknown),
+            np.where(np.isfinite(sigma_top), np.minimum(sigma_top, MOST_TOP_SIGMA_M), 0.05),
+            np.array([b.ends_open for b in bundles], dtype=np.bool_).reshape(-1, 2),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Grip:
+    """What the magnet would take at a placement.
+
+    gripped: positions in the table of the bundles under a pole and within reach. probability: of exactly
+    these. flips: (B,) probability for each bundle that it is wrongly counted in or out.
+    """
+
+    gripped: tuple[int, ...]
+    probability: float
+    flips: Float64
+
+
+def grip(
+    place: Placement, magnet: Magnet, tolerance: Tolerance, table: BundleTable, face_z_m: Float64
+) -> Grip:
+    """Count the bundles under the poles whose top lies within the magnet's reach.
+
+    face_z_m: (P,) height of each pole's face. tolerance: how far off the crane may set down; a hard bound.
+    """
+    if not table.bundles:
+        return Grip((), 1.0, np.empty(0))
+    slack = np.array([tolerance.x_m, tolerance.y_m, np.radians(tolerance.yaw_deg)])
+    flips, taken = _grip(
+        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, face_z_m - magnet.reach_m, slack,
+        table.centre, table.along, table.half, table.top, table.slope, table.sigma, table.sigma_top,
+        table.open_ends,
+    )  # fmt: skip
+    return Grip(tuple(np.flatnonzero(taken).tolist()), float(np.prod(1 - flips)), flips)
+
+
+@kernel()
+def _grip(
+    x: float, y: float, yaw: float, poles: Float64, reach_z: Float64, slack: Float64, centre: Float64,
+    along: Float64, half: Float64, top: Float64, slope: Float64, sigma: Float64, sigma_top: Float64,
+    open_ends: Bool,
+) -> tuple[Float64, Bool]:  # fmt: skip
+    """(B,) probability of a wrong count, and whether each bundle is taken."""
+    count = len(centre)
+    flips, taken = np.zeros(count), np.zeros(count, np.bool_)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    for b in range(count):
+        kept = 1.0
+        # Poles on one side of the middle err together; those on the other by the opposite yaw.
+        added = np.zeros(2)
+        for p in range(len(poles)):
+            px = x - poles[p, 0] * sin + poles[p, 1] * cos
+            py = y + poles[p, 0] * cos + poles[p, 1] * sin
+            dx, dy = px - centre[b, 0], py - centre[b, 1]
+            depth, spread, loose = overlap(
+                dx, dy, cos, sin, poles[p], along[b], half[b, 0], half[b, 1], sigma[b], slack
+            )
+            miss = _below(-max(abs(depth) - loose, 0.0) / spread)
+            if depth <= 0 and (open_ends[b, 0] or open_ends[b, 1]):
+                # Where a bundle's open end may lie under the pole, nobody knows.
+                longer = (open_ends[b, 0] + open_ends[b, 1]) * BEYOND_OPEN_END_M / 2
+                shift = (1.0 * open_ends[b, 1] - 1.0 * open_ends[b, 0]) * BEYOND_OPEN_END_M / 2
+                most = overlap(
+                    dx - shift * along[b, 0], dy - shift * along[b, 1], cos, sin, poles[p], along[b],
+                    half[b, 0], half[b, 1] + longer, sigma[b], slack,
+                )[0]  # fmt: skip
+                if most > 0:
+                    miss = 0.5
+            over = top[b] + (dx * along[b, 0] + dy * along[b, 1]) * slope[b] - reach_z[p]
+            low = _below(-abs(over) / np.hypot(sigma_top[b], HEIGHT_SIGMA_M))
+            under = (1 - miss if depth > 0 else miss) * (1 - low if over > 0 else low)
+            if depth > 0 and over > 0:
+                taken[b] = True
+                kept = min(kept, 1 - under)
+            side = 1 if dx * along[b, 0] + dy * along[b, 1] > 0 else 0
+            added[side] = max(added[side], under)
+        flips[b] = kept if taken[b] else min(added.sum(), 1.0)
+    return flips, taken
+
+
+@kernel()
+def _below(z: float) -> float:
+    """The normal distribution's share below z."""
+    return 0.5 * math.erfc(-z / math.sqrt(2.0))
+
+
+@kernel()
+def overlap(
+    dx: float, dy: float, cos: float, sin: float, pole: Float64, along: Float64, half_width: float,
+    half_length: float, sigma: Float64, slack: Float64,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Depth of a pole's overlap with a bundle (negative is a distance), its sigma and the crane's slack.
+
+    dx, dy: pole's centre minus bundle's. Of the four axes across the rectangles' sides the one with the
+    least overlap counts (separating axes).
+    """
+    best = (np.inf, 1.0, 0.0)
+    away = dx * along[0] + dy * along[1]
+    for axis in range(4):
+        if axis == 0:
+            nx, ny = along[1], -along[0]
+        elif axis == 1:
+            nx, ny = along[0], along[1]
+        elif axis == 2:
+            nx, ny = cos, sin
+        else:
+            nx, ny = -sin, cos
+        side, end = abs(nx * along[1] - ny * along[0]), abs(nx * along[0] + ny * along[1])
+        across, lengthwise = abs(nx * cos + ny * sin), abs(ny * cos - nx * sin)
+        depth = (
+            side * half_width + end * half_length + across * pole[3] / 2 + lengthwise * pole[2] / 2
+            - abs(dx * nx + dy * ny)
+        )  # fmt: skip
+        if depth < best[0]:
+            variance = side**2 * (sigma[0] ** 2 + (away * sigma[2]) ** 2 + sigma[3] ** 2)
+            variance += end**2 * (sigma[1] ** 2 + sigma[4] ** 2) + LEAST_SIGMA_M**2
+            loose = slack[0] * abs(nx) + slack[1] * abs(ny)
+            loose += slack[2] * across * (abs(pole[0]) + pole[2] / 2)
+            loose += slack[2] * lengthwise * (abs(pole[1]) + pole[3] / 2)
+            best = (depth, math.sqrt(variance), loose)
+    return best

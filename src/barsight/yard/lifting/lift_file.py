@@ -1,0 +1,139 @@
+"""`lifts.json`: ranked lift targets and the refused ones, as other programs read them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import InputError
+from barsight.core.files import atomic_path
+from barsight.core.json_values import DIGITS, json_value
+from barsight.yard.lifting.assessment import Lift
+from barsight.yard.lifting.targets import RULE, LiftPlan
+from barsight.yard.stability.stability import Footing
+from barsight.yard.vetoes import Veto
+
+SCHEMA_VERSION = 2
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema of lifts.json."""
+    text = resources.files("barsight.yard").joinpath("schemas/lifts.schema.json").read_text("utf-8")
+    content: dict[str, Any] = json.loads(text)
+    return content
+
+
+def write_lifts(plan: LiftPlan, reference: str, target: Path) -> None:
+    """lifts.json whole or not at all. reference: the frame, `yard` or `world`."""
+    with atomic_path(target) as path:
+        text = json.dumps(lifts_content(plan, reference), indent=1, allow_nan=False)
+        path.write_text(text + "\n", encoding="utf-8")
+
+
+def read_lifts(path: Path) -> dict[str, Any]:
+    """What lifts.json says. Raises InputError where it is missing, torn or of another version."""
+    remedy = "run barsight lifts on the folder"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        version = content["schema_version"]
+    except FileNotFoundError as error:
+        raise InputError(path, "no such file", remedy) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
+    if version != SCHEMA_VERSION:
+        raise InputError(path, f"has schema version {version} instead of {SCHEMA_VERSION}", remedy)
+    lifts: dict[str, Any] = content
+    return lifts
+
+
+def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
+    """What lifts.json says."""
+    content: dict[str, Any] = json_value(
+        {
+            "schema_version": SCHEMA_VERSION,
+            "reference": reference,
+            "captured_from_ns": plan.captured_ns[0] if plan.captured_ns else None,
+            "captured_to_ns": plan.captured_ns[1] if plan.captured_ns else None,
+            "judged_at_ns": plan.judged_at_ns,
+            "rule": RULE,
+            "magnet": asdict(plan.magnet),
+            "settings": asdict(plan.settings),
+            "vetoes": _vetoes(plan.vetoes),
+            "lifts": [_lift(lift, rank) for rank, lift in enumerate(plan.offered, start=1)],
+            "refused": [_lift(lift, None) for lift in plan.refused],
+            "footings": [_footing(footing) for footing in plan.footings],
+            "sides": [asdict(side) for side in plan.sides],
+            "free_places": [asdict(place) for place in plan.free],
+        },
+        DIGITS,
+    )
+    return content
+
+
+def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
+    contact, place = lift.contact, lift.place
+    return {
+        "rank": rank,
+        "target": {
+            "x_m": place.x_m,
+            "y_m": place.y_m,
+            "z_m": contact.centre_z_m if contact else None,
+            "yaw_deg": math.degrees(place.yaw_rad),
+        },
+        "bundles": lift.bundles,
+        "count": lift.count,
+        "count_probability": lift.count_probability,
+        "straddled": lift.straddled,
+        "tolerance": asdict(lift.tolerance),
+        "valid_from_ns": lift.validity.from_ns if lift.validity else None,
+        "valid_until_ns": lift.validity.until_ns if lift.validity else None,
+        "safety": lift.safety,
+        "mass_kg": lift.mass.kg,
+        "mass_sigma_kg": lift.mass.sigma_kg,
+        "pull_n": contact.pull_n if contact else None,
+        "pull_low_n": contact.pull_low_n if contact else None,
+        "pull_needed_n": lift.needed_n,
+        "pitch_deg": math.degrees(contact.pitch_rad) if contact else None,
+        "roll_deg": math.degrees(contact.roll_rad) if contact else None,
+        "contact_sigma_m": contact.sigma_m if contact else None,
+        "contact_share": contact.contact_share if contact else None,
+        "offset_along_m": lift.offset_along_m,
+        "offset_across_m": lift.offset_across_m,
+        "overhang_m": lift.overhang_m,
+        "poles": [
+            {
+                "z_m": pole.z_m,
+                "mean_gap_m": pole.gap_m,
+                "least_gap_m": pole.least_gap_m,
+                "contact_share": pole.contact_share,
+                "unknown_share": pole.unknown_share,
+                "pull_n": pole.pull_n,
+                "gap_map_m": [[_rounded(gap) for gap in row] for row in pole.gap_map_m.T.tolist()],
+            }
+            for pole in (contact.poles if contact else ())
+        ],
+        "vetoes": _vetoes(lift.vetoes),
+    }
+
+
+def _vetoes(vetoes: tuple[Veto, ...]) -> list[dict[str, str]]:
+    return [asdict(veto) for veto in vetoes]
+
+
+def _footing(footing: Footing) -> dict[str, Any]:
+    return {
+        "bundle": footing.bundle,
+        "overhang_m": footing.overhang_m,
+        "overhang_side": footing.overhang_side,
+        "lean_deg": footing.lean_deg,
+        "freeboard_m": footing.freeboard_m,
+        "sides": [asdict(side) for side in footing.sides],
+    }
+
+
+def _rounded(metres: float) -> float | None:
+    return round(metres, 4) if math.isfinite(metres) else None

@@ -1,0 +1,190 @@
+"""Where a rigid plane comes to rest on the map under the poles.
+
+The noise of a map would hold the plane up: heights are medians along the bars, made straighter by a prior.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
+from barsight.core.types import Source
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.types import HeightMap
+
+SEGMENT_M = 0.45
+"""Heights are taken as medians along the bars over this length: bars are straight, noise is not."""
+STEP_M = 0.01
+CORRELATED_CELLS = 5.0
+"""Neighbouring cells share their matching windows: so many count as one."""
+STRAIGHT_M = 0.002
+"""How straight and even bundles are along their bars, one sigma: what the map shows beyond that is mostly the
+map's own error, as long as its sigma explains it."""
+BENT_SIGMA = 3.0
+"""What is this many sigma from straight is taken as it was measured."""
+NEAR_LINE_M = 0.02
+"""A height further than this from its line along the bars has no say in the load's slope."""
+COLUMNS = 8
+U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)
+_STEEPEST = 0.35
+_UNKNOWN, _FILLED = Source.UNKNOWN, Source.FILLED
+
+
+def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list[tuple[int, int]], Float64]:
+    """Columns across and parts along of each pole; (N, COLUMNS) of all: place across and along, median
+    height, scatter, cells seen and in all, the cells' mean sigma, the pole."""
+    shape = [
+        (max(round(width / STEP_M), 2), max(round(length / SEGMENT_M), 1)) for _, _, length, width in poles
+    ]
+    points = np.empty((sum(a * b for a, b in shape), COLUMNS))
+    first = 0
+    for number, (pole, (columns, parts)) in enumerate(zip(poles, shape, strict=True)):
+        points[first : first + columns * parts, POLE] = number
+        _profile(
+            heights.z_m, heights.sigma_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m,
+            place.x_m, place.y_m, np.cos(place.yaw_rad), np.sin(place.yaw_rad), pole, parts, STEP_M,
+            points[first : first + columns * parts],
+        )  # fmt: skip
+        first += columns * parts
+    return shape, points
+
+
+def straighten(points: Float64, seen: Bool) -> float:
+    """Correct the heights, in place, towards a straight load; returns the noise that remains.
+
+    A load's section is the same under all poles but for a slope along. What departs from that, pole by pole
+    and point by point, is weighed by how straight bundles are against how sure the map is.
+    """
+    known = points[seen]
+    cells = max(float(np.median(known[:, SEEN])) / CORRELATED_CELLS, 1.0)
+    noise = float(1.25 * np.median(known[:, SCATTER]) / np.sqrt(cells))
+    _, column = np.unique(np.round(known[:, U], 6), return_inverse=True)
+    points[seen, Z] = _straight(known, column, noise)
+    return float(noise * STRAIGHT_M / np.hypot(STRAIGHT_M, noise))
+
+
+@kernel()
+def _straight(known: Float64, column: Int64, noise: float) -> Float64:
+    """The heights (N,) as they most likely are; column: (N,) number of the place across."""
+    v, z = known[:, V], known[:, Z]
+    pole = known[:, POLE].astype(np.int64)
+    slope = 0.0
+    line = np.zeros(z.size)
+    for _ in range(3):
+        for c in range(column.max() + 1):
+            own = column == c
+            line[own] = np.median(z[own] - slope * v[own])
+        rest_of = z - slope * v - line
+        near = np.abs(rest_of) < NEAR_LINE_M
+        slope += (v[near] * rest_of[near]).sum() / max((v[near] ** 2).sum(), 1e-9)
+    line += slope * v
+    likely = line.copy()
+    for p in range(pole.max() + 1):
+        own = pole == p
+        if not own.any():
+            continue
+        apart = np.median(z[own] - line[own])
+        likely[own] += _likely(apart, np.median(known[own, SIGMA]))
+        for k in np.flatnonzero(own):
+            likely[k] += _likely(z[k] - line[k] - apart, noise)
+    return likely
+
+
+@kernel()
+def _likely(measured: float, sigma: float) -> float:
+    """What a departure of `measured` from straight most likely is."""
+    if abs(measured) > BENT_SIGMA * np.hypot(STRAIGHT_M, sigma):
+        return measured
+    return measured * STRAIGHT_M**2 / (STRAIGHT_M**2 + sigma**2)
+
+
+@kernel()
+def settle(
+    u: Float64, v: Float64, z: Float64, noise: float, most_roll: float
+) -> tuple[float, float, float, float]:
+    """Height at the centre, roll, pitch, and how far beside the middle the faces rest."""
+    height, roll, pitch = rest(u, v, z, most_roll)
+    # The highest of many noisy points is too high.
+    height -= noise
+    rests_off = 0.0
+    if abs(roll) > 0.999 * most_roll:
+        gap = height + roll * u + pitch * v - z
+        rests_off = abs(np.median(u[gap <= gap.min() + noise + 0.0005]))
+    return height, roll, pitch, rests_off
+
+
+@kernel()
+def _profile(
+    z: Float32, sigma: Float32, source: UInt8, x0: float, y0: float, cell: float, x: float, y: float,
+    cos: float, sin: float, pole: Float64, parts: int, step: float, out: Float64,
+) -> None:  # fmt: skip
+    along, across, length, width = pole[0], pole[1], pole[2], pole[3]
+    columns = out.shape[0] // parts
+    samples = max(int(length / parts / step), 1)
+    values = np.empty(samples)
+    for i in range(columns):
+        u = across + width * ((i + 0.5) / columns - 0.5)
+        for k in range(parts):
+            count, unsure = 0, 0.0
+            for m in range(samples):
+                v = along + length * ((k + (m + 0.5) / samples) / parts - 0.5)
+                column = int(np.floor((x + u * cos - v * sin - x0) / cell + 0.5))
+                row = int(np.floor((y + u * sin + v * cos - y0) / cell + 0.5))
+                if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
+                    continue
+                if source[row, column] == _UNKNOWN or source[row, column] == _FILLED:
+                    continue
+                values[count] = z[row, column]
+                unsure += sigma[row, column]
+                count += 1
+            own = out[i * parts + k]
+            own[U], own[V] = u, along + length * ((k + 0.5) / parts - 0.5)
+            own[SEEN], own[ALL], own[SIGMA] = count, samples, unsure / max(count, 1)
+            own[Z] = own[SCATTER] = np.nan
+            if 2 * count >= samples:
+                middle = np.median(values[:count])
+                own[Z] = middle
+                own[SCATTER] = 1.4826 * np.median(np.abs(values[:count] - middle))
+
+
+@kernel()
+def rest(u: Float64, v: Float64, z: Float64, most_roll: float) -> tuple[float, float, float]:
+    """Height at the origin, slope along u and along v of the plane that rests on the points.
+
+    Of all planes on or above the points it has the lowest origin; its slope along u is held within
+    `most_roll`. The height is convex in the slopes: two nested searches find the one lowest place.
+    """
+    low, high = -most_roll, most_roll
+    for _ in range(26):
+        a, b = low + (high - low) * 0.382, low + (high - low) * 0.618
+        at_a, at_b = _rest_along(u, v, z, a), _rest_along(u, v, z, b)
+        if at_a[0] <= at_b[0]:
+            high = b
+        else:
+            low = a
+    roll = (low + high) / 2
+    if most_roll - abs(roll) < 1e-3 * most_roll:
+        roll = most_roll if roll > 0 else -most_roll
+    height, pitch = _rest_along(u, v, z, roll)
+    return height, roll, pitch
+
+
+@kernel()
+def _rest_along(u: Float64, v: Float64, z: Float64, roll: float) -> tuple[float, float]:
+    low, high = -_STEEPEST, _STEEPEST
+    for _ in range(26):
+        a, b = low + (high - low) * 0.382, low + (high - low) * 0.618
+        at_a = at_b = -np.inf
+        for i in range(u.size):
+            left = z[i] - roll * u[i]
+            at_a = max(at_a, left - a * v[i])
+            at_b = max(at_b, left - b * v[i])
+        if at_a <= at_b:
+            high = b
+        else:
+            low = a
+    slope = (low + high) / 2
+    height = -np.inf
+    for i in range(u.size):
+        height = max(height, z[i] - roll * u[i] - slope * v[i])
+    return height, slope

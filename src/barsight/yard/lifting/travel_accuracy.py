@@ -1,0 +1,173 @@
+"""How sure the map's place is along the crane's way, and whether that is enough for a lift there."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import interp1d
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import Failed
+from barsight.core.pose import skew
+from barsight.core.types import CraneSamples, RectifiedCamera, Trajectory
+from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.contact import UPPER
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.vetoes import Veto
+
+ALONGSIDE_M = 1.0
+"""Encoders are held against the map where the crane passed no further than this from the lift."""
+SURE_SIGMAS = 3.0
+"""Encoders this many sigma off the trajectory disagree with it."""
+MOVING_MPS = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Travel:
+    """The frames' way over the yard.
+
+    place_m: (N, 2) the body, x and y. sigma_m: (N, 3) of the ground below it in x, y, z. off_m: (N,) by how
+    much the encoders are off the trajectory, NaN where there are none; what a constant latency explains is
+    taken off. refused_m: (R, 2) where the refused frames must have been. reach_m: how far from the body a
+    frame sees. stamp_ns: (N,) of the frames, rising.
+    """
+
+    place_m: Float64
+    sigma_m: Float64
+    off_m: Float64
+    refused_m: Float64
+    reach_m: float
+    stamp_ns: Int64
+
+    @property
+    def captured_ns(self) -> tuple[int, int] | None:
+        """Stamps of the first and the last placed frame; None without any."""
+        return (int(self.stamp_ns[0]), int(self.stamp_ns[-1])) if self.stamp_ns.size else None
+
+    @classmethod
+    def of(
+        cls, trajectory: Trajectory, crane: CraneSamples | None, shift_ns: int, window_ns: int,
+        range_m: float, camera: RectifiedCamera,
+    ) -> Travel:  # fmt: skip
+        """shift_ns: from the camera's clock to the encoders'. window_ns: of readings that make one place.
+        range_m: the surface's depth below the body.
+        """
+        stamps, places = trajectory.stamp_ns, trajectory.positions_m
+        lever = np.array([0.0, 0.0, -range_m])
+        carry = np.hstack([-skew(lever), np.eye(3)])
+        ground = [np.diag(carry @ frame.covariance @ carry.T) for frame in trajectory.frames]
+        refused = np.array([frame.stamp_ns for frame in trajectory.refused], np.int64)
+        return cls(
+            places[:, :2],
+            np.sqrt(np.maximum(np.array(ground).reshape(-1, 3), 0)),
+            _disagreement(stamps, places, crane, shift_ns, window_ns),
+            _places_at(refused, stamps, places),
+            range_m * float(np.hypot(camera.width, camera.height)) / 2 / camera.focal_px,
+            stamps,
+        )  # fmt: skip
+
+    @classmethod
+    def read(cls, summary: dict[str, Any]) -> Travel | None:
+        """From result.json; None where it doesn't say."""
+        content = summary.get("travel")
+        if not isinstance(content, dict) or content.get("stamp_ns") is None:
+            return None
+        arrays = {
+            name: np.array(content[name], dtype=np.float64)
+            for name in ("place_m", "sigma_m", "off_m", "refused_m")
+        }
+        return cls(
+            arrays["place_m"].reshape(-1, 2), arrays["sigma_m"].reshape(-1, 3), arrays["off_m"].ravel(),
+            arrays["refused_m"].reshape(-1, 2), float(content["reach_m"]),
+            np.array(content["stamp_ns"], dtype=np.int64),
+        )  # fmt: skip
+
+    def content(self) -> dict[str, Any]:
+        """As result.json says it; NaN is left to the writer."""
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+
+
+def _places_at(wanted: Int64, stamps: Int64, places: Float64) -> Float64:
+    """(R, 2) x and y at other stamps, on straight lines between and beyond the placed frames."""
+    if stamps.size < 2:
+        return np.empty((0, 2))
+    way = interp1d(stamps - stamps[0], places[:, :2], axis=0, fill_value="extrapolate")
+    return np.asarray(way(wanted - stamps[0]), dtype=np.float64)
+
+
+def _disagreement(
+    stamps: Int64, places: Float64, crane: CraneSamples | None, shift_ns: int, window_ns: int
+) -> Float64:
+    """(N,) distance of the encoders' place from the body's, without what a constant latency explains."""
+    if crane is None or stamps.size < 2:
+        return np.full(stamps.size, np.nan)
+    off = np.full((stamps.size, 3), np.nan)
+    velocity = np.zeros((stamps.size, 3))
+    for k, stamp in enumerate(stamps.tolist()):
+        fit = fit_position(crane, stamp + shift_ns, window_ns)
+        if not isinstance(fit, Failed):
+            off[k] = fit.position_m + crane.crane_to_body_m - places[k]
+            velocity[k] = fit.velocity_mps
+    speed = np.linalg.norm(velocity, axis=1)
+    moving = np.isfinite(off).all(axis=1) & (speed > MOVING_MPS)
+    if moving.sum() >= 3:
+        late = -(off[moving] * velocity[moving]).sum(axis=1) / speed[moving] ** 2
+        off += velocity * float(np.median(late))
+    size: Float64 = np.linalg.norm(off, axis=1)
+    return size
+
+
+def travel_vetoes(
+    travel: Travel, place: Placement, magnet: Magnet, settings: LiftSettings
+) -> tuple[Veto, ...]:
+    """`trajectory-degraded` where the map's place or height isn't sure enough for this lift."""
+    here = np.array([place.x_m, place.y_m])
+    away = np.linalg.norm(travel.place_m - here, axis=1)
+    near = away < travel.reach_m
+    reasons = []
+    if not near.any():
+        reasons.append(f"no frame was placed within {travel.reach_m:.1f} m of it")
+    else:
+        reasons += _unsure(np.median(travel.sigma_m[near], axis=0), magnet)
+        refused = int((np.linalg.norm(travel.refused_m - here, axis=1) < travel.reach_m).sum())
+        if refused > settings.max_refused_share * (refused + near.sum()):
+            reasons.append(
+                f"{refused} of {refused + near.sum()} frames that see it were refused, "
+                f"{100 * settings.max_refused_share:.0f} % are allowed"
+            )
+    most = min(magnet.tolerance.x_m, magnet.tolerance.y_m)
+    known = np.isfinite(travel.off_m)
+    beyond = known & (travel.off_m > most + SURE_SIGMAS * travel.sigma_m[:, :2].max(axis=1, initial=0))
+    passing = beyond & (np.abs(travel.place_m[:, 0] - place.x_m) < ALONGSIDE_M)
+    if passing.any():
+        reasons.append(
+            f"encoders and map disagree by {1e3 * travel.off_m[passing].max():.0f} mm within "
+            f"{ALONGSIDE_M:g} m of it, {1e3 * most:.0f} mm are allowed"
+        )
+    elif known.any() and beyond[np.flatnonzero(known)[-1]]:
+        last = travel.off_m[np.flatnonzero(known)[-1]]
+        reasons.append(
+            f"at the end of the way encoders and map disagreed by {1e3 * last:.0f} mm: the crane would "
+            f"go beside its target, {1e3 * most:.0f} mm are allowed"
+        )
+    return tuple(Veto("trajectory-degraded", reason) for reason in reasons)
+
+
+def _unsure(sigma: Float64, magnet: Magnet) -> list[str]:
+    """Where the 95 % bound of the map's place is over the crane's tolerance, or its height's over the gap."""
+    out = []
+    for name, one, most in (
+        ("x", sigma[0], magnet.tolerance.x_m),
+        ("y", sigma[1], magnet.tolerance.y_m),
+        ("height", sigma[2], magnet.limits.gap_m),
+    ):
+        if not UPPER * one <= most:
+            out.append(
+                f"near it the trajectory knows {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
+                f"{1e3 * most:.0f} mm are allowed"
+            )
+    return out

@@ -1,0 +1,56 @@
+"""Validity in time: ages count from the frames' capture, never from the time of computing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.vetoes import Veto
+
+MAX_CLOCK_ERROR_NS = NS_PER_S
+"""Frames may be this much ahead of this computer's clock."""
+
+
+@dataclass(frozen=True)
+class Validity:
+    """Stamps (ns, capture clock) between which a lift may be believed."""
+
+    from_ns: int
+    until_ns: int
+
+
+def validity(travel: Travel, place: Placement, settings: LiftSettings) -> Validity | None:
+    """Find the validity of a place: from the last frame that saw it, for `max_age_s`. None if none did."""
+    near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.reach_m
+    if not near.any():
+        return None
+    seen_ns = int(travel.stamp_ns[near].max())
+    return Validity(seen_ns, seen_ns + seconds_to_ns(settings.max_age_s))
+
+
+def age_vetoes(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> tuple[Veto, ...]:
+    """Forbid what was captured too long ago, in the future, or nobody knows when. Stamps in ns since 1970."""
+    if captured_to_ns is None:
+        return (Veto("map-too-old", "when the map was captured is not known"),)
+    ahead_ns = captured_to_ns - now_ns
+    if ahead_ns > MAX_CLOCK_ERROR_NS:
+        reason = f"the last frame is {_span(ahead_ns)} ahead of this computer's clock: set the clocks"
+        return (Veto("map-from-the-future", reason),)
+    if -ahead_ns > seconds_to_ns(settings.max_age_s):
+        allowed = _span(seconds_to_ns(settings.max_age_s))
+        reason = f"the last frame that saw it is {_span(-ahead_ns)} old, {allowed} are allowed"
+        return (Veto("map-too-old", reason),)
+    return ()
+
+
+def _span(duration_ns: int) -> str:
+    minutes = duration_ns / NS_PER_S / 60
+    for unit, length in (("days", 24 * 60.0), ("h", 60.0)):
+        if minutes > 2 * length:
+            return f"{minutes / length:.0f} {unit}"
+    return f"{minutes:.0f} min" if minutes >= 2 else f"{60 * minutes:.0f} s"

@@ -1,0 +1,124 @@
+"""Long yards in stretches: what is held of a map at once doesn't grow with its length."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.mapping.free_space import FreeSpace
+from barsight.mapping.surface.surface import Surface, grey_levels
+from barsight.yard.types import HeightMap, YardMap
+
+WHOLE_M = 60.0
+"""A map up to so long is one stretch."""
+OWN_M, MARGIN_M = 44.0, 8.0
+"""The longest part that is a stretch's own, and what it has of its neighbours' on either side: a bundle whose
+middle is its own lies in it whole if it is not over 13 m long, with a metre to see where it ends."""
+
+
+class PartedMap:
+    """A `YardMap` of which parts are read when they are wanted; the last one is kept.
+
+    read: gives the part of these rows and columns.
+    """
+
+    def __init__(
+        self, x0_m: float, y0_m: float, cell_m: float, shape: tuple[int, int],
+        read: Callable[[slice, slice], HeightMap],
+    ) -> None:  # fmt: skip
+        self.x0_m, self.y0_m, self.cell_m, self.shape = x0_m, y0_m, cell_m, shape
+        self._read = read
+        self._last: tuple[slice, slice, HeightMap] | None = None
+
+    def part(self, rows: slice, columns: slice) -> HeightMap:
+        """A rectangle of the map, by cells from start to stop."""
+        if self._last is None or self._last[:2] != (rows, columns):
+            self._last = None
+            self._last = rows, columns, self._read(rows, columns)
+        return self._last[2]
+
+
+def surface_map(surface: Surface, free: FreeSpace | None = None) -> PartedMap:
+    """All that a surface knows, read from its tiles; free: what lines of sight prove free."""
+    cell_m = surface.cell_m
+
+    def read(rows: slice, columns: slice) -> HeightMap:
+        column, row = surface.columns[0] + columns.start, surface.rows[0] + rows.start
+        layers = surface.window(column, row, columns.stop - columns.start, rows.stop - rows.start)
+        grey = grey_levels(layers.intensity)
+        bounds = None if free is None else free.window(column, row, layers.z_m.shape[1], layers.z_m.shape[0])
+        return HeightMap(
+            column * cell_m, row * cell_m, cell_m,
+            layers.z_m, layers.sigma_m, layers.views, layers.source, grey, bounds,
+        )  # fmt: skip
+
+    return PartedMap(surface.columns[0] * cell_m, surface.rows[0] * cell_m, cell_m, surface.shape, read)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A part of a map, by rows and columns, that is worked on as if it were all. What lies in the rectangle
+    from low_m to high_m (x and y, infinite where the map ends) is its own, the rest its neighbours'."""
+
+    rows: slice
+    columns: slice
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+
+    def owns(self, place_m: Float64, slack_m: float = 0.0) -> bool:
+        """Whether a place (2 or more figures, x and y first) is its own, or no further off than slack_m."""
+        return all(
+            low - slack_m <= at < high + slack_m
+            for low, at, high in zip(self.low_m, place_m[:2], self.high_m, strict=True)
+        )
+
+    def reaches(self, place_m: Float64) -> bool:
+        """Whether a place is its own or in its margin."""
+        return self.owns(place_m, MARGIN_M)
+
+
+def stretches(yard: YardMap) -> list[Stretch]:
+    """A map's stretches; one for a map of up to WHOLE_M."""
+    rows, columns = (_cuts(cells, yard.cell_m) for cells in yard.shape)
+    return [
+        Stretch(
+            held_rows, held_columns,
+            (yard.x0_m + first_x, yard.y0_m + first_y), (yard.x0_m + last_x, yard.y0_m + last_y),
+        )
+        for (held_rows, first_y, last_y), (held_columns, first_x, last_x) in product(rows, columns)
+    ]  # fmt: skip
+
+
+def _cuts(cells: int, cell_m: float) -> list[tuple[slice, float, float]]:
+    """Along one axis: the cells that each stretch holds, and where its own begin and end from the first."""
+    count = 1 if cells * cell_m <= WHOLE_M else int(np.ceil(cells * cell_m / OWN_M))
+    edges = np.linspace(0, cells, count + 1).round().astype(int).tolist()
+    margin = round(MARGIN_M / cell_m)
+    borders = [-np.inf, *(cell_m * (edge - 0.5) for edge in edges[1:-1]), np.inf]
+    return [
+        (slice(max(edges[k] - margin, 0), min(edges[k + 1] + margin, cells)), borders[k], borders[k + 1])
+        for k in range(count)
+    ]
+
+
+def patches(yard: YardMap, cells: int) -> Iterator[tuple[slice, slice]]:
+    """Rows and columns of squares of so many cells that cover a map; smaller at its far ends."""
+    for first, other in product(*(range(0, size, cells) for size in yard.shape)):
+        yield (
+            slice(first, min(first + cells, yard.shape[0])),
+            slice(other, min(other + cells, yard.shape[1])),
+        )
+
+
+def part_about(yard: YardMap, x_m: Float64, y_m: Float64) -> HeightMap:
+    """The part that holds these places, or the nearest cells where they lie beyond the map."""
+    cuts = []
+    for at, first, size in ((y_m, yard.y0_m, yard.shape[0]), (x_m, yard.x0_m, yard.shape[1])):
+        cell = (np.array([at.min(), at.max()]) - first) / yard.cell_m
+        low, high = np.clip([np.floor(cell[0]), np.ceil(cell[1])], 0, size - 1).astype(int).tolist()
+        cuts.append(slice(low, high + 1))
+    return yard.part(cuts[0], cuts[1])

@@ -1,0 +1,1 @@
+"""Stability of the pile: its sides, supports and overhangs."""

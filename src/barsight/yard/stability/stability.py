@@ -1,0 +1,204 @@
+"""How the pile stands: its sides, what carries each bundle, what leans, how far stanchions reach.
+
+From above only tops are seen. What a bundle stands on is inferred from what shows beside it: where the layer
+below sticks out on one side by less than half a bundle and nothing shows on the other, the bundle stands that
+much over the other side's edge.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.types import Source
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.contact import UPPER
+from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.vetoes import Veto
+
+STEP_M = 0.01
+LOOK_M = 1.5
+STATIONS = 40
+DUNNAGE_M = 0.3
+"""The thickest dunnage that may lie between two layers."""
+LEAST_LEDGE_M = 0.03
+LEAST_KNOWN = 0.3
+BESIDE_M = 0.3
+
+
+@dataclass(frozen=True)
+class Side:
+    """What lies beside a bundle. drop_m: from its top to the lowest place within 1.5 m; run_m: from its edge
+    to that place's beginning; slope_deg: of the line between (90 is sheer); ledge_m: how far what lies below
+    the bundle shows beyond its edge; known_share: of the places looked at. NaN where unknown.
+    """
+
+    drop_m: float
+    run_m: float
+    slope_deg: float
+    ledge_m: float
+    known_share: float
+
+
+@dataclass(frozen=True)
+class Footing:
+    """How a bundle stands. sides: towards low and high x. overhang_m: over the edge of what carries it,
+    towards (overhang_side: -1 low x, 1 high x, 0 none), NaN where it can't be told; lean_deg: of the side
+    below it. freeboard_m: lowest stanchion beside it over its top, NaN where there is none.
+    """
+
+    bundle: int
+    sides: tuple[Side, Side]
+    overhang_m: float
+    overhang_side: int
+    lean_deg: float
+    freeboard_m: float
+
+
+def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> tuple[Footing, ...]:
+    """How each bundle stands, in the bundles' order."""
+    return tuple(_footing(heights, bundle, settings) for bundle in bundles)
+
+
+def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Footing:
+    low, high = (_side(_profile(heights, bundle, sign), bundle) for sign in (-1, 1))
+    overhang, side, lean = math.nan, 0, 0.0
+    if bundle.layer > 0:
+        for sign, outer, inner in ((-1, low, high), (1, high, low)):
+            stands_over = outer.ledge_m < LEAST_LEDGE_M and _is_free(outer, bundle)
+            shifted = LEAST_LEDGE_M <= inner.ledge_m < 0.5 * bundle.width_m + LEAST_LEDGE_M
+            if stands_over and shifted and _is_free(inner, bundle):
+                overhang, side = inner.ledge_m, sign
+                lean = math.degrees(math.atan2(inner.run_m, inner.drop_m))
+            elif stands_over and inner.ledge_m < LEAST_LEDGE_M and _is_free(inner, bundle):
+                overhang = 0.0
+    tops = [
+        z - bundle.top_z_m
+        for x, y, z in settings.stanchions
+        if _distance(bundle, x, y) < settings.beside_stanchion_m
+    ]
+    return Footing(bundle.id, (low, high), overhang, side, lean, min(tops, default=math.nan))
+
+
+def _is_free(side: Side, bundle: Bundle) -> bool:
+    """Whether the surface beside the bundle falls below what it stands on."""
+    return side.drop_m > 1.2 * bundle.width_m
+
+
+def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
+    """(N, 2) median height of the seen cells and their share, from the edge outwards every STEP_M."""
+    out = bundle.width_m / 2 + np.arange(0, LOOK_M, STEP_M)
+    along = np.linspace(-0.45, 0.45, STATIONS) * bundle.length_m
+    cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
+    x = bundle.centre_m[0] + sign * out[:, None] * cos - along[None] * sin
+    y = bundle.centre_m[1] + sign * out[:, None] * sin + along[None] * cos
+    z = look_up(heights, x, y) - along[None] * np.tan(bundle.pitch_rad)
+    known = np.isfinite(z)
+    filled = np.where(known, z, np.inf)
+    ordered = np.sort(filled, axis=1)
+    count = known.sum(axis=1)
+    middle = ordered[np.arange(len(out)), np.maximum(count - 1, 0) // 2]
+    return np.stack([np.where(count > 0, middle, np.nan), count / STATIONS], axis=1)
+
+
+def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, Int64, Bool]:
+    """Columns and rows of the nearest cells, and whether they lie in the map; (0, 0) where not."""
+    column = np.floor((x - heights.x0_m) / heights.cell_m + 0.5).astype(np.int64)
+    row = np.floor((y - heights.y0_m) / heights.cell_m + 0.5).astype(np.int64)
+    rows, columns = heights.z_m.shape
+    inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
+    return np.where(inside, column, 0), np.where(inside, row, 0), inside
+
+
+def look_up(heights: HeightMap, x: Float64, y: Float64) -> Float64:
+    """Heights of the nearest cells; NaN where they were not seen."""
+    column, row, inside = nearest_cells(heights, x, y)
+    source = heights.source[row, column]
+    seen = inside & (source != Source.UNKNOWN) & (source != Source.FILLED)
+    return np.where(seen, heights.z_m[row, column], np.nan).astype(np.float64)
+
+
+def _side(profile: Float64, bundle: Bundle) -> Side:
+    z, known = profile[:, 0], profile[:, 1] >= LEAST_KNOWN
+    share = float(profile[:, 1].mean())
+    if known.sum() < 10:
+        return Side(math.nan, math.nan, math.nan, math.nan, share)
+    # The bundle's own shoulder and its neighbour's may show in the first centimetres.
+    z = np.where(known, z, np.nan)
+    lowest = float(np.nanmin(z))
+    drop = bundle.top_z_m - lowest
+    run = float(np.flatnonzero(np.nan_to_num(z, nan=np.inf) <= lowest + 0.05)[0]) * STEP_M
+    slope = math.degrees(math.atan2(drop, run))
+    base = bundle.top_z_m - bundle.width_m
+    floor_of_layer = base - DUNNAGE_M / 2 - 0.5 * bundle.width_m
+    shows = np.flatnonzero(~(np.nan_to_num(z, nan=-np.inf) > max(floor_of_layer, 0.05)))
+    ledge = float(shows[0] if shows.size else len(z)) * STEP_M
+    return Side(drop, run, slope, ledge, share)
+
+
+def _distance(bundle: Bundle, x: float, y: float) -> float:
+    """From a place to the bundle's outline, seen from above."""
+    away = np.array([x, y]) - bundle.centre_m[:2]
+    cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
+    beside = abs(away @ (cos, sin)) - bundle.width_m / 2
+    beyond = abs(away @ (-sin, cos)) - bundle.length_m / 2
+    return math.hypot(max(float(beside), 0.0), max(float(beyond), 0.0))
+
+
+def footing_vetoes(
+    target: Bundle, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
+) -> tuple[Veto, ...]:
+    """What in the pile speaks against lifting this bundle."""
+    by_id = {footing.bundle: footing for footing in standing}
+    vetoes = []
+    own = by_id[target.id]
+    limit = settings.max_overhang_share * target.width_m
+    upper = own.overhang_m + UPPER * _sure(target.sigma.width_m / 2)
+    if own.overhang_m > 0.5 * target.width_m:
+        vetoes.append(
+            Veto("no-support", f"what carries it ends {1e3 * own.overhang_m:.0f} mm before its edge, "
+                 f"its middle is not carried")
+        )  # fmt: skip
+    elif own.overhang_side and upper > limit:
+        vetoes.append(
+            Veto("overhanging", f"it stands {1e3 * own.overhang_m:.0f} mm over the edge of what carries it, "
+                 f"{1e3 * limit:.0f} mm are allowed")
+        )  # fmt: skip
+    if own.lean_deg > settings.max_lean_deg:
+        vetoes.append(
+            Veto("unstable-side", f"the side of the pile below it leans by {own.lean_deg:.1f} deg, "
+                 f"{settings.max_lean_deg:g} are allowed")
+        )  # fmt: skip
+    if own.freeboard_m < settings.least_freeboard_m:
+        vetoes.append(
+            Veto("over-stanchion", f"the stanchion beside it is {1e3 * own.freeboard_m:.0f} mm above its "
+                 f"top, {1e3 * settings.least_freeboard_m:.0f} mm are needed")
+        )  # fmt: skip
+    for other in bundles:
+        leaning = by_id[other.id]
+        if other.id == target.id or not leaning.overhang_side or not _beside(target, other):
+            continue
+        towards = np.sign(target.centre_m[0] - other.centre_m[0]) == leaning.overhang_side
+        over = leaning.overhang_m > settings.max_overhang_share * other.width_m
+        if towards and (over or leaning.lean_deg > settings.max_lean_deg):
+            vetoes.append(
+                Veto("unstable-side", f"bundle {other.id} stands {1e3 * leaning.overhang_m:.0f} mm over the "
+                     f"edge on this side")
+            )  # fmt: skip
+    return tuple(vetoes)
+
+
+def _sure(sigma: float) -> float:
+    return sigma if math.isfinite(sigma) else 0.05
+
+
+def _beside(one: Bundle, other: Bundle) -> bool:
+    """Whether the outlines come nearer than BESIDE_M sideways and overlap along."""
+    away = other.centre_m[:2] - one.centre_m[:2]
+    cos, sin = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
+    clear = abs(away @ (cos, sin)) - (one.width_m + other.width_m) / 2
+    along = (one.length_m + other.length_m) / 2 - abs(away @ (-sin, cos))
+    return bool(clear < BESIDE_M and along > 0)
