@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.boards.board import Board, parse_board
 from barsight.calibration.boards.board_views import BoardView, Corners
 from barsight.calibration.files.euroc import write_imu, write_rig
-from barsight.calibration.files.yaml_document import ImuNoise
 from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
 from barsight.core.types import ImuSamples

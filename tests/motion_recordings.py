@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.files.yaml_document import ImuNoise
 from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples

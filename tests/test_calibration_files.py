@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.files.euroc import read_imu, read_rig, write_imu, write_rig
 from barsight.calibration.files.kalibr import read_camchain, read_imu_file, write_camchain, write_imu_file
-from barsight.calibration.files.yaml_document import ImuNoise, canonical_pose, read_document
+from barsight.calibration.files.yaml_document import canonical_pose, read_document
 from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError
 from recording_samples import NOISE, camera_yaml, mounts, real

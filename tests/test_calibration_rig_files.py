@@ -12,7 +12,7 @@ from barsight.calibration.files.yaml_document import canonical_pose
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.calibration.stereo.calibration import calibrate_stereo
+from barsight.calibration.stereo.calibration import calibrate_stereo, rig_file_section
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
 from barsight.calibration.stereo.projection_uncertainty import depth_sigma
 from barsight.cli.main import run
@@ -49,7 +49,7 @@ def test_every_format_reads_back(tmp_path: Path, form: RigFormat, name: str, dis
 
 def test_a_calibrations_covariance_comes_back(tmp_path: Path) -> None:
     calibration = calibrate_stereo(simulated(4), BOARD, Lens.RADTAN5, (SIZE, SIZE), Path("simulated"))
-    write_rig_file(tmp_path / "rig.yaml", calibration.rig, calibration)
+    write_rig_file(tmp_path / "rig.yaml", calibration.rig, rig_file_section(calibration))
     found = read_covariance(tmp_path / "rig.yaml")
     assert found is not None
     assert found[0] == calibration.parameter_names
@@ -119,7 +119,7 @@ def test_export_command(tmp_path: Path) -> None:
 def test_a_covariance_gives_the_shared_disparity_error(tmp_path: Path) -> None:
     """As the calibration's own depth uncertainty has it, and None where nothing is known."""
     calibration = calibrate_stereo(simulated(3), BOARD, Lens.RADTAN4, (SIZE, SIZE), Path("views"), [])
-    write_rig_file(tmp_path / "rig.yaml", calibration.rig, calibration)
+    write_rig_file(tmp_path / "rig.yaml", calibration.rig, rig_file_section(calibration))
     write_rig_file(tmp_path / "bare.yaml", calibration.rig)
     sigma_m = depth_sigma(calibration, [2.0])[0, 0]
     expected = sigma_m * calibration.rig.cam0.fx_px * calibration.rig.baseline_m / 2.0**2

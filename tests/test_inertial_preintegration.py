@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
 from barsight.core.types import ImuSamples
 from barsight.inertial.model import BodyState, ImuBias, corrected, integrate_slowly

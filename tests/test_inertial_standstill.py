@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
 from barsight.core.types import ImuSamples
 from barsight.inertial.standstill import StandingStart, standing_start, stands_still

@@ -7,7 +7,8 @@ import pytest
 
 from barsight.core.errors import ConfigError
 from barsight.core.types import DisparityRange, RectifiedPair
-from barsight.stereo.sgbm import Sgbm, SgbmSettings, image_noise
+from barsight.stereo.noise import image_noise
+from barsight.stereo.sgbm import Sgbm, SgbmSettings
 from synthetic_scenes import camera, slanted_pair
 
 MATCH = Sgbm(SgbmSettings())

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.checkpoint import checkpoint_folder

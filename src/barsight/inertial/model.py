@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import binary_opening
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64
 from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.core.types import ImuSamples

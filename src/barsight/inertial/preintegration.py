@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_opening, uniform_filter1d
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S

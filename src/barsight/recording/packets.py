@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame

@@ -11,6 +11,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.noise import image_noise
 
 _MODES = {
     "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
@@ -114,18 +115,3 @@ def _noise_sigma(texture: Float32, noise: float) -> Float32:
     """(H, W) Cramer-Rao bound of a block match: sqrt(2) image sigma over the root of the summed gradients."""
     sigma: Float32 = np.sqrt(2 * noise**2 / np.maximum(texture, _LEAST_TEXTURE), dtype=np.float32)
     return sigma.clip(max=1)
-
-
-def image_noise(image: UInt8 | Float32) -> float:
-    """The image's noise, one sigma in grey levels: robust, from a Laplacian that planes don't excite
-    [Immerkaer 1996], with the median instead of the mean so that texture counts less.
-    """
-    response = _bends(_bends(image.astype(np.float32)).T)
-    spread = float(np.median(np.abs(response))) / 0.6745
-    return max(spread / 6.0, 0.5)
-
-
-def _bends(image: Float32) -> Float32:
-    """Second differences down the columns at every third row."""
-    bends: Float32 = image[:-2:3] - 2 * image[1:-1:3] + image[2::3]
-    return bends

@@ -57,3 +57,7 @@ class LiftSettings:
             raise ConfigError("lift set_down_width_m and set_down_length_m must be over 0")
         if not 0 < self.max_lean_deg <= 45:
             raise ConfigError(f"lift max_lean_deg must lie in 0...45, not {self.max_lean_deg}")
+
+
+UPPER = 1.645
+"""Sigmas to a bound that holds in 95 % of cases."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from barsight.yard.lifting.contact import UPPER
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import Bundle
 
 STEEL_KG_PER_M3 = 7850.0

@@ -8,7 +8,7 @@ import numpy as np
 from barsight.core.arrays import Bool
 from barsight.core.types import RectifiedPair
 from barsight.stereo.direct.refinement import RefinementSettings
-from barsight.stereo.sgbm import image_noise
+from barsight.stereo.noise import image_noise
 
 _WINDOW_PX = 21
 

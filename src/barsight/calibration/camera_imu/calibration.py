@@ -19,7 +19,7 @@ from barsight.calibration.camera_imu.problem import MOUNT, Problem, Sightings, S
 from barsight.calibration.camera_imu.setup import prepare
 from barsight.calibration.camera_imu.solver import Solution, Spread, sensor_spreads, solve
 from barsight.calibration.camera_imu.uncertainty import Uncertainty, uncertainty
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError

@@ -15,8 +15,8 @@ from barsight.calibration.camera_imu.initialization import Alignment, CameraWay,
 from barsight.calibration.camera_imu.pose_spline import spline_through
 from barsight.calibration.camera_imu.problem import ImuTrack, Mount, Problem, Sightings, Sigmas, State
 from barsight.calibration.camera_imu.spline_kernels import DEGREE
-from barsight.calibration.files.yaml_document import ImuNoise
 from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import CalibrationError, Failed

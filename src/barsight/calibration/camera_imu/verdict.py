@@ -16,7 +16,7 @@ from barsight.calibration.camera_imu.calibration import (
     mount_differences,
 )
 from barsight.calibration.camera_imu.problem import MOUNT
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.verdict import Line, Verdict, judge
 from barsight.core.arrays import Float64

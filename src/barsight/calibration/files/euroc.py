@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from barsight.calibration.files.yaml_document import Document, ImuNoise, read_document, write_document
+from barsight.calibration.files.yaml_document import Document, read_document, write_document
 from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose

@@ -14,14 +14,9 @@ from typing import Any
 import numpy as np
 
 from barsight.calibration.files.euroc import build_rig, read_camera
-from barsight.calibration.files.yaml_document import (
-    Document,
-    ImuNoise,
-    canonical_pose,
-    read_document,
-    write_document,
-)
+from barsight.calibration.files.yaml_document import Document, canonical_pose, read_document, write_document
 from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose

@@ -16,7 +16,6 @@ from barsight.calibration.files.euroc import build_rig, read_camera
 from barsight.calibration.files.yaml_document import Document, read_document, write_document
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.calibration.stereo.calibration import StereoCalibration
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
@@ -26,14 +25,8 @@ VERSION_KEY = "barsight_rig"
 VERSION = 1
 
 
-def write_rig_file(
-    path: Path, rig: StereoRig, calibration: StereoCalibration | None = None,
-    section: Mapping[str, object] | None = None,
-) -> None:  # fmt: skip
-    """Write a rig, with its sigmas and covariance where a calibration is given; reads back bit for bit.
-
-    section: the key `calibration` of another kind of calibration than stereo.
-    """
+def write_rig_file(path: Path, rig: StereoRig, section: Mapping[str, object] | None = None) -> None:
+    """Write a rig and the key `calibration`, which says how well it is known; reads back bit for bit."""
     values: dict[str, object] = {
         VERSION_KEY: VERSION,
         "cam0": _camera(rig.cam0, rig.body_from_cam0),
@@ -41,26 +34,7 @@ def write_rig_file(
         "timeshift_cam_imu_s": rig.timeshift_cam_imu_ns / NS_PER_S,
         "baseline_m": rig.baseline_m,
     }
-    if calibration is not None:
-        sigmas = np.sqrt(np.diag(calibration.covariance))
-        values["calibration"] = {
-            "board": str(calibration.board),
-            "lens": str(calibration.lens),
-            "views": len(calibration.views),
-            "rms_px": calibration.rms_px,
-            "corner_sigma_px": calibration.sigma_px,
-            "baseline_sigma_m": calibration.baseline_sigma_m,
-            "board_shape": {
-                name: {"value": float(value), "sigma": float(sigma)}
-                for name, value, sigma in zip(
-                    calibration.shape.names, calibration.shape.values, calibration.shape.sigma, strict=True
-                )
-            },
-            "parameters": list(calibration.parameter_names),
-            "sigmas": [float(value) for value in sigmas],
-            "covariance": [[float(value) for value in row] for row in calibration.covariance],
-        }
-    elif section is not None:
+    if section is not None:
         values["calibration"] = dict(section)
     write_document(path, values)
 

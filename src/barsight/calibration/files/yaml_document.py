@@ -19,21 +19,6 @@ TRANSLATION_DECIMALS = 12
 
 
 @dataclass(frozen=True)
-class ImuNoise:
-    """The IMU's noise model, Kalibr's units.
-
-    gyro_density: rad/s/sqrt(Hz). gyro_walk: rad/s^2/sqrt(Hz). accel_density: m/s^2/sqrt(Hz).
-    accel_walk: m/s^3/sqrt(Hz). rate_hz: as the file states it.
-    """
-
-    gyro_density: float
-    gyro_walk: float
-    accel_density: float
-    accel_walk: float
-    rate_hz: float
-
-
-@dataclass(frozen=True)
 class Document:
     """One YAML mapping and the file it came from. Every getter raises `CalibrationError` naming both."""
 

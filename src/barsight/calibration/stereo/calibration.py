@@ -81,6 +81,28 @@ class StereoCalibration:
         return float(np.sqrt(direction @ self.covariance[-3:, -3:] @ direction))
 
 
+def rig_file_section(calibration: StereoCalibration) -> dict[str, object]:
+    """Form a rig file's key `calibration`: parameters with sigmas and covariance, the board's shape."""
+    sigmas = np.sqrt(np.diag(calibration.covariance))
+    return {
+        "board": str(calibration.board),
+        "lens": str(calibration.lens),
+        "views": len(calibration.views),
+        "rms_px": calibration.rms_px,
+        "corner_sigma_px": calibration.sigma_px,
+        "baseline_sigma_m": calibration.baseline_sigma_m,
+        "board_shape": {
+            name: {"value": float(value), "sigma": float(sigma)}
+            for name, value, sigma in zip(
+                calibration.shape.names, calibration.shape.values, calibration.shape.sigma, strict=True
+            )
+        },
+        "parameters": list(calibration.parameter_names),
+        "sigmas": [float(value) for value in sigmas],
+        "covariance": [[float(value) for value in row] for row in calibration.covariance],
+    }
+
+
 def calibrate_stereo(
     views: Sequence[BoardView], board: Board, lens: Lens, sizes: tuple[tuple[int, int], tuple[int, int]],
     source: Path, left_out: Sequence[Removed] = (),

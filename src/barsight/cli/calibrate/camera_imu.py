@@ -21,7 +21,7 @@ from barsight.calibration.camera_imu.verdict import assess_camera_imu, cross_hal
 from barsight.calibration.files.kalibr import read_imu_file
 from barsight.calibration.files.rig_file import read_board, read_covariance
 from barsight.calibration.files.rig_formats import read_rig_file
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.stereo.verdict import Verdict, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages

@@ -15,7 +15,7 @@ from barsight.calibration.boards.board import parse_board
 from barsight.calibration.boards.detection_files import has_detections
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.geometry.projection import Lens
-from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
+from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo, rig_file_section
 from barsight.calibration.stereo.verdict import Verdict, assess, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
@@ -63,7 +63,7 @@ def run(arguments: Sequence[str]) -> None:
         assessment = assess(calibration, range_m)
         html, data = out.with_suffix(".html"), out.with_suffix(".json")
         with atomic_path(out) as path:
-            write_rig_file(path, calibration.rig, calibration)
+            write_rig_file(path, calibration.rig, rig_file_section(calibration))
         write_calibration_report(calibration, assessment, html, data)
         _print(console, calibration, out, html)
         colour = COLOURS[assessment.verdict]

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from barsight.calibration.files.yaml_document import ImuNoise, read_document
+from barsight.calibration.files.yaml_document import read_document
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64, UInt8
 from barsight.core.errors import InputError

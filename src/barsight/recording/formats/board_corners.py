@@ -15,7 +15,7 @@ import numpy as np
 from barsight.calibration.boards.detection_files import NAMES, read_rows
 from barsight.calibration.files.kalibr import read_imu_file
 from barsight.calibration.files.rig_formats import read_rig_file
-from barsight.calibration.files.yaml_document import ImuNoise
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, NamedPoints, RefusedFrame, StereoFrame

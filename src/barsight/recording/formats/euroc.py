@@ -7,7 +7,8 @@ from pathlib import Path
 
 from barsight.calibration.files.euroc import read_imu, read_rig
 from barsight.calibration.files.rig_formats import chosen_rig
-from barsight.calibration.files.yaml_document import ImuNoise, read_document
+from barsight.calibration.files.yaml_document import read_document
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile

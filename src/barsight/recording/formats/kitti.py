@@ -14,8 +14,9 @@ import numpy as np
 
 from barsight.calibration.files.euroc import build_rig
 from barsight.calibration.files.rig_formats import chosen_rig
-from barsight.calibration.files.yaml_document import ImuNoise, canonical_pose
+from barsight.calibration.files.yaml_document import canonical_pose
 from barsight.calibration.geometry.camera import Camera
+from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import CalibrationError, InputError

@@ -20,8 +20,7 @@ from barsight.stereo.baselines.left_right_check import agreement, filled_from_be
 from barsight.stereo.baselines.postprocessing import OutputSettings, assemble, fits, mirrored_pair, nothing
 from barsight.stereo.baselines.region_voting import region_vote
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
-from barsight.stereo.noise import has_texture
-from barsight.stereo.sgbm import image_noise
+from barsight.stereo.noise import has_texture, image_noise
 
 _SUPPORT_RADIUS_PX = 4
 _MEDIAN_RADIUS_PX = 9

@@ -30,7 +30,7 @@ from barsight.stereo.direct.kernels.pyramid import carried_up, halved
 from barsight.stereo.direct.photometric_residuals import compare, lengthen, noise_power, weigh
 from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
 from barsight.stereo.direct.support_regions import MARGIN, axis_means, empty_frame, inside, tile_axes
-from barsight.stereo.sgbm import image_noise
+from barsight.stereo.noise import image_noise
 
 Image = UInt8 | Float32
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.checks import count_vetoes, face_vetoes, load_vetoes
 from barsight.yard.lifting.clearance import clearance_vetoes
-from barsight.yard.lifting.contact import NEWTON_PER_KG, UPPER, Contact, touch
+from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, touch
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, grip
 from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.lifting.travel_accuracy import Travel, travel_vetoes

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, kernel
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.resting_plane import ALL, POLE, SEEN, U, V, Z, profiles, settle, straighten
 from barsight.yard.types import HeightMap
 
 NEWTON_PER_KG = 9.81
-UPPER = 1.645
-"""Sigmas to a bound that holds in 95 % of cases."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from barsight.core.errors import Failed
 from barsight.core.pose import skew
 from barsight.core.types import CraneSamples, RectifiedCamera, Trajectory
 from barsight.motion.crane.encoder_trajectory import fit_position
-from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.contact import UPPER
+from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.vetoes import Veto

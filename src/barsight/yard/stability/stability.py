@@ -14,8 +14,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.types import Source
-from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.contact import UPPER
+from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 

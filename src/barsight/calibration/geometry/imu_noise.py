@@ -1,0 +1,20 @@
+"""The noise model of an IMU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """The IMU's noise model, Kalibr's units.
+
+    gyro_density: rad/s/sqrt(Hz). gyro_walk: rad/s^2/sqrt(Hz). accel_density: m/s^2/sqrt(Hz).
+    accel_walk: m/s^3/sqrt(Hz). rate_hz: as the file states it.
+    """
+
+    gyro_density: float
+    gyro_walk: float
+    accel_density: float
+    accel_walk: float
+    rate_hz: float
