@@ -59,9 +59,9 @@ def draw(folder: Path, seed: int) -> tuple[Path, Path]:
     if not out.exists():
         base = SimulationSettings.demo()
         yard = replace(
-            base.yard, max_layers=1 + seed % 4, crossed_share=0.0 if seed % 3 else 0.4,
+            base.yard, max_layers=1 + seed % 4, crossed_ratio=0.0 if seed % 3 else 0.4,
             dunnage_m=(0.05, 0.09, 0.12, 0.2)[seed % 4], gap_m=(0.02, 0.05, 0.01)[seed % 3],
-            missing_share=(0.08, 0.25)[seed % 2],
+            missing_ratio=(0.08, 0.25)[seed % 2],
         )  # fmt: skip
         simulate(
             recording, replace(base, seed=seed, bars=BARS[seed % 8], yard=yard), lambda done, total: None
@@ -74,7 +74,9 @@ def draw(folder: Path, seed: int) -> tuple[Path, Path]:
 def rises(
     recording: Path, lifts: dict[str, Any], stray_m: float, which: str
 ) -> Iterator[tuple[dict[str, Any], float]]:
-    """Each lift and the highest that truly stands above its faces' plane, within the crane's tolerance."""
+    """Return each lift and the highest that truly stands above its faces' plane, within the crane's
+    tolerance.
+    """
     truth = np.load(recording / "truth" / "height.npz")
     x0, y0, z = truth["x"][0], truth["y"][0], truth["z"]
     step_x, step_y = truth["x"][1] - x0, truth["y"][1] - y0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift, Yard, assess
+from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.footprint import BundleTable, Placement
 from barsight.yard.lifting.magnet import Magnet, load_magnet
 from barsight.yard.stability.stability import footings
@@ -47,8 +47,8 @@ def map_of(bundles: list[Laid], **changes: Any) -> HeightMap:
     return draw(bundles, **({"x_m": (-1.5, width), "y_m": (-4.0, 4.0), "sigma_m": 0.002} | changes))
 
 
-def yard_of(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings = SETTINGS) -> Yard:
-    return Yard(heights, BundleTable.of(bundles), footings(heights, bundles, settings), ())
+def yard_of(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings = SETTINGS) -> LiftScene:
+    return LiftScene(heights, BundleTable.of(bundles), footings(heights, bundles, settings), ())
 
 
 def judged(
@@ -60,7 +60,7 @@ def judged(
         bundles = tuple(record(one, k) for k, one in enumerate(stock))
     place = place or Placement(stock[0].x_m, 0.0, 0.0)
     heights = heights if heights is not None else map_of(stock)
-    return assess(place, yard_of(heights, bundles, settings), magnet, settings)
+    return assess_placement(place, yard_of(heights, bundles, settings), magnet, settings)
 
 
 def codes(lift: Lift) -> set[str]:

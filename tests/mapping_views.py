@@ -10,10 +10,10 @@ import numpy as np
 
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
-from barsight.mapping.fusion import fuse
+from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.height_selection import Sights
+from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
@@ -47,18 +47,18 @@ def fused(
     """The finished surface of some views, every cell for itself: it asks nothing of the cells beside it and
     takes nothing from them unless the settings say how much."""
     settings = settings or MapSettings(min_views=1)
-    if settings.along_share == MapSettings().along_share:
-        settings = replace(settings, along_share=0.001)
+    if settings.along_ratio == MapSettings().along_ratio:
+        settings = replace(settings, along_ratio=0.001)
     if settings.along_m == MapSettings().along_m:
         settings = replace(settings, along_m=0.0)
     folder.mkdir(parents=True, exist_ok=True)
     store = TileStore(folder, resident)
     poses = []
     for one in views:
-        fuse(store, one, settings)
+        fuse_view(store, one, settings)
         poses.append(high_above(one, cell_m))
     election = SurfaceElection(store, folder, cell_m, settings)
-    return election.finish(settings.min_views, Sights.of(poses, FAR_CAMERA))
+    return election.finish(settings.min_views, ViewFrusta.of(poses, FAR_CAMERA))
 
 
 HEIGHT_M = 5000.0

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from barsight.recording.stored_images import Source
+from barsight.recording.stored_images import StoredPictures
 
 DATA = Path(os.environ.get("BARSIGHT_DATA", Path(__file__).parents[1] / "../shared/data")).resolve()
 WIDTH, HEIGHT = 64, 48
@@ -119,7 +119,7 @@ def write_crane_and_laser(mav0: Path) -> None:
     (mav0 / "laser0" / "sensor.yaml").write_text(yaml.safe_dump({"range_std_m": 0.001}))
 
 
-def assert_same(one: Source, other: Source) -> None:
+def assert_same(one: StoredPictures, other: StoredPictures) -> None:
     """Both recordings hold the same, bit for bit."""
     for name in ("body_from_cam0", "body_from_cam1"):
         np.testing.assert_array_equal(getattr(one.rig, name).matrix, getattr(other.rig, name).matrix)

@@ -126,7 +126,7 @@ def summary() -> dict[str, Any]:
         "recording": {"path": "yards/<north> & south", "format": "euroc"},
         "reference": "yard",
         "hashes": {"calibration": "ca1b", "configuration": "c0f1", "inputs": {"cam0/data.csv": "1a2b"}},
-        "configuration": {"stereo": {"method": "sgbm", "lowest_disparity_px": None}},
+        "configuration": {"stereo": {"method": "sgbm", "min_disparity_px": None}},
         "sensors_used": ["stereo", "crane"],
         "frames": {
             "total": 14,

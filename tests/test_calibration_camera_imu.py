@@ -8,14 +8,20 @@ import pytest
 
 from barsight.calibration.boards.board import Board
 from barsight.calibration.boards.board_views import BoardView, Corners
-from barsight.calibration.boards.board_warp import bent
-from barsight.calibration.camera_imu.arrowhead_system import predicted
+from barsight.calibration.boards.board_warp import apply_shape
+from barsight.calibration.camera_imu.arrowhead_system import apply_jacobian
 from barsight.calibration.camera_imu.calibration import (
     CameraImuCalibration,
     calibrate_camera_imu,
-    mount_differences,
+    subtract_mounts,
 )
-from barsight.calibration.camera_imu.problem import Mount, Problem, State, linearise, moved
+from barsight.calibration.camera_imu.problem import (
+    CameraImuProblem,
+    CameraImuState,
+    Mount,
+    linearise_camera_imu,
+    retract_state,
+)
 from barsight.calibration.camera_imu.setup import prepare
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError
@@ -46,7 +52,7 @@ def errors(calibration: CameraImuCalibration, truth: Truth) -> np.ndarray:
         Mount(pose.rotation, pose.translation, shift)
         for pose, shift in zip(poses, truth.shift_s, strict=True)
     )
-    return mount_differences(state, replace(state, mounts=mounts))
+    return subtract_mounts(state, replace(state, mounts=mounts))
 
 
 def mean_square(seeds: range) -> float:
@@ -61,7 +67,7 @@ def mean_square(seeds: range) -> float:
 
 
 def test_a_bent_board_of_known_shape_is_no_error() -> None:
-    board = bent(BOARD, {"bow_x_m": 2e-3, "bow_y_m": -1e-3, "stretch_share": 3e-3, "skew_rad": 0.0,
+    board = apply_shape(BOARD, {"bow_x_m": 2e-3, "bow_y_m": -1e-3, "stretch_share": 3e-3, "skew_rad": 0.0,
                          "tag_share": -9e-3})  # fmt: skip
     views, imu, truth = simulated(3, board=board)
     flat, known = calibrated(views, imu), calibrated(views, imu, board=board)
@@ -74,14 +80,16 @@ def test_a_bent_board_of_known_shape_is_no_error() -> None:
 def test_derivatives_match_finite_differences(recorded: Recorded) -> None:
     views, imu, _ = recorded
     setup = prepare(views[:70], imu, RIG, BOARD, NOISE, SOURCE)
-    problem: Problem = replace(setup.problem, scales=True)
-    state: State = setup.start
-    here = linearise(problem, state, None)
+    problem: CameraImuProblem = replace(setup.problem, scales=True)
+    state: CameraImuState = setup.start
+    here = linearise_camera_imu(problem, state, None)
     rng = np.random.default_rng(0)
     chain = 1e-6 * rng.normal(size=(len(state.spline.places_m), 12))
     common = 1e-6 * rng.normal(size=len(problem.parameter_names))
-    there, back = (linearise(problem, moved(state, s * chain, s * common), None) for s in (1, -1))
-    change = predicted(here.samples, chain.ravel(), common)
+    there, back = (
+        linearise_camera_imu(problem, retract_state(state, s * chain, s * common), None) for s in (1, -1)
+    )
+    change = apply_jacobian(here.samples, chain.ravel(), common)
     count = problem.imu.time_s.size
     numeric = (back.samples.residual - there.samples.residual) / 2
     np.testing.assert_allclose(change[-count:], numeric[-count:], atol=1e-9)

@@ -7,7 +7,7 @@ import pytest
 
 from barsight.calibration.boards.board_warp import BentBoard
 from barsight.calibration.files.rig_file import read_board, read_covariance, write_rig_file
-from barsight.calibration.files.rig_formats import RigFormat, chosen_rig, read_rig_file, write_any_rig
+from barsight.calibration.files.rig_formats import RigFormat, read_rig_file, select_rig, write_any_rig
 from barsight.calibration.files.yaml_document import canonical_pose
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.projection import Lens
@@ -135,11 +135,11 @@ def test_a_rig_of_two_cameras_keeps_the_recordings_mounting(tmp_path: Path) -> N
     own = StereoRig(bare.cam0, bare.cam1, mount, mount @ bare.cam0_from_cam1, 7)
     write_rig_file(tmp_path / "cameras.yaml", bare)
     write_rig_file(tmp_path / "whole.yaml", StereoRig(bare.cam0, bare.cam1, mount, own.body_from_cam1, 9))
-    assert chosen_rig(None, own) is own
-    kept = chosen_rig(tmp_path / "cameras.yaml", own)
+    assert select_rig(None, own) is own
+    kept = select_rig(tmp_path / "cameras.yaml", own)
     assert kept.body_from_cam0.distance_to(mount) == 0
     assert kept.timeshift_cam_imu_ns == 7
     assert kept.cam0_from_cam1.distance_to(bare.cam0_from_cam1) < 1e-12
-    assert chosen_rig(tmp_path / "whole.yaml", own).timeshift_cam_imu_ns == 9
+    assert select_rig(tmp_path / "whole.yaml", own).timeshift_cam_imu_ns == 9
     with pytest.raises(CalibrationError):
-        chosen_rig(tmp_path / "none.yaml", own)
+        select_rig(tmp_path / "none.yaml", own)

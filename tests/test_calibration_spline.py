@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.camera_imu.arrowhead_system import (
     LOCAL,
     ROWS,
+    RandomWalks,
     Samples,
-    Walks,
+    apply_jacobian,
     assemble,
     eliminate,
-    predicted,
-    projected,
-    pulled,
+    gradient_of,
+    project_out_chain,
     step,
 )
 from barsight.calibration.camera_imu.pose_spline import STATE, PoseSpline, inverse_right_jacobian, locate
@@ -86,7 +86,7 @@ def test_the_arrow_system_is_the_dense_one() -> None:
         rng.integers(0, points - DEGREE, count), rng.normal(size=(count, ROWS)),
         rng.normal(size=(count, ROWS, LOCAL)), rng.normal(size=(count, ROWS, width)),
     )  # fmt: skip
-    walks = Walks(rng.normal(size=(points - 1, 6)), np.full(6, 0.5))
+    walks = RandomWalks(rng.normal(size=(points - 1, 6)), np.full(6, 0.5))
     size = points * STATE
     rows = np.zeros((count, ROWS, size + width))
     for k, first in enumerate(samples.first):
@@ -108,8 +108,10 @@ def test_the_arrow_system_is_the_dense_one() -> None:
     np.testing.assert_allclose(np.concatenate([chain, common]), best, atol=1e-7)
     covariance = np.linalg.inv(a.T @ a)[size:, size:]
     np.testing.assert_allclose(np.linalg.inv(eliminated.information), covariance, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(predicted(samples, chain, common), rows @ best, atol=1e-6)
-    gradient = np.concatenate(pulled(samples, samples.residual, size))
+    np.testing.assert_allclose(apply_jacobian(samples, chain, common), rows @ best, atol=1e-6)
+    gradient = np.concatenate(gradient_of(samples, samples.residual, size))
     np.testing.assert_allclose(gradient, np.einsum("krc,kr->c", rows, samples.residual), atol=1e-9)
     through = rows[:, :, :size] @ eliminated.through
-    np.testing.assert_allclose(projected(samples, eliminated.through), samples.by_common - through, atol=1e-9)
+    np.testing.assert_allclose(
+        project_out_chain(samples, eliminated.through), samples.by_common - through, atol=1e-9
+    )

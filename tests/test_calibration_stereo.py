@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.boards.board import parse_board
 from barsight.calibration.boards.board_views import BoardView
 from barsight.calibration.boards.detection_files import read_detections
-from barsight.calibration.geometry.projection import Lens, project
+from barsight.calibration.geometry.projection import Lens, project_lens
 from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
 from barsight.calibration.stereo.cross_validation import CrossValidation, cross_validate
-from barsight.calibration.stereo.projection_uncertainty import depth_sigma, sample_pairs, triangulate
+from barsight.calibration.stereo.projection_uncertainty import depth_sigma, sample_pairs, triangulate_depth
 from barsight.calibration.stereo.verdict import Verdict, assess
 from barsight.core.errors import CalibrationError
 from calibration_views import BOARD, CAM0, CAM1, ROTATION, SIZE, TRANSLATION_M, place, seen, simulated
@@ -43,15 +43,15 @@ def test_projection_is_the_cameras_and_its_derivatives_are_right(lens: Lens) -> 
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-0.6, 0.6, (40, 2)), rng.uniform(0.8, 2, 40)])
     parameters = np.array([458.0, 457.0, 367.0, 248.0, *COEFFICIENTS[lens]])
-    out = project(lens, parameters, points)
+    out = project_lens(lens, parameters, points)
     assert np.abs(out.pixels - lens.camera(parameters, 752, 480).project(points)).max() < 1e-8
     for k in range(3):
         step = 1e-6 * np.eye(3)[k]
-        ends = [project(lens, parameters, points + sign * step).pixels for sign in (1, -1)]
+        ends = [project_lens(lens, parameters, points + sign * step).pixels for sign in (1, -1)]
         assert np.allclose(out.by_point[:, :, k], (ends[0] - ends[1]) / 2e-6, atol=1e-4)
     for k in range(parameters.size):
         step = 1e-6 * np.eye(parameters.size)[k]
-        ends = [project(lens, parameters + sign * step, points).pixels for sign in (1, -1)]
+        ends = [project_lens(lens, parameters + sign * step, points).pixels for sign in (1, -1)]
         assert np.allclose(out.by_lens[:, :, k], (ends[0] - ends[1]) / 2e-6, atol=1e-4)
 
 
@@ -69,7 +69,7 @@ def test_errors_over_sigma_over_24_seeds() -> None:
         ratios.append(off**2 / np.diag(calibration.covariance))
         mahalanobis.append(off @ np.linalg.solve(calibration.covariance, off) / off.size)
         number, left, right = sample_pairs(calibration.rig, [3.0])
-        found = triangulate(calibration.rig, left, right)
+        found = triangulate_depth(calibration.rig, left, right)
         place = calibration.rig.cam0_from_cam1
         rays = CAM0.rays(left), CAM1.rays(right) @ ROTATION
         assert number.size

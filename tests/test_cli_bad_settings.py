@@ -86,7 +86,7 @@ def test_settings_that_are_no_numbers(
 
 def test_nothing_sure_enough(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(recording, capsys, "max_depth_m", flags=("--stereo.max-depth-m", "1"))
-    refused(recording, capsys, "320 px wide", flags=("--stereo.highest-disparity-px", "1000000"))
+    refused(recording, capsys, "320 px wide", flags=("--stereo.max-disparity-px", "1000000"))
 
 
 def test_a_simulation_of_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,14 +8,14 @@ import pytest
 
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
-from barsight.motion.rig_check.self_calibration import turned_right
+from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.open import open_recording
 
 
 def test_a_turned_camera_is_found(data: Path, tmp_path: Path) -> None:
     rig = open_recording(data / "yard_dev").rig
     turn = np.deg2rad([0.05, 0.01, -0.03])
-    write_rig_file(tmp_path / "old.yaml", turned_right(rig, -turn))
+    write_rig_file(tmp_path / "old.yaml", turn_right_camera(rig, -turn))
     arguments = ["calibrate", "check", str(data / "yard_dev"), "-o", str(tmp_path / "check.json")]
     assert run([*arguments, "--recording.rig", str(tmp_path / "old.yaml")]) == 0
     check = json.loads((tmp_path / "check.json").read_text())
@@ -45,7 +45,7 @@ def test_without_encoders_the_rows_are_checked(data: Path, capsys: pytest.Captur
         (["nowhere", "-o", "check.txt"], 4, "ends in .json"),
         (["nowhere", "--range-m", "0"], 2, "can't be"),
         (["nowhere", "--frames", "0"], 2, "must be positive"),
-        (["nowhere", "--most-mm", "-1"], 2, "must be positive"),
+        (["nowhere", "--max-depth-error-mm", "-1"], 2, "must be positive"),
     ],
 )
 def test_bad_input(arguments: list[str], code: int, reason: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from barsight import pipeline
 from barsight.calibration.files.rig_file import write_rig_file
-from barsight.checkpoint import checkpoint_folder, once
+from barsight.checkpoint import checkpoint_folder, checkpointed
 from barsight.cli.main import run
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
@@ -70,7 +70,7 @@ def test_what_is_matched_early_changes_nothing(
                 guess = frozenset(stamps[k] for k in early)
                 patch.setattr(pipeline, "_known_early", lambda *_, guess=guess: guess)
             matched = counting_matches(patch)
-            assert run(["measure", str(recording), "-o", str(out), *FAST, "--map.least-shift", "0.2"]) == 0
+            assert run(["measure", str(recording), "-o", str(out), *FAST, "--map.min-shift", "0.2"]) == 0
         written[early] = [(out / name).read_bytes() for name in SAME]
         if early is None:
             used = json.loads((out / "result.json").read_text())["frames"]["used"]
@@ -92,17 +92,17 @@ def counting_matches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_another_key_starts_anew(tmp_path: Path) -> None:
     first = checkpoint_folder(tmp_path / "kept", "a" * 64)
-    assert once(first, "x", lambda: 1) == 1
-    assert once(first, "x", lambda: 2) == 1
+    assert checkpointed(first, "x", lambda: 1) == 1
+    assert checkpointed(first, "x", lambda: 2) == 1
     second = checkpoint_folder(tmp_path / "kept", "b" * 64)
-    assert once(second, "x", lambda: 2) == 2
+    assert checkpointed(second, "x", lambda: 2) == 2
     assert not first.exists()
-    assert once(None, "x", lambda: 3) == 3
+    assert checkpointed(None, "x", lambda: 3) == 3
 
 
 def test_a_failure_leaves_nothing_to_go_on_from(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
-        once(tmp_path, "x", lambda: 1 // 0)
+        checkpointed(tmp_path, "x", lambda: 1 // 0)
     assert list(tmp_path.iterdir()) == []
 
 

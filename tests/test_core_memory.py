@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.core.memory import give_back
+from barsight.core.memory import trim_heap
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's count of resident pages")
@@ -22,6 +22,6 @@ def test_what_was_freed_between_things_that_stay_is_given_back() -> None:
     stay = arrays[::10]
     before = resident_mib()
     del arrays
-    give_back()
+    trim_heap()
     assert resident_mib() < before - 20
     assert sum(one.sum() for one in stay) == 40 * 12_500

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.arrays import expect_shape, kernel
-from barsight.core.parallel import begun_map, beside, in_bands, ordered_map, read_ahead
+from barsight.core.parallel import in_background, ordered_map, parallel_bands, prefetch, prefetched_map
 from barsight.core.timing import Stopwatch
 
 
@@ -66,7 +66,7 @@ def test_items_are_made_while_others_are_used() -> None:
         raise ZeroDivisionError
 
     before = threading.active_count()
-    ahead = read_ahead(items())
+    ahead = prefetch(items())
     assert next(ahead) == 0
     there.clear()
     assert made == [0, 1] or (there.wait(5) and made == [0, 1])
@@ -74,21 +74,21 @@ def test_items_are_made_while_others_are_used() -> None:
     with pytest.raises(ZeroDivisionError):
         next(ahead)
     assert threading.active_count() == before
-    left = read_ahead(iter(range(1000)), count=3)
+    left = prefetch(iter(range(1000)), count=3)
     assert next(left) == 0
     left.close()
     assert threading.active_count() == before
 
 
 def test_what_is_begun_goes_on_before_anybody_asks() -> None:
-    running, most_at_once, done = 0, 0, threading.Semaphore(0)
+    running, max_at_once, done = 0, 0, threading.Semaphore(0)
     lock = threading.Lock()
 
     def square(k: int) -> int:
-        nonlocal running, most_at_once
+        nonlocal running, max_at_once
         with lock:
             running += 1
-            most_at_once = max(most_at_once, running)
+            max_at_once = max(max_at_once, running)
         time.sleep(0.005)
         with lock:
             running -= 1
@@ -96,12 +96,12 @@ def test_what_is_begun_goes_on_before_anybody_asks() -> None:
         return k * k
 
     before = threading.active_count()
-    with begun_map(square, range(20), most=5, workers=3) as results:
+    with prefetched_map(square, range(20), most=5, workers=3) as results:
         assert all(done.acquire(timeout=5) for _ in range(5))
         assert not done.acquire(timeout=0.05)  # the sixth waits until a result is taken
-        assert most_at_once == 1
+        assert max_at_once == 1
         assert list(results) == [k * k for k in range(20)]
-        assert 1 < most_at_once <= 3
+        assert 1 < max_at_once <= 3
     assert threading.active_count() == before
 
 
@@ -113,7 +113,7 @@ def test_leaving_what_is_begun_drops_the_rest() -> None:
         time.sleep(0.02)
 
     before = threading.active_count()
-    with pytest.raises(KeyboardInterrupt), begun_map(slow, range(1000), most=8):
+    with pytest.raises(KeyboardInterrupt), prefetched_map(slow, range(1000), most=8):
         while not started:
             time.sleep(0.001)
         raise KeyboardInterrupt
@@ -126,11 +126,11 @@ def test_an_exception_of_what_is_begun_comes_at_its_turn() -> None:
         yield from (3, 2, 0, 1)
         raise KeyError("torn")
 
-    with begun_map(lambda k: 6 // k, items(), most=9) as results:
+    with prefetched_map(lambda k: 6 // k, items(), most=9) as results:
         assert [next(results), next(results)] == [2, 3]
         with pytest.raises(ZeroDivisionError):
             next(results)
-    with begun_map(lambda k: k, items(), most=2) as results, pytest.raises(KeyError):
+    with prefetched_map(lambda k: k, items(), most=2) as results, pytest.raises(KeyError):
         list(results)
 
 
@@ -141,7 +141,7 @@ def test_work_beside_a_block_is_done_at_its_end() -> None:
         assert begun.wait(5)
         done.append(1)
 
-    with beside(work):
+    with in_background(work):
         assert done == []
         begun.set()
     assert done == [1]
@@ -149,7 +149,7 @@ def test_work_beside_a_block_is_done_at_its_end() -> None:
     def fail() -> None:
         raise ZeroDivisionError
 
-    with pytest.raises(ZeroDivisionError), beside(fail):
+    with pytest.raises(ZeroDivisionError), in_background(fail):
         done.append(2)
     assert done == [1, 2]
 
@@ -192,7 +192,7 @@ def test_bands_cover_every_row_once_from_any_number_of_threads() -> None:
             time.sleep(0.0005)
             rows[first:end] += 1
 
-        in_bands(work, 1000, 64)
+        parallel_bands(work, 1000, 64)
         return int((rows == 1).sum())
 
     assert list(ordered_map(count, range(8), 4)) == [1000] * 8
@@ -204,4 +204,4 @@ def test_an_exception_in_a_band_comes_out() -> None:
             raise ValueError("row 30")
 
     with pytest.raises(ValueError, match="row 30"):
-        in_bands(work, 100, 10)
+        parallel_bands(work, 100, 10)

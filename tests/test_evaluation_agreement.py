@@ -4,15 +4,19 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import Failed
-from barsight.core.types import Agreement, Contour, LaserProfile, Source
-from barsight.mapping.agreement import agree, difference, smooth_places
+from barsight.core.types import Agreement, Contour, HeightSource, LaserProfile
+from barsight.mapping.agreement import compute_agreement, profile_difference, smooth_places
 
 X = np.round(5 + 0.01 * np.arange(8), 4)
 
 
 def contour(z: list[float], source: list[int] | None = None, shift: float = 0.0) -> Contour:
     heights = np.array(z)
-    codes = np.where(np.isfinite(heights), Source.VISION, Source.UNKNOWN) if source is None else source
+    codes = (
+        np.where(np.isfinite(heights), HeightSource.VISION, HeightSource.UNKNOWN)
+        if source is None
+        else source
+    )
     x = X[: heights.size] + shift
     return Contour(2, x, x * 0 + 0.7, heights, heights * 0 + 0.01, np.array(codes, dtype=np.uint8))
 
@@ -27,9 +31,16 @@ def test_the_figures_by_hand() -> None:
     """Differences of 1, -2, 3 and 6 mm; two of six laser points have no vision (unknown, filled)."""
     seen = contour(
         [1.001, 0.998, np.nan, 1.003, 1.5, 1.106],
-        [Source.VISION, Source.VISION, Source.UNKNOWN, Source.VISION, Source.FILLED, Source.VISION],
+        [
+            HeightSource.VISION,
+            HeightSource.VISION,
+            HeightSource.UNKNOWN,
+            HeightSource.VISION,
+            HeightSource.FILLED,
+            HeightSource.VISION,
+        ],
     )
-    figures = agree(seen, laser([1.0, 1.0, 1.0, 1.0, 1.0, 1.1]))
+    figures = compute_agreement(seen, laser([1.0, 1.0, 1.0, 1.0, 1.0, 1.1]))
     assert isinstance(figures, Agreement)
     assert (figures.profile, figures.y_m, figures.samples) == (2, 0.7, 4)
     assert figures.coverage_pct == pytest.approx(100 * 4 / 6)
@@ -48,9 +59,9 @@ def test_the_figures_by_hand() -> None:
 
 def test_vision_is_interpolated_to_the_lasers_places() -> None:
     seen = contour([1.0, 1.1, 1.2, np.nan, 1.4, 1.5])
-    between = difference(seen, laser([1.0] * 6, shift=0.0025))
+    between = profile_difference(seen, laser([1.0] * 6, shift=0.0025))
     np.testing.assert_allclose(between, [0.025, 0.125, np.nan, np.nan, 0.425, np.nan], atol=1e-9)
-    before = difference(seen, laser([1.0] * 6, shift=-0.0025))
+    before = profile_difference(seen, laser([1.0] * 6, shift=-0.0025))
     np.testing.assert_allclose(before, [np.nan, 0.075, 0.175, np.nan, np.nan, 0.475], atol=1e-9)
 
 
@@ -58,7 +69,9 @@ def test_vision_is_interpolated_to_the_lasers_places() -> None:
 def test_samples_on_the_lasers_grid_need_no_neighbours(shift: float) -> None:
     """Beside a gap a sample still counts where both grids agree but for rounding."""
     seen = contour([1.0, np.nan, 1.2, np.nan, 1.4], shift=shift)
-    np.testing.assert_allclose(difference(seen, laser([1.0] * 5)), [0, np.nan, 0.2, np.nan, 0.4], atol=1e-4)
+    np.testing.assert_allclose(
+        profile_difference(seen, laser([1.0] * 5)), [0, np.nan, 0.2, np.nan, 0.4], atol=1e-4
+    )
 
 
 def test_without_overlap_it_fails() -> None:
@@ -67,9 +80,9 @@ def test_without_overlap_it_fails() -> None:
         one,
         contour([]),
         contour([1.0, 1.0, 1.0], shift=7.0),
-        contour([1.0] * 3, [Source.FILLED] * 3),
+        contour([1.0] * 3, [HeightSource.FILLED] * 3),
     ):
-        failed = agree(seen, laser([1.0, 1.0, 1.0]))
+        failed = compute_agreement(seen, laser([1.0, 1.0, 1.0]))
         assert isinstance(failed, Failed)
         assert failed.code == "no-overlap"
         assert "profile 2" in failed.reason
@@ -91,9 +104,9 @@ def test_a_shifted_laser_is_found(x_shift_m: float, z_shift_m: float) -> None:
     x = 0.01 * np.arange(600)
     z = lambda at: 0.7 + 0.02 * np.abs(np.sin(at * 35)) + 0.3 * (at > 3)  # noqa: E731
     seen = z(x) + rng.normal(0, 0.001, 600) + np.where(rng.uniform(size=600) < 0.1, 0.4, 0)
-    measured = Contour(0, x, x * 0, seen, x * 0 + 0.01, np.full(600, Source.VISION, np.uint8))
+    measured = Contour(0, x, x * 0, seen, x * 0 + 0.01, np.full(600, HeightSource.VISION, np.uint8))
     scanned = LaserProfile(0, x, x * 0, z(x - x_shift_m) + z_shift_m, 0.001)
-    figures = agree(measured, scanned, speed_mps=0.5)
+    figures = compute_agreement(measured, scanned, speed_mps=0.5)
     assert isinstance(figures, Agreement)
     assert figures.x_shift_mm == pytest.approx(1e3 * x_shift_m, abs=1.0)
     assert figures.z_shift_mm == pytest.approx(1e3 * z_shift_m, abs=0.5)

@@ -13,7 +13,7 @@ import pytest
 from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.bar_edges import bar_diameter, find_outlines, tangent_planes
 from barsight.benchmarks.stereo.bar_fit import BarFit, BarGuess, fit_bar
-from barsight.benchmarks.stereo.bar_renderer import BAR, FLOOR, Bar, Rendered, render
+from barsight.benchmarks.stereo.bar_renderer import BAR, FLOOR, Rendered, RenderedBar, render_pair
 from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, tilted_floor
 from barsight.benchmarks.stereo.cramer_rao_bound import noise_limit_px
 from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
@@ -21,7 +21,7 @@ from barsight.benchmarks.stereo.steps import steps_picture
 from barsight.benchmarks.stereo.subpixel import (
     bench_subpixel,
     fraction_bias,
-    inner,
+    inner_pixels,
     pixel_errors,
     subpixel_table,
 )
@@ -38,16 +38,16 @@ def _without_noise(posed: PosedScene) -> PosedScene:
 @pytest.fixture(scope="module")
 def floor() -> tuple[PosedScene, Rendered]:
     posed = _without_noise(tilted_floor(np.random.default_rng(1), 6.0, 15.0))
-    return posed, render(posed.scene, seed=1)
+    return posed, render_pair(posed.scene, seed=1)
 
 
 @pytest.fixture(scope="module")
 def bar() -> tuple[PosedScene, Rendered]:
     posed = _without_noise(bar_over_floor(np.random.default_rng(2), 2.5, gloss=0.0, raised_m=0.3))
-    return posed, render(posed.scene, seed=2)
+    return posed, render_pair(posed.scene, seed=2)
 
 
-def _bar_of(posed: PosedScene) -> Bar:
+def _bar_of(posed: PosedScene) -> RenderedBar:
     assert posed.scene.bar is not None
     return posed.scene.bar
 
@@ -101,7 +101,7 @@ def test_the_bars_points_lie_on_its_cylinder(bar: tuple[PosedScene, Rendered]) -
 def test_both_images_show_the_same_matt_surface(name: str, request: pytest.FixtureRequest) -> None:
     _, rendered = request.getfixturevalue(name)
     surface = BAR if name == "bar" else FLOOR
-    where = inner(rendered, surface)
+    where = inner_pixels(rendered, surface)
     difference = _left_minus_warped_right(rendered)[where]
     assert np.abs(difference.mean()) < 0.05
     assert difference.std() < 1.0
@@ -109,8 +109,8 @@ def test_both_images_show_the_same_matt_surface(name: str, request: pytest.Fixtu
 
 def test_gloss_differs_between_the_images() -> None:
     posed = _without_noise(bar_over_floor(np.random.default_rng(2), 2.5, gloss=60.0, raised_m=0.3))
-    rendered = render(posed.scene, seed=2)
-    assert _left_minus_warped_right(rendered)[inner(rendered, BAR)].std() > 2.0
+    rendered = render_pair(posed.scene, seed=2)
+    assert _left_minus_warped_right(rendered)[inner_pixels(rendered, BAR)].std() > 2.0
 
 
 def test_what_the_bar_hides_from_the_right_camera_is_not_visible(bar: tuple[PosedScene, Rendered]) -> None:
@@ -126,7 +126,7 @@ def test_what_the_bar_hides_from_the_right_camera_is_not_visible(bar: tuple[Pose
 
 def test_the_same_seed_gives_the_same_images() -> None:
     posed = tilted_floor(np.random.default_rng(1), 6.0, 15.0)
-    first, again, other = (render(posed.scene, seed).pair.left for seed in (1, 1, 2))
+    first, again, other = (render_pair(posed.scene, seed).pair.left for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 
@@ -200,7 +200,7 @@ def test_locking_shows_as_its_own_height_and_sigma_is_counted(floor: tuple[Posed
     found = Disparity(
         (rendered.truth_px + wave + noise + 0.02).astype(np.float32), np.full(wave.shape, 0.05, np.float32)
     )
-    where = inner(rendered, FLOOR)
+    where = inner_pixels(rendered, FLOOR)
     bias = fraction_bias([pixel_errors(found, rendered.truth_px, where)])
     # The mean of a sine over the tenths next to its crests is 0.1 * (0.96...0.98).
     assert bias.peak_to_peak_px == pytest.approx(0.192, abs=0.01)
@@ -217,7 +217,7 @@ def test_a_method_that_finds_nothing_is_reported_as_nothing(floor: tuple[PosedSc
     _, rendered = floor
     nothing = np.full(rendered.truth_px.shape, np.nan, dtype=np.float32)
     bias = fraction_bias(
-        [pixel_errors(Disparity(nothing, nothing), rendered.truth_px, inner(rendered, FLOOR))]
+        [pixel_errors(Disparity(nothing, nothing), rendered.truth_px, inner_pixels(rendered, FLOOR))]
     )
     assert bias.coverage_pct == 0 and np.isnan(bias.peak_to_peak_px)
 

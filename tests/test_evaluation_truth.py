@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError
-from barsight.core.types import Contour, Source
-from barsight.evaluation.score import score
+from barsight.core.types import Contour, HeightSource
+from barsight.evaluation.score import score_folder
 from barsight.mapping.settings import MapSettings
 from barsight.report.result_files import write_contours, write_height
 from mapping_views import block, fused, view
@@ -69,14 +69,14 @@ def written(out: Path, error_mm: float = 0.0, sigma_m: float = 0.005, hole: slic
         profile[hole] = np.nan
     surface = fused([view(x[kept], y[kept], z[kept], sigma_m)], out / "s", MapSettings(min_views=1, fill_m=0))
     write_height(surface, out / "height.tif")
-    source = np.where(np.isfinite(profile), Source.VISION, Source.UNKNOWN).astype(np.uint8)
+    source = np.where(np.isfinite(profile), HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8)
     contour = Contour(0, X, X * 0 + 0.1, profile, profile * 0 + sigma_m, source)
     write_contours((contour,), out / "contour.csv")
     return out
 
 
 def test_an_exact_map_has_no_error(recording: Path, tmp_path: Path) -> None:
-    figures = score(recording, written(tmp_path / "out"))
+    figures = score_folder(recording, written(tmp_path / "out"))
     assert set(figures) == {
         "contour, smooth places",
         "contour, everywhere",
@@ -98,7 +98,7 @@ def test_an_exact_map_has_no_error(recording: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("error_mm", "within"), [(4.0, 100.0), (-12.0, 0.0)])
 def test_a_shifted_map(recording: Path, tmp_path: Path, error_mm: float, within: float) -> None:
     """The stated sigma of 5 mm covers 9.8 mm."""
-    for group in score(recording, written(tmp_path / "out", error_mm)).values():
+    for group in score_folder(recording, written(tmp_path / "out", error_mm)).values():
         assert group["bias_mm"] == pytest.approx(error_mm, abs=0.01)
         for name in ("median_mm", "mae_mm", "p95_mm", "max_mm"):
             assert group[name] == pytest.approx(abs(error_mm), abs=0.01)
@@ -107,7 +107,7 @@ def test_a_shifted_map(recording: Path, tmp_path: Path, error_mm: float, within:
 
 def test_coverage_counts_what_two_frames_see(recording: Path, tmp_path: Path) -> None:
     """The hole's 40 samples: all are counted in the height map; the profile's first 10 are not."""
-    figures = score(recording, written(tmp_path / "out", hole=slice(0, 40)))
+    figures = score_folder(recording, written(tmp_path / "out", hole=slice(0, 40)))
     assert figures["height, seen by two"]["coverage_pct"] == pytest.approx(60, abs=1e-3)
     profile = smooth(heights(X, np.array(0.1)), 0) & (np.arange(120) >= 10)
     expected = 100 * profile[40:].sum() / profile.sum()
@@ -120,7 +120,7 @@ def test_coverage_counts_what_two_frames_see(recording: Path, tmp_path: Path) ->
 
 def test_missing_files_are_named(recording: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"contour.csv: no such file"):
-        score(recording, tmp_path / "nowhere")
+        score_folder(recording, tmp_path / "nowhere")
     out = written(tmp_path / "out")
     with pytest.raises(InputError, match=r"height.npz: no such file; give a simulated recording"):
-        score(out, out)
+        score_folder(out, out)

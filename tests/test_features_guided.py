@@ -4,7 +4,12 @@ import cv2
 import numpy as np
 
 from barsight.core.types import RectifiedCamera, RectifiedPair
-from barsight.features.guided_matching import PredictedMotion, match_guided, predict_places, project_stereo
+from barsight.features.guided_matching import (
+    PredictedMotion,
+    match_guided,
+    predict_projections,
+    project_stereo,
+)
 from barsight.features.patch_alignment import PatchPair, patch_pair
 
 CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 0.4, 0.0, 320, 240)
@@ -34,12 +39,12 @@ def test_found_refused_and_ambiguous() -> None:
     shift_m = np.array([7.3 * DEPTH_M / 300, 0, 0])
     fine = np.eye(6) * 1e-6
     fine[3:, 3:] = np.eye(3) * 0.005**2
-    right = predict_places(points, 0.2, PredictedMotion(np.eye(3), shift_m, fine), CAMERA)
+    right = predict_projections(points, 0.2, PredictedMotion(np.eye(3), shift_m, fine), CAMERA)
     matches = match_guided(source, places, depth, wall(7.3), right, 0.2)
     assert matches.found.mean() > 0.9
     error = matches.stereo[matches.found, 0] - places[matches.found, 0] - 7.3
     assert np.abs(error).max() < 0.1
-    off = predict_places(
+    off = predict_projections(
         points, 0.05, PredictedMotion(np.eye(3), shift_m + np.array([0.12, 0, 0]), fine * 1e-2), CAMERA
     )
     assert not match_guided(source, places, depth, wall(7.3), off, 0.2).found.any()

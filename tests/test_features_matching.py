@@ -12,12 +12,12 @@ from barsight.core.types import RectifiedCamera
 from barsight.features.detectors import DETECTORS, DetectorName, make_detector
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import (
-    follows_trend,
+    homography_inliers,
     is_mutual,
     match_rows,
-    nearest,
-    on_one_plane,
-    passes_ratio,
+    motion_inliers,
+    nearest_neighbours,
+    ratio_test,
 )
 from synthetic_scenes import Texture, quantised
 
@@ -37,10 +37,10 @@ def test_features_are_found_again_within_their_sigma(name: DetectorName) -> None
         assert 50 < len(first) <= 480
         assert first.is_binary == (name == "orb")
         forward, backward = (
-            nearest(first.descriptors, second.descriptors),
-            nearest(second.descriptors, first.descriptors),
+            nearest_neighbours(first.descriptors, second.descriptors),
+            nearest_neighbours(second.descriptors, first.descriptors),
         )
-        kept = is_mutual(forward, backward) & passes_ratio(forward)
+        kept = is_mutual(forward, backward) & ratio_test(forward)
         error = second.pixels[forward.index[kept]] - first.pixels[kept] - shift
         sigma = np.hypot(first.sigma_px[kept], second.sigma_px[forward.index[kept]])
         true = np.linalg.norm(error, axis=1) < 2
@@ -54,7 +54,7 @@ def test_features_are_found_again_within_their_sigma(name: DetectorName) -> None
 def test_an_empty_picture_has_none(name: DetectorName) -> None:
     found = make_detector(name)(np.full((240, 320), 90, np.uint8), 480)
     assert len(found) == 0
-    assert len(nearest(found.descriptors, found.descriptors).index) == 0
+    assert len(nearest_neighbours(found.descriptors, found.descriptors).index) == 0
 
 
 def test_nearest_is_brute_force_for_both_distances() -> None:
@@ -63,7 +63,7 @@ def test_nearest_is_brute_force_for_both_distances() -> None:
     hamming = np.unpackbits(bits[:20, None] ^ bits[None, 5:], axis=2).sum(axis=2)
     euclid = np.linalg.norm(reals[:20, None] - reals[None, 5:], axis=2)
     for table, first, second in ((hamming, bits[:20], bits[5:]), (euclid, reals[:20], reals[5:])):
-        found = nearest(first, second)
+        found = nearest_neighbours(first, second)
         np.testing.assert_array_equal(found.index, table.argmin(axis=1))
         np.testing.assert_allclose(found.distance, np.sort(table, axis=1)[:, 0], atol=1e-5)
         np.testing.assert_allclose(found.next_distance, np.sort(table, axis=1)[:, 1], atol=1e-5)
@@ -86,13 +86,13 @@ def test_a_homography_loses_what_is_off_its_plane_and_the_trend_does_not() -> No
     move = np.array([0.3, 0.0, 0.0])
     first, second = (project_stereo(p, CAMERA)[:, :2] for p in (points, points + move))
     second[150:] += rng.uniform(12, 30, (50, 2))
-    plane = on_one_plane(first, second)
-    trend = follows_trend(points, second, np.eye(3), move, CAMERA, 2.0)
+    plane = homography_inliers(first, second)
+    trend = motion_inliers(points, second, np.eye(3), move, CAMERA, 2.0)
     assert plane[60:150].mean() > 0.98
     assert plane[:60].mean() < 0.1
     assert trend[:150].all()
     assert not trend[150:].any()
-    assert not on_one_plane(first[:3], second[:3]).any()
+    assert not homography_inliers(first[:3], second[:3]).any()
 
 
 def test_ours_is_precise_and_keeps_the_true_ones(data: Path) -> None:

@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from barsight.core.arrays import Float64, UInt8
 from barsight.features.orb import detect_orb
-from barsight.features.patch_alignment import HALF_PX, locate, patch_image
+from barsight.features.patch_alignment import HALF_PX, align_patches, patch_image
 from synthetic_scenes import Texture, quantised
 
 
@@ -30,7 +30,7 @@ def test_finer_than_a_twentieth_pixel_whatever_the_exposure(shift: tuple[float, 
     guesses = places + np.round(shift)
     before = guesses.copy()
     for picture in (target, dull):
-        again = locate(patch_image(source), patch_image(picture), places, guesses)
+        again = align_patches(patch_image(source), patch_image(picture), places, guesses)
         assert again.found.mean() > 0.95
         error = again.pixels[again.found] - places[again.found] - shift
         assert np.median(np.linalg.norm(error, axis=1)) < 0.02
@@ -47,7 +47,7 @@ def test_a_patch_that_grew() -> None:
     inside = ((true > 14) & (true < (305, 225))).all(axis=1)
     places, true = places[inside], true[inside]
     size = np.full(len(places), 1.15)
-    again = locate(patch_image(source), patch_image(target), places, true + 0.8, grown=size)
+    again = align_patches(patch_image(source), patch_image(target), places, true + 0.8, grown=size)
     error = np.linalg.norm(again.pixels - true, axis=1)[again.found]
     assert again.found.mean() > 0.95
     assert np.percentile(error, 95) < 0.06
@@ -58,7 +58,7 @@ def test_sigma_is_right() -> None:
     for seed in range(4):
         source, target = moved(0, 0, 3.0, seed=2 * seed), moved(0.4, 0.2, 3.0, seed=2 * seed + 1)
         places = corners(source)
-        again = locate(patch_image(source), patch_image(target), places, places, sure=True)
+        again = align_patches(patch_image(source), patch_image(target), places, places, sure=True)
         error = (again.pixels - places - (0.4, 0.2))[again.found]
         scaled.append(error / again.sigma_px[again.found, None])
     spread = float(np.sqrt((np.concatenate(scaled) ** 2).mean()))
@@ -69,12 +69,12 @@ def test_what_is_not_there_is_not_found() -> None:
     source, target = moved(0, 0), quantised(Texture(9)(*np.meshgrid(np.arange(320.0), np.arange(240.0))))
     places = corners(source)
     pictures = patch_image(source), patch_image(target)
-    assert locate(*pictures, places, places).found.mean() < 0.05
-    assert locate(*pictures, places[:0], places[:0]).found.shape == (0,)
+    assert align_patches(*pictures, places, places).found.mean() < 0.05
+    assert align_patches(*pictures, places[:0], places[:0]).found.shape == (0,)
     flat = patch_image(np.full((240, 320), 90, np.uint8))
-    assert not locate(flat, flat, places, places).found.any()
+    assert not align_patches(flat, flat, places, places).found.any()
     edge = np.array([[2.0, 100.0], [318.0, 5.0]])
-    assert not locate(pictures[0], pictures[0], edge, edge).found.any()
+    assert not align_patches(pictures[0], pictures[0], edge, edge).found.any()
 
 
 def slowly(source: UInt8, target: UInt8, place: Float64) -> Float64:
@@ -101,7 +101,7 @@ def slowly(source: UInt8, target: UInt8, place: Float64) -> Float64:
 def test_the_kernel_agrees_with_a_slow_reference() -> None:
     source, target = moved(0, 0, 2.0), moved(0.35, -0.2, 2.0, seed=1)
     places = corners(source)[:40] + 0.3
-    again = locate(patch_image(source), patch_image(target), places, places, sure=True)
+    again = align_patches(patch_image(source), patch_image(target), places, places, sure=True)
     checked = np.flatnonzero(again.found)
     assert len(checked) > 30
     expected = np.array([slowly(source, target, places[k]) for k in checked])
@@ -117,5 +117,5 @@ def test_a_middle_that_doesnt_fix_its_own_place_isnt_found() -> None:
     x = np.arange(20.0, 300, 7)
     for row, on_beam in ((118.0, True), (122.0, True), (104.0, False)):
         places = np.column_stack([x, np.full(x.size, row)])
-        again = locate(patch_image(source), patch_image(target), places, places + np.array([1.0, 0]))
+        again = align_patches(patch_image(source), patch_image(target), places, places + np.array([1.0, 0]))
         assert again.found.mean() < 0.1 if on_beam else again.found.mean() > 0.95

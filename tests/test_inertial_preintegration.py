@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
 from barsight.core.types import ImuSamples
-from barsight.inertial.model import BodyState, ImuBias, corrected, integrate_slowly
+from barsight.inertial.model import BodyState, ImuBias, integrate_reference, subtract_bias
 from barsight.inertial.preintegration import Preintegrated, Preintegrator
 from barsight.recording.formats.ground_truth import read_ground_truth
 
@@ -48,7 +48,7 @@ def error(found: BodyState, truth: BodyState) -> np.ndarray:
 @pytest.mark.parametrize(("first", "last"), [(0, 1_000_000_000), (3_700_001, 1_501_200_007)])
 def test_it_agrees_with_a_slow_integration(first: int, last: int) -> None:
     imu = lively()
-    slow = integrate_slowly(imu, START + first, START + last, STATE, BIAS)
+    slow = integrate_reference(imu, START + first, START + last, STATE, BIAS)
     fast = between(imu, START + first, START + last).predict(STATE)
     np.testing.assert_allclose(error(fast, slow), 0, atol=8e-4)
 
@@ -56,10 +56,10 @@ def test_it_agrees_with_a_slow_integration(first: int, last: int) -> None:
 def test_the_slow_one_is_exact_for_a_fall() -> None:
     stamps = START + np.arange(11, dtype=np.int64) * 100_000_000
     imu = ImuSamples(stamps, np.tile(BIAS.gyro_radps, (11, 1)), np.tile(BIAS.accel_mps2, (11, 1)))
-    end = integrate_slowly(imu, START, START + 1_000_000_000, STATE, BIAS)
+    end = integrate_reference(imu, START, START + 1_000_000_000, STATE, BIAS)
     np.testing.assert_allclose(end.position_m, STATE.position_m + STATE.velocity_mps - [0, 0, 9.80665 / 2])
     np.testing.assert_allclose(end.rotation, STATE.rotation, atol=1e-12)
-    assert np.abs(corrected(imu, BIAS).accel_mps2).max() == 0
+    assert np.abs(subtract_bias(imu, BIAS).accel_mps2).max() == 0
 
 
 def test_the_bias_jacobian_is_the_difference_quotient() -> None:

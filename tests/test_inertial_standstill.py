@@ -5,7 +5,7 @@ import numpy as np
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
 from barsight.core.types import ImuSamples
-from barsight.inertial.standstill import StandingStart, standing_start, stands_still
+from barsight.inertial.standstill import RestEstimate, estimate_at_rest, stands_still
 
 NOISE = ImuNoise(2.4e-4, 2e-5, 1.9e-3, 4e-4, 200.0)
 START = 1_700_000_000_000_000_000
@@ -33,19 +33,19 @@ def test_rest_is_found_and_motion_is_not() -> None:
 
 
 def test_gravity_and_gyro_bias_within_their_sigma() -> None:
-    start = standing_start(rest_then_travel(), START, START + 2_500_000_000, NOISE)
-    assert isinstance(start, StandingStart)
+    start = estimate_at_rest(rest_then_travel(), START, START + 2_500_000_000, NOISE)
+    assert isinstance(start, RestEstimate)
     assert np.abs(start.bias.gyro_radps - GYRO_BIAS).max() < 4 * start.gyro_sigma_radps
     assert np.linalg.norm(np.cross(start.up_in_body, UP)) < 4 * start.tilt_sigma_rad
     assert np.linalg.norm(start.bias.accel_mps2) < 0.01
 
 
 def test_what_is_no_start_is_refused() -> None:
-    moving = standing_start(rest_then_travel(), START + 3_500_000_000, START + 5_000_000_000, NOISE)
+    moving = estimate_at_rest(rest_then_travel(), START + 3_500_000_000, START + 5_000_000_000, NOISE)
     assert isinstance(moving, Failed)
     assert moving.code == "not-still"
-    in_g = standing_start(rest_then_travel(1 / 9.80665), START, START + 2_000_000_000, NOISE)
+    in_g = estimate_at_rest(rest_then_travel(1 / 9.80665), START, START + 2_000_000_000, NOISE)
     assert isinstance(in_g, Failed)
     assert "in g?" in in_g.reason
-    none = standing_start(rest_then_travel(), START - 10**9, START - 1, NOISE)
+    none = estimate_at_rest(rest_then_travel(), START - 10**9, START - 1, NOISE)
     assert isinstance(none, Failed)

@@ -11,7 +11,7 @@ import tifffile
 from barsight.cli.main import run
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
-from barsight.mapping.ego_mask import carried_along
+from barsight.mapping.ego_mask import mask_carried
 
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.5, 0.0, 640, 480)
 DEPTH_M, WAY_M = 7.5, 0.5
@@ -39,7 +39,7 @@ def views(ground: np.ndarray, swing: tuple[int, int]) -> tuple[np.ndarray, np.nd
 def test_a_plate_is_found_and_nothing_else(swing: tuple[int, int]) -> None:
     left, neighbour, disparity = views(noise(1, (480, 700)), swing)
     moved = Pose("rect0", "rect0", np.eye(3), np.array([-WAY_M, 0.0, 0.0]))
-    found = carried_along(left, disparity, CAMERA, neighbour, moved)
+    found = mask_carried(left, disparity, CAMERA, neighbour, moved)
     assert found[PLATE].mean() > 0.9
     inside = np.zeros(left.shape, np.bool_)
     inside[130:330, 220:460] = True
@@ -52,13 +52,13 @@ def test_bars_alike_are_the_yards() -> None:
     left, neighbour = bars[:, :640], bars[:, WAY_PX : 640 + WAY_PX]
     disparity = np.full((480, 640), 600.0 * 0.5 / DEPTH_M, np.float32)
     moved = Pose("rect0", "rect0", np.eye(3), np.array([-WAY_M, 0.0, 0.0]))
-    assert not carried_along(left, disparity, CAMERA, neighbour, moved).any()
+    assert not mask_carried(left, disparity, CAMERA, neighbour, moved).any()
 
 
 def test_a_crane_at_rest_carries_nothing() -> None:
     left, _, disparity = views(noise(1, (480, 700)), (0, 0))
     still = Pose.identity("rect0", "rect0")
-    assert not carried_along(left, disparity, CAMERA, left, still).any()
+    assert not mask_carried(left, disparity, CAMERA, left, still).any()
 
 
 @pytest.mark.slow

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.core.types import Contour, LaserProfile, Source
+from barsight.core.types import Contour, HeightSource, LaserProfile
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.contours import cut, cut_contours, smoothed
+from barsight.mapping.surface.contours import cut_contour, cut_contours, smooth_contour
 from barsight.mapping.surface.surface import Surface
 from mapping_views import block, fused, view
 
@@ -27,7 +27,7 @@ def sloping(tmp_path: Path) -> Surface:
 @pytest.mark.parametrize("y_m", [0.0, 0.123, -0.377, 0.385])
 @pytest.mark.parametrize("phase_m", [0.0, 0.0037, -17.2949])
 def test_a_plane_is_met_exactly(sloping: Surface, y_m: float, phase_m: float) -> None:
-    contour = cut(sloping, 3, y_m, phase_m)
+    contour = cut_contour(sloping, 3, y_m, phase_m)
     assert contour.profile == 3
     known = np.isfinite(contour.z_m)
     inside = (contour.x_m > -0.595) & (contour.x_m < 0.585)
@@ -41,14 +41,14 @@ def test_a_plane_is_met_exactly(sloping: Surface, y_m: float, phase_m: float) ->
     assert between.sum() >= 118
     np.testing.assert_allclose(contour.z_m[between], plane(contour.x_m[between], y_m), atol=2e-6)
     np.testing.assert_allclose(contour.sigma_m[known], np.hypot(0.01, 0.005), rtol=1e-4)
-    assert (contour.source[known] == Source.VISION).all()
+    assert (contour.source[known] == HeightSource.VISION).all()
 
 
 def test_an_edge_stays_an_edge(tmp_path: Path) -> None:
     """A step of 40 mm between two cells: every sample has one side's height, that of the nearest cell."""
     x, y = block(40, 10)
     surface = fused([view(x, y, np.where(x < 20, 1.0, 1.04))], tmp_path)
-    contour = cut(surface, 0, 0.053, 0.003)
+    contour = cut_contour(surface, 0, 0.053, 0.003)
     np.testing.assert_allclose(contour.z_m[:19], 1.0, atol=1e-6)
     known = np.isfinite(contour.z_m)
     expected = np.where(contour.x_m < 0.195, 1.0, 1.04)
@@ -59,14 +59,14 @@ def test_the_unknown_stays_unknown(tmp_path: Path) -> None:
     x, y = block(60, 10)
     hole = (x >= 20) & (x < 40)
     surface = fused([view(x[~hole], y[~hole], 1.0)], tmp_path, MapSettings(min_views=1, fill_m=0.03))
-    contour = cut(surface, 0, 0.05)
+    contour = cut_contour(surface, 0, 0.05)
     inside = (contour.x_m > 0.196) & (contour.x_m < 0.394)
     assert inside.sum() == 20
     assert np.isnan(contour.z_m[inside]).all()
     assert np.isnan(contour.sigma_m[inside]).all()
-    assert (contour.source[inside] == Source.UNKNOWN).all()
+    assert (contour.source[inside] == HeightSource.UNKNOWN).all()
     np.testing.assert_allclose(contour.z_m[~inside][:-1], 1.0)
-    away = cut(surface, 0, 5.0)
+    away = cut_contour(surface, 0, 5.0)
     assert np.isnan(away.z_m).all()
 
 
@@ -74,8 +74,8 @@ def test_filled_places_say_so(tmp_path: Path) -> None:
     x, y = block(60, 10)
     gap = (x >= 30) & (x < 32)
     surface = fused([view(x[~gap], y[~gap], 1.0)], tmp_path)
-    contour = cut(surface, 0, 0.05)
-    filled = contour.source == Source.FILLED
+    contour = cut_contour(surface, 0, 0.05)
+    filled = contour.source == HeightSource.FILLED
     np.testing.assert_allclose(contour.x_m[filled], [0.30, 0.31], atol=1e-9)
     np.testing.assert_allclose(contour.z_m[filled], 1.0, atol=1e-6)
 
@@ -101,7 +101,7 @@ def test_where_contours_are_cut(sloping: Surface) -> None:
 
 def test_an_empty_surface_has_empty_contours(tmp_path: Path) -> None:
     surface = fused([], tmp_path)
-    contour = cut(surface, 0, 0.0)
+    contour = cut_contour(surface, 0, 0.0)
     assert np.isnan(contour.z_m).all()
 
 
@@ -110,7 +110,7 @@ def test_coarser_cells(tmp_path: Path, cell_m: float) -> None:
     """Samples every 10 mm whatever the cell's side."""
     x, y = block(60, 20)
     surface = fused([view(x, y, plane(x * cell_m, y * cell_m))], tmp_path, cell_m=cell_m)
-    contour = cut(surface, 0, 0.17)
+    contour = cut_contour(surface, 0, 0.17)
     between = (contour.x_m >= 0) & (contour.x_m <= 59 * cell_m)
     assert between.sum() == round(59 * cell_m / 0.01) + 1
     np.testing.assert_allclose(contour.z_m[between], plane(contour.x_m[between], 0.17), atol=1e-5)
@@ -122,13 +122,13 @@ def test_the_papers_contour_fills_gaps_and_says_so(tmp_path: Path) -> None:
     hole = (x >= 30) & (x < 50)
     z = plane(x * CELL_M, y * CELL_M) + np.where(x == 10, 0.02, 0.0)
     surface = fused([view(x[~hole], y[~hole], z[~hole])], tmp_path, MapSettings(min_views=1, fill_m=0))
-    raw = cut(surface, 0, 0.05)
-    contour = smoothed(raw)
+    raw = cut_contour(surface, 0, 0.05)
+    contour = smooth_contour(raw)
     np.testing.assert_allclose(contour.z_m[3:-3], plane(contour.x_m[3:-3], 0.05), atol=0.003)
     filled = np.isnan(raw.z_m) & (raw.x_m < 0.6)
     assert filled.sum() == 20
-    assert (contour.source[filled] == Source.FILLED).all()
+    assert (contour.source[filled] == HeightSource.FILLED).all()
     np.testing.assert_array_equal(contour.source[~filled], raw.source[~filled])
     assert contour.sigma_m[filled].min() > 0.5 * 0.3 * 0.19
     lonely = Contour(0, raw.x_m, raw.y_m, np.full_like(raw.z_m, np.nan), raw.sigma_m, raw.source)
-    assert smoothed(lonely) is lonely
+    assert smooth_contour(lonely) is lonely

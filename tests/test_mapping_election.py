@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera, Source
-from barsight.mapping.fusion import fuse
+from barsight.core.types import HeightSource, RectifiedCamera
+from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.height_selection import Sights, first_heights
+from barsight.mapping.surface.height_selection import ViewFrusta, elect_by_votes
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Layers
 from barsight.mapping.tiles import FIELDS, SLOTS, VIEWS, TileStore, Z
@@ -55,8 +55,8 @@ def scene_view(left_eye_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def surface_of(views: list[CellObservations], folder: Path) -> Layers:
     store = TileStore(folder, 64)
     for one in views:
-        fuse(store, one, MapSettings())
-    sights = Sights.of([pose_at(x) for x in EYES_X_M], CAMERA)
+        fuse_view(store, one, MapSettings())
+    sights = ViewFrusta.of([pose_at(x) for x in EYES_X_M], CAMERA)
     return (
         SurfaceElection(store, folder, CELL_M, MapSettings(fill_m=0.0))
         .finish(2, sights)
@@ -77,7 +77,7 @@ def test_what_is_seen_is_elected_and_what_hangs_in_the_air_is_not(tmp_path: Path
     layers = surface_of(views, tmp_path)
     wall = slice(200 + WALL[0], 200 + WALL[1])
     np.testing.assert_allclose(layers.z_m[:, wall], 1.0)
-    assert (layers.source[:, wall] == Source.VISION).all()
+    assert (layers.source[:, wall] == HeightSource.VISION).all()
     beside = np.delete(layers.z_m, np.arange(wall.start, wall.stop), axis=1)
     np.testing.assert_allclose(beside[np.isfinite(beside)], 0.0)
     expected = sum(seen_by_both(np.arange(-200, 200), np.zeros(400), eye) for eye in EYES_X_M)
@@ -110,13 +110,13 @@ def test_a_hook_that_travels_along_leaves_no_ghost(tmp_path: Path) -> None:
         x, y = np.append(x[kept], hook_x), np.append(y[kept], hook_y)
         views.append(view(x, y, np.append(z[kept], np.full(hook_x.size, 4.0))))
     layers = surface_of(views, tmp_path)
-    assert (layers.source == Source.VISION).mean() > 0.85
+    assert (layers.source == HeightSource.VISION).mean() > 0.85
     assert np.nanmax(layers.z_m) <= 1.0 + 1e-6
 
 
 @pytest.mark.parametrize(("low", "high", "held"), [(-0.5, 0.5, True), (30.0, 31.0, False), (7.0, 8.0, False)])
 def test_views_far_from_a_box_are_left_out(low: float, high: float, held: bool) -> None:
-    sights = Sights.of([pose_at(0.0)], CAMERA)
+    sights = ViewFrusta.of([pose_at(0.0)], CAMERA)
     near = sights.near(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0]))
     assert len(near.eyes) == held
 
@@ -132,10 +132,12 @@ def test_views_with_few_points_a_cell_owe_few_votes(tmp_path: Path) -> None:
         hit = rng.random(x.size) < 0.1
         votes += hit
         one = view(x[hit], y[hit], np.zeros(int(hit.sum())))
-        fuse(store, one, MapSettings())
+        fuse_view(store, one, MapSettings())
         poses.append(high_above(one, 0.01))
-    surface = SurfaceElection(store, tmp_path, 0.01, MapSettings(fill_m=0.0)).finish(2, Sights.of(poses, far))
-    known = surface.window(0, 0, 60, 60).source == Source.VISION
+    surface = SurfaceElection(store, tmp_path, 0.01, MapSettings(fill_m=0.0)).finish(
+        2, ViewFrusta.of(poses, far)
+    )
+    known = surface.window(0, 0, 60, 60).source == HeightSource.VISION
     np.testing.assert_array_equal(known.ravel(), votes >= 2)
 
 
@@ -150,8 +152,8 @@ def test_beneath_a_surface_that_the_border_cuts_off_nothing_is_known(
     top_m = np.where((x >= 0) & (y < wall_ends) & (y < 38), 1.0, 0.0)
     store = TileStore(tmp_path, 64)
     for _ in EYES_X_M:
-        fuse(store, view(x, y, top_m), MapSettings())
-    sights = Sights.of([pose_at(eye) for eye in EYES_X_M], camera)
+        fuse_view(store, view(x, y, top_m), MapSettings())
+    sights = ViewFrusta.of([pose_at(eye) for eye in EYES_X_M], camera)
     known = np.isfinite(
         SurfaceElection(store, tmp_path, CELL_M, MapSettings(fill_m=0.0))
         .finish(2, sights)
@@ -168,7 +170,7 @@ def test_first_heights_are_the_highest_with_enough_votes() -> None:
     tile = np.zeros((6, 7, SLOTS, FIELDS), np.float32)
     tile[..., VIEWS], tile[..., Z] = rng.integers(0, 9, tile.shape[:3]), rng.normal(size=tile.shape[:3])
     tile[0] = 0
-    found = first_heights(tile, 3, 0.35)
+    found = elect_by_votes(tile, 3, 0.35)
     for i, j in np.ndindex(found.shape):
         needed = max(3, 0.35 * tile[i, j, :, VIEWS].max())
         enough = [z for z, views in tile[i, j][:, [Z, VIEWS]] if views >= needed]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.mapping.fusion import PRIOR_VIEWS
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import SLOTS, TILE_CELLS, VIEWS, TileStore, Z
@@ -69,10 +69,10 @@ def test_many_different_outliers_dont_fill_the_cell(tmp_path: Path) -> None:
 def test_the_highest_supported_height_wins(tmp_path: Path) -> None:
     """A bar over a floor that is seen past it more often, but not a height with too few views."""
     floor, bar = [(0.0, 0.01)] * 10, [(1.0, 0.01)]
-    assert at_origin(floor + bar * 4, tmp_path / "a", own_share=0.25, along_share=1.0)[0] == pytest.approx(
+    assert at_origin(floor + bar * 4, tmp_path / "a", own_ratio=0.25, along_ratio=1.0)[0] == pytest.approx(
         1.0
     )
-    assert at_origin(floor + bar * 3, tmp_path / "b", own_share=0.25, along_share=1.0)[0] == pytest.approx(
+    assert at_origin(floor + bar * 3, tmp_path / "b", own_ratio=0.25, along_ratio=1.0)[0] == pytest.approx(
         0.0
     )
 
@@ -82,7 +82,7 @@ def test_too_few_views_are_unknown(tmp_path: Path) -> None:
     layers = surface.window(0, 0, 1, 1)
     assert np.isnan(layers.z_m).all()
     assert np.isnan(layers.sigma_m).all()
-    assert layers.source[0, 0] == Source.UNKNOWN
+    assert layers.source[0, 0] == HeightSource.UNKNOWN
     assert surface.seen == 0
     assert surface.shape == (0, 0)
 
@@ -107,7 +107,7 @@ def voted_slowly(heights: list[tuple[float, float]], settings: MapSettings) -> t
         near = [
             k
             for k in kept
-            if abs(k[0] - z) <= max(settings.gate_sigma * np.sqrt(sigma**2 + 1 / k[1]), settings.least_gate_m)
+            if abs(k[0] - z) <= max(settings.gate_sigma * np.sqrt(sigma**2 + 1 / k[1]), settings.min_gate_m)
         ]
         if near:
             nearest = min(near, key=lambda k: abs(k[0] - z))
@@ -124,7 +124,7 @@ def voted_slowly(heights: list[tuple[float, float]], settings: MapSettings) -> t
 
 def test_the_kernels_agree_with_the_slow_reference(tmp_path: Path) -> None:
     rng = np.random.default_rng(9)
-    settings = MapSettings(min_views=1, own_share=0.01, fill_m=0)
+    settings = MapSettings(min_views=1, own_ratio=0.01, fill_m=0)
     x, y = block(200, 5)
     level = rng.choice(
         [0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.4], (12, 5, 200), p=[0.3, 0.3, 0.1, 0.1, 0.1, 0.05, 0.05]
@@ -212,7 +212,7 @@ def test_a_store_holds_no_more_than_it_may(tmp_path: Path) -> None:
         {"cell_m": 0.0},
         {"min_views": 0},
         {"resident_tiles": 1},
-        {"top_share": 0.0},
+        {"top_ratio": 0.0},
         {"fill_m": -1.0},
         {"along_m": -1.0},
     ],

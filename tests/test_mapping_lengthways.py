@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from barsight.mapping.surface.directional_filter import blur_sigma, lengthways, sharpened, valleys
+from barsight.mapping.surface.directional_filter import (
+    blur_sigma,
+    deblur_across,
+    smooth_along_bars,
+    valley_mask,
+)
 
 CELL_M, GATE_M, REACH = 0.01, 0.015, 12
 BLUR_CELLS = 0.7
@@ -45,7 +50,7 @@ def test_the_kernel_agrees_with_the_slow_reference() -> None:
     weight = rng.uniform(1, 5, z.shape)
     weight[rng.random(z.shape) < 0.1] = 0
     z[weight == 0] = np.nan
-    found, direction = lengthways(z.astype(np.float32), weight.astype(np.float32), GATE_M, REACH)
+    found, direction = smooth_along_bars(z.astype(np.float32), weight.astype(np.float32), GATE_M, REACH)
     assert np.array_equal(direction < 0, weight == 0)
     np.testing.assert_allclose(found, averaged_slowly(z, weight), atol=1e-6)
 
@@ -56,7 +61,7 @@ def test_noise_falls_and_bars_keep_their_shape(turn_deg: float) -> None:
     truth = bars(turn_deg)
     rng = np.random.default_rng(1)
     noisy = (truth + rng.normal(0, 0.002, truth.shape)).astype(np.float32)
-    error = lengthways(noisy, np.ones_like(noisy), GATE_M, REACH)[0] - truth
+    error = smooth_along_bars(noisy, np.ones_like(noisy), GATE_M, REACH)[0] - truth
     inner = error[15:-15, 15:-15]
     crest = truth[15:-15, 15:-15] > 0.03
     assert np.std(inner[crest]) < 0.0013
@@ -66,8 +71,8 @@ def test_noise_falls_and_bars_keep_their_shape(turn_deg: float) -> None:
 def test_a_step_stays_a_step() -> None:
     z = np.zeros((40, 40), np.float32)
     z[:, 20:] = 0.05
-    averaged, direction = lengthways(z, np.ones_like(z), GATE_M, REACH)
-    np.testing.assert_allclose(sharpened(averaged, direction, BLUR_CELLS + 0 * z), z, atol=1e-7)
+    averaged, direction = smooth_along_bars(z, np.ones_like(z), GATE_M, REACH)
+    np.testing.assert_allclose(deblur_across(averaged, direction, BLUR_CELLS + 0 * z), z, atol=1e-7)
 
 
 def sharpened_slowly(z: np.ndarray, direction: np.ndarray, blur_cells: np.ndarray) -> np.ndarray:
@@ -90,7 +95,9 @@ def test_sharpening_agrees_with_the_slow_reference() -> None:
     z[rng.random(z.shape) < 0.1] = np.nan
     direction = np.where(np.isfinite(z), rng.integers(0, 16, z.shape), -1).astype(np.int8)
     blur = rng.uniform(0, 2, z.shape).astype(np.float32)
-    np.testing.assert_allclose(sharpened(z, direction, blur), sharpened_slowly(z, direction, blur), atol=1e-6)
+    np.testing.assert_allclose(
+        deblur_across(z, direction, blur), sharpened_slowly(z, direction, blur), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 30.0, 90.0])
@@ -98,14 +105,14 @@ def test_sharpening_agrees_with_the_slow_reference() -> None:
 def test_sharpening_undoes_part_of_a_windows_blur(turn_deg: float, diameter_m: float) -> None:
     truth = bars(turn_deg, diameter_m)
     blurred = gaussian_filter(truth, BLUR_CELLS).astype(np.float32)
-    averaged, direction = lengthways(blurred, np.ones_like(blurred), GATE_M, REACH)
+    averaged, direction = smooth_along_bars(blurred, np.ones_like(blurred), GATE_M, REACH)
     inner = (slice(15, -15),) * 2
-    sharp = sharpened(averaged, direction, BLUR_CELLS + 0 * blurred)
+    sharp = deblur_across(averaged, direction, BLUR_CELLS + 0 * blurred)
     before, after = averaged - truth, sharp - truth
     left = 0.8 if turn_deg % 90 == 0 else 0.9
     assert np.std(after[inner]) < left * np.std(before[inner])
     assert abs(np.mean(after[inner])) < 0.0005
-    sigma = blur_sigma(sharp - averaged, valleys(sharp, direction))
+    sigma = blur_sigma(sharp - averaged, valley_mask(sharp, direction))
     assert np.mean((np.abs(after) <= 1.96 * sigma)[inner]) > 0.8
 
 
@@ -130,7 +137,7 @@ def test_valleys_agree_with_the_slow_reference() -> None:
     z = (bars(20.0, cells=40) + rng.normal(0, 0.005, (40, 40))).astype(np.float32)
     z[rng.random(z.shape) < 0.1] = np.nan
     direction = np.where(np.isfinite(z), rng.integers(0, 16, z.shape), -1).astype(np.int8)
-    np.testing.assert_array_equal(valleys(z, direction), valleys_slowly(z, direction))
+    np.testing.assert_array_equal(valley_mask(z, direction), valleys_slowly(z, direction))
 
 
 @pytest.mark.parametrize("diameter_m", [0.04, 0.06])
@@ -140,11 +147,11 @@ def test_valleys_lie_between_crests(diameter_m: float) -> None:
     z = bars(0.0, diameter_m).astype(np.float32)
     direction = np.full(z.shape, 8, np.int8)
     depth = z.max() - z
-    found = valleys(z, direction)[:, 15:-15]
+    found = valley_mask(z, direction)[:, 15:-15]
     assert not found[depth[:, 15:-15] < 1e-6].any()
     assert found[(depth[:, 15:-15] > 0.004) & (depth[:, 15:-15] < 0.02)].all()
     slope = np.broadcast_to(np.arange(40, dtype=np.float32) * 0.005, (40, 40))
-    assert not valleys(slope, np.full((40, 40), 8, np.int8)).any()
+    assert not valley_mask(slope, np.full((40, 40), 8, np.int8)).any()
 
 
 def test_what_blur_leaves_is_twice_the_rms_moved_and_more_in_valleys() -> None:

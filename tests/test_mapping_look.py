@@ -11,7 +11,7 @@ import pytest
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera
-from barsight.mapping.scene_extent import apart, apart_by_encoders
+from barsight.mapping.scene_extent import select_keyframes, select_keyframes_by_encoders
 from barsight.mapping.settings import MapSettings
 from barsight.pipeline import MeasureSettings
 
@@ -36,10 +36,10 @@ def _rectifier() -> Any:
 def test_frames_are_taken_once_the_picture_has_moved_far_enough() -> None:
     # A tenth of 800 px at 8 m and 1000 px is 0.64 m.
     frames = _frames([0.0, 0.3, 0.65, 0.9, 1.2, 1.3, 1.4], [0.0] * 7)
-    assert apart(frames, _rectifier(), RANGE_M, 0.1) == {0, 2, 5, 6}
-    assert apart(frames, _rectifier(), RANGE_M, 0.0) == set(range(7))
+    assert select_keyframes(frames, _rectifier(), RANGE_M, 0.1) == {0, 2, 5, 6}
+    assert select_keyframes(frames, _rectifier(), RANGE_M, 0.0) == set(range(7))
     turned = _frames([0.0] * 4, [0.0, 0.05, 0.1, 0.1])
-    assert apart(turned, _rectifier(), RANGE_M, 0.1) == {0, 2, 3}
+    assert select_keyframes(turned, _rectifier(), RANGE_M, 0.1) == {0, 2, 3}
 
 
 def test_encoders_choose_as_the_trajectory_does() -> None:
@@ -48,15 +48,15 @@ def test_encoders_choose_as_the_trajectory_does() -> None:
     places = np.column_stack([read, 0 * read + 2, 0 * read + 8])
     crane = CraneSamples(np.array([100, 102, 105, 106]), places, np.zeros(3), np.eye(3), 0.001)
     for share in (0.0, 0.1, 0.15):
-        chosen = apart_by_encoders(range(7), crane, 100, CAMERA, RANGE_M, share)
-        assert set(chosen) == apart(frames, _rectifier(), RANGE_M, share)
+        chosen = select_keyframes_by_encoders(range(7), crane, 100, CAMERA, RANGE_M, share)
+        assert set(chosen) == select_keyframes(frames, _rectifier(), RANGE_M, share)
 
 
 def test_preset_fast_says_what_it_changes() -> None:
     best, fast = MeasureSettings().chosen(), MeasureSettings(preset="fast").chosen()
-    assert (best.stereo.barsight.preset, best.map.least_shift) == ("best", 0.0)
-    assert (fast.stereo.barsight.preset, fast.map.least_shift) == ("fast", 0.1)
-    wider = MeasureSettings(preset="fast", map=MapSettings(least_shift=0.2)).chosen()
-    assert wider.map.least_shift == 0.2
-    with pytest.raises(ConfigError, match="least_shift"):
-        MapSettings(least_shift=0.9)
+    assert (best.stereo.barsight.preset, best.map.min_shift) == ("best", 0.0)
+    assert (fast.stereo.barsight.preset, fast.map.min_shift) == ("fast", 0.1)
+    wider = MeasureSettings(preset="fast", map=MapSettings(min_shift=0.2)).chosen()
+    assert wider.map.min_shift == 0.2
+    with pytest.raises(ConfigError, match="min_shift"):
+        MapSettings(min_shift=0.9)

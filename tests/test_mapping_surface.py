@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from barsight.core.pose import Pose
-from barsight.core.types import Source
-from barsight.mapping.fusion import fuse
+from barsight.core.types import HeightSource
+from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.height_selection import Sights
+from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Layers, fill_gaps, read_tile
 from barsight.mapping.tiles import TileStore
@@ -37,7 +37,7 @@ def test_windows_over_tile_borders(tmp_path: Path, column: int, row: int, column
     inside = (x >= -280) & (x < 280) & (y >= -270) & (y < 270)
     np.testing.assert_allclose(layers.z_m[inside], height_at(x, y)[inside], atol=1e-6)
     assert np.isnan(layers.z_m[~inside]).all()
-    np.testing.assert_array_equal(layers.source, np.where(inside, Source.VISION, Source.UNKNOWN))
+    np.testing.assert_array_equal(layers.source, np.where(inside, HeightSource.VISION, HeightSource.UNKNOWN))
     np.testing.assert_array_equal(layers.views, inside)
 
 
@@ -57,7 +57,7 @@ def test_the_intensity_is_that_of_the_elected_height(tmp_path: Path) -> None:
     surface = fused([*views, stray], tmp_path, MapSettings(min_views=2))
     layers = surface.window(0, 0, 9, 1)
     np.testing.assert_allclose(layers.intensity[seen], 155)
-    assert layers.source[0, 4] == Source.FILLED
+    assert layers.source[0, 4] == HeightSource.FILLED
     assert np.isnan(layers.intensity[0, 4])
 
 
@@ -68,7 +68,7 @@ def layers_of(z: np.ndarray, sigma: float = 0.01) -> Layers:
         z.astype(np.float32),
         np.where(seen, sigma, np.nan).astype(np.float32),
         seen.astype(np.float32),
-        np.where(seen, Source.VISION, Source.UNKNOWN).astype(np.uint8),
+        np.where(seen, HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8),
         np.where(seen, 100, np.nan).astype(np.float32),
     )
 
@@ -104,17 +104,17 @@ def test_gaps_are_filled_between_two_seen_cells_only(reach: int) -> None:
     layers = layers_of(z)
     fill_gaps(layers, reach)
     height, spread = filled_slowly(z, 0.01, reach)
-    filled = layers.source == Source.FILLED
+    filled = layers.source == HeightSource.FILLED
     np.testing.assert_array_equal(filled, np.isfinite(height))
     assert 100 < filled.sum() < np.isnan(z).sum()
     np.testing.assert_allclose(layers.z_m[filled], height[filled], atol=1e-6)
     np.testing.assert_allclose(layers.sigma_m[filled], spread[filled], atol=1e-6)
     seen = np.isfinite(z)
     np.testing.assert_array_equal(layers.z_m[seen], z[seen].astype(np.float32))
-    assert (layers.source[seen] == Source.VISION).all()
+    assert (layers.source[seen] == HeightSource.VISION).all()
     unknown = ~seen & ~filled
     assert np.isnan(layers.z_m[unknown]).all()
-    assert (layers.source[unknown] == Source.UNKNOWN).all()
+    assert (layers.source[unknown] == HeightSource.UNKNOWN).all()
     assert (layers.views[~seen] == 0).all()
 
 
@@ -123,8 +123,8 @@ def test_nothing_is_extrapolated() -> None:
     z[3:6, 3:6] = 1.0
     layers = layers_of(z)
     fill_gaps(layers, 3)
-    np.testing.assert_array_equal(layers.source == Source.VISION, np.isfinite(z))
-    assert (layers.source != Source.FILLED).all()
+    np.testing.assert_array_equal(layers.source == HeightSource.VISION, np.isfinite(z))
+    assert (layers.source != HeightSource.FILLED).all()
 
 
 def test_gaps_are_filled_across_tile_borders(tmp_path: Path) -> None:
@@ -136,11 +136,11 @@ def test_gaps_are_filled_across_tile_borders(tmp_path: Path) -> None:
     )
     layers = surface.window(226, 0, 60, 10)
     narrow = (x >= 255) & (x < 258)
-    assert (layers.source[narrow] == Source.FILLED).all()
+    assert (layers.source[narrow] == HeightSource.FILLED).all()
     np.testing.assert_allclose(layers.z_m[narrow], 1 + 0.01 * x[narrow], atol=1e-5)
     assert (layers.sigma_m[narrow] > 0.019).all()
     wide = (x >= 270) & (x < 277)
-    assert (layers.source[wide] == Source.UNKNOWN).all()
+    assert (layers.source[wide] == HeightSource.UNKNOWN).all()
     assert (surface.seen, surface.filled) == ((~gap).sum(), narrow.sum())
     unfilled = fused([view(x[~gap], y[~gap], 1.0)], tmp_path / "b", MapSettings(min_views=1, fill_m=0.0))
     assert unfilled.filled == 0
@@ -203,16 +203,16 @@ def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
         store, poses, shown = TileStore(folder, 64), [], []
         election = SurfaceElection(store, folder, 0.01, settings)
         for one in views:
-            fuse(store, one, settings)
+            fuse_view(store, one, settings)
             poses.append(low_above(one))
             if kind == "often":
-                shown.append(election.snapshot(2, Sights.of(poses, CAMERA)))
+                shown.append(election.snapshot(2, ViewFrusta.of(poses, CAMERA)))
         if shown:
             first = shown[1].window(0, 200, 300, 90)
             assert np.isfinite(first.z_m).mean() > 0.9
             elected = [t.stat().st_ino for t in sorted(shown[-2].folder.glob("surface_0_*"))]
             assert elected == [t.stat().st_ino for t in sorted(shown[-1].folder.glob("surface_0_*"))]
-        surface = election.finish(2, Sights.of(poses, CAMERA))
+        surface = election.finish(2, ViewFrusta.of(poses, CAMERA))
         clouds = [
             np.concatenate([getattr(p, n).ravel() for n in ("xyz_m", "sigma_z_m")]) for p in surface.cloud()
         ]

@@ -12,9 +12,9 @@ from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.types import RefusedFrame
-from barsight.evaluation.board_poses import board_poses, by_gyro_alone_deg
-from barsight.evaluation.trajectory_error import Drift, compare
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.evaluation.board_poses import board_poses, gyro_only_rmse_deg
+from barsight.evaluation.trajectory_error import Drift, trajectory_drift
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats import board_corners as corners
@@ -48,10 +48,10 @@ def opened(path: Path, data: Path) -> CornerRecording:
 
 
 def drift(recording: CornerRecording, truth: GroundTruth, use: str) -> Drift:
-    estimator = FusedTrajectory(FusionSettings(use=use), CraneSettings())
+    estimator = BatchFusion(FusionSettings(use=use), CraneSettings())
     trajectory = estimator(recording, Rectifier(recording.rig), lambda: None)
     assert len(trajectory.refused) <= 1
-    found = compare(trajectory, truth, 0)
+    found = trajectory_drift(trajectory, truth, 0)
     assert found is not None
     return found
 
@@ -121,9 +121,9 @@ def test_the_gyro_alone_follows_true_poses() -> None:
     stamps = START_NS + (np.arange(0.1, 3.9, 0.05) * 1e9).astype(np.int64)
     turns = way.rotation((stamps - START_NS) / 1e9)
     true = GroundTruth(stamps, tuple(Pose("world", "body", turn, np.zeros(3)) for turn in turns))
-    assert by_gyro_alone_deg(imu, true, 0) < 0.05
-    assert by_gyro_alone_deg(imu, true, 20_000_000) > 0.2
-    assert np.isnan(by_gyro_alone_deg(imu, true, 10**12))
+    assert gyro_only_rmse_deg(imu, true, 0) < 0.05
+    assert gyro_only_rmse_deg(imu, true, 20_000_000) > 0.2
+    assert np.isnan(gyro_only_rmse_deg(imu, true, 10**12))
 
 
 def test_euroc_s_board(data: Path, tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_euroc_s_board(data: Path, tmp_path: Path) -> None:
     assert truth is not None and imu is not None
     both, pictures = drift(recording, truth, "stereo,imu"), drift(recording, truth, "stereo")
     assert both.aligned_rmse_mm < 10
-    assert by_gyro_alone_deg(imu, truth, 0) > 0.3
+    assert gyro_only_rmse_deg(imu, truth, 0) > 0.3
     assert both.aligned_rmse_deg < 0.45
     assert pictures.aligned_rmse_mm < 8
     assert pictures.aligned_rmse_deg < 0.3

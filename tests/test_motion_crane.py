@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.types import CraneSamples, ImuSamples
-from barsight.motion.crane.encoder_trajectory import CraneSettings, CraneTrajectory, fit_position
+from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry, fit_position
 from barsight.motion.crane.robust_parabola import ROUNDS, fit_parabola
 from barsight.motion.crane.sway import sway_at, turned_angle
 from motion_recordings import MemoryRecording, ideal_rig
@@ -117,7 +117,7 @@ def test_the_trajectory_is_the_crane_points_plus_the_mount() -> None:
     source = recording(30_000_000, stamps_ns=stamps, crane_samples=crane)
     told = []
     settings = CraneSettings(attitude_std_deg=0.2)
-    trajectory = CraneTrajectory(settings)(source, Rectifier(source.rig), lambda: told.append(1))
+    trajectory = EncoderOdometry(settings)(source, Rectifier(source.rig), lambda: told.append(1))
     assert trajectory.reference == "yard"
     assert trajectory.sensors == ("crane",)
     assert [f.stamp_ns for f in trajectory.frames] == list(stamps[:5])
@@ -134,7 +134,7 @@ def test_the_trajectory_is_the_crane_points_plus_the_mount() -> None:
 
 def test_without_encoders_it_says_so() -> None:
     with pytest.raises(MeasurementError, match="memory: no crane encoders; measure without them"):
-        CraneTrajectory(CraneSettings())(recording(), Rectifier(ideal_rig()), lambda: None)
+        EncoderOdometry(CraneSettings())(recording(), Rectifier(ideal_rig()), lambda: None)
 
 
 def swaying(bias: float) -> tuple[ImuSamples, np.ndarray]:
@@ -158,7 +158,7 @@ def test_the_sway_turns_the_attitude() -> None:
     stamp = int(imu.stamp_ns[2000])
     crane = readings(400)
     source = recording(stamps_ns=(stamp,), crane_samples=crane, imu_samples=imu)
-    trajectory = CraneTrajectory(CraneSettings())(source, Rectifier(source.rig), lambda: None)
+    trajectory = EncoderOdometry(CraneSettings())(source, Rectifier(source.rig), lambda: None)
     assert trajectory.sensors == ("crane", "imu")
     expected = NOMINAL @ Rotation.from_rotvec(truth[2000]).as_matrix()
     found = trajectory.frames[0].reference_from_body.rotation
@@ -179,7 +179,7 @@ def test_an_imu_that_doesnt_cover_the_frame() -> None:
     crane = readings(40)
     source = recording(stamps_ns=(START_NS + 900_000_000,), crane_samples=crane, imu_samples=holed)
     source.imu_samples = ImuSamples(imu.stamp_ns + 10**12, imu.gyro_radps, imu.accel_mps2)
-    trajectory = CraneTrajectory(CraneSettings())(source, Rectifier(source.rig), lambda: None)
+    trajectory = EncoderOdometry(CraneSettings())(source, Rectifier(source.rig), lambda: None)
     assert trajectory.sensors == ("crane",)
     assert trajectory.warnings == ("the IMU doesn't cover 1 frames: nominal attitude",)
 

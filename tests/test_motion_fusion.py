@@ -12,18 +12,18 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, Trajectory
-from barsight.evaluation.trajectory_error import Drift, compare
-from barsight.features.guided_matching import project_stereo, triangulate
+from barsight.evaluation.trajectory_error import Drift, trajectory_drift
+from barsight.features.guided_matching import project_stereo, triangulate_stereo
 from barsight.motion.batch import fusion
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.frontend.tracking import Sighting
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
 from barsight.recording.open import open_recording
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
-from barsight.simulation.settings import CameraSettings, MotionSettings, SensorSettings
-from barsight.simulation.trajectory import CraneTrajectory
+from barsight.simulation.settings import CameraSettings, SensorSettings, TravelSettings
+from barsight.simulation.trajectory import SimulatedTrajectory
 from motion_recordings import MemoryRecording, ideal_rig
 
 SIGMA_PX = 0.1
@@ -47,7 +47,7 @@ def simulated(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTr
     The nominal attitude and the disparity are off by as much as the settings say they may be.
     """
     rng = np.random.default_rng(seed)
-    way = CraneTrajectory.plan(6.0, CameraSettings(), MotionSettings(), DOWN, rng)
+    way = SimulatedTrajectory.plan(6.0, CameraSettings(), TravelSettings(), DOWN, rng)
     rig = ideal_rig(1280, 1024)
     mount = Pose("body", "cam0", np.eye(3), np.array([0.06, -0.09, 0.04]))
     rig = replace(rig, body_from_cam0=mount, body_from_cam1=mount @ rig.cam0_from_cam1)
@@ -84,10 +84,8 @@ def simulated(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTr
 def fused(
     recording: Recording, monkeypatch: pytest.MonkeyPatch, sightings: tuple[Sighting, ...]
 ) -> Trajectory:
-    monkeypatch.setattr(fusion, "follow", lambda *_: (sightings, ()))
-    return FusedTrajectory(FusionSettings(), CraneSettings())(
-        recording, Rectifier(recording.rig), lambda: None
-    )
+    monkeypatch.setattr(fusion, "track_recording", lambda *_: (sightings, ()))
+    return BatchFusion(FusionSettings(), CraneSettings())(recording, Rectifier(recording.rig), lambda: None)
 
 
 def relative_nees(trajectory: Trajectory, truth: GroundTruth) -> np.ndarray:
@@ -112,7 +110,7 @@ def test_the_covariance_is_right_over_seeds(monkeypatch: pytest.MonkeyPatch) -> 
     for seed in range(20):
         recording, sightings, truth = simulated(seed)
         trajectory = fused(recording, monkeypatch, sightings)
-        drift = compare(trajectory, truth, 0)
+        drift = trajectory_drift(trajectory, truth, 0)
         assert drift is not None
         drifts.append(drift)
         relative.append(relative_nees(trajectory, truth))
@@ -128,11 +126,11 @@ def test_the_covariance_is_right_over_seeds(monkeypatch: pytest.MonkeyPatch) -> 
 def measured(path: Path, use: str) -> Drift:
     recording = open_recording(path)
     told: list[int] = []
-    estimator = FusedTrajectory(FusionSettings(use=use), CraneSettings())
+    estimator = BatchFusion(FusionSettings(use=use), CraneSettings())
     trajectory = estimator(recording, Rectifier(recording.rig), lambda: told.append(1))
     stamps = np.array(recording.index.stamps_ns)
     assert len(told) == len(trajectory.frames) == len(stamps)
-    drift = compare(trajectory, read_ground_truth(path, stamps), recording.rig.timeshift_cam_imu_ns)
+    drift = trajectory_drift(trajectory, read_ground_truth(path, stamps), recording.rig.timeshift_cam_imu_ns)
     assert drift is not None
     return drift
 
@@ -150,10 +148,10 @@ def test_a_crane_over_bars(data: Path) -> None:
     assert drift.nees_position < 2
 
 
-@pytest.mark.parametrize(("use", "most_mm"), [("stereo", 1.2), ("stereo,imu", 1.0)])
-def test_a_crane_without_encoders(data: Path, use: str, most_mm: float) -> None:
+@pytest.mark.parametrize(("use", "max_depth_error_mm"), [("stereo", 1.2), ("stereo,imu", 1.0)])
+def test_a_crane_without_encoders(data: Path, use: str, max_depth_error_mm: float) -> None:
     drift = measured(data / "yard_dev", use)
-    assert drift.aligned_rmse_mm < most_mm
+    assert drift.aligned_rmse_mm < max_depth_error_mm
     assert drift.aligned_rmse_deg < 0.03
 
 
@@ -167,7 +165,7 @@ def test_what_cant_be() -> None:
             FusionSettings(use=use)
     recording = MemoryRecording(ideal_rig())
     with pytest.raises(MeasurementError, match="no crane encoders"):
-        FusedTrajectory(FusionSettings(use="crane"), CraneSettings())(
+        BatchFusion(FusionSettings(use="crane"), CraneSettings())(
             recording, Rectifier(recording.rig), lambda: None
         )
 
@@ -175,4 +173,4 @@ def test_what_cant_be() -> None:
 def test_projection_and_triangulation_are_inverse() -> None:
     camera = Rectifier(ideal_rig()).camera
     points = np.array([[0.1, -0.2, 3.0], [1.0, 0.5, 7.0]])
-    np.testing.assert_allclose(triangulate(project_stereo(points, camera), camera), points)
+    np.testing.assert_allclose(triangulate_stereo(project_stereo(points, camera), camera), points)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.core.types import ImuSamples
-from barsight.motion.gravity import level_attitude
+from barsight.motion.gravity import align_with_gravity
 from motion_recordings import BODY_FROM_CAM0, MemoryRecording, ideal_rig
 
 START_NS = 1_700_000_000_000_000_000
@@ -18,7 +18,7 @@ def at_rest(up_in_body: np.ndarray, strength: float = 9.81) -> ImuSamples:
 
 
 def level_of(imu: ImuSamples | None) -> tuple[np.ndarray, bool, tuple[str, ...]]:
-    level = level_attitude(MemoryRecording(ideal_rig(), stamps_ns=(START_NS,), imu_samples=imu))
+    level = align_with_gravity(MemoryRecording(ideal_rig(), stamps_ns=(START_NS,), imu_samples=imu))
     pose = level.world_from_body
     assert (pose.target, pose.source) == ("world", "body")
     np.testing.assert_array_equal(pose.translation, 0)

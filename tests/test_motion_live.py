@@ -11,15 +11,15 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, RefusedFrame, StereoFrame, Trajectory
-from barsight.evaluation.trajectory_error import compare
+from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch import fusion
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.fixed_lag import estimator as live
-from barsight.motion.fixed_lag.estimator import LiveSettings, LiveTrajectory
-from barsight.motion.fixed_lag.sensor_buffer import Readings
-from barsight.motion.fixed_lag.smoother import LiveEstimator
+from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
+from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.recording.open import open_recording
@@ -28,8 +28,8 @@ from simulated_ways import steady
 from test_motion_fusion import simulated
 
 ESTIMATORS = {
-    "fused": lambda use: FusedTrajectory(FusionSettings(use=use), CraneSettings()),
-    "live": lambda use: LiveTrajectory(FusionSettings(use=use), LiveSettings(), CraneSettings()),
+    "fused": lambda use: BatchFusion(FusionSettings(use=use), CraneSettings()),
+    "live": lambda use: FixedLagFusion(FusionSettings(use=use), FixedLagSettings(), CraneSettings()),
 }
 
 
@@ -46,9 +46,9 @@ def estimated(
     name: str, use: str, recording: Recording, seen: tuple, patch: pytest.MonkeyPatch
 ) -> Trajectory:
     patch.setattr(
-        fusion, "follow", lambda *_: (tuple(s for s in seen if not isinstance(s, RefusedFrame)), ())
+        fusion, "track_recording", lambda *_: (tuple(s for s in seen if not isinstance(s, RefusedFrame)), ())
     )
-    patch.setattr(live, "follow_live", lambda *_: iter(seen))
+    patch.setattr(live, "track_incrementally", lambda *_: iter(seen))
     return ESTIMATORS[name](use)(recording, Rectifier(recording.rig), lambda: None)
 
 
@@ -59,7 +59,7 @@ def test_live_agrees_with_batch(monkeypatch: pytest.MonkeyPatch) -> None:
         recording, seen, truth = simulated(seed)
         batch, found = (estimated(n, "stereo,imu,crane", recording, seen, monkeypatch) for n in ESTIMATORS)
         assert off_in_sigmas(found, batch) < 1.3
-        drift = compare(found, truth, 0)
+        drift = trajectory_drift(found, truth, 0)
         assert drift is not None
         assert drift.reference_rmse_mm < 2.0
         nees.append([drift.nees_position, drift.nees_attitude])
@@ -75,19 +75,19 @@ def test_a_crane_over_bars(data: Path) -> None:
     )
     assert off_in_sigmas(found, batch) < 1.3
     truth = read_ground_truth(data / "yard_dev", np.array(recording.index.stamps_ns))
-    drift = compare(found, truth, recording.rig.timeshift_cam_imu_ns)
+    drift = trajectory_drift(found, truth, recording.rig.timeshift_cam_imu_ns)
     assert drift is not None
     assert drift.reference_rmse_mm < 1.5
     assert drift.reference_rmse_deg < 0.05
     assert drift.nees_position < 2
 
 
-def estimator_of(recording: Recording, use: str, held: int) -> LiveEstimator:
+def estimator_of(recording: Recording, use: str, held: int) -> FixedLagEstimator:
     crane = recording.crane() if "crane" in use else None
-    readings = Readings(crane, recording.imu(), recording.imu_noise() or ORDINARY_NOISE)
-    level = None if crane else live.level_attitude(recording)
+    readings = ReadingsSoFar(crane, recording.imu(), recording.imu_noise() or ORDINARY_NOISE)
+    level = None if crane else live.align_with_gravity(recording)
     settings = FusionSettings(use=use)
-    return LiveEstimator(settings, CraneSettings(), held, Rectifier(recording.rig), 0, readings, level)
+    return FixedLagEstimator(settings, CraneSettings(), held, Rectifier(recording.rig), 0, readings, level)
 
 
 def test_what_is_held_doesnt_grow() -> None:
@@ -136,7 +136,7 @@ def test_no_motion_and_even_motion(
 ) -> None:
     """Where an IMU sees nothing of the velocity, pictures and encoders must say it."""
     recording, seen, truth = steady(speed_mps, 3)
-    drift = compare(estimated(name, use, recording, seen, monkeypatch), truth, 0)
+    drift = trajectory_drift(estimated(name, use, recording, seen, monkeypatch), truth, 0)
     assert drift is not None
     assert drift.frames == len(seen)
     # Live, `world` is upright only as far as the first seconds tell.
@@ -153,7 +153,7 @@ def test_no_texture(name: str) -> None:
     gray = np.full((1024, 1280), 90, np.uint8)
     blank = replace(recording, pictures=tuple(StereoFrame(s, gray, gray) for s in recording.stamps_ns))
     rectifier = Rectifier(blank.rig)
-    drift = compare(ESTIMATORS[name]("stereo,imu,crane")(blank, rectifier, lambda: None), truth, 0)
+    drift = trajectory_drift(ESTIMATORS[name]("stereo,imu,crane")(blank, rectifier, lambda: None), truth, 0)
     assert drift is not None
     assert drift.frames == len(truth.poses)
     assert drift.reference_rmse_mm < 10
@@ -166,7 +166,7 @@ def test_frames_that_show_nothing_are_bridged(monkeypatch: pytest.MonkeyPatch) -
     recording, seen, truth = simulated(4)
     gone = tuple(RefusedFrame(s.stamp_ns, "dark") if 8 <= k < 11 else s for k, s in enumerate(seen))
     found = estimated("live", "stereo,imu,crane", recording, gone, monkeypatch)
-    drift = compare(found, truth, 0)
+    drift = trajectory_drift(found, truth, 0)
     assert drift is not None
     assert drift.frames == len(seen)
     assert drift.reference_rmse_mm < 3
@@ -191,7 +191,7 @@ def test_what_slides_alike_is_in_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
         recording, seen, truth = simulated(seed)
         angle = np.random.default_rng(100 + seed).normal(0, 2.5e-4)
         found = estimated("live", "stereo,imu,crane", recording, turned(seen, angle), monkeypatch)
-        drift = compare(found, truth, 0)
+        drift = trajectory_drift(found, truth, 0)
         assert drift is not None
         nees.append([drift.nees_position, drift.nees_attitude])
     assert (np.mean(nees, axis=0) < 1.4).all()
@@ -220,10 +220,10 @@ def test_a_spoiled_window_is_left() -> None:
 
 def test_settings() -> None:
     with pytest.raises(ConfigError, match="frames"):
-        LiveSettings(frames=2)
+        FixedLagSettings(frames=2)
     recording = MemoryRecording(ideal_rig())
     assert (
-        LiveTrajectory(FusionSettings(), LiveSettings(), CraneSettings())(
+        FixedLagFusion(FusionSettings(), FixedLagSettings(), CraneSettings())(
             recording, Rectifier(recording.rig), lambda: None
         ).frames
         == ()

@@ -11,9 +11,19 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose, skew
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame, Trajectory
-from barsight.features.guided_matching import project_stereo, stereo_jacobian, triangulate, triangulated_by
+from barsight.features.guided_matching import (
+    project_stereo,
+    stereo_jacobian,
+    triangulate_stereo,
+    triangulation_jacobian,
+)
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
-from barsight.motion.frontend.relative_pose import Step, carried, in_world, refine
+from barsight.motion.frontend.relative_pose import (
+    RelativePose,
+    refine_pose,
+    rotate_covariance,
+    transport_covariance,
+)
 from barsight.motion.frontend.relative_pose_kernel import step_equations
 from barsight.motion.frontend.stereo_features import OdometrySettings
 from barsight.recording.formats.ground_truth import read_ground_truth
@@ -30,7 +40,7 @@ TURN, MOVE = np.array([0.01, 0.02, -0.005]), np.array([0.1, -0.02, 0.3])
 
 def refined(
     rng: np.random.Generator, camera: RectifiedCamera, depth_m: tuple[float, float], count: int, wild: int = 0
-) -> tuple[Step, np.ndarray]:
+) -> tuple[RelativePose, np.ndarray]:
     """A step from points seen with noise in all four pictures, and its error (6,)."""
     z = rng.uniform(*depth_m, count)
     u, v = rng.uniform(30, camera.width - 30, count), rng.uniform(30, camera.height - 30, count)
@@ -40,10 +50,10 @@ def refined(
     noise = rng.normal(0, SETTINGS.pixel_sigma_px, (2, count, 3))
     target = project_stereo(points @ rotation.T + MOVE, camera) + noise[1]
     target[:wild] += rng.uniform(-30, 30, (wild, 3))
-    old = triangulate(project_stereo(points, camera) + noise[0], camera)
+    old = triangulate_stereo(project_stereo(points, camera) + noise[0], camera)
     start = Rotation.from_rotvec(TURN + 2e-4).as_matrix()
-    step = refine(old, target, start, MOVE + 0.002, camera, SETTINGS)
-    assert isinstance(step, Step)
+    step = refine_pose(old, target, start, MOVE + 0.002, camera, SETTINGS)
+    assert isinstance(step, RelativePose)
     turn = Rotation.from_matrix(step.rotation @ rotation.T)
     return step, np.r_[turn.as_rotvec(), step.translation - turn.apply(MOVE)]
 
@@ -78,7 +88,9 @@ def test_a_step_without_agreement_fails() -> None:
     rng = np.random.default_rng(2)
     places = rng.uniform(50, 300, (60, 3))
     places[:, 2] = places[:, 0] - rng.uniform(20, 40, 60)
-    failed = refine(triangulate(places, STREET), places[::-1], np.eye(3), np.zeros(3), STREET, SETTINGS)
+    failed = refine_pose(
+        triangulate_stereo(places, STREET), places[::-1], np.eye(3), np.zeros(3), STREET, SETTINGS
+    )
     assert isinstance(failed, Failed)
     assert failed.code == "no-consensus"
 
@@ -89,9 +101,11 @@ def test_how_points_move_with_their_places() -> None:
     expected = np.empty((3, 3, 3))
     for k in range(3):
         moved = np.eye(3)[k] * 1e-5
-        expected[:, :, k] = (triangulate(places + moved, HALL) - triangulate(places - moved, HALL)) / 2e-5
+        expected[:, :, k] = (
+            triangulate_stereo(places + moved, HALL) - triangulate_stereo(places - moved, HALL)
+        ) / 2e-5
     np.testing.assert_allclose(
-        triangulated_by(triangulate(places, HALL), HALL), expected, rtol=1e-6, atol=1e-9
+        triangulation_jacobian(triangulate_stereo(places, HALL), HALL), expected, rtol=1e-6, atol=1e-9
     )
 
 
@@ -102,7 +116,7 @@ def test_the_kernel_against_matrices() -> None:
     turn, variance = Rotation.from_rotvec(TURN).as_matrix(), 0.09
     target = project_stereo(points @ turn.T + MOVE, HALL) + rng.normal(0, 0.5, (80, 3))
     target[:10] += rng.uniform(-20, 20, (10, 3))
-    by_old = triangulated_by(points, HALL)
+    by_old = triangulation_jacobian(points, HALL)
     base = HALL.focal_px * HALL.baseline_m
     lens = np.array([HALL.focal_px, HALL.cx_px, HALL.cy_px, base, HALL.doffs_px])
     distance, normal, gradient = np.empty(80), np.empty((6, 6)), np.empty(6)
@@ -142,8 +156,8 @@ def test_covariances_add_up_along_a_chain() -> None:
         world_from_new = pose @ mount @ step.inverse()
         following = world_from_new @ mount.inverse()
         lever = following.translation - world_from_new.translation
-        stated = carried(stated, following.translation - pose.translation)
-        stated += carried(in_world(sigma, world_from_new.rotation), lever)
+        stated = transport_covariance(stated, following.translation - pose.translation)
+        stated += transport_covariance(rotate_covariance(sigma, world_from_new.rotation), lever)
         pose = following
     errors = []
     for _ in range(1000):
@@ -216,7 +230,7 @@ def test_nothing_that_can_be_followed() -> None:
 
 
 def test_settings() -> None:
-    for setting in ({"features": 10}, {"least_inliers": 3}, {"pixel_sigma_px": 0.0}, {"ransac_px": -1.0}):
+    for setting in ({"features": 10}, {"min_inliers": 3}, {"pixel_sigma_px": 0.0}, {"ransac_px": -1.0}):
         with pytest.raises(ConfigError):
             OdometrySettings(**setting)
 

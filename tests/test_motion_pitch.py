@@ -10,10 +10,10 @@ from bar_pictures import CAMERA, bar_view
 from barsight.core.errors import Failed
 from barsight.features.guided_matching import GuidedMatches, PredictedMotion
 from barsight.features.patch_alignment import PatchPair, patch_pair
-from barsight.features.tracks import Tracks, TrackSettings, carry_on
-from barsight.motion.frontend.relative_pose import move
-from barsight.motion.frontend.stereo_features import View
-from barsight.motion.frontend.tracking import FrontEndSettings, consensus, look_at_corners
+from barsight.features.tracks import Tracks, TrackSettings, update_tracks
+from barsight.motion.frontend.relative_pose import estimate_step
+from barsight.motion.frontend.stereo_features import FeatureView
+from barsight.motion.frontend.tracking import FrontEndSettings, describe_corners, motion_consensus
 from barsight.stereo.search_range import coarse_disparity
 
 WAY_M = 0.5
@@ -28,7 +28,7 @@ def followed(old: PatchPair) -> Tracks:
     none = np.zeros(0, np.bool_)
     nothing = GuidedMatches(np.empty((0, 3)), np.empty(0), none, none)
     coarse = coarse_disparity(old.pair.left, old.pair.right, CAMERA.doffs_px)
-    return carry_on(Tracks(), old, nothing, none, coarse, TrackSettings())
+    return update_tracks(Tracks(), old, nothing, none, coarse, TrackSettings())
 
 
 def moved(pitch_m: float, contrast: float, bars_off: float, sure_m: float) -> float | Failed:
@@ -36,7 +36,7 @@ def moved(pitch_m: float, contrast: float, bars_off: float, sure_m: float) -> fl
     tracks, new = views(pitch_m, contrast)
     covariance = np.diag([3e-4] * 3 + [sure_m] * 3) ** 2
     predicted = PredictedMotion(np.eye(3), np.array([-WAY_M - bars_off * pitch_m, 0, 0]), covariance)
-    found = consensus(tracks, new, predicted, FrontEndSettings())
+    found = motion_consensus(tracks, new, predicted, FrontEndSettings())
     return found if isinstance(found, Failed) else -float(found[2].translation[0])
 
 
@@ -71,7 +71,7 @@ def test_the_motion_that_thick_bars_show_tells_thin_ones_apart() -> None:
     tracks = followed(old)
     covariance = np.diag([3e-4] * 3 + [0.007] * 3) ** 2
     predicted = PredictedMotion(np.eye(3), np.array([-WAY_M - 0.003, 0, 0]), covariance)
-    found = consensus(tracks, new, predicted, FrontEndSettings())
+    found = motion_consensus(tracks, new, predicted, FrontEndSettings())
     assert not isinstance(found, Failed)
     kept, matches, motion = found
     assert abs(motion.translation[0] + WAY_M) < 1e-3
@@ -96,12 +96,12 @@ def half_and_half(above_m: float, below_m: float, x_m: float, seed: int) -> Patc
 def test_pictures_alone_find_the_right_bar(pitch_m: float, contrast: float) -> None:
     """Standing still, there and back, far; bars of three pixels may be refused."""
     settings = FrontEndSettings()
-    old = look_at_corners(bar_view(pitch_m, 0.0, contrast), settings)
+    old = describe_corners(bar_view(pitch_m, 0.0, contrast), settings)
     for way in (0.0, WAY_M, -WAY_M, 1.0):
-        new = look_at_corners(bar_view(pitch_m, way, contrast, seed=9), settings)
-        assert isinstance(old, View)
-        assert isinstance(new, View)
-        step = move(old, new, settings.rough)
+        new = describe_corners(bar_view(pitch_m, way, contrast, seed=9), settings)
+        assert isinstance(old, FeatureView)
+        assert isinstance(new, FeatureView)
+        step = estimate_step(old, new, settings.rough)
         if isinstance(step, Failed):
             assert pitch_m == 0.02
         else:

@@ -9,12 +9,12 @@ import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame
-from barsight.evaluation.trajectory_error import compare
+from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import without_saturation
 from barsight.motion.batch.fault_detection import check_crane
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings, _untied
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings, _untied
 from barsight.motion.crane.encoder_jumps import NOISE_SIGMAS, find_jumps, jump_test
-from barsight.motion.crane.encoder_trajectory import CraneSettings, with_seen_noise
+from barsight.motion.crane.encoder_trajectory import CraneSettings, reestimate_noise
 from barsight.motion.frontend.tracking import Sighting
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.recording.open import open_recording
@@ -117,10 +117,10 @@ def test_five_hundred_drawn_cranes() -> None:
 
 def test_the_noise_is_what_the_readings_show() -> None:
     for stated in (0.001, 0.002, 0.003):
-        seen = with_seen_noise(replace(travelling(), position_std_m=stated))
+        seen = reestimate_noise(replace(travelling(), position_std_m=stated))
         assert seen.position_std_m == pytest.approx(0.00153, rel=0.1)
-    assert with_seen_noise(replace(travelling(), position_std_m=0.02)).position_std_m == 0.01
-    wild = with_seen_noise(with_outliers(travelling(), 0.05, 0.05))
+    assert reestimate_noise(replace(travelling(), position_std_m=0.02)).position_std_m == 0.01
+    wild = reestimate_noise(with_outliers(travelling(), 0.05, 0.05))
     assert wild.position_std_m == pytest.approx(0.00153, rel=0.15)
 
 
@@ -141,9 +141,9 @@ def test_saturated_samples_leave() -> None:
 def estimated(path: Path, **spoiling: Callable) -> tuple[float, float, tuple[str, ...]]:
     """mm, deg and warnings of the whole estimate on a spoiled recording."""
     recording = SpoiledRecording(open_recording(path), **spoiling)
-    estimator = FusedTrajectory(FusionSettings(), CraneSettings())
+    estimator = BatchFusion(FusionSettings(), CraneSettings())
     trajectory = estimator(recording, Rectifier(recording.rig), lambda: None)
-    drift = compare(trajectory, read_ground_truth(path), recording.rig.timeshift_cam_imu_ns)
+    drift = trajectory_drift(trajectory, read_ground_truth(path), recording.rig.timeshift_cam_imu_ns)
     assert drift is not None
     return drift.reference_rmse_mm, drift.reference_rmse_deg, trajectory.warnings
 

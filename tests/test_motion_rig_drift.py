@@ -12,12 +12,17 @@ from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, RigDrift
 from barsight.features.guided_matching import project_stereo
 from barsight.motion.batch import fusion
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.frontend.tracking import Sighting
 from barsight.motion.problem.problem import Problem
-from barsight.motion.problem.rig_drift import MATCHING_BIAS_PX, weigh, with_own_bias
-from barsight.motion.rig_check.self_calibration import is_drifted, left_open_px, self_calibrated, turned_right
+from barsight.motion.problem.rig_drift import MATCHING_BIAS_PX, combine_with_prior, with_matching_bias
+from barsight.motion.rig_check.self_calibration import (
+    is_drifted,
+    residual_sigma_px,
+    self_calibrate,
+    turn_right_camera,
+)
 from motion_recordings import MemoryRecording, ideal_rig
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -68,8 +73,8 @@ def travel(seed: int, yaw_rad: float, scale: float, bias_px: float) -> tuple[Mem
 
 
 def drift_of(recording: MemoryRecording, sightings: list[Sighting], patch: pytest.MonkeyPatch) -> RigDrift:
-    patch.setattr(fusion, "follow", lambda *_: (tuple(sightings), ()))
-    estimator = FusedTrajectory(FusionSettings(), CraneSettings())
+    patch.setattr(fusion, "track_recording", lambda *_: (tuple(sightings), ()))
+    estimator = BatchFusion(FusionSettings(), CraneSettings())
     found = estimator(recording, Rectifier(RIG), lambda: None).drift
     assert found is not None
     assert found.by_encoders
@@ -100,12 +105,12 @@ def test_without_encoders_nothing_is_corrected(monkeypatch: pytest.MonkeyPatch) 
     drift = drift_of(*travel(3, np.deg2rad(0.05), 0.0, 0.0), monkeypatch)
     rectifier = Rectifier(RIG)
     blind = replace(drift, by_encoders=False)
-    believed = self_calibrated(RIG, rectifier, blind, 0.05, correct=False)
+    believed = self_calibrate(RIG, rectifier, blind, 0.05, correct=False)
     assert (believed.warnings, believed.sigma_px) == ((), 0.05)
-    refused = self_calibrated(RIG, rectifier, blind, 0.05, correct=True)
+    refused = self_calibrate(RIG, rectifier, blind, 0.05, correct=True)
     assert refused.rectifier is rectifier
     assert "only with encoders" in refused.warnings[0]
-    warned = self_calibrated(RIG, rectifier, drift, 0.05, correct=False)
+    warned = self_calibrate(RIG, rectifier, drift, 0.05, correct=False)
     assert warned.rectifier is rectifier
     assert "calibrate anew" in warned.warnings[0]
 
@@ -113,9 +118,9 @@ def test_without_encoders_nothing_is_corrected(monkeypatch: pytest.MonkeyPatch) 
 def test_the_turned_rig_takes_the_yaw_off() -> None:
     """A point's disparity in the corrected rectification is that of its true depth."""
     yaw = np.deg2rad(0.2)
-    true = turned_right(RIG, np.array([0.0, yaw, 0.0]))
+    true = turn_right_camera(RIG, np.array([0.0, yaw, 0.0]))
     drift = RigDrift(yaw, 0.0, np.eye(2) * 1e-12, np.ones(2), 0.4, 7.0, True)
-    corrected = self_calibrated(RIG, Rectifier(RIG), drift, 0.05, correct=True).rectifier
+    corrected = self_calibrate(RIG, Rectifier(RIG), drift, 0.05, correct=True).rectifier
     assert corrected.camera == Rectifier(true).camera
     point = np.array([[0.3, -0.4, 7.0]])
     cam1_from_cam0 = true.cam0_from_cam1.inverse()
@@ -131,9 +136,9 @@ def test_the_drift_is_told_as_if_pieces_were_not_unknowns() -> None:
     without = SimpleNamespace(sightings=seen, has_latency=True, scale_prior=5e-4, pieces=None)
     with_pieces = SimpleNamespace(**{**vars(without), "pieces": ()})
     theta, covariance = np.array([1e-4, 2e-4]), np.array([[4e-10, 1e-9], [1e-9, 9e-8]])
-    inside = weigh(theta, covariance, cast(Problem, with_pieces))
-    told = with_own_bias(inside, cast(Problem, with_pieces))
-    expected = weigh(theta, covariance, cast(Problem, without))
+    inside = combine_with_prior(theta, covariance, cast(Problem, with_pieces))
+    told = with_matching_bias(inside, cast(Problem, with_pieces))
+    expected = combine_with_prior(theta, covariance, cast(Problem, without))
     assert told.yaw_sigma_rad > 1.2 * inside.yaw_sigma_rad
     np.testing.assert_allclose(told.covariance, expected.covariance, rtol=1e-6)
     np.testing.assert_allclose([told.yaw_rad, told.scale], [expected.yaw_rad, expected.scale], rtol=1e-6)
@@ -148,14 +153,16 @@ def shown(yaw_px: float, yaw_sigma_px: float, scale_sigma: float = 1e-9) -> RigD
 def test_what_the_rig_leaves_open() -> None:
     """Travel and calibration believed together where they agree; what contradicts counts as error until it is
     taken off; a baseline counts by the disparity."""
-    left = left_open_px(shown(0.02, 0.03), 1250, 0.04, False)
+    left = residual_sigma_px(shown(0.02, 0.03), 1250, 0.04, False)
     assert left == pytest.approx(1 / np.hypot(1 / 0.03, 1 / 0.04), rel=1e-4)
-    assert left_open_px(shown(0.2, 50.0), 1250, 0.05, False) == pytest.approx(0.05, rel=1e-4)
-    assert left_open_px(shown(0.02, 0.03), 1250, 0.0, False) == pytest.approx(0, abs=1e-4)
-    assert left_open_px(shown(0.2, 0.02), 1250, 0.05, False) == pytest.approx(np.hypot(0.2, 0.02), rel=1e-4)
-    assert left_open_px(shown(0.2, 0.02), 1250, 0.05, True) == pytest.approx(0.02, rel=1e-4)
+    assert residual_sigma_px(shown(0.2, 50.0), 1250, 0.05, False) == pytest.approx(0.05, rel=1e-4)
+    assert residual_sigma_px(shown(0.02, 0.03), 1250, 0.0, False) == pytest.approx(0, abs=1e-4)
+    assert residual_sigma_px(shown(0.2, 0.02), 1250, 0.05, False) == pytest.approx(
+        np.hypot(0.2, 0.02), rel=1e-4
+    )
+    assert residual_sigma_px(shown(0.2, 0.02), 1250, 0.05, True) == pytest.approx(0.02, rel=1e-4)
     baseline_px = 1e-3 * 1250 * 0.4 / 7
-    wide = left_open_px(shown(0.0, 1e-9, 1e-3), 1250, 0.05, False)
+    wide = residual_sigma_px(shown(0.0, 1e-9, 1e-3), 1250, 0.05, False)
     assert wide == pytest.approx(baseline_px, rel=1e-4)
 
 
@@ -166,7 +173,7 @@ def test_intervals_hold_over_rigs(rig_px: float) -> None:
     rng = np.random.default_rng(2)
     off = rng.normal(0, rig_px, 3000)
     seen = off + rng.normal(0, 0.018, off.size)
-    stated = np.array([left_open_px(shown(yaw, 0.018), 1250, 0.05, False) for yaw in seen])
+    stated = np.array([residual_sigma_px(shown(yaw, 0.018), 1250, 0.05, False) for yaw in seen])
     error = off + rng.normal(0, 0.026, off.size)
     assert 0.94 < np.mean(np.abs(error) <= 1.96 * np.hypot(stated, 0.026)) < 0.97
-    assert left_open_px(shown(0.22, 0.018), 1250, 0.05, False) > 0.22
+    assert residual_sigma_px(shown(0.22, 0.018), 1250, 0.05, False) > 0.22

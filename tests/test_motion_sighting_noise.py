@@ -8,21 +8,21 @@ import pytest
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
-from barsight.motion.problem.problem import StereoSightings
-from barsight.motion.problem.stereo_factors import nearness, persistence, taken_up
+from barsight.motion.problem.problem import StereoObservations
+from barsight.motion.problem.stereo_factors import dof_correction, spatial_inflation, temporal_inflation
 from motion_recordings import ideal_rig
 
 FRAMES, POINTS = 20, 800
 
 
-def seen_once_each(rng: np.random.Generator) -> StereoSightings:
+def seen_once_each(rng: np.random.Generator) -> StereoObservations:
     """Points all over each picture, none of them seen again."""
     camera = Rectifier(ideal_rig(1280, 1024)).camera
     place = rng.uniform((0, 0), (camera.width, camera.height), (FRAMES * POINTS, 2))
     stereo = np.column_stack([place, place[:, 0] - 80])
     node = np.repeat(np.arange(FRAMES), POINTS)
     mount = Pose("body", "rect0", np.eye(3), np.zeros(3))
-    return StereoSightings(
+    return StereoObservations(
         node, np.arange(len(node)), stereo, np.full(len(node), 0.1), camera, mount
     )  # fmt: skip
 
@@ -37,7 +37,7 @@ def test_independent_errors_are_taken_as_such() -> None:
     rng = np.random.default_rng(1)
     seen = seen_once_each(rng)
     residual = rng.normal(0, 0.1, (len(seen.node), 3))
-    assert nearness(residual, seen, np.ones(len(seen.node), np.bool_)) < 1.03
+    assert spatial_inflation(residual, seen, np.ones(len(seen.node), np.bool_)) < 1.03
 
 
 def test_what_neighbours_share_widens_sigma_by_what_their_mean_scatters_more() -> None:
@@ -49,7 +49,7 @@ def test_what_neighbours_share_widens_sigma_by_what_their_mean_scatters_more() -
         square = ((seen.stereo[:, :2] + 37) // 90).astype(int)
         shared = rng.normal(0, 0.04, (FRAMES, 20, 20, 3))[seen.node, square[:, 0], square[:, 1]]
         residual = shared + rng.normal(0, 0.1, (len(seen.node), 3))
-        found.append(nearness(residual, seen, np.ones(len(seen.node), np.bool_)))
+        found.append(spatial_inflation(residual, seen, np.ones(len(seen.node), np.bool_)))
         true.append(spread_of_means(residual))
     assert 1.2 < np.mean(true) < 2.0
     assert 0.85 * np.mean(true) < np.mean(found) < 1.05 * np.mean(true)
@@ -62,16 +62,16 @@ def test_what_a_fit_takes_up_is_given_back() -> None:
         seen = seen_once_each(rng)
         track = np.arange(len(seen.node)) // often
         node = np.tile(np.arange(often), len(seen.node) // often)
-        seen = StereoSightings(
+        seen = StereoObservations(
             node, track, seen.stereo, seen.sigma_px, seen.camera, seen.body_from_rect0
         )  # fmt: skip
         error = rng.normal(0, 0.1, (len(node) // often, often, 3))
         residual = error - error.mean(axis=1, keepdims=True)
         used = np.ones(len(node), np.bool_)
-        assert abs(residual.std() * taken_up(seen, used) / 0.1 - 1) < 0.02
+        assert abs(residual.std() * dof_correction(seen, used) / 0.1 - 1) < 0.02
 
 
-def slow_nearness(residual: Float64, seen: StereoSightings, used: np.ndarray) -> float:
+def slow_nearness(residual: Float64, seen: StereoObservations, used: np.ndarray) -> float:
     scaled = np.clip(residual[used] / seen.sigma_px[used, None], -4, 4)
     cell = (seen.stereo[used, :2] * (8 / seen.camera.width)).astype(np.int64)
     _, name = np.unique(np.column_stack([seen.node[used], cell]), axis=0, return_inverse=True)
@@ -79,7 +79,7 @@ def slow_nearness(residual: Float64, seen: StereoSightings, used: np.ndarray) ->
     return float(max(1.0, (sums**2).sum() / (scaled**2).sum()) ** 0.5)
 
 
-def slow_persistence(residual: Float64, seen: StereoSightings, used: np.ndarray) -> float:
+def slow_persistence(residual: Float64, seen: StereoObservations, used: np.ndarray) -> float:
     order = np.flatnonzero(used)
     track = seen.track[order]
     length = np.bincount(track)[track[:-1]]
@@ -98,6 +98,10 @@ def test_the_kernels_say_what_arrays_say() -> None:
     seen = replace(seen, track=track, node=node, sigma_px=rng.uniform(0.05, 0.3, len(track)))
     shared = rng.normal(0, 0.1, (2500, 3))[track] + rng.normal(0, 0.05, (FRAMES, 3))[node]
     residual, used = shared + rng.normal(0, 0.1, shared.shape), rng.random(len(track)) < 0.8
-    assert persistence(residual, seen, used) == pytest.approx(slow_persistence(residual, seen, used))
-    assert nearness(residual, seen, used) == pytest.approx(slow_nearness(residual, seen, used))
-    assert nearness(residual, seen, np.zeros_like(used)) == persistence(residual, seen, used & False) == 1.0
+    assert temporal_inflation(residual, seen, used) == pytest.approx(slow_persistence(residual, seen, used))
+    assert spatial_inflation(residual, seen, used) == pytest.approx(slow_nearness(residual, seen, used))
+    assert (
+        spatial_inflation(residual, seen, np.zeros_like(used))
+        == temporal_inflation(residual, seen, used & False)
+        == 1.0
+    )

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.evaluation.trajectory_error import compare
-from barsight.features.guided_matching import triangulate
+from barsight.evaluation.trajectory_error import trajectory_drift
+from barsight.features.guided_matching import triangulate_stereo
 from barsight.motion.batch import apparent_motion as slides
 from barsight.motion.frontend.tracking import Sighting
 from barsight.recording.formats.ground_truth import GroundTruth
@@ -28,7 +28,9 @@ def sliding(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTrut
     own = rng.normal(rng.choice([-1, 1]) * COMMON_RAD, OWN_RAD, 2000)
     slid = []
     for sighting, pose in zip(sightings, truth.poses, strict=True):
-        place = (pose @ rectifier.body_from_rect0).apply(triangulate(sighting.stereo, rectifier.camera))
+        place = (pose @ rectifier.body_from_rect0).apply(
+            triangulate_stereo(sighting.stereo, rectifier.camera)
+        )
         turn = np.where(place[:, 2] > FLOOR_M, own[sighting.track], 0.0)
         u, v = sighting.stereo[:, 0] - rectifier.camera.cx_px, sighting.stereo[:, 1] - rectifier.camera.cy_px
         stereo = sighting.stereo + np.column_stack([-turn * v, turn * u, -turn * v])
@@ -44,7 +46,9 @@ def glossy(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTruth
     strips = rng.normal(0, GLOSS_PX, 20)
     off = []
     for sighting, pose in zip(sightings, truth.poses, strict=True):
-        place = (pose @ rectifier.body_from_rect0).apply(triangulate(sighting.stereo, rectifier.camera))
+        place = (pose @ rectifier.body_from_rect0).apply(
+            triangulate_stereo(sighting.stereo, rectifier.camera)
+        )
         strip = np.floor(place[:, 0] / STRIP_M).astype(int) + 5
         more = np.where(place[:, 2] > FLOOR_M, strips[strip], 0.0)
         off.append(replace(sighting, stereo=sighting.stereo - more[:, None] * [0, 0, 1]))
@@ -58,7 +62,7 @@ def test_gloss_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
         found = []
         for seed in range(2):
             recording, sightings, truth = glossy(seed)
-            drift = compare(fused(recording, monkeypatch, sightings), truth, 0)
+            drift = trajectory_drift(fused(recording, monkeypatch, sightings), truth, 0)
             assert drift is not None
             found.append((drift.reference_rmse_deg, drift.nees_attitude))
         rmse, nees = np.mean(found, axis=0)
@@ -79,12 +83,12 @@ def test_slides_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
         found = []
         for seed in range(2):
             recording, sightings, truth = sliding(seed)
-            drift = compare(fused(recording, monkeypatch, sightings), truth, 0)
+            drift = trajectory_drift(fused(recording, monkeypatch, sightings), truth, 0)
             assert drift is not None
             found.append(drift.nees_attitude)
         return float(np.mean(found))
 
     counted = nees()
-    monkeypatch.setattr(slides, "pieces_of", lambda *_: None)
+    monkeypatch.setattr(slides, "partition_points", lambda *_: None)
     assert counted < 1.5
     assert nees() > 2 * counted

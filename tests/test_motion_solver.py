@@ -16,14 +16,20 @@ from barsight.core.types import RectifiedCamera
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ImuBias
 from barsight.motion.frontend.tracking import Sighting
-from barsight.motion.linear import skyline
-from barsight.motion.linear.chain_elimination import Chain, with_gaps, without_gaps
-from barsight.motion.problem.gauss_newton import State, cost_of, moved, optimise
-from barsight.motion.problem.gtsam_factors import factors, start_values
-from barsight.motion.problem.marginals import marginals, piece_variances
-from barsight.motion.problem.problem import Attitude, Pieces, Placed, Problem, StereoSightings
+from barsight.motion.linear import skyline_inverse
+from barsight.motion.linear.chain_elimination import Chain, back_substitute_nodes, eliminate_nodes
+from barsight.motion.problem.gauss_newton import GraphState, cost_of, optimise_graph, retract
+from barsight.motion.problem.gtsam_factors import build_graph, initial_values
+from barsight.motion.problem.marginals import marginals, slide_variances
+from barsight.motion.problem.problem import (
+    AttitudePrior,
+    EncoderPosition,
+    Pieces,
+    Problem,
+    StereoObservations,
+)
 from barsight.motion.problem.rig_drift import HUBER_SIGMAS
-from barsight.motion.problem.stereo_factors import often, start_points
+from barsight.motion.problem.stereo_factors import initial_points, well_observed
 
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.3, 4.0, 640, 480)
 MOUNT = Pose("body", "rect0", Rotation.from_rotvec([0.1, -0.3, 1.5]).as_matrix(), np.array([0.1, -0.2, 0.3]))
@@ -47,17 +53,17 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
     matrix, rows = banded(rng, n, width)
     right = rng.normal(size=(2, n))
     expected = np.linalg.solve(matrix, right.T).T
-    factor = skyline.even(rows)
-    assert skyline.factorise(factor)
+    factor = skyline.uniform_band(rows)
+    assert skyline.factorise_skyline(factor)
     beside = right.T.copy()
     skyline.solve_forward(factor, beside)
-    skyline.solve_back(factor, beside)
+    skyline.solve_back_dense(factor, beside)
     right = beside.T
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     blocks = np.empty((n // 3, 3, 3))
     pairs = np.array([[k, k + 1] for k in range(n // 3 - 1)], np.int64).reshape(-1, 2)
     cross, diagonal = np.empty((len(pairs), 3, 3)), np.empty(n)
-    skyline.inverse_blocks(factor, np.arange(0, n, 3), diagonal, blocks, pairs, cross)
+    skyline_inverse.inverse_blocks(factor, np.arange(0, n, 3), diagonal, blocks, pairs, cross)
     inverse = np.linalg.inv(matrix)
     np.testing.assert_allclose(diagonal, np.diag(inverse), rtol=1e-8)
     for k, block in enumerate(cross):
@@ -73,7 +79,7 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
 
 def test_an_undetermined_band_is_told() -> None:
     rows = np.array([[0.0, 1.0], [1.0, 1.0]])
-    assert not skyline.factorise(skyline.even(rows))
+    assert not skyline.factorise_skyline(skyline.uniform_band(rows))
 
 
 def test_rows_that_begin_late_are_solved_like_a_dense_matrix() -> None:
@@ -84,17 +90,19 @@ def test_rows_that_begin_late_are_solved_like_a_dense_matrix() -> None:
     matrix = np.where(held, np.tril(rng.normal(size=(n, n)), -1), 0)
     matrix = matrix + matrix.T
     matrix += np.diag(np.abs(matrix).sum(axis=1) + 0.5)
-    factor = skyline.empty(first)
+    factor = skyline.empty_skyline(first)
     for i in range(n):
         factor.values[factor.offset[i] + np.arange(first[i], i + 1)] = matrix[i, first[i] : i + 1]
     right = rng.normal(size=(n, 2))
     expected = np.linalg.solve(matrix, right)
-    assert skyline.factorise(factor)
+    assert skyline.factorise_skyline(factor)
     skyline.solve_forward(factor, right)
-    skyline.solve_back(factor, right)
+    skyline.solve_back_dense(factor, right)
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     diagonal, none = np.empty(n), np.empty((0, 1, 1))
-    skyline.inverse_blocks(factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none)
+    skyline_inverse.inverse_blocks(
+        factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none
+    )
     np.testing.assert_allclose(diagonal, np.diag(np.linalg.inv(matrix)), rtol=1e-9)
 
 
@@ -106,13 +114,13 @@ def test_nodes_between_frames_are_taken_out() -> None:
     wide[:, -size - 1 :] = rows
     gradient, side = rng.normal(size=(2, size * count))
     kept, latency = np.array([1, 2, 5]), 0.7
-    left, gaps = without_gaps(Chain(wide, gradient, side, 9.0, 0.5), kept)
+    left, gaps = eliminate_nodes(Chain(wide, gradient, side, 9.0, 0.5), kept)
     small = np.zeros((9, 9))
     for i in range(9):
         for j in range(max(0, i - 2 * size + 1), i + 1):
             small[i, j] = small[j, i] = left.rows[i, 2 * size - 1 - i + j]
     step = -np.linalg.solve(small, left.gradient + latency * left.side)
-    found = with_gaps(step.reshape(3, 3), latency, kept, gaps, count)
+    found = back_substitute_nodes(step.reshape(3, 3), latency, kept, gaps, count)
     np.testing.assert_allclose(found.ravel(), -np.linalg.solve(matrix, gradient + latency * side), atol=1e-12)
     whole = np.linalg.solve(matrix, np.column_stack([side, gradient]))
     rest = np.linalg.solve(small, np.column_stack([left.side, left.gradient]))
@@ -140,22 +148,24 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
         )
         poses.append(rect0 @ MOUNT.inverse() @ off)
         places.append((rect0 @ MOUNT.inverse()).translation + rng.normal(0, 0.0005, 3))
-    seen = StereoSightings.of(sightings, range(count), CAMERA, MOUNT)
+    seen = StereoObservations.of(sightings, range(count), CAMERA, MOUNT)
     stamps = np.arange(count) * 500_000_000
     placed, attitudes = (), ()
     if with_crane:
         v, a = np.array([0.8, 0, 0]), np.array([0.3, 0.1, 0])
         places[2] += 0.01 * (wrong_px > 0)  # beyond Huber's length
-        placed = tuple(Placed(k, place, v * (k % 3 - 1), a, 0.002) for k, place in enumerate(places))
-        attitudes = tuple(Attitude(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
+        placed = tuple(EncoderPosition(k, place, v * (k % 3 - 1), a, 0.002) for k, place in enumerate(places))
+        attitudes = tuple(AttitudePrior(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
     problem = Problem(
         tuple(poses), stamps, not with_crane, seen, (None,) * (count - 1), placed, attitudes, (),
         ImuBias.none(), has_latency=with_crane,
     )  # fmt: skip
-    return problem, often(seen, np.ones(len(seen.node), np.bool_))
+    return problem, well_observed(seen, np.ones(len(seen.node), np.bool_))
 
 
-def encoder_error(place: Placed) -> Callable[[Any, gtsam.Values, list[np.ndarray] | None], np.ndarray]:
+def encoder_error(
+    place: EncoderPosition,
+) -> Callable[[Any, gtsam.Values, list[np.ndarray] | None], np.ndarray]:
     """The body's place minus the encoders' reading `latency` later, and its derivatives."""
 
     def error(factor: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
@@ -171,14 +181,14 @@ def encoder_error(place: Placed) -> Callable[[Any, gtsam.Values, list[np.ndarray
 
 def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Marginals]:
     """The slow way: a factor and its objects for every sighting and every place of the encoders."""
-    seen, graph, values = problem.sightings, factors(problem), start_values(problem)
+    seen, graph, values = problem.sightings, build_graph(problem), initial_values(problem)
     assert seen is not None
     lens = gtsam.Cal3_S2Stereo(
         CAMERA.focal_px, CAMERA.focal_px, 0.0, CAMERA.cx_px, CAMERA.cy_px, CAMERA.baseline_m
     )
     mounted = gtsam.Pose3(gtsam.Rot3(MOUNT.rotation), MOUNT.translation)
     huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS)
-    points = start_points(problem)
+    points = initial_points(problem)
     for place in problem.placed:
         model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, place.sigma_m))
         graph.add(gtsam.CustomFactor(model, [X(place.node), E(0)], encoder_error(place)))
@@ -200,10 +210,10 @@ def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Ma
 def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
     problem, used = seen_from(8, 1, with_crane, 2.0)
     expected, covariance = by_gtsam(problem, used)
-    graph = factors(problem)
-    state = State(start_values(problem), start_points(problem), np.zeros(2))
+    graph = build_graph(problem)
+    state = GraphState(initial_values(problem), initial_points(problem), np.zeros(2))
     for _ in range(10):
-        state, system = optimise(problem, graph, state, used)
+        state, system = optimise_graph(problem, graph, state, used)
     found = marginals(system)
     for k in range(8):
         off = expected.atPose3(X(k)).localCoordinates(state.values.atPose3(X(k)))
@@ -221,12 +231,12 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
     wide = replace(problem.sightings, sigma_px=6 * problem.sightings.sigma_px)  # none beyond Huber's length
     pieces = Pieces(rng.integers(0, 3, len(wide.first) - 1), np.array([2e-3, 3e-3, 4e-3]), 0.7, 0.2)
     problem = replace(problem, sightings=wide, pieces=pieces)
-    graph = factors(problem)
-    state = State(start_values(problem), start_points(problem), np.zeros(2), np.zeros(6))
+    graph = build_graph(problem)
+    state = GraphState(initial_values(problem), initial_points(problem), np.zeros(2), np.zeros(6))
     for _ in range(6):
-        state, system = optimise(problem, graph, state, used)
+        state, system = optimise_graph(problem, graph, state, used)
     at, weights = system.layout.pieces, np.array([1 / 2e-3, 1 / 3e-3, 1 / 4e-3, 0.5, -1.0, 2.0])
-    variances, of_sum = piece_variances(system, weights)
+    variances, of_sum = slide_variances(system, weights)
 
     def check(pulls: np.ndarray, variance: float) -> None:
         gradient = np.zeros_like(system.gradient)
@@ -236,7 +246,7 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
         np.testing.assert_allclose(step[1] @ pulls, -np.sqrt(variance), rtol=1e-6)
         costs = []
         for side in (0.0, 0.3, -0.3):
-            there = moved(problem, state, used, *(side * part for part in step))
+            there = retract(problem, state, used, *(side * part for part in step))
             costs.append(cost_of(problem, graph, there, used))
         np.testing.assert_allclose((costs[1] + costs[2] - 2 * costs[0]) / 0.3**2, 1.0, rtol=0.02)
 
@@ -249,7 +259,7 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
         by[axis] = 0.3 / np.sqrt(own[axis, axis])
         costs = [
             cost_of(
-                problem, graph, moved(problem, state, used, *system.step(problem.free, fixed=s * by)), used
+                problem, graph, retract(problem, state, used, *system.step(problem.free, fixed=s * by)), used
             )
             for s in (0.0, 1.0, -1.0)
         ]
@@ -264,17 +274,20 @@ def test_the_drifts_share_is_right() -> None:
     assert problem.sightings is not None
     wide = replace(problem.sightings, sigma_px=6 * problem.sightings.sigma_px)  # none beyond Huber's length
     problem = replace(problem, sightings=wide)
-    graph = factors(problem)
-    state = State(start_values(problem), start_points(problem), np.zeros(2))
+    graph = build_graph(problem)
+    state = GraphState(initial_values(problem), initial_points(problem), np.zeros(2))
     for _ in range(6):
-        state, system = optimise(problem, graph, state, used)
-    swing = marginals(system).swing
+        state, system = optimise_graph(problem, graph, state, used)
+    drift_jacobian_of_pose = marginals(system).drift_jacobian_of_pose
     for axis, small in enumerate((1e-3, 1e-2)):
         drift = np.eye(2)[axis] * small
         other = replace(state, drift=drift)
         for _ in range(6):
-            other, _ = optimise(problem, graph, other, used)
+            other, _ = optimise_graph(problem, graph, other, used)
         moved = [state.values.atPose3(X(k)).localCoordinates(other.values.atPose3(X(k))) for k in range(6)]
         np.testing.assert_allclose(
-            np.array(moved) / small, swing[:, :, axis], rtol=0.1, atol=0.02 * np.abs(swing[:, :, axis]).max()
+            np.array(moved) / small,
+            drift_jacobian_of_pose[:, :, axis],
+            rtol=0.1,
+            atol=0.02 * np.abs(drift_jacobian_of_pose[:, :, axis]).max(),
         )

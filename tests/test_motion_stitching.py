@@ -34,6 +34,6 @@ def test_the_chain_and_what_it_refuses() -> None:
 
 
 def test_settings() -> None:
-    for setting in ({"homography_px": 0.0}, {"trend_px": -1.0}, {"least_matches": 3}):
+    for setting in ({"homography_px": 0.0}, {"trend_px": -1.0}, {"min_matches": 3}):
         with pytest.raises(ConfigError):
             StitchingSettings(**setting)

@@ -6,9 +6,9 @@ from barsight.core.linalg import skyline
 from barsight.motion.fixed_lag.window_equations import (
     SLIDE_SIGMA_RAD,
     SLIDE_WAY_M,
-    Equations,
-    prior_of,
-    slid_on,
+    DenseEquations,
+    marginal_prior,
+    propagate_slide,
 )
 from barsight.motion.linear import dense_cholesky
 
@@ -23,13 +23,13 @@ def test_a_dense_system_is_solved() -> None:
     """Whole as a skyline."""
     matrix, right = positive(0, 23)
     factor, x = matrix.copy(), right[:, None].copy()
-    assert skyline.factorise(skyline.full(factor))
+    assert skyline.factorise_skyline(skyline.full(factor))
     np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix))
     skyline.solve_forward(skyline.full(factor), x)
-    skyline.solve_back(skyline.full(factor), x)
+    skyline.solve_back_dense(skyline.full(factor), x)
     np.testing.assert_allclose(x[:, 0], np.linalg.solve(matrix, right))
-    np.testing.assert_allclose(dense_cholesky.product(matrix, right), matrix @ right)
-    assert not skyline.factorise(skyline.full(-matrix))
+    np.testing.assert_allclose(dense_cholesky.multiply(matrix, right), matrix @ right)
+    assert not skyline.factorise_skyline(skyline.full(-matrix))
 
 
 def test_bands_and_blocks_are_added() -> None:
@@ -53,7 +53,7 @@ def test_bands_and_blocks_are_added() -> None:
 def test_a_prior_says_the_same_of_what_stays() -> None:
     matrix, gradient = positive(2, 9)
     step = np.linspace(-1, 1, 9)
-    left, slope = prior_of(Equations(matrix, gradient, ()), step, 4)
+    left, slope = marginal_prior(DenseEquations(matrix, gradient, ()), step, 4)
     best = -np.linalg.solve(matrix, gradient)
     np.testing.assert_allclose(np.linalg.inv(left), np.linalg.inv(matrix)[4:, 4:])
     np.testing.assert_allclose(-np.linalg.solve(left, slope), (best - step)[4:])
@@ -73,11 +73,11 @@ def test_a_slide_is_forgotten() -> None:
     right += fresh * (1 - keeps) * slide * by
     covariance = np.linalg.inv(whole)
     order = [0, 1, 2, 3, 7, 5, 6]
-    found, slope = slid_on(matrix, gradient, slide, 1.0)
+    found, slope = propagate_slide(matrix, gradient, slide, 1.0)
     np.testing.assert_allclose(np.linalg.inv(found), covariance[np.ix_(order, order)], rtol=1e-6)
     np.testing.assert_allclose(
         np.linalg.solve(found, slope), np.linalg.solve(whole, right)[order], rtol=1e-6, atol=1e-15
     )
-    far, slope = slid_on(matrix, gradient, slide, 1e3)
+    far, slope = propagate_slide(matrix, gradient, slide, 1e3)
     np.testing.assert_allclose(np.linalg.inv(far)[4, 4], SLIDE_SIGMA_RAD**2)
     np.testing.assert_allclose(np.linalg.solve(far, slope)[4], slide)

@@ -8,8 +8,8 @@ import pytest
 
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
-from barsight.evaluation.score import score
-from barsight.motion.rig_check.self_calibration import turned_right
+from barsight.evaluation.score import score_folder
+from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.open import open_recording
 
 YARD = (
@@ -23,13 +23,13 @@ def test_the_height_bias_of_a_yaw_falls_to_a_fifth(tmp_path: Path) -> None:
     recording = tmp_path / "yard"
     assert run(["simulate", str(recording), *YARD]) == 0
     turn = np.array([0.0, np.deg2rad(0.01), 0.0])
-    write_rig_file(tmp_path / "old.yaml", turned_right(open_recording(recording).rig, -turn))
+    write_rig_file(tmp_path / "old.yaml", turn_right_camera(open_recording(recording).rig, -turn))
     turned = ["--recording.rig", str(tmp_path / "old.yaml")]
     bias, warnings = {}, {}
     for name, more in (("true", []), ("old", turned), ("mended", [*turned, "--self-calibrate", "yaw"])):
         out = tmp_path / name
         assert run(["measure", str(recording), "-o", str(out), "--stereo.method", "sgbm", *more]) == 0
-        bias[name] = score(recording, out)["height, smooth stack"]["bias_mm"]
+        bias[name] = score_folder(recording, out)["height, smooth stack"]["bias_mm"]
         warnings[name] = {w["code"] for w in json.loads((out / "result.json").read_text())["warnings"]}
     assert bias["old"] - bias["true"] > 10
     assert abs(bias["mended"] - bias["true"]) < (bias["old"] - bias["true"]) / 5

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from rich.console import Console
 
-from barsight.recording.info import describe, stream_info
+from barsight.recording.info import describe_recording, stream_info
 from barsight.recording.info_tables import print_info
 from barsight.recording.open import open_recording
 from recording_samples import START_NS, camera_yaml, mounts, real, stamps, write_euroc
@@ -30,7 +30,7 @@ def test_describe_and_print(tmp_path: Path) -> None:
     path = root / "mav0" / "cam1" / "data.csv"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
     (root / "mav0" / "cam0" / "data" / f"{stamps(4)[0]}.png").write_bytes(b"x")
-    info = describe(open_recording(root))
+    info = describe_recording(open_recording(root))
     assert info.pairs == 3
     assert [frame.stamp_ns for frame in info.dropped] == [stamps(4)[3]]
     assert info.first_refused == f"cam0/data/{stamps(4)[0]}.png is no readable picture"
@@ -57,7 +57,7 @@ def test_odd_things_are_noted(tmp_path: Path) -> None:
         (tmp_path / "mav0" / f"cam{camera}" / "sensor.yaml").write_text(text)
     rows = [f"{k * 5_000_000},9,0,0,0,0,30" for k in range(10)]
     (tmp_path / "mav0" / "imu0" / "data.csv").write_text("\n".join(rows) + "\n")
-    notes = " / ".join(describe(open_recording(tmp_path)).notes)
+    notes = " / ".join(describe_recording(open_recording(tmp_path)).notes)
     assert "30.00 m/s^2" in notes
     assert "not in degrees/s" in notes
     assert "imu0 and cam0 have no time in common" in notes
@@ -70,7 +70,7 @@ def test_a_crane_in_millimetres_is_noted(tmp_path: Path) -> None:
     write_euroc(tmp_path)
     rows = [f"{stamp},35000.0,120.0,8500.0" for stamp in stamps(3)]
     (tmp_path / "mav0" / "crane0" / "data.csv").write_text("\n".join(rows) + "\n")
-    notes = describe(open_recording(tmp_path)).notes
+    notes = describe_recording(open_recording(tmp_path)).notes
     assert any("the crane is up to 35000 m away" in note for note in notes)
 
 
@@ -80,12 +80,12 @@ def test_no_picture_beyond_the_first_pair_is_decoded(tmp_path: Path, monkeypatch
     calls = []
     decode = pairing.decode_gray
     monkeypatch.setattr(pairing, "decode_gray", lambda data: calls.append(0) or decode(data))
-    describe(open_recording(write_euroc(tmp_path, 6)))
+    describe_recording(open_recording(write_euroc(tmp_path, 6)))
     assert len(calls) == 2
 
 
 def test_real_info() -> None:
-    info = describe(open_recording(real("yard_dev")))
+    info = describe_recording(open_recording(real("yard_dev")))
     assert info.pairs == 19
     assert info.notes == ()
     assert info.first_refused is None

@@ -6,14 +6,14 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.registration.rigid import Alignment, align
+from barsight.registration.rigid import Alignment, align_rigid
 
 FRAMES = ("yard", "world")
 TRUTH = Pose(*FRAMES, Rotation.from_rotvec([0.3, -2.0, 0.7]).as_matrix(), np.array([20.0, -3.0, 8.0]))
 
 
 def found(source: np.ndarray, target: np.ndarray, covariance: np.ndarray | None = None) -> Alignment:
-    result = align(source, target, FRAMES, covariance)
+    result = align_rigid(source, target, FRAMES, covariance)
     assert isinstance(result, Alignment)
     return result
 
@@ -58,6 +58,6 @@ def test_the_covariance_is_right(stated: bool) -> None:
 def test_what_cant_be_aligned_is_refused_with_the_reason() -> None:
     line = np.column_stack([np.linspace(0, 7, 20), np.zeros(20), np.zeros(20)])
     for source, code in ((line, "collinear"), (np.zeros((5, 3)), "collinear"), (line[:2], "few-points")):
-        result = align(source, TRUTH.apply(source), FRAMES)
+        result = align_rigid(source, TRUTH.apply(source), FRAMES)
         assert isinstance(result, Failed)
         assert result.code == code

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.core.types import Contour, LaserProfile, Source
+from barsight.core.types import Contour, HeightSource, LaserProfile
 from barsight.report.map_images import cut_strips, hillshade, paint_height, read_raster
-from barsight.report.page import number, render_page, write_report
+from barsight.report.page import format_number, render_page, write_report
 from barsight.report.page_trajectory import turned_since_start_deg
-from barsight.report.plots import compare, contour_plot, keep_extremes
+from barsight.report.plots import contour_plot, keep_extremes, pair_with_laser
 from barsight.result_folder import CameraPath, read_contours, read_laser
 from result_folders import BIAS_MM, CELL_M, LEFT_M, TOP_M, bands, summary, write_folder, write_height
 
@@ -148,8 +148,8 @@ def test_a_missing_number_is_a_dash(tmp_path: Path) -> None:
     lacking["map"]["median_sigma_m"] = None
     lacking["agreement"][0]["bias_mm"] = None
     assert "Median sigma–" in Page(render_page(write_folder(tmp_path, **lacking))).text.replace("\n", "")
-    assert number(float("nan")) == number("text") == number(True) == "–"
-    assert number(-1234.56, 1, "mm") == "−1\u202f234.6\u00a0mm"
+    assert format_number(float("nan")) == format_number("text") == format_number(True) == "–"
+    assert format_number(-1234.56, 1, "mm") == "−1\u202f234.6\u00a0mm"
 
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_the_raster_is_the_map(folder: Path) -> None:
     np.testing.assert_array_equal(raster.source, source)
     np.testing.assert_array_equal(np.isnan(raster.views), views == 0)
     picture = paint_height(raster, 0.0, 0.5)
-    np.testing.assert_array_equal(picture[..., 3] == 0, source == Source.UNKNOWN)
+    np.testing.assert_array_equal(picture[..., 3] == 0, source == HeightSource.UNKNOWN)
     seen, filled = picture[65, 95, :3].astype(int), picture[65, 105, :3].astype(int)
     assert np.abs(seen - filled).max() > 60
 
@@ -246,7 +246,7 @@ def test_a_slope_towards_the_lamp_is_bright() -> None:
 
 
 def test_the_difference_is_the_bias(folder: Path) -> None:
-    compared = compare(read_contours(folder), read_laser(folder))
+    compared = pair_with_laser(read_contours(folder), read_laser(folder))
     for item, bias in zip(compared, BIAS_MM, strict=True):
         known = item.error_m[np.isfinite(item.error_m)] * 1e3
         assert known.size == 280 - 14
@@ -271,7 +271,7 @@ def test_a_long_contour_keeps_its_extremes() -> None:
     x = np.arange(z.size) * 0.01
     contour = Contour(0, x, 0 * x, z, 0 * x + 0.01, np.where(np.isnan(z), 0, 1).astype(np.uint8))
     laser = LaserProfile(0, x, 0 * x, 0 * x, 0.001)
-    plot = contour_plot(compare((contour,), (laser,))[0])
+    plot = contour_plot(pair_with_laser((contour,), (laser,))[0])
     assert "70001 samples" in plot.caption
     assert max(len(trace["x"]) for trace in plot.traces if trace["name"] == "vision") <= 20_000
 

@@ -9,19 +9,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.simulation.sensors import GRAVITY_MPS2, exact_imu, record_encoders, record_imu, seconds, stamps
-from barsight.simulation.settings import CameraSettings, MotionSettings, SensorSettings
-from barsight.simulation.trajectory import CraneTrajectory
+from barsight.simulation.settings import CameraSettings, SensorSettings, TravelSettings
+from barsight.simulation.trajectory import SimulatedTrajectory
 
 NOMINAL = Rotation.from_euler("zyx", [86, 2, 179], degrees=True).as_matrix()
 
 
 @pytest.fixture(scope="module")
-def trajectory() -> CraneTrajectory:
-    motion = MotionSettings(sway_deg=0.2)
-    return CraneTrajectory.plan(4.0, CameraSettings(), motion, NOMINAL, np.random.default_rng(3))
+def trajectory() -> SimulatedTrajectory:
+    motion = TravelSettings(sway_deg=0.2)
+    return SimulatedTrajectory.plan(4.0, CameraSettings(), motion, NOMINAL, np.random.default_rng(3))
 
 
-def test_derivatives_are_those_of_the_position(trajectory: CraneTrajectory) -> None:
+def test_derivatives_are_those_of_the_position(trajectory: SimulatedTrajectory) -> None:
     t = np.linspace(0.1, trajectory.duration_s - 0.1, 700)
     h = 1e-4
     before, now, after = trajectory.at(t - h), trajectory.at(t), trajectory.at(t + h)
@@ -35,7 +35,7 @@ def test_derivatives_are_those_of_the_position(trajectory: CraneTrajectory) -> N
     )
 
 
-def test_it_rests_travels_and_rests(trajectory: CraneTrajectory) -> None:
+def test_it_rests_travels_and_rests(trajectory: SimulatedTrajectory) -> None:
     motion = trajectory.motion
     rest = trajectory.at(np.linspace(0, motion.standstill_s, 20))
     end = trajectory.at(np.linspace(trajectory.settled_s, trajectory.duration_s, 20))
@@ -54,7 +54,7 @@ def test_it_rests_travels_and_rests(trajectory: CraneTrajectory) -> None:
     )
 
 
-def test_exact_imu_integrates_to_the_trajectory(trajectory: CraneTrajectory) -> None:
+def test_exact_imu_integrates_to_the_trajectory(trajectory: SimulatedTrajectory) -> None:
     stamp_ns = stamps(trajectory.duration_s, 2000)
     gyro, force = exact_imu(trajectory, stamp_ns)
     t = seconds(stamp_ns)
@@ -73,7 +73,7 @@ def test_exact_imu_integrates_to_the_trajectory(trajectory: CraneTrajectory) -> 
     assert (rotation.inv() * Rotation.from_matrix(truth.yard_from_body[-1])).magnitude() < 1e-5
 
 
-def test_imu_noise_and_walk_have_the_stated_densities(trajectory: CraneTrajectory) -> None:
+def test_imu_noise_and_walk_have_the_stated_densities(trajectory: SimulatedTrajectory) -> None:
     quiet = replace(
         SensorSettings(),
         gyro_random_walk=0.0,
@@ -92,7 +92,7 @@ def test_imu_noise_and_walk_have_the_stated_densities(trajectory: CraneTrajector
     assert np.diff(bias, axis=0).std() == pytest.approx(0.01 / np.sqrt(200), rel=0.03)
 
 
-def test_encoders_plus_lever_are_the_truth(trajectory: CraneTrajectory) -> None:
+def test_encoders_plus_lever_are_the_truth(trajectory: SimulatedTrajectory) -> None:
     lever = np.array([0.35, -0.2, -0.55])
     settings = SensorSettings()
     stamp_ns, place = record_encoders(trajectory, settings, lever, np.random.default_rng(2))

@@ -11,7 +11,7 @@ from barsight.core.pose import Pose
 from barsight.simulation.lighting import Lamps, Lightmap, bake, hall_lamps
 from barsight.simulation.optics import sample_rays
 from barsight.simulation.rays import cast_rays
-from barsight.simulation.render import Look, render, shade
+from barsight.simulation.render import Shading, render_view, shade
 from barsight.simulation.scene import Primitives, Scene, build_grid, build_scene
 from barsight.simulation.settings import SimulationSettings, YardSettings
 from barsight.simulation.stock import stack_yard
@@ -140,12 +140,12 @@ def test_open_floor_gets_the_light_of_the_formula(scene: Scene, lightmap: Lightm
 
 
 def test_render_is_the_mean_of_its_shaded_samples(scene: Scene, lightmap: Lightmap) -> None:
-    look = Look(hall_lamps(8.0), lightmap, surface_tile(np.random.default_rng(1), 0.0064))
+    look = Shading(hall_lamps(8.0), lightmap, surface_tile(np.random.default_rng(1), 0.0064))
     camera = Camera(96, 80, 120.0, 120.0, 47.5, 39.5)
     rotation = np.diag([1.0, -1.0, -1.0])
     pose = Pose("yard", "cam", rotation, np.array([0.8, 0.1, 3.0]))
     rays = sample_rays(camera, 2)
-    image = render(scene, look, rays, 2, pose)
+    image = render_view(scene, look, rays, 2, pose)
     rng = np.random.default_rng(2)
     for _ in range(25):
         v, u = int(rng.integers(80)), int(rng.integers(96))

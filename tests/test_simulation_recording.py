@@ -24,14 +24,14 @@ from barsight.simulation.sensors import heights
 from barsight.simulation.settings import (
     BarKind,
     CameraSettings,
-    MotionSettings,
     SensorSettings,
     SimulationSettings,
+    TravelSettings,
     YardSettings,
     parse_bars,
 )
 from barsight.simulation.simulate import World, simulate
-from barsight.simulation.stock import Bundle, stack_yard
+from barsight.simulation.stock import StackedBundle, stack_yard
 
 SMALL = SimulationSettings(
     length_m=1.5,
@@ -39,7 +39,7 @@ SMALL = SimulationSettings(
     seed=11,
     camera=CameraSettings(width_px=320, height_px=256, focal_px=312.0),
     yard=YardSettings(max_layers=2),
-    motion=MotionSettings(speed_mps=1.0, acceleration_mps2=1.5, standstill_s=1.0),
+    motion=TravelSettings(speed_mps=1.0, acceleration_mps2=1.5, standstill_s=1.0),
 )
 
 
@@ -217,7 +217,7 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "kept"
 
 
-def x_at(bundle: Bundle, y: float) -> float:
+def x_at(bundle: StackedBundle, y: float) -> float:
     return float(bundle.centre_m[0] - np.tan(bundle.yaw_rad) * (y - bundle.centre_m[1]))
 
 
@@ -278,7 +278,7 @@ def test_bars_are_read_from_text() -> None:
         (lambda: SimulationSettings(camera=CameraSettings(above_floor_m=2)), "above_floor_m"),
         (lambda: CameraSettings(width_px=10), "64 px"),
         (lambda: YardSettings(max_layers=9), "max_layers"),
-        (lambda: MotionSettings(speed_mps=0), "speed_mps"),
+        (lambda: TravelSettings(speed_mps=0), "speed_mps"),
         (lambda: SensorSettings(timeshift_cam_imu_s=2), "timeshift"),
         (lambda: SensorSettings(imu_rate_hz=1), "imu_rate_hz"),
     ],

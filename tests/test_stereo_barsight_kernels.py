@@ -8,23 +8,28 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from barsight.core.errors import ConfigError
-from barsight.stereo.direct.confidence import bend_around, beside_edges, start_disagreement
-from barsight.stereo.direct.consistency import agrees, lands_on, without_islands
+from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement
+from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove_islands
 from barsight.stereo.direct.curvature import curvature_row
 from barsight.stereo.direct.depth_edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
-from barsight.stereo.direct.disparity_update import blend, settle, variances
+from barsight.stereo.direct.disparity_update import blend_fits, fit_variance, update_disparity
 from barsight.stereo.direct.kernels.box_sums import window_means
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
-from barsight.stereo.direct.kernels.pyramid import carried_up, halved
-from barsight.stereo.direct.occlusion_filling import fill
-from barsight.stereo.direct.photometric_residuals import compare, lengthen, noise_power, weigh
+from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
+from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes
+from barsight.stereo.direct.photometric_residuals import (
+    noise_power,
+    photometric_residual,
+    robust_weights,
+    step_gain,
+)
 from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
-from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match
+from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 from barsight.stereo.direct.support_regions import (
     TILE_COLUMNS,
     TILE_ROWS,
+    allocate_frame,
     axis_means,
-    empty_frame,
     inside,
     tile_axes,
 )
@@ -38,7 +43,7 @@ def _noise(seed: int, spread: float = 1.0) -> np.ndarray:
 
 
 def _frame(image: np.ndarray) -> np.ndarray:
-    frame = empty_frame(image.shape)
+    frame = allocate_frame(image.shape)
     inside(frame, image.shape)[:] = image
     return frame
 
@@ -115,7 +120,7 @@ def _planes(
 ) -> tuple[np.ndarray, np.ndarray]:
     found = np.empty_like(disparity), np.empty_like(disparity)
     frames = [_frame(image) for image in (disparity, weight, pull)]
-    room = empty_frame(disparity.shape), empty_frame(disparity.shape)
+    room = allocate_frame(disparity.shape), allocate_frame(disparity.shape)
     fit_planes(*frames, _axes(0, 1), shape, same_px, room, *found)
     return found
 
@@ -204,9 +209,9 @@ def _slow_semiglobal(left: np.ndarray, right: np.ndarray, lowest: int, count: in
                     continue
                 before = path[row, column]
                 contrast = abs(greys[0][y, x] - greys[0][row, column])
-                jump = max(settings.large_jump * 8 // (8 + contrast), settings.least_jump)
+                jump = max(settings.p2 * 8 // (8 + contrast), settings.min_p2)
                 near = np.minimum(np.append(before[1:], 10**6), np.append(10**6, before[:-1]))
-                best = np.minimum(np.minimum(before, near + settings.small_jump), before.min() + jump)
+                best = np.minimum(np.minimum(before, near + settings.p1), before.min() + jump)
                 path[y, x] = cost[y, x] + best - before.min()
         total += path
     return total
@@ -217,7 +222,7 @@ def test_semiglobal_is_the_minimum_of_the_eight_paths(lowest: int) -> None:
     rng = np.random.default_rng(9)
     wide = cv2.GaussianBlur(rng.normal(120, 90, (14, 60)), (0, 0), 1.0).clip(0, 255).astype(np.uint8)
     left, right = wide[:, 5:37].copy(), wide[:, 9:41].copy()
-    found = match(left, right, lowest, 12, SemiGlobalSettings())
+    found = match_semiglobal(left, right, lowest, 12, SemiGlobalSettings())
     total = _slow_semiglobal(left, right, lowest, 12)
     winner = total.argmin(axis=-1)
     assert np.abs(found.left_px - lowest - winner).max() <= 0.5
@@ -233,24 +238,24 @@ def test_stripes_of_the_semiglobal_match_leave_no_mark() -> None:
     rng = np.random.default_rng(10)
     wide = cv2.GaussianBlur(rng.normal(120, 90, (300, 90)), (0, 0), 1.2).clip(0, 255).astype(np.uint8)
     left, right = wide[:, :64].copy(), wide[:, 7:71].copy()
-    whole = match(left, right, 0, 20, SemiGlobalSettings()).left_px
+    whole = match_semiglobal(left, right, 0, 20, SemiGlobalSettings()).left_px
     assert (np.abs(whole[:, 10:] - 7) < 0.5).mean() > 0.999
 
 
 def test_left_right_check_and_islands() -> None:
     left, right = np.full((8, 20), 3, np.float32), np.full((8, 20), 3, np.float32)
     right[2, 5] = 6
-    same = agrees(left, right, 1.0)
+    same = is_consistent(left, right, 1.0)
     assert not same[:, :3].any()
     assert not same[2, 8]
     assert same[:, 3:].sum() == 8 * 17 - 1
     valid = np.ones((8, 20), dtype=bool)
     valid[1, 0], valid[2, 5] = False, False
-    landed = lands_on(valid, left)
+    landed = hits_valid(valid, left)
     assert not landed[1, :4].any() and not landed[2, 8]
     assert landed.sum() == 8 * 20 - 5
     left[4:6, 10:12] = 9
-    cleaned = without_islands(left, 10, 1.0)
+    cleaned = remove_islands(left, 10, 1.0)
     assert np.isnan(cleaned[4:6, 10:12]).all()
     assert np.isfinite(cleaned).sum() == 8 * 20 - 4
 
@@ -289,7 +294,9 @@ def test_filling_continues_the_plane_behind_and_leaves_the_input() -> None:
     disparity[:, :12] = np.nan
     before = disparity.copy()
     right = np.full_like(disparity, 30)
-    filled, sigma = fill(disparity, np.full(disparity.shape, 100, np.uint8), right, 0, 60)
+    filled, sigma = fill_occlusions_by_planes(
+        disparity, np.full(disparity.shape, 100, np.uint8), right, 0, 60
+    )
     assert np.array_equal(before, disparity, equal_nan=True)
     hidden = (slice(None), slice(60, 70))
     assert (np.abs(filled[hidden] - (20 + 0.05 * columns[hidden])) < 0.5).mean() > 0.97
@@ -301,7 +308,9 @@ def test_filling_continues_the_plane_behind_and_leaves_the_input() -> None:
 
 def test_filling_leaves_an_empty_map_empty() -> None:
     empty = np.full((20, 30), np.nan, np.float32)
-    filled, sigma = fill(empty, np.zeros((20, 30), np.uint8), np.zeros((20, 30), np.float32), 0, 10)
+    filled, sigma = fill_occlusions_by_planes(
+        empty, np.zeros((20, 30), np.uint8), np.zeros((20, 30), np.float32), 0, 10
+    )
     assert np.isnan(filled).all()
     assert np.isnan(sigma).all()
 
@@ -309,15 +318,15 @@ def test_filling_leaves_an_empty_map_empty() -> None:
 def test_bend_is_zero_on_a_plane_and_half_the_step_beside_an_edge() -> None:
     rows, columns = np.mgrid[0:20, 0:30].astype(np.float32)
     plane = 0.1 * columns + 0.2 * rows
-    assert bend_around(plane, 0.5)[4:-4, 4:-4].max() < 1e-5
+    assert disparity_bend(plane, 0.5)[4:-4, 4:-4].max() < 1e-5
     step = np.where(columns < 15, 0, 0.6).astype(np.float32)
-    assert bend_around(step, 0.5)[10, 13] == pytest.approx(0.3)
-    assert bend_around(step * 100, 0.5).max() == np.float32(0.5)
+    assert disparity_bend(step, 0.5)[10, 13] == pytest.approx(0.3)
+    assert disparity_bend(step * 100, 0.5).max() == np.float32(0.5)
 
 
 def test_penalties_must_be_in_order() -> None:
     with pytest.raises(ConfigError, match="penalties"):
-        SemiGlobalSettings(small_jump=50, large_jump=40)
+        SemiGlobalSettings(p1=50, p2=40)
 
 
 def _curvature(disparity: np.ndarray, axes: np.ndarray) -> np.ndarray:
@@ -352,7 +361,7 @@ def test_only_jumps_between_known_neighbours_are_edges() -> None:
     disparity = np.full((HEIGHT, WIDTH), 5, dtype=np.float32)
     disparity[:, 40:] = 9
     disparity[:, 20] = np.nan
-    beside, other_side = beside_edges(disparity, 1.0)
+    beside, other_side = edge_risk(disparity, 1.0)
     assert (beside[:, 39:41] == 1).all() and (beside[:, 18:23] < 0.01).all()
     assert (other_side[:, 38:42] == 4).all() and not other_side[:, :37].any() and not other_side[:, 43:].any()
     np.testing.assert_allclose(beside[20, 43], np.exp(-1.0), rtol=0.05)
@@ -374,8 +383,8 @@ def test_comparison_is_what_box_filters_say(rows: int) -> None:
     means = [_mean(usable * image) / share for image in (left, right)]
     powers = [_mean(usable * i * i) / share - m * m + 4 for i, m in zip((left, right), means, strict=True)]
     wanted = left - means[0] - np.sqrt(powers[0] / powers[1]) * (right - means[1])
-    residual, trust = empty_frame(left.shape), empty_frame(left.shape)
-    compare(left, right, usable, 21, 8.0, residual, trust)
+    residual, trust = allocate_frame(left.shape), allocate_frame(left.shape)
+    photometric_residual(left, right, usable, 21, 8.0, residual, trust)
     np.testing.assert_allclose(inside(residual, left.shape), wanted, atol=5e-3)
     np.testing.assert_allclose(inside(trust, left.shape), usable / (1 + (wanted / 8) ** 2), atol=1e-3)
 
@@ -390,13 +399,13 @@ def test_pulls_are_what_box_filters_say() -> None:
     share = np.minimum(1, 0.5 * agreement)
     wanted = trust * (slope_detail**2 + share * means[1] ** 2)
     wanted_pull = -trust * (slope_detail * detail + share * means[1] * means[0])
-    weight, pull = empty_frame(usable.shape), empty_frame(usable.shape)
-    weigh(_frame(residual), _frame(slope), _frame(trust), means, 21, 10.0, 0.5, weight, pull)
+    weight, pull = allocate_frame(usable.shape), allocate_frame(usable.shape)
+    robust_weights(_frame(residual), _frame(slope), _frame(trust), means, 21, 10.0, 0.5, weight, pull)
     np.testing.assert_allclose(inside(weight, usable.shape), wanted, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(inside(pull, usable.shape), wanted_pull, rtol=1e-3, atol=1e-2)
 
     mean_weight = np.empty_like(usable)
-    short_of = lengthen(weight, _frame(trust), 20.0, 21, False, pull, mean_weight)
+    short_of = step_gain(weight, _frame(trust), 20.0, 21, False, pull, mean_weight)
     mean = _mean(wanted)
     longer = mean / np.maximum(mean - 20 * _mean(trust), mean / 3 + 1e-6)
     np.testing.assert_allclose(mean_weight, mean, rtol=1e-4)
@@ -414,15 +423,15 @@ def test_pulls_are_what_box_filters_say() -> None:
 def test_a_step_at_half_size_is_carried_up_without_mixing_surfaces() -> None:
     y, x = np.mgrid[0:41, 0:63].astype(np.float32)
     start = np.where(x < 30, 20 + 0.05 * x + 0.03 * y, 40 - 0.04 * x).astype(np.float32)
-    small = halved(start)
+    small = halve(start)
     assert small.shape == (21, 32)
     np.testing.assert_allclose(small[3, 5], start[6:8, 10:12].mean(), rtol=1e-6)
     moved = np.where(np.arange(32)[None, :] < 15, 0.1, -0.2).astype(np.float32) * np.ones((21, 1), np.float32)
-    carried = carried_up(0.5 * small, moved, start, 1.0)
+    carried = upsample_update(0.5 * small, moved, start, 1.0)
     np.testing.assert_allclose(carried - start, np.where(x < 30, 0.2, -0.4), atol=1e-5)
 
     ramp = np.broadcast_to(np.arange(32, dtype=np.float32) * 0.01, (21, 32)).copy()
-    rising = carried_up(np.full_like(small, 10), ramp, np.full_like(start, 20), 1.0)
+    rising = upsample_update(np.full_like(small, 10), ramp, np.full_like(start, 20), 1.0)
     inner = slice(1, 61)
     np.testing.assert_allclose(rising[:, inner] - 20, (0.01 * (x - 0.5))[:, inner], atol=1e-5)
 
@@ -431,11 +440,11 @@ def test_supports_are_blended_and_steps_settled_as_written() -> None:
     long, short = _noise(41), _noise(42, 0.5)
     information, power = (1 + np.abs(_noise(43)), 1 + np.abs(_noise(44))), 0.1 * np.abs(_noise(45))
     usable = (_noise(46) > -0.8).astype(np.float32)
-    variance = [variances(power, one) for one in information]
+    variance = [fit_variance(power, one) for one in information]
     gap = long - short
     excess = _mean(usable * (gap**2 - 0.5 * variance[1]), 9) / (_mean(usable, 9) + 1e-6)
     share = variance[1] / (variance[1] + np.maximum(excess, 0) + 1e-9)
-    fitted, unsure = blend((long, information[0]), (short, information[1]), power, usable)
+    fitted, unsure = blend_fits((long, information[0]), (short, information[1]), power, usable)
     np.testing.assert_allclose(fitted, short + share * gap, atol=1e-4)
     mixture = share * variance[0] + (1 - share) * (variance[1] + share * gap**2)
     np.testing.assert_allclose(unsure, mixture, atol=1e-5)
@@ -445,6 +454,6 @@ def test_supports_are_blended_and_steps_settled_as_written() -> None:
     move = np.clip(fitted - sag - start, -1.5, 1.5)
     wanted = unsure + 0.25 * sag**2
     disparity = _frame(start)
-    settle(fitted, axes, disparity, unsure)
+    update_disparity(fitted, axes, disparity, unsure)
     np.testing.assert_allclose(inside(disparity, start.shape), start + move, atol=1e-5)
     np.testing.assert_allclose(unsure, wanted, rtol=1e-4, atol=1e-5)

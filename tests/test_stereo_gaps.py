@@ -3,7 +3,7 @@
 import numpy as np
 
 from barsight.core.types import Disparity
-from barsight.stereo.masking import in_gap, without_gaps
+from barsight.stereo.masking import gap_mask, mask_gaps
 
 
 def steel(level: float, seed: int = 0) -> np.ndarray:
@@ -14,7 +14,7 @@ def steel(level: float, seed: int = 0) -> np.ndarray:
 def test_a_dark_stripe_is_a_gap_and_steel_is_not() -> None:
     image = steel(100)
     image[:, 90:98] = 15
-    gap = in_gap(image.astype(np.uint8), 0.55)
+    gap = gap_mask(image.astype(np.uint8), 0.55)
     assert gap[:, 91:97].all()
     assert gap[:, :88].mean() < 0.001 and gap[:, 100:].mean() < 0.001
 
@@ -22,18 +22,18 @@ def test_a_dark_stripe_is_a_gap_and_steel_is_not() -> None:
 def test_a_darker_bundle_is_no_gap() -> None:
     image = steel(100)
     image[:, 100:] = steel(60, seed=1)[:, 100:]
-    assert in_gap(image.astype(np.uint8), 0.55).mean() < 0.005
+    assert gap_mask(image.astype(np.uint8), 0.55).mean() < 0.005
 
 
 def test_a_black_picture_has_no_gap() -> None:
-    assert not in_gap(np.zeros((60, 60), np.uint8), 0.55).any()
+    assert not gap_mask(np.zeros((60, 60), np.uint8), 0.55).any()
 
 
 def test_gaps_lose_disparity_and_sigma() -> None:
     image = steel(100).astype(np.uint8)
     image[:, 90:98] = 10
     known = np.full(image.shape, 20, np.float32)
-    masked = without_gaps(Disparity(known, known * 0 + 0.1, 0.05), image, 0.55)
+    masked = mask_gaps(Disparity(known, known * 0 + 0.1, 0.05), image, 0.55)
     assert np.isnan(masked.disparity_px[:, 92:96]).all() and np.isnan(masked.sigma_px[:, 92:96]).all()
     assert np.isfinite(masked.disparity_px[:, :80]).all() and masked.bias_sigma_px == 0.05
-    assert without_gaps(masked, image, 0.0) is masked
+    assert mask_gaps(masked, image, 0.0) is masked

@@ -14,11 +14,15 @@ from barsight.stereo.baselines.cross_aggregation import cross_filter, cross_regi
 from barsight.stereo.baselines.csca import _Scale, _tie, scale_weights
 from barsight.stereo.baselines.gradient_cost import GradientCostSettings, cost_images, gradient_cost
 from barsight.stereo.baselines.guided_filter import colour_guided_filter, guided_filter
-from barsight.stereo.baselines.left_right_check import agreement, filled_from_behind, weighted_median
-from barsight.stereo.baselines.nonlocal_aggregation import refined
+from barsight.stereo.baselines.left_right_check import (
+    fill_from_background,
+    left_right_agreement,
+    weighted_median,
+)
+from barsight.stereo.baselines.nonlocal_aggregation import refine_nonlocal
 from barsight.stereo.baselines.region_voting import region_vote
 from barsight.stereo.baselines.spanning_tree import spanning_tree, tree_filter
-from barsight.stereo.baselines.winner_takes_all import between_candidates, no_winners, sweep, take_slices
+from barsight.stereo.baselines.winner_takes_all import no_winners, subpixel_winners, sweep, take_slices
 
 
 @pytest.fixture
@@ -196,7 +200,7 @@ def test_winners_of_slices_in_blocks_are_those_of_the_whole_volume(rng: np.rando
     winners = sweep((6, 9), candidates, fill)
     best = volume.argmin(0)
     np.testing.assert_array_equal(winners.candidate_px, best - 3)
-    between = between_candidates(winners)
+    between = subpixel_winners(winners)
     for y in range(6):
         for x in range(9):
             d = best[y, x]
@@ -212,21 +216,21 @@ def test_the_parabola_finds_a_parabolas_minimum() -> None:
     truth = np.linspace(3, 7, 50)
     volume = ((np.arange(11)[:, None] - truth) ** 2).astype(np.float32)[:, None, :]
     take_slices(winners, np.ascontiguousarray(volume), 0)
-    np.testing.assert_allclose(between_candidates(winners)[0], truth, atol=1e-5)
+    np.testing.assert_allclose(subpixel_winners(winners)[0], truth, atol=1e-5)
 
 
 def test_left_right_agreement_and_filling_by_hand() -> None:
     left = np.array([[2, 2, 2, 3, 2, 2, 5, 2]], dtype=np.int32)
     right = np.array([[2, 2, 2, 2, 2, 2, 2, 2]], dtype=np.int32)
     strict = np.array([[False, False, True, False, True, True, False, True]])
-    np.testing.assert_array_equal(agreement(left, right), strict)
+    np.testing.assert_array_equal(left_right_agreement(left, right), strict)
     loose = strict.copy()
     loose[0, 3] = True
-    np.testing.assert_array_equal(agreement(left, right, tolerance_px=1), loose)
+    np.testing.assert_array_equal(left_right_agreement(left, right, tolerance_px=1), loose)
     values = np.array([[9, 4, 9, 9, 6, 9]], dtype=np.int32)
     usable = np.array([[False, True, False, False, True, False]])
-    np.testing.assert_array_equal(filled_from_behind(values, usable), [[4, 4, 4, 4, 6, 6]])
-    np.testing.assert_array_equal(filled_from_behind(values, np.zeros_like(usable)), values)
+    np.testing.assert_array_equal(fill_from_background(values, usable), [[4, 4, 4, 4, 6, 6]])
+    np.testing.assert_array_equal(fill_from_background(values, np.zeros_like(usable)), values)
 
 
 def test_weighted_median_against_sorting(rng: np.random.Generator) -> None:
@@ -293,7 +297,7 @@ def test_nonlocal_refinement_is_the_weighted_median_over_the_tree(rng: np.random
     values = rng.integers(2, 30, (8, 10)).astype(np.int32)
     matched = rng.random((8, 10)) > 0.3
     tree = spanning_tree(guide)
-    found = refined(values, matched, tree, DisparityRange(0, 40), 9.0)
+    found = refine_nonlocal(values, matched, tree, DisparityRange(0, 40), 9.0)
     edges = scipy.sparse.csr_matrix(
         (tree.weight[1:] + 1e-9, (tree.node[1:], tree.parent[1:])), shape=(80, 80)
     )

@@ -189,9 +189,9 @@ def test_every_name_in_the_settings_makes_its_method() -> None:
         lambda: NonlocalSettings(sigma=0),
         lambda: CensusSettings(rounds=0),
         lambda: CensusSettings(short_arm_px=20),
-        lambda: CensusSettings(vote_share=2),
+        lambda: CensusSettings(min_vote_ratio=2),
         lambda: PaperSettings(eta=0),
-        lambda: PaperSettings(most_rounds=0),
+        lambda: PaperSettings(max_rounds=0),
         lambda: OutputSettings(filled_sigma_px=-1),
     ],
 )

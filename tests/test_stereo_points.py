@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from barsight.core.types import Disparity, RectifiedPair
-from barsight.stereo.triangulation import refine_grid, triangulate
+from barsight.stereo.triangulation import refine_grid, triangulate_disparity
 from synthetic_scenes import slanted_pair
 
 
@@ -29,7 +29,7 @@ def pixels_of(points: np.ndarray, pair: RectifiedPair) -> tuple[np.ndarray, np.n
 def test_points_project_back(scene: tuple[RectifiedPair, np.ndarray], per_pixel: int) -> None:
     """Sub-pixel points lie on the same plane, evenly within their pixels."""
     pair, truth = scene
-    points = triangulate(pair, disparity(truth), 0.1, per_pixel=per_pixel)
+    points = triangulate_disparity(pair, disparity(truth), 0.1, per_pixel=per_pixel)
     assert len(points.xyz_m) == truth.size * per_pixel**2
     u, v, d = pixels_of(points.xyz_m, pair)
     steps = [(np.arange(n * per_pixel) + 0.5) / per_pixel - 0.5 for n in (240, 160)]
@@ -48,13 +48,15 @@ def test_stated_sigma_is_the_errors_along_the_ray(scene: tuple[RectifiedPair, np
     pair, truth = scene
     rng = np.random.default_rng(5)
     sigma, bias, shared = 0.25, 0.15, 0.08
-    exact = triangulate(pair, disparity(truth, sigma, bias), shared)
+    exact = triangulate_disparity(pair, disparity(truth, sigma, bias), shared)
     noise_px = np.sqrt(sigma**2 - bias**2)
-    noisy = triangulate(pair, disparity(truth + rng.normal(0, noise_px, truth.shape), sigma, bias), shared)
+    noisy = triangulate_disparity(
+        pair, disparity(truth + rng.normal(0, noise_px, truth.shape), sigma, bias), shared
+    )
     moved = np.linalg.norm(noisy.xyz_m, axis=1) - np.linalg.norm(exact.xyz_m, axis=1)
     assert np.std(moved / exact.range_sigma_m) == pytest.approx(1, abs=0.02)
     for common in (bias, shared):
-        shifted = triangulate(pair, disparity(truth + common), shared)
+        shifted = triangulate_disparity(pair, disparity(truth + common), shared)
         moved = np.linalg.norm(shifted.xyz_m, axis=1) - np.linalg.norm(exact.xyz_m, axis=1)
         expected = common / np.hypot(bias, shared)
         np.testing.assert_allclose(np.abs(moved) / exact.shared_sigma_m, expected, rtol=0.03)
@@ -63,9 +65,9 @@ def test_stated_sigma_is_the_errors_along_the_ray(scene: tuple[RectifiedPair, np
 def test_noise_and_shared_part_are_apart(scene: tuple[RectifiedPair, np.ndarray]) -> None:
     """Each input widens its own part only."""
     pair, truth = scene
-    base = triangulate(pair, disparity(truth, 0.3, 0.1), 0.05)
-    surer = triangulate(pair, disparity(truth, 0.2, 0.1), 0.05)
-    worse_calibrated = triangulate(pair, disparity(truth, 0.3, 0.1), 0.2)
+    base = triangulate_disparity(pair, disparity(truth, 0.3, 0.1), 0.05)
+    surer = triangulate_disparity(pair, disparity(truth, 0.2, 0.1), 0.05)
+    worse_calibrated = triangulate_disparity(pair, disparity(truth, 0.3, 0.1), 0.2)
     assert (surer.range_sigma_m < base.range_sigma_m).all()
     np.testing.assert_array_equal(surer.shared_sigma_m, base.shared_sigma_m)
     np.testing.assert_array_equal(worse_calibrated.range_sigma_m, base.range_sigma_m)
@@ -79,14 +81,16 @@ def test_what_is_left_out(scene: tuple[RectifiedPair, np.ndarray]) -> None:
     values[:10] = np.nan
     values[10:20] = -4.5
     values[20:30] = -6.0
-    points = triangulate(pair, disparity(values), 0.1)
+    points = triangulate_disparity(pair, disparity(values), 0.1)
     assert len(points.xyz_m) == truth.size - 30 * 240
     depth = 200 / (truth + 4.5)
-    assert len(triangulate(pair, disparity(truth), 0.1, max_depth_m=7.0).xyz_m) == (depth <= 7).sum()
+    assert (
+        len(triangulate_disparity(pair, disparity(truth), 0.1, max_depth_m=7.0).xyz_m) == (depth <= 7).sum()
+    )
     within = depth**2 / 200 * 0.3 <= 0.07
     assert 0 < within.sum() < within.size
-    assert len(triangulate(pair, disparity(truth), 0.1, max_sigma_m=0.07).xyz_m) == within.sum()
-    nothing = triangulate(pair, disparity(np.full_like(truth, np.nan)), 0.1, per_pixel=2)
+    assert len(triangulate_disparity(pair, disparity(truth), 0.1, max_sigma_m=0.07).xyz_m) == within.sum()
+    nothing = triangulate_disparity(pair, disparity(np.full_like(truth, np.nan)), 0.1, per_pixel=2)
     assert nothing.xyz_m.shape == (0, 3)
 
 

@@ -7,14 +7,14 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.types import DisparityRange, RectifiedPair
-from barsight.stereo.search_range import coarse_disparity, find_range
+from barsight.stereo.search_range import coarse_disparity, find_disparity_range
 from synthetic_scenes import camera, slanted_pair
 
 
 @pytest.mark.parametrize(("start_px", "slope"), [(12.4, (0.02, 0.01)), (60.2, (0.05, -0.03)), (90.0, (0, 0))])
 def test_the_range_holds_the_truth(start_px: float, slope: tuple[float, float]) -> None:
     pair, truth = slanted_pair(480, 320, start_px, slope)
-    found = find_range(pair)
+    found = find_disparity_range(pair)
     assert isinstance(found, DisparityRange)
     assert found.lowest_px <= truth.min()
     assert truth.max() < found.highest_px
@@ -26,7 +26,7 @@ def test_the_range_holds_the_truth(start_px: float, slope: tuple[float, float]) 
 def test_converging_cameras_have_disparities_below_zero() -> None:
     """With doffs 70 px depth reaches down to a disparity of -70 px."""
     pair, truth = slanted_pair(480, 320, -30.0, doffs_px=70.0)
-    found = find_range(pair)
+    found = find_disparity_range(pair)
     assert isinstance(found, DisparityRange)
     assert -70 <= found.lowest_px <= truth.min()
     assert truth.max() < found.highest_px
@@ -34,7 +34,7 @@ def test_converging_cameras_have_disparities_below_zero() -> None:
 
 def test_the_range_ends_at_infinity() -> None:
     pair, _ = slanted_pair(480, 320, 3.0)
-    found = find_range(pair)
+    found = find_disparity_range(pair)
     assert isinstance(found, DisparityRange)
     assert found.lowest_px == 0
 
@@ -42,7 +42,7 @@ def test_the_range_ends_at_infinity() -> None:
 @pytest.mark.parametrize("doffs_px", [0.0, 6.0])
 def test_swapped_images_are_found_out(doffs_px: float) -> None:
     pair, _ = slanted_pair(480, 320, 40.0, doffs_px=doffs_px)
-    found = find_range(replace(pair, left=pair.right, right=pair.left))
+    found = find_disparity_range(replace(pair, left=pair.right, right=pair.left))
     assert isinstance(found, Failed)
     assert found.code == "swapped"
     assert "swapped" in found.reason
@@ -52,7 +52,7 @@ def test_images_without_texture() -> None:
     valid = np.ones((320, 480), dtype=np.bool_)
     noise = np.random.default_rng(0).integers(126, 130, (2, 320, 480), dtype=np.uint8)
     for left, right in (np.zeros((2, 320, 480), np.uint8), noise):
-        found = find_range(RectifiedPair(1, left, right, valid, valid, camera(480, 320)))
+        found = find_disparity_range(RectifiedPair(1, left, right, valid, valid, camera(480, 320)))
         assert isinstance(found, Failed)
         assert found.code == "no-texture"
 
@@ -70,7 +70,7 @@ def test_coarse_disparity() -> None:
 def test_a_surface_nearer_than_usual(start_px: float) -> None:
     """Disparities about and over 40 % of the width, where the search ends at first."""
     pair, truth = slanted_pair(480, 320, start_px, (0.02, 0.05))
-    found = find_range(pair)
+    found = find_disparity_range(pair)
     assert isinstance(found, DisparityRange)
     assert found.lowest_px <= np.percentile(truth, 5)
     assert np.percentile(truth, 95) < found.highest_px
@@ -80,7 +80,7 @@ def test_saturated_images_are_not_taken_for_swapped() -> None:
     pair, truth = slanted_pair(480, 320, 40.0)
     left, right = pair.left.copy(), pair.right.copy()
     left[:, 140:], right[:, 100:] = 255, 255
-    found = find_range(replace(pair, left=left, right=right))
+    found = find_disparity_range(replace(pair, left=left, right=right))
     assert isinstance(found, DisparityRange)
     assert found.lowest_px <= truth.min() and truth.max() < found.highest_px
     assert np.isnan(coarse_disparity(left, right)[:, 40:]).all()

@@ -13,9 +13,9 @@ import pytest
 
 from barsight.cli.main import run
 from barsight.core.errors import InputError, OutputError
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.result_folder import read_cloud, read_heights
-from barsight.viewer.cloud import SOURCE_RGB, colour, seen_layer, surface_layer
+from barsight.viewer.cloud import SOURCE_RGB, colour_layer, seen_layer, surface_layer
 from barsight.viewer.view import line_segments, serving, view
 from result_folders import surface_m, write_folder
 
@@ -107,7 +107,7 @@ def test_the_cloud_is_thinned_evenly(folder: Path) -> None:
 @pytest.mark.parametrize("by", ["height", "intensity", "sigma", "views"])
 def test_colours_follow_the_property(folder: Path, by: str) -> None:
     layer = seen_layer(read_cloud(folder / "cloud.ply", 10_000))
-    painted = colour(layer, by)
+    painted = colour_layer(layer, by)
     assert painted.rgb.shape == (5000, 3)
     values = layer.properties[by]
     highest, lowest = int(np.argmax(values)), int(np.argmin(values))
@@ -122,10 +122,10 @@ def test_the_surface_shows_filled_cells_and_says_so(folder: Path) -> None:
     assert (layer.total, layer.xyz_m.shape) == (150 * 280, (150 * 280, 3))
     assert list(layer.properties) == ["height", "source", "sigma", "views"]
     np.testing.assert_allclose(layer.xyz_m[:, 2], surface_m(layer.xyz_m[:, 0].astype(np.float64)), atol=2e-3)
-    painted = colour(layer, "source")
-    filled = (painted.rgb == SOURCE_RGB[Source.FILLED][1]).all(axis=1)
+    painted = colour_layer(layer, "source")
+    filled = (painted.rgb == SOURCE_RGB[HeightSource.FILLED][1]).all(axis=1)
     assert filled.sum() == 100
-    assert (painted.rgb[~filled] == SOURCE_RGB[Source.VISION][1]).all()
+    assert (painted.rgb[~filled] == SOURCE_RGB[HeightSource.VISION][1]).all()
     assert painted.caption == "vision 99.8 %, filled 0.2 %"
     assert surface_layer(read_heights(folder), 1000).xyz_m.shape == (1000, 3)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.headings import find_headings
@@ -118,7 +118,7 @@ def test_the_bars_of_a_bundle_are_found_one_by_one() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"catalogue_mm": (0.5,)}, {"widest_m": 0.05}, {"slice_m": 0.0}, {"max_skew_deg": 40.0}],
+    [{"catalogue_mm": (0.5,)}, {"max_width_m": 0.05}, {"slice_m": 0.0}, {"max_skew_deg": 40.0}],
 )
 def test_impossible_settings_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
@@ -160,6 +160,6 @@ def test_ripples_of_the_floor_are_no_heading() -> None:
     stack = x < 2.0
     z[stack] = 0.3 + np.sqrt(0.045**2 - (np.mod(x[stack], 0.09) - 0.045) ** 2)
     flat = np.full(z.shape, 0.005, np.float32)
-    seen = np.full(z.shape, Source.VISION, np.uint8)
+    seen = np.full(z.shape, HeightSource.VISION, np.uint8)
     height_map = HeightMap(0.0, 0.0, 0.01, z.astype(np.float32), flat, flat + 3, seen)
     assert find_headings(height_map, 3.0) == (0.0,)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.types import HeightMap
 from lift_yards import codes, judged, laid, map_of, record
@@ -29,7 +29,7 @@ def with_block(
         return heights
     free = np.full(heights.shape, np.inf, np.float32)
     free[rows, columns] = free_m
-    heights.source[rows, columns] = Source.UNKNOWN
+    heights.source[rows, columns] = HeightSource.UNKNOWN
     heights.z_m[rows, columns] = np.nan
     return replace(heights, free_m=free)
 

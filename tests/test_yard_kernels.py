@@ -9,7 +9,7 @@ from barsight.yard.bundles.fitting.gauss_newton import Heights, _normal_equation
 from barsight.yard.bundles.fitting.outline import STEP_M, hexagon, make_outline, trace_with_changes
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.fitting.template_matching import _KNOWN, _SPREAD_M, _match, make_templates
-from barsight.yard.bundles.set_packing import choose
+from barsight.yard.bundles.set_packing import choose_readings
 
 SMOOTHING_M = 0.006
 
@@ -108,6 +108,6 @@ def test_the_normal_equations_are_those_of_the_outlines_derivatives() -> None:
 
 def test_the_set_that_weighs_most_is_chosen_and_no_place_twice() -> None:
     claims = [np.array([1, 2, 3]), np.array([3, 4, 5]), np.array([5, 6]), np.array([9]), np.array([9])]
-    assert choose(np.array([3.0, 5.0, 3.0, 1.0, 2.0]), claims).tolist() == [0, 2, 4]
-    assert choose(np.array([3.0, 7.0, 3.0, 1.0, -2.0]), claims).tolist() == [1, 3]
-    assert choose(np.array([3.0]), claims[:1]).tolist() == [0]
+    assert choose_readings(np.array([3.0, 5.0, 3.0, 1.0, 2.0]), claims).tolist() == [0, 2, 4]
+    assert choose_readings(np.array([3.0, 7.0, 3.0, 1.0, -2.0]), claims).tolist() == [1, 3]
+    assert choose_readings(np.array([3.0]), claims[:1]).tolist() == [0]

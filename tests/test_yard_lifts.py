@@ -15,20 +15,20 @@ import pytest
 from scipy.optimize import linprog
 
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.contact import touch
-from barsight.yard.lifting.footprint import BundleTable, Placement, grip
+from barsight.yard.lifting.contact import set_down
+from barsight.yard.lifting.footprint import BundleTable, Placement, count_gripped
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
 from barsight.yard.lifting.magnet import Beam, Magnet, Tolerance
-from barsight.yard.lifting.resting_plane import rest
+from barsight.yard.lifting.resting_plane import rest_plane
 from barsight.yard.lifting.set_down import CLEARANCE_M, COARSE_M, free_places
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.vetoes import VETOES, Veto
-from barsight.yard.weight import mass_of
+from barsight.yard.weight import bundle_mass
 from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
 from yard_maps import Laid
 
@@ -54,7 +54,7 @@ def test_the_plane_rests_as_the_linear_program_says() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         u, v, z = rng.uniform(-0.05, 0.05, 40), rng.uniform(-2.5, 2.5, 40), rng.normal(0, 0.003, 40)
-        height, roll, pitch = rest(u, v, z, 0.1)
+        height, roll, pitch = rest_plane(u, v, z, 0.1)
         table = -np.column_stack([np.ones(40), u, v])
         best = linprog([1, 0, 0], table, -z, bounds=[(None, None), (-0.1, 0.1), (-0.35, 0.35)])
         assert height == pytest.approx(best.x[0], abs=2e-5)
@@ -63,7 +63,7 @@ def test_the_plane_rests_as_the_linear_program_says() -> None:
 
 def test_pull_is_the_table_over_the_faces() -> None:
     heights = map_of([], sigma_m=0.0)
-    contact = touch(heights, Placement(0.5, 0.0, 0.0), MAGNET, 0.003)
+    contact = set_down(heights, Placement(0.5, 0.0, 0.0), MAGNET, 0.003)
     assert contact is not None
     whole = 4 * 0.9 * 0.1 * 560e3
     assert contact.pull_n == pytest.approx(whole, rel=0.01)
@@ -79,7 +79,7 @@ def test_the_count_is_as_sure_as_monte_carlo_says() -> None:
     for x in (0.10, 0.12, 0.13):
         place = Placement(x, 0.0, 0.0)
         faces = np.full(4, stock[0].top_z_m)
-        said = grip(place, MAGNET, exact, table, faces)
+        said = count_gripped(place, MAGNET, exact, table, faces)
         right = 0
         for _ in range(600):
             drawn = tuple(
@@ -90,7 +90,7 @@ def test_the_count_is_as_sure_as_monte_carlo_says() -> None:
                     ), k, width_m=one.width_m + rng.normal(0, 0.02),
                 ) for k, one in enumerate(stock)
             )  # fmt: skip
-            right += grip(place, MAGNET, exact, BundleTable.of(drawn), faces).gripped == said.gripped
+            right += count_gripped(place, MAGNET, exact, BundleTable.of(drawn), faces).gripped == said.gripped
         # The stated figure may be too careful, since it bounds how poles err together.
         assert right / 600 - 0.12 < said.probability < right / 600 + 0.04
 
@@ -104,7 +104,7 @@ def test_unknown_cells_under_a_pole() -> None:
     heights = map_of(stock)
     rows = slice(*np.searchsorted(heights.y0_m + np.arange(heights.z_m.shape[0]) * 0.01, (0.5, 0.8)))
     columns = slice(*np.searchsorted(heights.x0_m + np.arange(heights.z_m.shape[1]) * 0.01, (0.2, 0.4)))
-    for source in (Source.FILLED, Source.UNKNOWN):
+    for source in (HeightSource.FILLED, HeightSource.UNKNOWN):
         heights.source[rows, columns] = source
         assert codes(judged(stock, heights=heights)) == {"unknown-under-footprint"}
 
@@ -190,7 +190,7 @@ def test_mass_that_cannot_be_told() -> None:
 def test_mass_by_the_outline_agrees_with_mass_by_the_bars() -> None:
     for bars, diameter in ((7, 0.09), (19, 0.04), (37, 0.02), (61, 0.02)):
         one = record(Laid(0, 0, 0.2, 0, diameter, bars, 6.0))
-        known, unknown = mass_of(one), mass_of(replace(one, bars=0))
+        known, unknown = bundle_mass(one), bundle_mass(replace(one, bars=0))
         assert abs(unknown.kg - known.kg) < 2 * unknown.sigma_kg
 
 
@@ -394,7 +394,7 @@ def test_free_places_lie_beside_the_bundles_and_on_the_level() -> None:
 def test_an_unseen_floor_is_no_free_place() -> None:
     heights = map_of([])
     assert free_places(heights, 0.3, 6.0)
-    heights.source[:] = Source.FILLED
+    heights.source[:] = HeightSource.FILLED
     assert free_places(heights, 0.3, 6.0) == ()
     assert free_places(heights, 30.0, 6.0) == ()
 

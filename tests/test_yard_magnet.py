@@ -61,7 +61,7 @@ def test_a_magnet_file_that_is_not_there_is_one_line(
 
 
 @pytest.mark.parametrize(
-    "change", [{"bundles": 0}, {"max_age_s": 0.0}, {"least_confidence": 2.0}, {"max_lean_deg": 0.0}]
+    "change", [{"bundles": 0}, {"max_age_s": 0.0}, {"min_confidence": 2.0}, {"max_lean_deg": 0.0}]
 )
 def test_impossible_lift_settings_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(ConfigError):

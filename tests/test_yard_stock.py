@@ -13,7 +13,7 @@ from barsight.core.errors import InputError
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.inventory.bundle_file import read_bundles, schema, write_bundles
-from barsight.yard.inventory.stock_list import Expected, match_stock, read_stock, stock_warnings
+from barsight.yard.inventory.stock_list import ListedBundle, match_stock, read_stock, stock_warnings
 from barsight.yard.types import Bundle
 from yard_maps import Laid, draw
 
@@ -27,7 +27,7 @@ def bundles() -> tuple[Bundle, ...]:
 
 def test_a_list_that_fits_has_nothing_missing_moved_or_extra(bundles: tuple[Bundle, ...]) -> None:
     listed = tuple(
-        Expected(f"B{k}", one.x_m, one.y_m, one.top_z_m, bars=7, width_m=one.width_m)
+        ListedBundle(f"B{k}", one.x_m, one.y_m, one.top_z_m, bars=7, width_m=one.width_m)
         for k, one in enumerate(LAID)
     )
     match = match_stock(listed, bundles)
@@ -41,10 +41,10 @@ def test_a_list_that_fits_has_nothing_missing_moved_or_extra(bundles: tuple[Bund
 
 def test_a_list_that_contradicts_the_map_is_told_so(bundles: tuple[Bundle, ...]) -> None:
     listed = (
-        Expected("shifted", 0.42, 0.0, LAID[0].top_z_m),
-        Expected("thinner", 0.9, 0.0, LAID[1].top_z_m, bar_diameter_m=0.02, length_m=5.0),
-        Expected("gone", 4.0, 0.0),
-        Expected("under", 1.5, 0.1, 0.1),
+        ListedBundle("shifted", 0.42, 0.0, LAID[0].top_z_m),
+        ListedBundle("thinner", 0.9, 0.0, LAID[1].top_z_m, bar_diameter_m=0.02, length_m=5.0),
+        ListedBundle("gone", 4.0, 0.0),
+        ListedBundle("under", 1.5, 0.1, 0.1),
     )
     match = match_stock(listed, bundles)
     assert match.moved == ("shifted",)
@@ -66,7 +66,7 @@ def test_a_list_that_contradicts_the_map_is_told_so(bundles: tuple[Bundle, ...])
 def test_an_empty_yard_lacks_everything_and_an_empty_list_makes_all_extra(
     bundles: tuple[Bundle, ...],
 ) -> None:
-    assert match_stock((Expected("a", 0.0, 0.0),), ()).missing == ("a",)
+    assert match_stock((ListedBundle("a", 0.0, 0.0),), ()).missing == ("a",)
     assert match_stock((), bundles).extra == (0, 1, 2)
 
 
@@ -75,7 +75,7 @@ def test_csv_and_json_say_the_same(tmp_path: Path) -> None:
     rows = [{"name": "A", "x_m": 1.0, "y_m": -0.5, "bars": 7}]
     (tmp_path / "stock.json").write_text(json.dumps({"bundles": rows}), encoding="utf-8")
     assert read_stock(tmp_path / "stock.csv") == read_stock(tmp_path / "stock.json")
-    assert read_stock(tmp_path / "stock.csv") == (Expected("A", 1.0, -0.5, bars=7),)
+    assert read_stock(tmp_path / "stock.csv") == (ListedBundle("A", 1.0, -0.5, bars=7),)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:
 
 def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ...], tmp_path: Path) -> None:
     path = tmp_path / "bundles.json"
-    match = match_stock((Expected("gone", 9.0, 0.0),), bundles)
+    match = match_stock((ListedBundle("gone", 9.0, 0.0),), bundles)
     write_bundles(bundles, match, "yard", path)
     content = json.loads(path.read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema())

@@ -10,7 +10,7 @@ from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.targets import plan_lifts
-from barsight.yard.sections import part_about, patches, stretches
+from barsight.yard.sections import part_about, patches, split_map
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET
 from yard_maps import Laid, draw
@@ -43,7 +43,7 @@ def test_a_yard_in_stretches_has_the_same_bundles_and_lifts(monkeypatch: pytest.
     assert len(whole) == 29
     plan = plan_lifts(heights, whole, MAGNET, LiftSettings(), ())
     in_short_stretches(monkeypatch)
-    assert len(stretches(heights)) == 4
+    assert len(split_map(heights)) == 4
     cut = find_bundles(heights, BundleSettings())
     assert len(cut) == len(whole)
     for one, other in zip(cut, whole, strict=True):
@@ -68,7 +68,7 @@ def test_every_place_is_one_stretchs_own_and_well_inside_it(monkeypatch: pytest.
     in_short_stretches(monkeypatch)
     nothing = np.zeros((500, 3000), np.float32)
     heights = HeightMap(-7.0, 100.0, 0.01, nothing, nothing, nothing, nothing.astype(np.uint8))
-    parts = stretches(heights)
+    parts = split_map(heights)
     assert len(parts) == 8
     for place in np.random.default_rng(0).uniform((-8, 99), (24, 106), (300, 2)):
         (own,) = (part for part in parts if part.owns(place))

@@ -24,13 +24,13 @@ from barsight.pair_matching import match_pictures
 from barsight.pipeline import Advance, MeasureSettings
 from barsight.recording.open import open_recording as open_path
 from barsight.recording.packets import packets as packets
-from barsight.recording.stored_images import Source
+from barsight.recording.stored_images import StoredPictures
 from barsight.result import Yard
 from barsight.stereo.settings import StereoSettings
 
 
-def open_recording(path: Path | str) -> Source:
-    """The recording at `path`: an EuRoC folder, a ROS bag or a KITTI sequence. Raises InputError."""
+def open_recording(path: Path | str) -> StoredPictures:
+    """Return the recording at `path`: an EuRoC folder, a ROS bag or a KITTI sequence. Raises InputError."""
     return open_path(Path(path))
 
 
@@ -66,7 +66,7 @@ def measure(
 
 
 def load(folder: Path | str) -> Yard:
-    """The yard of a folder that `barsight measure` or `Yard.save` wrote. Raises InputError."""
+    """Return the yard of a folder that `barsight measure` or `Yard.save` wrote. Raises InputError."""
     return Yard(Path(folder))
 
 
@@ -85,7 +85,7 @@ def disparity(
     """
     chosen: StereoSettings = with_settings(StereoSettings(), settings)
     if range_px is not None:
-        chosen = replace(chosen, lowest_disparity_px=range_px[0], highest_disparity_px=range_px[1])
+        chosen = replace(chosen, min_disparity_px=range_px[0], max_disparity_px=range_px[1])
     first, second = (Path(one) if isinstance(one, str) else one for one in (left, right))
     return match_pictures(first, second, chosen, Path(rig) if isinstance(rig, str) else rig)[1]
 
@@ -106,7 +106,7 @@ def calibrate_stereo(
 
 
 def with_settings(default: Any, told: Mapping[str, Any]) -> Any:
-    """A settings record with some fields told, nested ones as mappings. Raises ConfigError."""
+    """Return a settings record with some fields told, nested ones as mappings. Raises ConfigError."""
     known = sorted(field.name for field in fields(default))
     for name in told:
         if name not in known:

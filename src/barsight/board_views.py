@@ -21,7 +21,7 @@ Size = tuple[int, int]
 
 
 def views_from_detections(
-    folder: Path, board: Board, most_views: int, resolution: str | None
+    folder: Path, board: Board, max_views: int, resolution: str | None
 ) -> tuple[list[BoardView], tuple[Size, Size], list[Removed]]:
     """Read the views of a folder of detections, their cameras' sizes and what is left out.
 
@@ -34,15 +34,15 @@ def views_from_detections(
             f"detections need the cameras' --resolution as WIDTHxHEIGHT, not {resolution!r}"
         ) from None
     views = read_detections(folder, board)
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(most_views, len(views))).astype(int))
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(max_views, len(views))).astype(int))
     return [views[n] for n in chosen], ((width, height), (width, height)), []
 
 
 def views_from_pictures(
-    path: Path, board: Board, most_views: int, advance: Callable[[str, int, int], None]
+    path: Path, board: Board, max_views: int, advance: Callable[[str, int, int], None]
 ) -> tuple[list[BoardView], tuple[Size, Size], list[Removed]]:
     """Detect the board in pairs of pictures, or of a bag: views, the cameras' sizes, what is left out."""
-    count, pairs = _pairs(path, most_views)
+    count, pairs = _pairs(path, max_views)
     views: list[BoardView] = []
     left_out: list[Removed] = []
     sizes: list[Size | None] = [None, None]
@@ -72,7 +72,7 @@ def views_from_pictures(
 
 
 def _pairs(path: Path, most: int) -> tuple[int, Sequence[ReadPair] | map[ReadPair]]:
-    """How many pairs, and the pairs: of a bag through its reader, of a folder file by file."""
+    """Count and yield the pairs: of a bag through its reader, of a folder file by file."""
     is_bag = path.suffix in BAG_KINDS or (path / "metadata.yaml").is_file()
     if is_bag:
         recording = open_recording(path)

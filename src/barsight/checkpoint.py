@@ -15,7 +15,7 @@ import numpy as np
 
 from barsight.core.errors import Failed
 from barsight.core.files import atomic_path
-from barsight.core.motion_detail import Inertial, InSigmas, MotionDetail, Relative
+from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.pose import Pose
 from barsight.core.types import (
     Disparity,
@@ -26,7 +26,7 @@ from barsight.core.types import (
     RigDrift,
     Trajectory,
 )
-from barsight.mapping.view import Matched
+from barsight.mapping.view import MatchedFrame
 from barsight.recording.base import Recording
 from barsight.recording.formats.image_folders import PictureFiles
 
@@ -35,10 +35,22 @@ T = TypeVar("T")
 _KEPT: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
-        Trajectory, PosedFrame, RefusedFrame, Pose, RigDrift, MotionDetail, Inertial, InSigmas, Relative,
-        Matched, RectifiedPair, RectifiedCamera, Disparity, Failed,
+        Trajectory,
+        PosedFrame,
+        RefusedFrame,
+        Pose,
+        RigDrift,
+        MotionDetail,
+        InertialStates,
+        NormalisedResiduals,
+        RelativePoses,
+        MatchedFrame,
+        RectifiedPair,
+        RectifiedCamera,
+        Disparity,
+        Failed,
     )
-}  # fmt: skip
+}
 _TORN = (OSError, EOFError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile)
 """What reading raises on a file that is cut short or is something else."""
 
@@ -68,8 +80,8 @@ def pictures_digest(recording: Recording) -> str:
     return found.hexdigest()
 
 
-def once(folder: Path | None, name: str, make: Callable[[], T]) -> T:
-    """make()'s result, or what an earlier run kept of it under this name; without a folder nothing is kept.
+def checkpointed(folder: Path | None, name: str, make: Callable[[], T]) -> T:
+    """Load the checkpoint of this name, or compute and save make(); without a folder nothing is kept.
 
     The file appears whole or not at all; one that is torn is made anew.
     """

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
-from barsight.evaluation.score import score
+from barsight.evaluation.score import score_folder
 from barsight.pipeline import Advance, MeasureSettings, measure
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
@@ -78,7 +78,7 @@ def write_measured(
         write_results(measured, staging)
         shutil.rmtree(scratch)
         if truth_of is not None:
-            content["truth"] = score(truth_of, staging)
+            content["truth"] = score_folder(truth_of, staging)
         write_summary(content, staging / "result.json")
         if report:
             write_report(staging, staging / "report.html")

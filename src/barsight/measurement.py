@@ -1,4 +1,4 @@
-"""What a measurement yields: the record that the result files and the report are written from."""
+"""Define the record of a measurement that the result files and the report are written from."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from barsight.yard.types import Bundle
 
 @dataclass(frozen=True)
 class StageTime:
-    """How long a stage took in all, seconds, and over how many frames (0 where it isn't done by frame)."""
+    """Duration of a stage in all, seconds, and its number of frames (0 where it isn't done by frame)."""
 
     name: str
     seconds: float
@@ -45,7 +45,7 @@ class Refusal:
 
     @property
     def stamp_ns(self) -> int:
-        """The frame's."""
+        """Return the frame's stamp."""
         return self.frame.stamp_ns
 
 
@@ -91,17 +91,17 @@ class Measurement:
     travel: Travel
 
 
-def plain(value: Any) -> Any:
-    """Settings and calibrations as JSON knows them."""
+def to_json(value: Any) -> Any:
+    """Convert settings and calibrations to JSON values."""
     if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: to_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [to_json(item) for item in value]
     if isinstance(value, np.ndarray):
         return value.tolist()
     return str(value) if isinstance(value, Path) else value
 
 
-def digest(value: Any) -> str:
-    """SHA-256 of a value that JSON knows, whatever the order of its keys."""
+def json_digest(value: Any) -> str:
+    """Compute SHA-256 of a JSON value, whatever the order of its keys."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

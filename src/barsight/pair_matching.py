@@ -16,9 +16,9 @@ from barsight.core.errors import CalibrationError, ConfigError, Failed, InputErr
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
 from barsight.mapping.view import disparity_range
 from barsight.recording.image_decoding import TornImageError, decode_with_colour
-from barsight.stereo.search_range import nothing_to_match
+from barsight.stereo.search_range import check_matchable
 from barsight.stereo.settings import MethodName, StereoSettings, make_method
-from barsight.stereo.vertical_offset import MOST_OFFSET_PX, vertical_offset
+from barsight.stereo.vertical_offset import MAX_OFFSET_PX, vertical_offset
 
 Picture = Path | UInt8
 """A file, or (H, W) uint8."""
@@ -28,7 +28,7 @@ _REMEDIES = {
     "swapped": "exchange the two pictures or give --range A:B",
     "same-image": "give two pictures of one pair",
 }
-_LEAST_SIZE = (3, 16)
+_MIN_SIZE = (3, 16)
 """Rows and columns below which nothing is matched."""
 
 
@@ -49,7 +49,7 @@ def match_pictures(
     disparity = make_method(settings)(pair, candidates)
     if disparity.coverage == 0:
         span = f"no pixel has a match from {candidates.lowest_px} to {candidates.highest_px} px"
-        raise MeasurementError(f"{_name(left)}: {nothing_to_match(pair) or span}")
+        raise MeasurementError(f"{_name(left)}: {check_matchable(pair) or span}")
     return pair, disparity
 
 
@@ -58,7 +58,7 @@ def _name(picture: Picture) -> Path:
 
 
 def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: MethodName) -> RectifiedPair:
-    """The rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
+    """Load the rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
     (left_grey, left_colour), (right_grey, right_colour) = _read(left), _read(right)
     frame = StereoFrame(0, left_grey, right_grey)
     colours = None
@@ -79,14 +79,14 @@ def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: M
                 _name(right), f"the pictures' sizes differ ({sizes})", "give two pictures of one pair"
             )
         pair = pair_from_images(frame.left, frame.right, *(colours or ()))
-    if any(side < least for side, least in zip(pair.left.shape, _LEAST_SIZE, strict=True)):
-        rows, columns = _LEAST_SIZE
+    if any(side < least for side, least in zip(pair.left.shape, _MIN_SIZE, strict=True)):
+        rows, columns = _MIN_SIZE
         size = f"{pair.camera.width}x{pair.camera.height}"
         raise InputError(
             _name(left), f"is {size}: {columns}x{rows} at least can be matched", "give whole pictures"
         )
     offset = vertical_offset(pair.left, pair.right)
-    if not isinstance(offset, Failed) and offset > MOST_OFFSET_PX:
+    if not isinstance(offset, Failed) and offset > MAX_OFFSET_PX:
         remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their --rig"
         raise InputError(
             _name(left), f"the pair is not rectified: matches lie {offset:.1f} px off their rows", remedy
@@ -115,7 +115,7 @@ def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
 
 
 def _expect_inside(candidates: DisparityRange, pair: RectifiedPair) -> None:
-    """Raises ConfigError where no candidate, or more than the picture's width of them, can be."""
+    """Raise ConfigError where no candidate, or more than the picture's width of them, can be."""
     width = pair.camera.width
     if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""The way of the data, whole: a recording in, a measured yard out.
+"""Run the whole measurement: a recording in, a measured yard out.
 
 recording -> rectified pair -> disparity -> points --+
 crane or matched features -> trajectory -------------+-> map -> height surface -> contours -> agreement
@@ -20,28 +20,34 @@ import numpy as np
 import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
-from barsight.checkpoint import checkpoint_folder, once, pictures_digest
+from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.memory import give_back, peak_memory_mib
-from barsight.core.parallel import begun_map, beside
+from barsight.core.memory import peak_memory_mib, trim_heap
+from barsight.core.parallel import in_background, prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.settings import expect_numbers
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory
-from barsight.mapping.agreement import agree
+from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.free_space import FreeSpace
-from barsight.mapping.fusion import fuse
-from barsight.mapping.scene_extent import apart, apart_by_encoders, choose_cell, first_look, points_per_pixel
+from barsight.mapping.fusion import fuse_view
+from barsight.mapping.scene_extent import (
+    choose_cell_size,
+    points_per_pixel,
+    probe_recording,
+    select_keyframes,
+    select_keyframes_by_encoders,
+)
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.contours import cut_contours
-from barsight.mapping.surface.height_selection import Sights
+from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
-from barsight.mapping.view import Matched, Matcher, Neighbour, Placer
-from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, digest, plain
-from barsight.motion.rig_check.self_calibration import self_calibrated
+from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner
+from barsight.measurement import Measurement, Notice, Preview, Refusal, StageTime, json_digest, to_json
+from barsight.motion.rig_check.self_calibration import self_calibrate
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.sensor_samples import imu_hints
@@ -69,7 +75,7 @@ _TIDIED_EVERY = 8
 
 @dataclass(frozen=True)
 class MeasureSettings:
-    """Everything that `barsight measure` can be told; each stage gets its own part only."""
+    """Settings of `barsight measure`; each stage gets its own part only."""
 
     preset: Literal["best", "fast"] = "best"
     """fast: the stereo preset `fast`, and no more pictures matched than lie a tenth apart."""
@@ -90,12 +96,12 @@ class MeasureSettings:
         expect_numbers(asdict(self))
 
     def chosen(self) -> MeasureSettings:
-        """The same with what the preset says written out."""
+        """Apply the preset to the settings."""
         if self.preset == "best":
             return self
         stereo = replace(self.stereo, barsight=replace(self.stereo.barsight, preset="fast"))
-        shift = max(self.map.least_shift, _FAST_SHIFT)
-        return replace(self, stereo=stereo, map=replace(self.map, least_shift=shift))
+        shift = max(self.map.min_shift, _FAST_SHIFT)
+        return replace(self, stereo=stereo, map=replace(self.map, min_shift=shift))
 
 
 def measure(
@@ -127,14 +133,14 @@ def measure(
     start = time.perf_counter()
     with watch("look"):
         rectifier = Rectifier(source.rig)
-        first = first_look(source, rectifier)
+        first = probe_recording(source, rectifier)
         imu = source.imu()
         hints = imu_hints(imu) if imu is not None else ()
-        cell_m = settings.map.cell_m or choose_cell(first, has_crane=source.crane() is not None)
+        cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
     known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
     calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
     total = len(source.index.stamps_ns)
-    configuration, inputs = plain(asdict(settings)), source.digests()
+    configuration, inputs = to_json(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
         kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
@@ -145,33 +151,33 @@ def measure(
     # Pictures are matched on the core that the trajectory leaves idle.
     begun = islice(source.frames(early), len(early))
     with ExitStack() as pools:
-        ahead = pools.enter_context(begun_map(match, begun, _MATCHED_AHEAD))
+        ahead = pools.enter_context(prefetched_map(match, begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = _counter("trajectory", total, advance)
-            trajectory = once(kept, "trajectory", lambda: estimate(source, rectifier, count))
-            give_back()
-            calibrated = self_calibrated(
+            trajectory = checkpointed(kept, "trajectory", lambda: estimate(source, rectifier, count))
+            trim_heap()
+            calibrated = self_calibrate(
                 source.rig, rectifier, trajectory.drift, calibration_px,
                 correct=settings.self_calibrate == "yaw",
             )  # fmt: skip
             rectifier = calibrated.rectifier
             stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
-        taken = apart(trajectory.frames, rectifier, first.range_m, settings.map.least_shift)
+        taken = select_keyframes(trajectory.frames, rectifier, first.range_m, settings.map.min_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
         late = min((stamp for stamp in poses if stamp not in early), default=None)
-        matched: Iterator[Matched | Refusal] = ahead
+        matched: Iterator[MatchedFrame | Refusal] = ahead
         if late is not None:
             rest = source.frames({stamp for stamp in poses if stamp >= late})
             match = matching(replace(matcher, rectifier=rectifier), kept)
-            after = pools.enter_context(begun_map(match, rest, _MATCHED_AFTER))
+            after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
 
         refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
         refusals += [Refusal("trajectory", frame) for frame in trajectory.refused]
         per_pixel = points_per_pixel(first, cell_m)
         body_from_rect0 = rectifier.body_from_rect0
-        placer = Placer(stereo, body_from_rect0, cell_m, per_pixel, settings.map.max_sigma_m, watch)
+        placer = PointBinner(stereo, body_from_rect0, cell_m, per_pixel, settings.map.max_sigma_m, watch)
         store = TileStore(scratch, settings.map.resident_tiles)
         free = FreeSpace(cell_m)
         preview = None
@@ -184,14 +190,14 @@ def measure(
                 refusals.append(view)
             else:
                 with watch("fuse", 1):
-                    fuse(store, view.cells, settings.map)
+                    fuse_view(store, view.cells, settings.map)
                 placed.append(posed.reference_from_body @ body_from_rect0)
                 with watch("free space", 1):
-                    free.carve(view.cells, Sights.of([placed[-1]], rectifier.camera).eyes[0])
+                    free.carve(view.cells, ViewFrusta.of([placed[-1]], rectifier.camera).eyes[0])
                 if preview is None or abs(done - len(poses) / 2) < 1:
                     preview = Preview(view.left, view.disparity_px)
             if done % _TIDIED_EVERY == 1:
-                give_back()
+                trim_heap()
             advance("map", done, len(poses))
     used = len(placed)
     if used == 0:
@@ -199,9 +205,9 @@ def measure(
 
     with watch("surface"):
         min_views = settings.map.min_views if used > 1 else 1
-        sights = Sights.of(placed, rectifier.camera, per_pixel)
+        sights = ViewFrusta.of(placed, rectifier.camera, per_pixel)
         surface = SurfaceElection(store, scratch, cell_m, settings.map).finish(min_views, sights)
-        give_back()
+        trim_heap()
     if surface.seen == 0:
         raise MeasurementError(f"{source.path}: no place was seen by {min_views} frames; lower map.min_views")
     with watch("contours"):
@@ -211,9 +217,11 @@ def measure(
         contours = cut_contours(surface, laser, settings.map.profile_y_m, settings.map.contours)
         by_number = {contour.profile: contour for contour in contours}
         speed_mps = _speed_along_x(trajectory)
-        agreed = [agree(by_number[p.profile], p, speed_mps) for p in laser if p.profile in by_number]
+        agreed = [
+            compute_agreement(by_number[p.profile], p, speed_mps) for p in laser if p.profile in by_number
+        ]
 
-    with watch("bundles"), beside(lambda: write(surface, free)):
+    with watch("bundles"), in_background(lambda: write(surface, free)):
         heights = surface_map(surface, free)
         bundles = find_bundles(heights, settings.bundles)
         stock = (
@@ -250,8 +258,8 @@ def measure(
         recording_path=source.path,
         recording_format=source.format,
         is_simulated=source.is_simulated,
-        calibration_hash=digest(plain(asdict(source.rig))),
-        configuration_hash=digest(configuration),
+        calibration_hash=json_digest(to_json(asdict(source.rig))),
+        configuration_hash=json_digest(configuration),
         input_hashes=inputs,
         configuration=configuration,
         trajectory=trajectory,
@@ -290,40 +298,40 @@ def _lifts(
 
 
 def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
-    """A digest of all that trajectory and disparities depend on."""
+    """Return a digest of all that trajectory and disparities depend on."""
     stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
-    rig = plain(asdict(recording.rig))
-    return digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
+    rig = to_json(asdict(recording.rig))
+    return json_digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
 
 
 def _known_early(
     source: Recording, settings: MeasureSettings, rectifier: Rectifier, range_m: float
 ) -> frozenset[int]:
-    """Stamps of frames that may be matched before the trajectory is known: all, or the first few that lie
-    apart by the encoders. Where the trajectory says otherwise, it decides.
+    """Select stamps of frames that may be matched before the trajectory is known: all, or the first few that
+    lie apart by the encoders. Where the trajectory says otherwise, it decides.
     """
-    stamps, least_shift = source.index.stamps_ns, settings.map.least_shift
+    stamps, min_shift = source.index.stamps_ns, settings.map.min_shift
     if settings.self_calibrate != "none":
         return frozenset()
-    if least_shift == 0:
+    if min_shift == 0:
         return frozenset(stamps)
     crane = source.crane()
     if crane is None or crane.stamp_ns.size == 0:
         return frozenset()
     shift_ns = source.rig.timeshift_cam_imu_ns
-    chosen = apart_by_encoders(stamps, crane, shift_ns, rectifier.camera, range_m, least_shift)
+    chosen = select_keyframes_by_encoders(stamps, crane, shift_ns, rectifier.camera, range_m, min_shift)
     return frozenset(chosen[:_MATCHED_AHEAD])
 
 
 def matching(
     matcher: Matcher, kept: Path | None
-) -> Callable[[StereoFrame | RefusedFrame], Matched | Refusal]:
+) -> Callable[[StereoFrame | RefusedFrame], MatchedFrame | Refusal]:
     """Match frames, each once for all runs that keep checkpoints in `kept`."""
 
-    def match(frame: StereoFrame | RefusedFrame) -> Matched | Refusal:
+    def match(frame: StereoFrame | RefusedFrame) -> MatchedFrame | Refusal:
         if isinstance(frame, RefusedFrame):
             return Refusal("recording", frame)
-        matched = once(kept, f"matched_{frame.stamp_ns}", lambda: matcher(frame))
+        matched = checkpointed(kept, f"matched_{frame.stamp_ns}", lambda: matcher(frame))
         if isinstance(matched, Failed):
             return Refusal("stereo", RefusedFrame(frame.stamp_ns, matched.reason))
         return matched
@@ -332,9 +340,9 @@ def matching(
 
 
 def _placed(
-    matched: Iterator[Matched | Refusal], poses: dict[int, PosedFrame]
-) -> Iterator[tuple[Matched | Refusal, PosedFrame, list[Neighbour]]]:
-    """The frames that are taken, each with those before and after it."""
+    matched: Iterator[MatchedFrame | Refusal], poses: dict[int, PosedFrame]
+) -> Iterator[tuple[MatchedFrame | Refusal, PosedFrame, list[Neighbour]]]:
+    """Yield the posed frames, each with those before and after it."""
     known = ((frame, poses[frame.stamp_ns]) for frame in matched if frame.stamp_ns in poses)
     before = None
     for here, after in pairwise(chain(known, (None,))):
@@ -345,7 +353,9 @@ def _placed(
 
 
 def _speed_along_x(trajectory: Trajectory) -> float:
-    """Mean velocity along X while travelling, signed, m/s: the median over the steps between frames."""
+    """Estimate the velocity along X while travelling, signed, m/s: the median over the steps
+    between frames.
+    """
     seconds = np.diff(trajectory.stamp_ns) / NS_PER_S
     if seconds.size == 0:
         return float("nan")

@@ -74,7 +74,7 @@ class Yard:
 
     @cached_property
     def height_map(self) -> HeightMap:
-        """The whole map."""
+        """Return the whole map."""
         heights = read_heights(self.folder)
         rows, columns = heights.shape
         return heights.part(slice(0, rows), slice(0, columns))
@@ -86,7 +86,7 @@ class Yard:
 
     @cached_property
     def trajectory(self) -> CameraPath:
-        """The body's poses. Raises InputError where the folder has none."""
+        """Return the body's poses. Raises InputError where the folder has none."""
         path = read_path(self.folder)
         if path is None:
             raise InputError(self.folder, "has no trajectory.tum", "measure the recording again")
@@ -94,19 +94,19 @@ class Yard:
 
     @cached_property
     def bundles(self) -> tuple[Bundle, ...]:
-        """The bundles found."""
+        """Return the bundles found."""
         return read_bundles(self.folder / "bundles.json")
 
     @cached_property
     def lifts(self) -> Lifts:
-        """The lifts, and what forbids them."""
+        """Return the lifts, and what forbids them."""
         content = read_lifts(self.folder / "lifts.json")
         offered, refused = (tuple(map(_target, content[name])) for name in ("lifts", "refused"))
         return Lifts(offered, refused, _vetoes(content))
 
     @property
     def warnings(self) -> tuple[tuple[str, str], ...]:
-        """(code, sentence) of each warning."""
+        """Return (code, sentence): of each warning."""
         return tuple((str(one["code"]), str(one["message"])) for one in self.summary["warnings"])
 
     def save(self, out: Path | str, *, overwrite: bool = False) -> Path:
@@ -135,7 +135,7 @@ class Yard:
         )
 
     def _repr_html_(self) -> str:
-        """The map as a picture with what was found in it, for a notebook."""
+        """Return the map as a picture with what was found in it, for a notebook."""
         warnings = "".join(f"<li>{escape(text)}</li>" for _, text in self.warnings)
         return f"{self.height_map._repr_html_()}<p>{escape(self._figures())}</p><ul>{warnings}</ul>"
 

@@ -1,4 +1,4 @@
-"""Floor 6: reading back the folder that `barsight measure` wrote, for page, viewer, export and lifts."""
+"""Read back the folder that `barsight measure` wrote, for page, viewer, export and lifts."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _REMEDY = "measure the recording again"
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """Where the body was. stamp_ns: (N,). position_m: (N, 3), quaternion_xyzw: (N, 4), reference axes."""
+    """Trajectory of the body. stamp_ns: (N,). position_m: (N, 3), quaternion_xyzw: (N, 4), reference axes."""
 
     stamp_ns: Int64
     position_m: Float64
@@ -60,7 +60,7 @@ class Cloud:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """result.json. Raises InputError where the folder or the file is missing or the file is torn."""
+    """Read result.json. Raises InputError where the folder or the file is missing or the file is torn."""
     path = folder / "result.json"
     remedy = "name a folder that `barsight measure` wrote"
     if not folder.is_dir():
@@ -116,7 +116,7 @@ def read_heights(folder: Path) -> PartedMap:
 
 @contextmanager
 def _first_page(path: Path) -> Iterator[tifffile.TiffPage]:
-    """The picture in a TIFF; what goes wrong while it is open says that the file is torn."""
+    """Open the picture in a TIFF; what goes wrong while it is open says that the file is torn."""
     try:
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
@@ -127,7 +127,9 @@ def _first_page(path: Path) -> Iterator[tifffile.TiffPage]:
 
 
 def _rectangle(page: tifffile.TiffPage, bands: int, rows: slice, columns: slice) -> NDArray[Any]:
-    """(bands, R, C) of a tiled picture whose first row lies at the highest y; rows count from the lowest."""
+    """Read (bands, R, C) of a tiled picture whose first row lies at the highest y; rows count from the
+    lowest.
+    """
     height = page.shape[-2]
     top, left = height - rows.stop, columns.start
     out = np.empty((bands, rows.stop - rows.start, columns.stop - left), page.dtype)
@@ -152,7 +154,7 @@ def _rectangle(page: tifffile.TiffPage, bands: int, rows: slice, columns: slice)
 
 
 def read_path(folder: Path) -> CameraPath | None:
-    """trajectory.tum; None where there is none. Raises InputError for a line that is none of TUM's."""
+    """Read trajectory.tum; None where there is none. Raises InputError for a line that is none of TUM's."""
     path = folder / "trajectory.tum"
     if not path.is_file():
         return None
@@ -173,8 +175,8 @@ def read_path(folder: Path) -> CameraPath | None:
     return CameraPath(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
 
 
-def read_cloud(path: Path, most_points: int | None = None) -> Cloud:
-    """cloud.ply, of which at most `most_points` evenly drawn points (all, if None) are read from disk.
+def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
+    """Read at most `max_points` evenly drawn points of cloud.ply (all, if None) from disk.
 
     Raises InputError where the file is missing, torn, empty or has other properties than formats.md says.
     """
@@ -189,7 +191,7 @@ def read_cloud(path: Path, most_points: int | None = None) -> Cloud:
         raise InputError(path, f"has no property {missing[0]}", _REMEDY)
     if data.size == 0:
         raise InputError(path, "has no points", _REMEDY)
-    count = int(data.size) if most_points is None else min(int(data.size), most_points)
+    count = int(data.size) if max_points is None else min(int(data.size), max_points)
     drawn = data[np.arange(count) * data.size // count]
     column = {name: np.asarray(drawn[name], dtype=np.float32) for name in PROPERTIES}
     return Cloud(
@@ -202,7 +204,7 @@ def read_cloud(path: Path, most_points: int | None = None) -> Cloud:
 
 
 def read_contours(folder: Path) -> tuple[Contour, ...]:
-    """contour.csv, a contour per profile; empty where there is no such file."""
+    """Read contour.csv, a contour per profile; empty where there is no such file."""
     table = _read_table(folder / "contour.csv", 6)
     parts = _by_profile(table)
     return tuple(
@@ -212,7 +214,7 @@ def read_contours(folder: Path) -> tuple[Contour, ...]:
 
 
 def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
-    """laser.csv; empty where there is no such file. The files don't carry range_std_m: it is NaN."""
+    """Read laser.csv; empty where there is no such file. The files don't carry range_std_m: it is NaN."""
     table = _read_table(folder / "laser.csv", 4)
     parts = _by_profile(table)
     return tuple(
@@ -226,7 +228,7 @@ def _by_profile(table: Float64) -> dict[int, Float64]:
 
 
 def _read_table(path: Path, columns: int) -> Float64:
-    """(N, columns) from a CSV with a header; an empty field is NaN."""
+    """Read (N, columns) from a CSV with a header; an empty field is NaN."""
     if not path.is_file():
         return np.empty((0, columns))
     lines = path.read_text(encoding="utf-8").splitlines()[1:]

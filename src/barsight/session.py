@@ -22,20 +22,26 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import CraneSamples, PosedFrame, StereoFrame
-from barsight.mapping.fusion import fuse
-from barsight.mapping.scene_extent import FirstLook, choose_cell, first_look, least_way_m, points_per_pixel
-from barsight.mapping.surface.height_selection import Sights
+from barsight.mapping.fusion import fuse_view
+from barsight.mapping.scene_extent import (
+    RecordingProbe,
+    choose_cell_size,
+    least_way_m,
+    points_per_pixel,
+    probe_recording,
+)
+from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
-from barsight.mapping.view import Matched, Matcher, Placer
+from barsight.mapping.view import MatchedFrame, Matcher, PointBinner
 from barsight.measure_folder import write_measured
-from barsight.measurement import Refusal, plain
-from barsight.motion.crane.encoder_trajectory import CraneTrajectory
+from barsight.measurement import Refusal, to_json
+from barsight.motion.crane.encoder_trajectory import EncoderOdometry
 from barsight.pipeline import MeasureSettings, checkpoint_key, matching
 from barsight.recording.base import FrameIndex
 from barsight.recording.packets import Packet, PacketRecording
-from barsight.recording.wrapper import Forwarded
+from barsight.recording.wrapper import RecordingProxy
 from barsight.result import Yard
 from barsight.stereo.settings import make_method
 from barsight.yard.sections import surface_map
@@ -57,7 +63,7 @@ class Snapshot:
 
     @cached_property
     def height_map(self) -> HeightMap | None:
-        """The whole map."""
+        """Return the whole map."""
         if self.surface is None:
             return None
         rows, columns = self.surface.shape
@@ -65,7 +71,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True, eq=False)
-class _Frames(Forwarded):
+class _Frames(RecordingProxy):
     stamps_ns: tuple[int, ...]
 
     @property
@@ -76,16 +82,16 @@ class _Frames(Forwarded):
 class _Map:
     """The map by the encoders' poses, which `finish` doesn't use."""
 
-    def __init__(self, first: FirstLook, settings: MeasureSettings, rectifier: Rectifier, folder: Path):
-        self.cell_m = settings.map.cell_m or choose_cell(first, has_crane=True)
+    def __init__(self, first: RecordingProbe, settings: MeasureSettings, rectifier: Rectifier, folder: Path):
+        self.cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=True)
         self.per_pixel = points_per_pixel(first, self.cell_m)
-        self.placer = Placer(
+        self.placer = PointBinner(
             settings.stereo, rectifier.body_from_rect0, self.cell_m, self.per_pixel, settings.map.max_sigma_m,
             Stopwatch(),
         )  # fmt: skip
         self.store = TileStore(folder, settings.map.resident_tiles)
         self.election = SurfaceElection(self.store, folder, self.cell_m, settings.map)
-        self.least_way_m = least_way_m(rectifier.camera, first.range_m, settings.map.least_shift)
+        self.least_way_m = least_way_m(rectifier.camera, first.range_m, settings.map.min_shift)
         self.ahead = np.array([0.0, 0.0, first.range_m])
         self.last: Float64 | None = None
         self.placed: list[Pose] = []
@@ -110,7 +116,7 @@ class Session:
         self._recording = PacketRecording(rig, self._folder, imu_noise, is_simulated=is_simulated)
         self._rectifier = Rectifier(rig)
         method = make_method(self._settings.stereo.for_map())
-        key = checkpoint_key(self._recording, plain(asdict(self._settings)), {})
+        key = checkpoint_key(self._recording, to_json(asdict(self._settings)), {})
         kept = checkpoint_folder(self._folder / "checkpoints", key)
         # A rig that is to be turned at the end gives other disparities then.
         kept_for_end = kept if self._settings.self_calibrate == "none" else None
@@ -129,16 +135,16 @@ class Session:
             self._place_waiting()
 
     def snapshot(self) -> Snapshot:
-        """The map of what came so far, by the encoders' poses; it changes nothing at the end."""
+        """Return the map of what came so far, by the encoders' poses; it changes nothing at the end."""
         held = self._map
         if held is None or len(held.placed) < 2:
             return Snapshot(None, 0 if held is None else len(held.placed))
-        sights = Sights.of(held.placed, self._rectifier.camera, held.per_pixel)
+        sights = ViewFrusta.of(held.placed, self._rectifier.camera, held.per_pixel)
         surface = held.election.snapshot(self._settings.map.min_views, sights)
         return Snapshot(surface, len(held.placed), owner=self)
 
     def finish(self) -> Yard:
-        """The yard from all packets, as `measure` has it of the same recording."""
+        """Return the yard from all packets, as `measure` has it of the same recording."""
         out = self._folder / "yard"
         write_measured(
             self._recording, out, self._asked, keep=self._folder / "checkpoints", magnet=self._magnet,
@@ -162,12 +168,12 @@ class Session:
         self._waiting = self._waiting[len(ready) :]
         if self._map is None:
             try:
-                first = first_look(self._recording, self._rectifier)
+                first = probe_recording(self._recording, self._rectifier)
             except MeasurementError:
                 return
             self._map = _Map(first, self._settings, self._rectifier, self._folder)
         stamps = tuple(frame.stamp_ns for frame in ready)
-        poses = CraneTrajectory(self._settings.motion.crane)(
+        poses = EncoderOdometry(self._settings.motion.crane)(
             _Frames(self._recording, stamps), self._rectifier, lambda: None
         )
         at = {frame.stamp_ns: frame for frame in ready}
@@ -180,10 +186,10 @@ class Session:
         seen = pose.apply(held.ahead)
         if held.last is not None and np.linalg.norm(seen - held.last) < held.least_way_m:
             return
-        matched: Matched | Refusal = self._match(frame)
+        matched: MatchedFrame | Refusal = self._match(frame)
         view: Any = matched if isinstance(matched, Refusal) else held.placer(matched, posed)
         if isinstance(view, (Refusal, Failed)):
             return
-        fuse(held.store, view.cells, self._settings.map)
+        fuse_view(held.store, view.cells, self._settings.map)
         held.placed.append(pose)
         held.last = seen

@@ -1,4 +1,4 @@
-"""Where a benchmark ran and on what code, and its times: what makes a table repeatable."""
+"""Record machine, commit and times of a benchmark: what makes a table repeatable."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T")
-LEAST_REPEATS = 5
+MIN_REPEATS = 5
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Timing:
 
 
 def provenance() -> Provenance:
-    """Of this process."""
+    """Record this process's provenance."""
     return Provenance(
         _commit(), _processor(), len(os.sched_getaffinity(0)), platform.python_version(), np.__version__
     )
 
 
-def timed(work: Callable[[], T], repeats: int = LEAST_REPEATS) -> tuple[T, list[float]]:
-    """`work`'s result and the wall seconds of `repeats` runs; one run before them isn't counted."""
+def time_repeats(work: Callable[[], T], repeats: int = MIN_REPEATS) -> tuple[T, list[float]]:
+    """Time `repeats` runs of `work` (wall seconds) after one that isn't counted; also its result."""
     result = work()
     seconds = []
     for _ in range(repeats):
@@ -65,14 +65,14 @@ def timed(work: Callable[[], T], repeats: int = LEAST_REPEATS) -> tuple[T, list[
     return result, seconds
 
 
-def timing(seconds: Sequence[float] | Float64) -> Timing:
-    """The summary of `timed`'s seconds."""
+def summarise_times(seconds: Sequence[float] | Float64) -> Timing:
+    """Summarise the seconds of `time_repeats`."""
     ms = 1e3 * np.array(seconds)
     return Timing(float(np.median(ms)), float(ms.min()), float(ms.max()), len(seconds))
 
 
 def write_json(target: Path, record: DataclassInstance) -> None:
-    """A frozen record as JSON, whole or not at all; NaN and infinity become null."""
+    """Write a frozen record as JSON, whole or not at all; NaN and infinity become null."""
     text = json.dumps(json_value(dataclasses.asdict(record)), indent=1) + "\n"
     with atomic_path(target) as temporary:
         temporary.write_text(text, encoding="utf-8")

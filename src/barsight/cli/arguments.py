@@ -1,4 +1,4 @@
-"""Command lines from functions and frozen settings (tyro), which a TOML file may give."""
+"""Parse command lines by function signatures and frozen settings (tyro), optionally from a TOML file."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import tyro
 
+from barsight.core.renamed_settings import refuse_old_flags
 from barsight.core.settings_file import read_settings
 
 Settings = TypeVar("Settings")
@@ -15,11 +16,12 @@ Settings = TypeVar("Settings")
 
 def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> None:
     """Parse `arguments` by the function's signature and call it; wrong usage exits with 2."""
+    refuse_old_flags(arguments)
     tyro.cli(command, prog=f"barsight {name}", args=_listed(arguments), compact_help=False)
 
 
 def _listed(arguments: Sequence[str]) -> list[str]:
-    """`--use stereo,imu` as `--use stereo imu`."""
+    """Rewrite `--use stereo,imu` as `--use stereo imu`."""
     listed: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")
@@ -33,7 +35,7 @@ def _listed(arguments: Sequence[str]) -> list[str]:
 
 
 def config_path(arguments: Sequence[str]) -> Path | None:
-    """The FILE of `--config FILE` or `--config=FILE`, needed before the other flags are read."""
+    """Find the FILE of `--config FILE` or `--config=FILE`, needed before the other flags are read."""
     for number, argument in enumerate(arguments):
         if argument == "--config" and number + 1 < len(arguments):
             return Path(arguments[number + 1])
@@ -43,7 +45,7 @@ def config_path(arguments: Sequence[str]) -> Path | None:
 
 
 def load_settings(path: Path | None, kind: type[Settings]) -> Settings:
-    """Settings of `kind` from a TOML file over the defaults; the defaults where there is no file.
+    """Load settings of `kind` from a TOML file over the defaults; the defaults where there is no file.
 
     Raises InputError for a file that can't be read and ConfigError for a key or value that can't be.
     """

@@ -1,4 +1,4 @@
-"""`barsight compare OLD NEW`."""
+"""Run `barsight compare OLD NEW`."""
 
 from __future__ import annotations
 

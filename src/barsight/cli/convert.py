@@ -1,4 +1,4 @@
-"""`barsight convert RECORDING -o OUT --to FORMAT`."""
+"""Run `barsight convert RECORDING -o OUT --to FORMAT`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`barsight demo`."""
+"""Run `barsight demo`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`barsight disparity LEFT RIGHT -o FILE`."""
+"""Run `barsight disparity LEFT RIGHT -o FILE`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def run(arguments: Sequence[str]) -> None:
             raise OutputError(f"{out}: disparities are written as {', '.join(SUFFIXES)}")
         if range is not None:
             low, high = _parsed_range(range)
-            settings = replace(settings, lowest_disparity_px=low, highest_disparity_px=high)
+            settings = replace(settings, min_disparity_px=low, max_disparity_px=high)
         pair, disparity = match_pictures(left, right, settings, rig)
         write_disparity(out, disparity)
         if preview is not None:

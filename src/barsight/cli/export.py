@@ -1,4 +1,4 @@
-"""`barsight export OUT FILE`."""
+"""Run `barsight export OUT FILE`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`barsight info RECORDING`."""
+"""Run `barsight info RECORDING`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.console import Console
 
 from barsight.cli.arguments import call
 from barsight.recording.base import RecordingSettings
-from barsight.recording.info import describe
+from barsight.recording.info import describe_recording
 from barsight.recording.info_tables import print_info
 from barsight.recording.open import open_recording
 
@@ -29,6 +29,6 @@ def run(arguments: Sequence[str]) -> None:
             recording: The recording.
             settings: How to read it.
         """
-        print_info(describe(open_recording(recording, settings)), Console())
+        print_info(describe_recording(open_recording(recording, settings)), Console())
 
     call(command, "info", arguments)

@@ -1,4 +1,4 @@
-"""`barsight lifts OUT --magnet FILE`."""
+"""Run `barsight lifts OUT --magnet FILE`."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def print_lifts(plan: LiftPlan, console: Console) -> None:
-    """The offered lifts as a table, the vetoes as counts."""
+    """Print the offered lifts as a table, the vetoes as counts."""
     console.print(f"magnet: {escape(plan.magnet.name)}", highlight=False)
     for veto in plan.vetoes:
         console.print(f"[red]{veto.code}:[/red] {escape(veto.reason)}", highlight=False)

@@ -1,4 +1,4 @@
-"""`barsight COMMAND ...`: finds the command, runs it, and turns a user's mistake into one line."""
+"""Dispatch `barsight COMMAND ...` and turn a user's mistake into one line."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ INTERRUPTED = 130
 
 
 def main() -> None:
-    """The console script: signals end a run as Ctrl-C does."""
+    """Run the console script: signals end a run as Ctrl-C does."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it

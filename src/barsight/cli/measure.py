@@ -1,4 +1,4 @@
-"""`barsight measure RECORDING -o OUT`."""
+"""Run `barsight measure RECORDING -o OUT`."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -> None:
-    """The run in a few lines: frames, agreement with the laser, truth, warnings."""
+    """Print the run in a few lines: frames, agreement with the laser, truth, warnings."""
     frames, trajectory = content["frames"], content["trajectory"]
     console.print(
         f"{frames['used']} of {frames['total']} frames over {trajectory['length_m']:.2f} m "

@@ -1,4 +1,4 @@
-"""`barsight odometry RECORDING -o OUT`."""
+"""Run `barsight odometry RECORDING -o OUT`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from barsight.cli.arguments import call
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_directory
 from barsight.core.types import Trajectory
-from barsight.evaluation.board_poses import board_poses, by_gyro_alone_deg
-from barsight.evaluation.trajectory_error import Drift, compare, frame_errors
+from barsight.evaluation.board_poses import board_poses, gyro_only_rmse_deg
+from barsight.evaluation.trajectory_error import Drift, frame_errors, trajectory_drift
 from barsight.motion.frontend.matching_example import matching_example
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
@@ -60,7 +60,9 @@ def run(arguments: Sequence[str]) -> None:
             why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"
             raise MeasurementError(f"{recording}: no frame could be placed: {why}")
         truth = _truth(source)
-        drift = None if truth is None else compare(trajectory, truth, source.rig.timeshift_cam_imu_ns)
+        drift = (
+            None if truth is None else trajectory_drift(trajectory, truth, source.rig.timeshift_cam_imu_ns)
+        )
         if out is not None:
             front_end, with_crane = settings.fusion.front_end, "crane" in trajectory.sensors
             example = matching_example(source, rectifier, trajectory.stamp_ns, front_end, with_crane)
@@ -103,14 +105,14 @@ def _truth(source: Recording) -> GroundTruth | None:
 
 def _board_lines(source: CornerRecording, trajectory: Trajectory) -> list[str]:
     poses, imu, shift = board_poses(source), source.imu(), source.rig.timeshift_cam_imu_ns
-    drift = None if poses is None else compare(trajectory, poses, 0)
+    drift = None if poses is None else trajectory_drift(trajectory, poses, 0)
     if poses is None or drift is None:
         return ["too few corners for a PnP of the board"]
     lines = [
         f"against a PnP of the board by cam0: {drift.aligned_rmse_mm:.2f} mm, "
         f"{drift.aligned_rmse_deg:.3f} deg RMSE, aligned"
     ]
-    gyro_deg = float("nan") if imu is None else by_gyro_alone_deg(imu, poses, shift)
+    gyro_deg = float("nan") if imu is None else gyro_only_rmse_deg(imu, poses, shift)
     if not math.isnan(gyro_deg):
         lines.append(f"the gyro alone, one bias fitted to those poses, is {gyro_deg:.3f} deg off them")
     return lines

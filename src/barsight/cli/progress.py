@@ -1,4 +1,4 @@
-"""What a person sees of a run while it runs."""
+"""Show the progress of a run."""
 
 from __future__ import annotations
 

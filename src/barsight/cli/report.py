@@ -1,4 +1,4 @@
-"""`barsight report OUT`."""
+"""Run `barsight report OUT`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`barsight score RECORDING OUT`."""
+"""Run `barsight score RECORDING OUT`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from barsight.cli.arguments import call
-from barsight.evaluation.score import score
+from barsight.evaluation.score import score_folder
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -23,7 +23,7 @@ def run(arguments: Sequence[str]) -> None:
             recording: The recording, with its folder truth.
             out: The folder that barsight measure wrote from it.
         """
-        json.dump(score(recording, out), sys.stdout, indent=1)
+        json.dump(score_folder(recording, out), sys.stdout, indent=1)
         sys.stdout.write("\n")
 
     call(command, "score", arguments)

@@ -1,4 +1,4 @@
-"""`barsight simulate OUT`."""
+"""Run `barsight simulate OUT`."""
 
 from __future__ import annotations
 

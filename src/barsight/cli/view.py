@@ -1,4 +1,4 @@
-"""`barsight view OUT`."""
+"""Run `barsight view OUT`."""
 
 from __future__ import annotations
 

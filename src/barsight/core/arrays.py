@@ -1,4 +1,4 @@
-"""Array aliases, shape checks and the typed compile decorator that every kernel uses."""
+"""Define array aliases, shape checks and the compile decorator that every kernel uses."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def expect_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...]) 
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """The same data as a read-only view: what a frozen dataclass hands out can't be written through."""
+    """Return a read-only view: what a frozen dataclass hands out can't be written through."""
     view = array.view()
     view.flags.writeable = False
     return view

@@ -1,4 +1,4 @@
-"""The exception tree, and `Failed` for shortfalls that are expected.
+"""Define the exception tree, and `Failed` for shortfalls that are expected.
 
 Bugs raise ordinary exceptions. A user's mistake raises a `BarsightError`, whose text is one line that
 names the file and the remedy; the command line prints it and exits with the error's `exit_code`.
@@ -35,7 +35,7 @@ class InputError(BarsightError):
 
 
 class CalibrationError(InputError):
-    """A calibration that can't be: a rotation that is none, focal lengths below zero, swapped cameras."""
+    """An impossible calibration: a rotation that is none, focal lengths below zero, swapped cameras."""
 
 
 class OutputError(BarsightError):

@@ -1,4 +1,4 @@
-"""Outputs that are written whole or not at all: a temporary name beside the target, then a rename."""
+"""Write outputs whole or not at all: a temporary name beside the target, then a rename."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
 
 @contextlib.contextmanager
 def translated_os_errors(target: Path) -> Iterator[None]:
-    """Turn the operating system's refusals (full disk, no permission) into one `OutputError` line.
+    """Translate the operating system's refusals (full disk, no permission) into one `OutputError` line.
 
     `InputError` where it is a file elsewhere that may not be read.
     """
@@ -115,7 +115,7 @@ def translated_os_errors(target: Path) -> Iterator[None]:
 
 
 def _belongs(name: object, target: Path) -> bool:
-    """Whether the file is `target`, lies in it or above it, or is one of ours that waits beside it."""
+    """Check whether the file is `target`, lies in it or above it, or is one of ours that waits beside it."""
     if not isinstance(name, str):
         return True
     path, target = Path(name).absolute(), target.absolute()

@@ -8,7 +8,7 @@ from functools import cache
 
 
 def peak_memory_mib() -> float:
-    """The most that this process has held so far; NaN where the system doesn't tell."""
+    """Return the most that this process has held so far; NaN where the system doesn't tell."""
     try:
         import resource
     except ImportError:  # Windows
@@ -16,9 +16,10 @@ def peak_memory_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def give_back() -> None:
-    """Return what was freed: glibc keeps it in a pool for each thread, large pictures too, so that several
-    threads hold a few hundred MB of nothing. Does nothing where the C library is another."""
+def trim_heap() -> None:
+    """Trim the heap: glibc keeps freed memory in a pool for each thread, large pictures too, so that several
+    threads hold a few hundred MB of nothing. Does nothing where the C library is another.
+    """
     _trim()(0)
 
 

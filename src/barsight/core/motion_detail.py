@@ -1,4 +1,4 @@
-"""What an estimate of the motion knows besides the poses, for reports."""
+"""Record details of a motion estimate besides the poses, for reports."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from barsight.core.arrays import Float64, Int64
 
 
 @dataclass(frozen=True, eq=False)
-class InSigmas:
-    """What a sensor measured minus what the whole estimate says, over its stated sigma.
+class NormalisedResiduals:
+    """Normalised residuals of a sensor: measured minus estimated, over its stated sigma.
 
     stamp_ns: (K,) cam0's clock. values: (K, C), one column for each of `names`. One value should scatter
     by 1; a root mean square of many stands for them where there are many at a stamp.
@@ -21,7 +21,7 @@ class InSigmas:
 
 
 @dataclass(frozen=True, eq=False)
-class Inertial:
+class InertialStates:
     """Velocity (reference axes) and the IMU's biases (body axes), (F, 3) each, with one sigma of each."""
 
     stamp_ns: Int64
@@ -34,10 +34,10 @@ class Inertial:
 
 
 @dataclass(frozen=True, eq=False)
-class Relative:
-    """How each frame but the first stands to the one before. covariance: (F - 1, 6, 6) of its pose there,
-    rotation (rad) then translation (m) of a small motion that follows it, in its own body axes; NaN where the
-    two are too far apart to tell.
+class RelativePoses:
+    """Covariance of each frame's pose relative to the one before. covariance: (F - 1, 6, 6) of its pose
+    there, rotation (rad) then translation (m) of a small motion that follows it, in its own body axes; NaN
+    where the two are too far apart to tell.
     """
 
     covariance: Float64
@@ -51,10 +51,10 @@ class MotionDetail:
     and way of `rect0` since the frame before, as pictures find them, against what other sensors predicted.
     """
 
-    inertial: Inertial | None
-    pictures: InSigmas | None
-    imu: InSigmas | None
-    encoders: InSigmas | None
+    inertial: InertialStates | None
+    pictures: NormalisedResiduals | None
+    imu: NormalisedResiduals | None
+    encoders: NormalisedResiduals | None
     points: Int64
-    relative: Relative | None = None
-    innovations: InSigmas | None = None
+    relative: RelativePoses | None = None
+    innovations: NormalisedResiduals | None = None

@@ -1,4 +1,4 @@
-"""Work spread over threads with its order kept and its memory bounded."""
+"""Spread work over threads with its order kept and its memory bounded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WORKERS = 2
 def ordered_map(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int = WORKERS
 ) -> Iterator[Result]:
-    """`map` over a pool of threads: results in the items' order, at most workers + 1 items under way.
+    """Map over a pool of threads: results in the items' order, at most workers + 1 items under way.
 
     For functions that release the interpreter (OpenCV, compiled kernels). An exception of the function comes
     out at its item's turn; leaving the loop early waits for the items under way and drops the rest.
@@ -42,11 +42,11 @@ def ordered_map(
 
 
 @contextmanager
-def begun_map(
+def prefetched_map(
     function: Callable[[Item], Result], items: Iterable[Item], most: int, workers: int = WORKERS
 ) -> Iterator[Iterator[Result]]:
-    """`ordered_map` that begins at once, in one thread beside whatever the caller does first; from the first
-    result asked for on it has all workers.
+    """Run `ordered_map` at once, in one thread beside whatever the caller does first; from the first result
+    asked for on it has all workers.
 
     At most `most` results are under way or wait. An exception of the function or the items comes out at its
     turn; leaving waits for what is under way and drops the rest.
@@ -88,8 +88,8 @@ def begun_map(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def read_ahead(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
-    """The items in order, the next `count` of them made in a thread of their own while one is used.
+def prefetch(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
+    """Prefetch the next `count` items in a thread while one is used; the order is kept.
 
     An exception of the items comes out at its turn; leaving early waits for the item under way.
     """
@@ -110,16 +110,17 @@ def read_ahead(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
 
 
 @contextmanager
-def beside(work: Callable[[], Result]) -> Iterator[Future[Result]]:
-    """Do `work` in a thread of its own while the block under it runs; what it raises comes out where its
-    result is asked for, at the latest at the block's end."""
+def in_background(work: Callable[[], Result]) -> Iterator[Future[Result]]:
+    """Run `work` in a background thread while the block under it runs; what it raises comes out where its
+    result is asked for, at the latest at the block's end.
+    """
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         yield working
         working.result()
 
 
-def in_bands(work: Callable[[int, int], None], rows: int, band_rows: int) -> None:
+def parallel_bands(work: Callable[[int, int], None], rows: int, band_rows: int) -> None:
     """Call `work(first, end)` for every band of `rows` rows, on all cores at once; bands may not depend on
     each other.
 

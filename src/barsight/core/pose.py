@@ -1,4 +1,4 @@
-"""Rigid poses that carry their frames: `yard_from_cam0 = yard_from_body @ body_from_cam0`."""
+"""Define rigid poses that carry their frames: `yard_from_cam0 = yard_from_body @ body_from_cam0`."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class Pose:
 
     @classmethod
     def identity(cls, target: str, source: str) -> Pose:
-        """The pose of two frames that coincide."""
+        """Return the pose of two frames that coincide."""
         return cls(target, source, np.eye(3), np.zeros(3))
 
     @classmethod
     def from_matrix(cls, target: str, source: str, matrix: ArrayLike) -> Pose:
-        """From a 4x4 (or 3x4) homogeneous matrix."""
+        """Build from a 4x4 (or 3x4) homogeneous matrix."""
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape not in ((4, 4), (3, 4)):
             raise ValueError(f"a pose needs a 4x4 or 3x4 matrix, not {m.shape}")
@@ -68,13 +68,13 @@ class Pose:
     def from_quaternion_xyzw(
         cls, target: str, source: str, quaternion: ArrayLike, translation: ArrayLike
     ) -> Pose:
-        """From a quaternion in TUM's order `qx qy qz qw` (normalised here) and a translation (m)."""
+        """Build from a quaternion in TUM's order `qx qy qz qw` (normalised here) and a translation (m)."""
         rotation = Rotation.from_quat(np.asarray(quaternion, dtype=np.float64)).as_matrix()
         return cls(target, source, rotation, np.asarray(translation, dtype=np.float64))
 
     @property
     def matrix(self) -> Float64:
-        """(4, 4) homogeneous matrix."""
+        """Return the homogeneous matrix (4, 4)."""
         m = np.eye(4)
         m[:3, :3] = self.rotation
         m[:3, 3] = self.translation
@@ -82,7 +82,7 @@ class Pose:
 
     @property
     def quaternion_xyzw(self) -> Float64:
-        """(4,) unit quaternion `qx qy qz qw` with qw >= 0."""
+        """Return the unit quaternion (4,) `qx qy qz qw` with qw >= 0."""
         return Rotation.from_matrix(self.rotation).as_quat(canonical=True)
 
     def __matmul__(self, other: Pose) -> Pose:
@@ -99,26 +99,28 @@ class Pose:
         )
 
     def inverse(self) -> Pose:
-        """`source_from_target`."""
+        """Invert to `source_from_target`."""
         return Pose(self.source, self.target, self.rotation.T, -self.rotation.T @ self.translation)
 
     def apply(self, points: Float64) -> Float64:
-        """(..., 3) points in `source` to (..., 3) points in `target`, metres."""
+        """Transform points (..., 3) in `source` to points (..., 3) in `target`, metres."""
         moved: Float64 = points @ self.rotation.T + self.translation
         return moved
 
     def angle_to(self, other: Pose) -> float:
-        """The rotation between two poses of the same two frames, radians."""
+        """Compute the rotation angle between two poses of the same two frames, radians."""
         self._expect_same_frames(other)
         return float(Rotation.from_matrix(self.rotation.T @ other.rotation).magnitude())
 
     def distance_to(self, other: Pose) -> float:
-        """The distance between two poses' origins, metres."""
+        """Compute the distance between two poses' origins, metres."""
         self._expect_same_frames(other)
         return float(np.linalg.norm(self.translation - other.translation))
 
     def interpolate(self, other: Pose, share: float) -> Pose:
-        """The pose at `share` of the way to `other` (0 here, 1 there): linear in place, slerp in rotation."""
+        """Interpolate at `share` of the way to `other` (0 here, 1 there): linear in place, slerp in
+        rotation.
+        """
         self._expect_same_frames(other)
         turn = Rotation.from_matrix(self.rotation.T @ other.rotation).as_rotvec()
         rotation = self.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
@@ -133,7 +135,7 @@ class Pose:
 
 
 def skew(vectors: Float64) -> Float64:
-    """(..., 3) to (..., 3, 3) with `skew(v) @ w = v x w`."""
+    """Build skew matrices (..., 3, 3) of vectors (..., 3): `skew(v) @ w = v x w`."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)

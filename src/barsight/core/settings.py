@@ -1,4 +1,4 @@
-"""What holds for every setting, whichever stage it belongs to."""
+"""Check numeric settings of any stage."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from barsight.core.errors import ConfigError
 
-MOST = 2**31 - 1
+MAX_VALUE = 2**31 - 1
 
 
 def expect_numbers(settings: Mapping[str, Any], prefix: str = "") -> None:
@@ -21,5 +21,5 @@ def expect_numbers(settings: Mapping[str, Any], prefix: str = "") -> None:
                 expect_numbers(number, f"{prefix}{name}.")
             if isinstance(number, float) and not math.isfinite(number):
                 raise ConfigError(f"{prefix}{name} is {number}; give a number")
-            if isinstance(number, int) and abs(number) > MOST:
-                raise ConfigError(f"{prefix}{name} is {number}; the most is {MOST}")
+            if isinstance(number, int) and abs(number) > MAX_VALUE:
+                raise ConfigError(f"{prefix}{name} is {number}; the most is {MAX_VALUE}")

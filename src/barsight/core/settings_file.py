@@ -1,4 +1,4 @@
-"""Frozen settings from TOML files (cattrs), with one line for whatever is wrong with the file."""
+"""Read frozen settings from TOML files (cattrs), with one line for whatever is wrong with the file."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Any, TypeVar
 import cattrs
 
 from barsight.core.errors import BarsightError, ConfigError, InputError
+from barsight.core.renamed_settings import refuse_old_keys
 
 Settings = TypeVar("Settings")
 
 
 def read_settings(path: Path, kind: type[Settings], help_at: str, flag: str) -> Settings:
-    """Settings of `kind` from a TOML file over the defaults.
+    """Read settings of `kind` from a TOML file over the defaults.
 
     help_at: where the keys are explained; flag: which flag named the file. Raises InputError for a file that
     can't be read and ConfigError for a key or value that can't be.
@@ -26,6 +27,7 @@ def read_settings(path: Path, kind: type[Settings], help_at: str, flag: str) -> 
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(path, f"is no TOML file: {error}", help_at) from error
     try:
+        refuse_old_keys(content)
         return _converter().structure(content, kind)
     except Exception as error:
         own = _own_error(error)
@@ -58,7 +60,7 @@ def _whole(value: Any, _: type) -> int:
 
 
 def _own_error(error: BaseException) -> BarsightError | None:
-    """The check of our own that failed somewhere inside a group of errors."""
+    """Find our own failed check inside a group of errors."""
     if isinstance(error, BarsightError):
         return error
     if isinstance(error, BaseExceptionGroup):

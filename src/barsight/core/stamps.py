@@ -1,4 +1,4 @@
-"""Time stamps: integers in nanoseconds, never floats. TUM files carry seconds with nine decimals."""
+"""Handle time stamps: integers in nanoseconds, never floats. TUM files carry seconds with nine decimals."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ NS_PER_S = 1_000_000_000
 
 
 def seconds_to_ns(seconds: float) -> int:
-    """A duration in seconds to whole nanoseconds. Not for absolute stamps, which a float can't hold."""
+    """Convert a duration in seconds to whole nanoseconds.
+
+    Not for absolute stamps, which a float can't hold.
+    """
     return round(seconds * NS_PER_S)
 
 
 def format_seconds(stamp_ns: int) -> str:
-    """`1700000000603500000` to `"1700000000.603500000"`, exact."""
+    """Format `1700000000603500000` as `"1700000000.603500000"`, exact."""
     sign = "-" if stamp_ns < 0 else ""
     whole, rest = divmod(abs(stamp_ns), NS_PER_S)
     return f"{sign}{whole}.{rest:09d}"
 
 
 def parse_seconds(text: str) -> int:
-    """The inverse of `format_seconds`; any number of decimals, those past the ninth are cut.
+    """Parse what `format_seconds` writes; any number of decimals, those past the ninth are cut.
 
     Exponents are read too (`1.4e+09`, as `numpy.savetxt` writes). Raises ValueError for what is no number.
     """
@@ -53,7 +56,7 @@ def expect_increasing(stamps_ns: Int64, path: Path, first_line: int = 2) -> None
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which left stamp belongs to which right stamp.
+    """Pairs of left and right stamps.
 
     left, right: (N,) indices into the two inputs, increasing. left_only, right_only: indices without partner.
     """
@@ -88,7 +91,7 @@ def _nearest(query_ns: Int64, among_ns: Int64) -> Int64:
 
 
 def interpolate_at(query_ns: Int64, stamps_ns: Int64, values: Float64) -> Float64:
-    """Linear interpolation of `values` (N, ...) given at increasing `stamps_ns` (N,), at `query_ns` (M,).
+    """Interpolate `values` (N, ...) given at increasing `stamps_ns` (N,) linearly at `query_ns` (M,).
 
     Returns (M, ...); NaN outside the stamps' span. Integer differences first, so that no nanosecond is lost.
     """

@@ -1,4 +1,4 @@
-"""How long the stages of a run take."""
+"""Time the stages of a run."""
 
 from __future__ import annotations
 
@@ -28,5 +28,5 @@ class Stopwatch:
                 self._frames[stage] = self._frames.get(stage, 0) + frames
 
     def entries(self) -> tuple[tuple[str, float, int], ...]:
-        """(stage, seconds, frames) in the order in which the stages first ended."""
+        """Return (stage, seconds, frames) in the order in which the stages first ended."""
         return tuple((stage, seconds, self._frames[stage]) for stage, seconds in self._seconds.items())

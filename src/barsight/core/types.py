@@ -1,4 +1,4 @@
-"""What travels between the stages: frozen records whose fields say shape, unit and frame.
+"""Define the records that travel between the stages: frozen, with shape, unit and frame per field.
 
 The frames are `yard` (or `world`), `body` (the IMU), `cam0`, `cam1` (raw cameras), `rect0` (the left camera
 after rectification) and `crane`; docs/reference/conventions.md defines them. No match and no depth are NaN.
@@ -30,7 +30,7 @@ class StereoFrame:
 
 @dataclass(frozen=True, eq=False)
 class NamedPoints:
-    """What a pair shows of points that are known one from another. stamp_ns: cam0's clock.
+    """Points of a pair that are known one from another. stamp_ns: cam0's clock.
 
     names: (N,) int64, each once. left, right: (N, 2) raw px in cam0 and cam1.
     """
@@ -145,7 +145,7 @@ class DisparityRange:
 
     @property
     def count(self) -> int:
-        """The number of whole candidates."""
+        """Return the number of whole candidates."""
         return self.highest_px - self.lowest_px
 
 
@@ -166,7 +166,7 @@ class Disparity:
 
     @property
     def coverage(self) -> float:
-        """The share of pixels that have a disparity."""
+        """Return the fraction of pixels that have a disparity."""
         return float(np.isfinite(self.disparity_px).mean()) if self.disparity_px.size else 0.0
 
 
@@ -188,7 +188,7 @@ class StereoPoints:
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """Where one frame was taken. reference_from_body: target is `yard` or `world`.
+    """Pose of one frame. reference_from_body: target is `yard` or `world`.
 
     covariance: (6, 6), rotation (rad) then translation (m), both in the reference frame's axes.
     """
@@ -203,7 +203,7 @@ class PosedFrame:
 
 @dataclass(frozen=True, eq=False)
 class RigDrift:
-    """What the motion shows of the rig against its calibration.
+    """Rig drift against its calibration as the motion shows it.
 
     yaw_rad: how far cam1 has turned about `rect0`'s y axis. scale: by which share the baseline is longer than
     calibrated, if the encoders' metre is right. covariance: (2, 2) of both. prior_sigma: (2,) what was held
@@ -229,7 +229,7 @@ class RigDrift:
         return float(self.covariance[1, 1] ** 0.5)
 
     def depth_error_m(self, range_m: float) -> float:
-        """What the yaw adds to a depth of `range_m` straight ahead if nothing is done about it."""
+        """Return the depth error by the uncorrected yaw at `range_m` straight ahead."""
         return -self.yaw_rad * range_m**2 / self.baseline_m
 
 
@@ -251,23 +251,23 @@ class Trajectory:
 
     @property
     def stamp_ns(self) -> Int64:
-        """(N,) the frames' stamps."""
+        """Return the frames' stamps (N,)."""
         return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
 
     @property
     def positions_m(self) -> Float64:
-        """(N, 3) the body's places in the reference frame."""
+        """Return the body's positions (N, 3) in the reference frame."""
         places = [frame.reference_from_body.translation for frame in self.frames]
         return np.array(places, dtype=np.float64).reshape(-1, 3)
 
     @property
     def length_m(self) -> float:
-        """The way along the frames."""
+        """Return the path length along the frames."""
         return float(np.linalg.norm(np.diff(self.positions_m, axis=0), axis=1).sum())
 
 
-class Source:
-    """Codes of where a cell's height comes from (`height.tif` band `source`, `contour.csv`)."""
+class HeightSource:
+    """Codes of the origin of a cell's height (`height.tif` band `source`, `contour.csv`)."""
 
     UNKNOWN = 0
     VISION = 1
@@ -277,7 +277,9 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """Heights along X at one y. x_m, y_m, z_m, sigma_m: (N,), NaN where unknown. source: (N,) `Source`."""
+    """Heights along X at one y. x_m, y_m, z_m, sigma_m: (N,), NaN where unknown. source: (N,)
+    `HeightSource`.
+    """
 
     profile: int
     x_m: Float64
@@ -289,7 +291,7 @@ class Contour:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How a contour agrees with a reference profile; all in mm but for the coverage.
+    """Agreement of a contour with a reference profile; all in mm but for the coverage.
 
     samples: compared points. coverage_pct: share of the reference's points that vision measured.
     bias is vision minus reference; loa_low, loa_high are Bland-Altman's 95 % limits of agreement. median and

@@ -1,4 +1,4 @@
-"""Recorded corners of a board: the poses that PnP gives, and how near the gyro alone comes to them."""
+"""Compute PnP poses of recorded board corners and the drift of the gyro alone against them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import ImuSamples
-from barsight.motion.frontend.board_corners import LEAST_POINTS
+from barsight.motion.frontend.board_corners import MIN_POINTS
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.ground_truth import GroundTruth
 
 FIELDS = ("stamp_ns", "u", "v", "x", "y", "z")
-LEAST_POSES = 3
+MIN_POSES = 3
 
 
 def board_poses(recording: CornerRecording) -> GroundTruth | None:
-    """The body over the board at each frame: PnP of cam0's corners alone, by the board's places as stored.
+    """Solve PnP of cam0's corners for the body over the board at each frame, by the board's places as stored.
 
     It takes the board as stored and the lens as calibrated: what both are off by is in these poses. Frames
     of fewer than 12 corners are left out; None for fewer than three. Raises CalibrationError where the
@@ -33,7 +33,7 @@ def board_poses(recording: CornerRecording) -> GroundTruth | None:
     stamps, poses = [], []
     for stamp in recording.index.stamps_ns:
         seen = rows[slice(*np.searchsorted(rows["stamp_ns"], (stamp, stamp + 1)))]
-        if len(seen) < LEAST_POINTS:
+        if len(seen) < MIN_POINTS:
             continue
         board = np.column_stack([seen["x"], seen["y"], seen["z"]]).astype(np.float64)
         rays = camera.rays(np.column_stack([seen["u"], seen["v"]]).astype(np.float64))
@@ -44,27 +44,30 @@ def board_poses(recording: CornerRecording) -> GroundTruth | None:
             cam0_from_board = Pose("cam0", "world", rotation, place.ravel())
             stamps.append(stamp)
             poses.append((body_from_cam0 @ cam0_from_board).inverse())
-    if len(poses) < LEAST_POSES:
+    if len(poses) < MIN_POSES:
         return None
     return GroundTruth(np.array(stamps, np.int64), tuple(poses))
 
 
-def by_gyro_alone_deg(imu: ImuSamples, truth: GroundTruth, shift_ns: int) -> float:
-    """RMSE of the gyro's turns against the poses, NaN where it covers fewer than three of them.
+def gyro_only_rmse_deg(imu: ImuSamples, truth: GroundTruth, shift_ns: int) -> float:
+    """Compute the RMSE of the gyro's turns against the poses, NaN where it covers fewer than three of them.
 
     The rates are integrated step by step; the start and one constant bias, fitted to the poses themselves,
     are all that is free. An estimate that believes the gyro comes hardly nearer.
     """
     stamps = truth.stamp_ns + shift_ns
     known = (stamps >= imu.stamp_ns[0]) & (stamps <= imu.stamp_ns[-1])
-    if known.sum() < LEAST_POSES:
+    if known.sum() < MIN_POSES:
         return float("nan")
     turns = Rotation.from_matrix([pose.rotation for pose in truth.poses])[known]
     samples_s = (imu.stamp_ns - imu.stamp_ns[0]) / NS_PER_S
     frames_s = (stamps[known] - imu.stamp_ns[0]) / NS_PER_S
 
     def off(unknowns: Float64) -> Float64:
-        """(K * 3,) turns from the gyro's attitude to the pose's, rad. unknowns: bias, turn of the start."""
+        """Return (K * 3,): turns from the gyro's attitude to the pose's, rad.
+
+        unknowns: bias, turn of the start.
+        """
         gyro = Slerp(samples_s, _integrated(imu, unknowns[:3]))(frames_s)
         start = turns[0] * gyro[0].inv() * Rotation.from_rotvec(unknowns[3:])
         return np.asarray((turns.inv() * start * gyro).as_rotvec().ravel())
@@ -74,7 +77,7 @@ def by_gyro_alone_deg(imu: ImuSamples, truth: GroundTruth, shift_ns: int) -> flo
 
 
 def _integrated(imu: ImuSamples, bias: Float64) -> Rotation:
-    """(N,) attitude at each sample, the first one's own being none."""
+    """Integrate the attitude at each sample (N,), from the identity."""
     rate = (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) / 2 - bias
     steps = Rotation.from_rotvec(rate * np.diff(imu.stamp_ns)[:, None] / NS_PER_S).as_matrix()
     attitude = np.empty((len(steps) + 1, 3, 3))

@@ -1,4 +1,6 @@
-"""A measured folder against the truth of its (simulated) recording: evaluation only, never measuring."""
+"""Score a measured folder against the truth of its (simulated) recording: evaluation only, never
+measuring.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import tifffile
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.mapping.agreement import smooth_places
 
 _SPACING_M = 0.01
@@ -18,8 +20,8 @@ _SPACING_M = 0.01
 Figures = dict[str, float]
 
 
-def score(recording: Path, out: Path) -> dict[str, Figures]:
-    """Contours and heights in mm against `truth/height.npz` of the recording.
+def score_folder(recording: Path, out: Path) -> dict[str, Figures]:
+    """Score contours and heights in mm against `truth/height.npz` of the recording.
 
     `smooth` places have no step over 30 mm within two samples, in the height map along x and along y;
     `seen by two` are those that at least two frames see in both cameras. coverage is the share of those that
@@ -45,7 +47,7 @@ def _score_contours(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
                 continue
             measured = heights.setdefault(profile, np.full((2, x_true.size), np.nan))
             k = round((float(row["x_m"]) - x_true[0]) / _SPACING_M)
-            if int(row["source"]) == Source.VISION and 0 <= k < x_true.size:
+            if int(row["source"]) == HeightSource.VISION and 0 <= k < x_true.size:
                 measured[:, k] = float(row["z_m"]), float(row["sigma_m"])
     errors, sigmas, smooth, covered = [], [], [], []
     for profile, (z, sigma) in heights.items():
@@ -76,7 +78,7 @@ def _score_height(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
     column, row = np.floor((x - left) / cell).astype(int), np.floor((top - y) / cell).astype(int)
     inside = (column >= 0) & (row >= 0) & (column < z.shape[1]) & (row < z.shape[0])
     column, row = column * inside, row * inside
-    seen = inside & (source[row, column] == Source.VISION)
+    seen = inside & (source[row, column] == HeightSource.VISION)
     error = np.where(seen, z[row, column] - z_true, np.nan)
     spread = np.where(seen, sigma[row, column], np.nan)
     level = smooth_places(z_true) & smooth_places(z_true.T).T

@@ -1,4 +1,4 @@
-"""A trajectory against the true one: evaluation only, never measuring."""
+"""Compare a trajectory with the true one: evaluation only, never measuring."""
 
 from __future__ import annotations
 
@@ -46,14 +46,16 @@ class FrameErrors:
 
 
 def frame_errors(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> FrameErrors | None:
-    """shift_ns: truth's clock minus the frames'. None where fewer than 3 overlap."""
+    """Compute per-frame errors; shift_ns: truth's clock minus the frames'. None where fewer than 3
+    overlap.
+    """
     met = _met(trajectory, truth, shift_ns)
     if met is None:
         return None
     place, true_place = met.place, met.true_place
     off = met.turn * met.true_turn.inv()
     if trajectory.reference != "yard":
-        place, off = align(place, true_place), off.mean().inv() * off
+        place, off = align_umeyama(place, true_place), off.mean().inv() * off
     stamps = np.array([frame.stamp_ns for frame in met.frames], np.int64)
     return FrameErrors(stamps, place - true_place, off.as_rotvec())
 
@@ -85,16 +87,19 @@ def _met(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> _Met | No
     return _Met(frames, place, turn, true_place, true_turn)
 
 
-def compare(
+def trajectory_drift(
     trajectory: Trajectory, truth: GroundTruth, shift_ns: int, least_way_m: float = 10.0
 ) -> Drift | None:
-    """shift_ns: truth's clock minus the frames' (`timeshift_cam_imu`). None where fewer than 3 overlap."""
+    """Compute drift figures; shift_ns: truth's clock minus the frames' (`timeshift_cam_imu`).
+
+    None where fewer than 3 overlap.
+    """
     met = _met(trajectory, truth, shift_ns)
     if met is None:
         return None
     frames, place, turn = met.frames, met.place, met.turn
     true_place, true_turn = met.true_place, met.true_turn
-    aligned = align(place, true_place)
+    aligned = align_umeyama(place, true_place)
     off = turn * true_turn.inv()
     spread = (off.mean().inv() * off).magnitude()
     nan = float("nan")
@@ -114,8 +119,8 @@ def compare(
     )
 
 
-def align(place: Float64, target: Float64) -> Float64:
-    """(N, 3) places moved rigidly to fit the target best [Umeyama 1991], without scale."""
+def align_umeyama(place: Float64, target: Float64) -> Float64:
+    """Align places (N, 3) rigidly to the target [Umeyama 1991], without scale."""
     centred, wanted = place - place.mean(axis=0), target - target.mean(axis=0)
     aligned: Float64 = centred @ nearest_rotation(wanted.T @ centred).T + target.mean(axis=0)
     return aligned

@@ -1,4 +1,4 @@
-"""SIFT, ORB and SURF behind one Protocol, spread over the image, each place with its sigma."""
+"""Detect SIFT, ORB and SURF features behind one Protocol, spread over the image, with a sigma each."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Keypoints:
 
     @property
     def is_binary(self) -> bool:
-        """Whether descriptors are compared by Hamming distance; otherwise L2."""
+        """Check whether descriptors are compared by Hamming distance; otherwise L2."""
         return self.descriptors.dtype == np.uint8
 
 
@@ -47,12 +47,14 @@ class Detector(Protocol):
 
 
 def make_detector(name: DetectorName) -> Detector:
-    """The detector of that name."""
+    """Make the detector of that name."""
     return {"sift": _sift, "surf": _surf, "orb": _orb}[name]
 
 
 def spread(pixels: Float32, strength: Float32, shape: tuple[int, ...], count: int) -> Int64:
-    """Indices, ascending, of the strongest features of each cell, so that a bright label doesn't take all."""
+    """Select the strongest features of each cell (indices, ascending), so that a bright label doesn't take
+    all.
+    """
     height, width = shape
     row = (pixels[:, 1] * CELLS[0] / height).astype(int).clip(0, CELLS[0] - 1)
     column = (pixels[:, 0] * CELLS[1] / width).astype(int).clip(0, CELLS[1] - 1)

@@ -1,4 +1,4 @@
-"""Matching by the predicted motion: a known 3D point is looked for only where it must be.
+"""Match by predicted motion: known 3D points are searched only inside their predicted ellipses.
 
 Bars all look alike: two matches one bar further agree with each other as well as the true ones. So each
 point is carried by the predicted motion, and only what lies in its predicted ellipse is a match.
@@ -13,10 +13,16 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64
 from barsight.core.pose import skew
 from barsight.core.types import RectifiedCamera
-from barsight.features.patch_alignment import FINE_REACH_PX, Located, PatchImage, PatchPair, locate
+from barsight.features.patch_alignment import (
+    FINE_REACH_PX,
+    AlignedPatches,
+    PatchImage,
+    PatchPair,
+    align_patches,
+)
 
 GATE_SIGMAS = 4.0
-MOST_OFF_ROW_PX = 1.0
+MAX_OFF_ROW_PX = 1.0
 MARGIN_PX = 8.0
 """Nearer to its border a picture doesn't show a patch whole with what its spline needs."""
 
@@ -33,8 +39,9 @@ class PredictedMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class Predicted:
-    """Where N points must be in the new pair. stereo: (N, 3) u, v and right u, px, NaN behind the camera.
+class PredictedProjections:
+    """Predicted projections of N points in the new pair. stereo: (N, 3) u, v and right u, px, NaN behind the
+    camera.
 
     covariance: (N, 3, 3) px^2 of the prediction. inside: (N,) whether both pictures show it.
     """
@@ -45,7 +52,7 @@ class Predicted:
 
     @property
     def reach_px(self) -> Float64:
-        """(N,) one sigma of the predicted place along the ellipse's longer axis."""
+        """Return one sigma (N,) of the predicted place along the ellipse's longer axis."""
         result: Float64 = np.sqrt(np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, 1])
         return result
 
@@ -63,15 +70,15 @@ class GuidedMatches:
 
 
 def project_stereo(points: Float64, camera: RectifiedCamera) -> Float64:
-    """(N, 3) points in `rect0` to (N, 3) u, v and right u, px; NaN behind the camera."""
+    """Project points (N, 3) in `rect0` to u, v and right u (N, 3), px; NaN behind the camera."""
     x, y, z = points.T
     depth = np.where(z > 0.05, z, np.nan)
     u, v = camera.focal_px * x / depth + camera.cx_px, camera.focal_px * y / depth + camera.cy_px
     return np.column_stack([u, v, u - camera.focal_px * camera.baseline_m / depth + camera.doffs_px])
 
 
-def triangulate(stereo: Float64, camera: RectifiedCamera) -> Float64:
-    """The inverse of `project_stereo`: (N, 3) m, NaN where the disparity is not positive."""
+def triangulate_stereo(stereo: Float64, camera: RectifiedCamera) -> Float64:
+    """Invert `project_stereo`: (N, 3) m, NaN where the disparity is not positive."""
     disparity = stereo[:, 0] - stereo[:, 2] + camera.doffs_px
     depth = camera.focal_px * camera.baseline_m / np.where(disparity > 1e-3, disparity, np.nan)
     x = (stereo[:, 0] - camera.cx_px) / camera.focal_px * depth
@@ -80,7 +87,7 @@ def triangulate(stereo: Float64, camera: RectifiedCamera) -> Float64:
 
 
 def stereo_jacobian(points: Float64, camera: RectifiedCamera) -> Float64:
-    """(N, 3, 3) how `project_stereo` moves with the points, px per m."""
+    """Differentiate `project_stereo` by the points (N, 3, 3), px per m."""
     x, y, z = points.T
     f, zero = camera.focal_px, np.zeros(len(points))
     by_u = np.stack([f / z, zero, -f * x / z**2], axis=1)
@@ -89,8 +96,8 @@ def stereo_jacobian(points: Float64, camera: RectifiedCamera) -> Float64:
     return np.stack([by_u, by_v, by_right], axis=1)
 
 
-def triangulated_by(points: Float64, camera: RectifiedCamera) -> Float64:
-    """(N, 3, 3) how `triangulate`d points move with their u, v and right u, m per px."""
+def triangulation_jacobian(points: Float64, camera: RectifiedCamera) -> Float64:
+    """Differentiate `triangulate_stereo` by u, v and right u (N, 3, 3), m per px."""
     depth = points[:, 2]
     along_ray = points * (depth / (camera.focal_px * camera.baseline_m))[:, None]
     by_places = np.stack([-along_ray, np.zeros_like(points), along_ray], axis=2)
@@ -99,14 +106,14 @@ def triangulated_by(points: Float64, camera: RectifiedCamera) -> Float64:
     return by_places
 
 
-def predict_places(
+def predict_projections(
     points: Float64,
     sigma_px: float | Float64,
     motion: PredictedMotion,
     camera: RectifiedCamera,
-) -> Predicted:
-    """points: (N, 3) in the old `rect0`, seen there with `sigma_px`, one for all or (N, 3), in u, v and
-    right u.
+) -> PredictedProjections:
+    """Predict projections of points (N, 3) in the old `rect0`, seen there with `sigma_px`, one for all or (N,
+    3), in u, v and right u.
     """
     moved = points @ motion.rotation.T + motion.translation
     stereo = project_stereo(moved, camera)
@@ -114,21 +121,21 @@ def predict_places(
     by_point = stereo_jacobian(safe, camera)
     by_motion = np.concatenate([by_point @ -skew(safe), by_point], axis=2)
     covariance = by_motion @ motion.covariance @ by_motion.transpose(0, 2, 1)
-    old = by_point @ motion.rotation @ triangulated_by(points, camera)
+    old = by_point @ motion.rotation @ triangulation_jacobian(points, camera)
     variance = np.broadcast_to(np.square(sigma_px), (len(points), 3))
     covariance += (old * variance[:, None, :]) @ old.transpose(0, 2, 1)
     with np.errstate(invalid="ignore"):
         inside: Bool = (stereo[:, [0, 2]] > MARGIN_PX).all(1) & (stereo[:, 1] > MARGIN_PX)
         inside &= (stereo[:, [0, 2]] < camera.width - MARGIN_PX).all(1)
         inside &= stereo[:, 1] < camera.height - MARGIN_PX
-    return Predicted(stereo, covariance, inside)
+    return PredictedProjections(stereo, covariance, inside)
 
 
 def match_guided(
-    source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: Predicted,
+    source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: PredictedProjections,
     sigma_px: float, repeat_px: Float64 | None = None,
 ) -> GuidedMatches:  # fmt: skip
-    """Looks for the patches of `source` at `places` (N, 2), `depth` (N,) m off, in both pictures of `pair`.
+    """Match the patches of `source` at `places` (N, 2), `depth` (N,) m off, in both pictures of `pair`.
 
     From the predicted place in the left picture, by full-size pictures alone where that is near enough, then
     across to the right one. repeat_px: (N,) how far off each patch's likeness is (the bars' pitch); an
@@ -148,7 +155,7 @@ def match_guided(
     camera = pair.pair.camera
     now = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
     sure = bool(GATE_SIGMAS * np.quantile(predicted.reach_px[tried], 0.9) < FINE_REACH_PX)
-    left = locate(source, pair.left, places[tried], guess[:, :2], sure, grown=depth[tried] / now)
+    left = align_patches(source, pair.left, places[tried], guess[:, :2], sure, grown=depth[tried] / now)
     right = match_across(pair, left.pixels, disparity, sure=True)
     stereo[tried] = np.column_stack([left.pixels, right.pixels[:, 0]])
     sigma[tried] = np.hypot(left.sigma_px, right.sigma_px) / 2**0.5
@@ -160,10 +167,10 @@ def match_guided(
 
 
 def match_left(
-    source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: Predicted,
+    source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: PredictedProjections,
     sigma_px: float, repeat_px: Float64,
 ) -> tuple[Float64, Bool]:  # fmt: skip
-    """(N, 2) and (N,): patches that only the left picture of `pair` shows, and which are found.
+    """Match patches that only the left picture of `pair` shows: places (N, 2), found (N,).
 
     As `match_guided`, but for a prediction that consensus has checked already: one picture alone doesn't
     check the depth.
@@ -176,7 +183,7 @@ def match_left(
     tried = np.flatnonzero(shown)
     disparity = guess[tried, 0] - guess[tried, 2]
     now = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
-    left = locate(source, pair.left, places[tried], guess[tried, :2], grown=depth[tried] / now)
+    left = align_patches(source, pair.left, places[tried], guess[tried, :2], grown=depth[tried] / now)
     off = left.pixels - guess[tried, :2]
     spread = predicted.covariance[tried, :2, :2] + sigma_px**2 * np.eye(2)
     distance2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
@@ -184,11 +191,11 @@ def match_left(
     return pixels, found
 
 
-def match_across(pair: PatchPair, left: Float64, disparity: Float64, sure: bool = False) -> Located:
-    """Left places (N, 2), whose disparity (N,) is about known, in the right picture; found only on their row.
+def match_across(pair: PatchPair, left: Float64, disparity: Float64, sure: bool = False) -> AlignedPatches:
+    """Match left places (N, 2) of about known disparity (N,) in the right picture, on their row only.
 
     sure: the disparities are good to a pixel or two.
     """
     guess = np.column_stack([left[:, 0] - disparity, left[:, 1]])
-    right = locate(pair.left, pair.right, left, guess, sure)
-    return replace(right, found=right.found & (np.abs(right.pixels[:, 1] - left[:, 1]) < MOST_OFF_ROW_PX))
+    right = align_patches(pair.left, pair.right, left, guess, sure)
+    return replace(right, found=right.found & (np.abs(right.pixels[:, 1] - left[:, 1]) < MAX_OFF_ROW_PX))

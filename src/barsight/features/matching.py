@@ -1,4 +1,4 @@
-"""Matching of descriptors, one function a step: nearest, ratio, mutual, along the row, plane, trend."""
+"""Match descriptors, one function a step: nearest, ratio, mutual, along the row, plane, trend."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from barsight.features.guided_matching import project_stereo
 from barsight.features.orb import Features
 
 ROW_PX = 1.5
-LEAST_FOR_PLANE = 4
+MIN_FOR_PLANE = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Nearest:
+class NearestNeighbours:
     """Of each of N first descriptors: index (N,) of the nearest second one, its distance and the next one's.
 
     The distance is Hamming's [paper Eq. 6] for bits, else L2.
@@ -28,8 +28,11 @@ class Nearest:
     next_distance: Float64
 
 
-def nearest(first: UInt8 | Float32, second: UInt8 | Float32) -> Nearest:
-    """Brute force. next_distance is infinite where there is only one second descriptor."""
+def nearest_neighbours(first: UInt8 | Float32, second: UInt8 | Float32) -> NearestNeighbours:
+    """Find nearest neighbours by brute force.
+
+    next_distance is infinite where there is only one second descriptor.
+    """
     count = len(first)
     index, distance = np.full(count, -1, np.int64), np.full((count, 2), np.inf)
     if count and len(second):
@@ -38,29 +41,29 @@ def nearest(first: UInt8 | Float32, second: UInt8 | Float32) -> Nearest:
         sides = min(2, len(second))
         found, which = cv2.batchDistance(first, second, kind, normType=norm, K=sides)
         index, distance[:, :sides] = which[:, 0].astype(np.int64), found
-    return Nearest(index, distance[:, 0], distance[:, 1])
+    return NearestNeighbours(index, distance[:, 0], distance[:, 1])
 
 
-def passes_ratio(found: Nearest, ratio: float = 0.9) -> Bool:
-    """(N,) whether the nearest is clearly nearer than the next [Lowe 2004]."""
+def ratio_test(found: NearestNeighbours, ratio: float = 0.9) -> Bool:
+    """Apply the ratio test (N,) [Lowe 2004]."""
     kept: Bool = (found.index >= 0) & (found.distance < ratio * found.next_distance)
     return kept
 
 
-def is_mutual(forward: Nearest, backward: Nearest) -> Bool:
-    """(N,) whether the nearest's own nearest is the first again."""
+def is_mutual(forward: NearestNeighbours, backward: NearestNeighbours) -> Bool:
+    """Check mutual nearest neighbours (N,)."""
     kept: Bool = forward.index >= 0
     kept[kept] = backward.index[forward.index[kept]] == np.flatnonzero(kept)
     return kept
 
 
 def match_mutual(first: Features, second: Features, ratio: float = 0.9) -> Int64:
-    """(M, 2) index pairs that are each other's nearest and pass the ratio test."""
+    """Match mutual nearest neighbours that pass the ratio test: index pairs (M, 2)."""
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), dtype=np.int64)
-    forward = nearest(first.descriptors, second.descriptors)
-    clear = np.flatnonzero(passes_ratio(forward, ratio))
-    backward = nearest(second.descriptors[forward.index[clear]], first.descriptors)
+    forward = nearest_neighbours(first.descriptors, second.descriptors)
+    clear = np.flatnonzero(ratio_test(forward, ratio))
+    backward = nearest_neighbours(second.descriptors[forward.index[clear]], first.descriptors)
     kept = clear[backward.index == clear]
     return np.column_stack([kept, forward.index[kept]])
 
@@ -69,7 +72,7 @@ def match_rows(
     left: Float32, left_descriptors: UInt8 | Float32, right: Float32, right_descriptors: UInt8 | Float32,
     camera: RectifiedCamera, depth_m: tuple[float, float],
 ) -> Int64:  # fmt: skip
-    """(M, 2) pairs of left and right features (N, 2) on one row at a depth in the range, mutual nearest."""
+    """Match left and right features (N, 2) on one row within the depth range: mutual nearest pairs (M, 2)."""
     disparity = left[:, None, 0] - right[None, :, 0] + camera.doffs_px
     base = camera.focal_px * camera.baseline_m
     fits = np.abs(left[:, None, 1] - right[None, :, 1]) < ROW_PX
@@ -89,20 +92,22 @@ def match_rows(
     return np.column_stack([index[kept], best[kept]])
 
 
-def on_one_plane(first: Float64, second: Float64, reach_px: float = 3.0) -> Bool:
-    """(N,) matches that fit the best homography [paper Eq. 7], by MAGSAC++; true ones off the plane leave."""
-    if len(first) < LEAST_FOR_PLANE:
+def homography_inliers(first: Float64, second: Float64, reach_px: float = 3.0) -> Bool:
+    """Select matches (N,) that fit the best homography [paper Eq. 7], by MAGSAC++; true ones off the plane
+    leave.
+    """
+    if len(first) < MIN_FOR_PLANE:
         return np.zeros(len(first), np.bool_)
     cv2.setRNGSeed(1)
     _, inside = cv2.findHomography(first, second, cv2.USAC_MAGSAC, reach_px, maxIters=5000, confidence=0.999)
     return np.zeros(len(first), np.bool_) if inside is None else inside.ravel().astype(np.bool_)
 
 
-def follows_trend(
+def motion_inliers(
     points: Float64, second: Float64, rotation: Float64, translation: Float64, camera: RectifiedCamera,
     reach_px: float,
 ) -> Bool:  # fmt: skip
-    """(N,) matches that lie within `reach_px` of where the motion takes their points [paper Eq. 12].
+    """Select matches (N,) within `reach_px` of where the motion takes their points [paper Eq. 12].
 
     points: (N, 3) in the first `rect0`, rotation and translation new_from_old, from Eq. 11.
     """

@@ -1,4 +1,4 @@
-"""ORB features [Rublee 2011] spread evenly over the image."""
+"""Detect ORB features [Rublee 2011] spread evenly over the image."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Features:
         return len(self.pixels)
 
     def chosen(self, kept: Bool) -> Features:
-        """The features for which `kept` (N,) is true."""
+        """Select the features for which `kept` (N,) is true."""
         return Features(self.pixels[kept], self.descriptors[kept], self.scale[kept])
 
 
 def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Features:
-    """At most `count` ORB features, the strongest of each cell of a (rows, columns) grid.
+    """Detect at most `count` ORB features, the strongest of each cell of a (rows, columns) grid.
 
     Detection uses a low FAST threshold so that dark, dull steel yields features too; the grid keeps a bright
     label from taking them all.
@@ -59,7 +59,7 @@ def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Fea
 
 
 def describe_upright(image: UInt8, places: Float32) -> Features:
-    """ORB's bits at given places (N, 2), but upright and all of the picture at half size.
+    """Describe given places (N, 2) by ORB's bits, but upright and all of the picture at half size.
 
     For pictures that hardly turn or grow from one to the next. Places too near the border are left out.
     """

@@ -1,4 +1,4 @@
-"""Patches found again to a few hundredths of a pixel, whatever the gain and offset between the pictures.
+"""Track patches by inverse-compositional alignment with gain and offset, to a few hundredths of a pixel.
 
 Lucas-Kanade by Gauss-Newton [Baker 2004, inverse compositional] with two more unknowns, gain and offset:
 two cameras never expose alike, and where a patch is brighter on one side an offset of 5 % moves plain
@@ -19,19 +19,19 @@ from barsight.core.types import RectifiedPair
 
 HALF_PX = 5
 """A patch is 2 * HALF_PX + 1 wide."""
-MOST_ROWS = 64
+MAX_ROWS = 64
 """A patch that covers more rows of its source isn't looked for."""
-MOST_STEPS = 15
+MAX_STEPS = 15
 CLOSE_PX = 0.01
 COARSE_REACH_PX = 6.0
 """How far from its guess the half-size picture may take a patch, full px."""
 FINE_REACH_PX = 2.5
-LEAST_LIKENESS = 0.7
-CORE_PX, LEAST_CORE_LIKENESS = 2, -0.5
-MIDDLE_PX, MOST_MIDDLE_SIGMA_PX = 3, 0.4
+MIN_LIKENESS = 0.7
+CORE_PX, MIN_CORE_LIKENESS = 2, -0.5
+MIDDLE_PX, MAX_MIDDLE_SIGMA_PX = 3, 0.4
 """The innermost pixels must be alike and the middle fix its own place: else it was the rim that has matched,
 and the rim may belong to another surface."""
-LEAST_CONTRAST_DN = 1.0
+MIN_CONTRAST_DN = 1.0
 _SIZE = 2 * HALF_PX + 1
 _POLE = 3.0**0.5 - 2.0
 _PREFILTER = (3.0**0.5 * _POLE ** np.abs(np.arange(-8, 9))).astype(np.float32)
@@ -55,7 +55,7 @@ class PatchPair:
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
+class AlignedPatches:
     """pixels: (N, 2) x, y in the target. sigma_px: (N,) of x and y each, from the patch's own misfit, along
     its weaker direction. likeness: (N,) share of the patch's variance that the other patch explains.
     found: (N,) whether it settled near its guess and is alike, also in its middle.
@@ -68,20 +68,20 @@ class Located:
 
 
 def patch_image(image: UInt8) -> PatchImage:
-    """The coefficients of an (H, W) picture."""
+    """Compute the spline coefficients of an (H, W) picture."""
     return PatchImage(_coefficients(image), _coefficients(cv2.pyrDown(image)))
 
 
 def patch_pair(pair: RectifiedPair) -> PatchPair:
-    """Both pictures of a pair made ready."""
+    """Prepare both pictures of a pair."""
     return PatchPair(pair, patch_image(pair.left), patch_image(pair.right))
 
 
-def locate(
+def align_patches(
     source: PatchImage, target: PatchImage, places: Float64, guesses: Float64, sure: bool = False,
     grown: Float64 | None = None,
-) -> Located:  # fmt: skip
-    """Where `target` shows the patches of `source` at `places` (N, 2), near the `guesses` (N, 2).
+) -> AlignedPatches:  # fmt: skip
+    """Align the patches of `source` at `places` (N, 2) in `target`, near the `guesses` (N, 2).
 
     grown: (N,) how much larger the target shows them, 1 where it isn't given. sure: the guesses are within
     `FINE_REACH_PX`; otherwise the half-size pictures are asked first.
@@ -98,16 +98,18 @@ def locate(
 
 def _located(
     source: Float32, target: Float32, places: Float64, guesses: Float64, grown: Float64, reach: float
-) -> Located:
+) -> AlignedPatches:
     count = len(places)
     pixels, sigma, likeness = guesses.copy(), np.full(count, np.nan), np.zeros(count)
     _locate(source, target, places, pixels, grown, sigma, likeness, reach)
-    found: Bool = np.isfinite(sigma) & (likeness > LEAST_LIKENESS)
-    return Located(pixels, sigma, likeness, found)
+    found: Bool = np.isfinite(sigma) & (likeness > MIN_LIKENESS)
+    return AlignedPatches(pixels, sigma, likeness, found)
 
 
 def _coefficients(image: UInt8) -> Float32:
-    """Cubic B-spline coefficients; the recursive prefilter's tail is cut at 8 px, where it is 3e-5."""
+    """Compute cubic B-spline coefficients; the recursive prefilter's tail is cut at 8 px, where it
+    is 3e-5.
+    """
     result: Float32 = cv2.sepFilter2D(
         image, cv2.CV_32F, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REFLECT_101
     )
@@ -116,7 +118,7 @@ def _coefficients(image: UInt8) -> Float32:
 
 @kernel(fastmath=True)
 def _weights(t: float, weights: Float32) -> None:
-    """The four B-spline weights at a fraction t of a pixel."""
+    """Compute the four B-spline weights at a fraction t of a pixel."""
     t2, rest = t * t, 1 - t
     weights[0] = rest * rest * rest / 6
     weights[3] = t2 * t / 6
@@ -138,7 +140,7 @@ def _inside(image: Float32, x: float, y: float, reach: float) -> bool:
 def _read(
     image: Float32, x: float, y: float, half: int, step: float, patch: Float32, rows: Float32, room: Float32
 ) -> None:
-    """The (2 half + 1)^2 patch around (x, y), `step` px between its pixels, all of it inside.
+    """Sample the (2 half + 1)^2 patch around (x, y), `step` px between its pixels, all of it inside.
 
     rows: (at least 2 half step + 5, 2 half + 1) and room: (2, at least 2 half + 1, 4) are scratch.
     """
@@ -168,7 +170,7 @@ def _read(
 
 @kernel(fastmath=True)
 def _read_whole(image: Float32, x: float, y: float, patch: Float32, rows: Float32, room: Float32) -> None:
-    """`_read` of a whole patch at full size: all its pixels share their weights, so rows go before columns.
+    """Sample a whole patch at full size: all its pixels share their weights, so rows go before columns.
 
     rows: (at least _SIZE + 3, _SIZE) scratch.
     """
@@ -189,8 +191,8 @@ def _read_whole(image: Float32, x: float, y: float, patch: Float32, rows: Float3
 
 @kernel(fastmath=True)
 def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
-    """The design (5, _SIZE^2) of a patch: columns' and rows' slope, gain, offset and the patch itself; the
-    normal matrix (4, 4) of the first four. Returns the patch's standard deviation.
+    """Build the design (5, _SIZE^2) of a patch: columns' and rows' slope, gain, offset and the patch itself;
+    the normal matrix (4, 4) of the first four. Returns the patch's standard deviation.
     """
     mean = wide[1:-1, 1:-1].sum() / np.float32(_SIZE * _SIZE)
     half = np.float32(0.5)
@@ -213,7 +215,7 @@ def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
 
 @kernel(fastmath=True)
 def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
-    """The Gauss-Newton step (4,) that the other patch (_SIZE^2,) asks for."""
+    """Compute the Gauss-Newton step (4,) from the other patch (_SIZE^2,)."""
     along, down, gain, offset = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
     for k in range(_SIZE * _SIZE):
         off = other[k] - design[4, k]
@@ -227,7 +229,7 @@ def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
 
 @kernel(fastmath=True)
 def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[float, float]:
-    """Sums of squares over the middle (2 half + 1)^2 of the patch: what the step leaves, and the other patch
+    """Sum squares over the middle (2 half + 1)^2 of the patch: what the step leaves, and the other patch
     about its mean there.
     """
     a, b, c, d = np.float32(step[0]), np.float32(step[1]), np.float32(step[2]), np.float32(step[3])
@@ -245,9 +247,9 @@ def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[
 
 @kernel(fastmath=True)
 def _middle_holds(other: Float32, design: Float32, step: Float64, variance: float) -> bool:
-    """Whether the patch's middle alone is found at that place; variance: DN^2 of a pixel's noise."""
+    """Check whether the patch's middle alone is found at that place; variance: DN^2 of a pixel's noise."""
     left, spread = _misfit(other, design, step, CORE_PX)
-    if 1 - left / max(spread, 1e-9) < LEAST_CORE_LIKENESS:
+    if 1 - left / max(spread, 1e-9) < MIN_CORE_LIKENESS:
         return False
     along, both, down = 0.0, 0.0, 0.0
     for i in range(HALF_PX - MIDDLE_PX, HALF_PX + MIDDLE_PX + 1):
@@ -256,7 +258,7 @@ def _middle_holds(other: Float32, design: Float32, step: Float64, variance: floa
             both += design[0, k] * design[1, k]
             down += design[1, k] * design[1, k]
     weaker = (along + down) / 2 - np.sqrt(((along - down) / 2) ** 2 + both * both)
-    return bool(variance < MOST_MIDDLE_SIGMA_PX**2 * weaker)
+    return bool(variance < MAX_MIDDLE_SIGMA_PX**2 * weaker)
 
 
 @kernel()
@@ -266,19 +268,19 @@ def _locate(
 ) -> None:  # fmt: skip
     wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
     room = np.empty((2, _SIZE + 2, 4), np.float32)
-    rows = np.empty((MOST_ROWS, _SIZE + 2), np.float32)
+    rows = np.empty((MAX_ROWS, _SIZE + 2), np.float32)
     other = np.empty((_SIZE, _SIZE), np.float32)
     flat = other.ravel()
     design = np.empty((5, _SIZE * _SIZE), np.float32)
     normal, step = np.empty((4, 4)), np.empty(4)
     for n in range(places.shape[0]):
         size = 1 / grown[n]
-        if (_SIZE + 2) * size + 5 > MOST_ROWS or not _inside(
+        if (_SIZE + 2) * size + 5 > MAX_ROWS or not _inside(
             source, places[n, 0], places[n, 1], (HALF_PX + 1) * size
         ):
             continue
         _read(source, places[n, 0], places[n, 1], HALF_PX + 1, size, wide, rows, room)
-        if _prepare(wide, design, normal) < LEAST_CONTRAST_DN:
+        if _prepare(wide, design, normal) < MIN_CONTRAST_DN:
             continue
         if normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2 < 1e-3 * normal[0, 0] * normal[1, 1] + 1e-9:
             continue
@@ -286,7 +288,7 @@ def _locate(
         x0, y0 = pixels[n, 0], pixels[n, 1]
         x, y = x0, y0
         settled = False
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             if not _inside(target, x, y, HALF_PX):
                 break
             _read_whole(target, x, y, other, rows, room)

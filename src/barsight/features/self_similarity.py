@@ -1,4 +1,4 @@
-"""How far off a picture's pattern is like itself along the rows: bars side by side."""
+"""Estimate the period of repeated texture along the rows: bars side by side."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ TILES = (4, 4)
 NEAREST_PX = 5
 ROW_STEP = 8
 """Rows taken: those between show the same bars."""
-LEAST_LIKENESS = 0.35
+MIN_LIKENESS = 0.35
 """Autocorrelation of a tile's rows, at its first peak, from which the tile repeats."""
 
 
-def repeat_px(image: UInt8, places: Float64) -> Float64:
-    """(N,) px after which the tile around each place (N, 2) repeats along the row; infinite where it doesn't.
+def texture_period_px(image: UInt8, places: Float64) -> Float64:
+    """Estimate the period (N,) px along the row of the tile around each place (N, 2); infinite where none.
 
     The first peak of the mean autocorrelation of the tile's rows, the slow changes of light taken off.
     """
@@ -35,7 +35,7 @@ def repeat_px(image: UInt8, places: Float64) -> Float64:
 
 
 def _likeness(tiles: Float32) -> Float64:
-    """(..., W / 2) mean autocorrelation of the rows of tiles (..., H, W), 1 at no lag; 0 for a blank one."""
+    """Compute the mean autocorrelation (..., W / 2) of tiles (..., H, W), 1 at no lag; 0 for a blank one."""
     width = tiles.shape[-1]
     centred = tiles - tiles.mean(axis=-1, keepdims=True)
     power = (np.abs(rfft(centred, 2 * width)) ** 2).mean(axis=-2)
@@ -45,14 +45,14 @@ def _likeness(tiles: Float32) -> Float64:
 
 
 def _first_peak(likeness: Float64) -> float:
-    """The lag of the first peak after the autocorrelation has fallen, or infinity."""
+    """Find the lag of the first peak after the autocorrelation has fallen, or infinity."""
     if likeness[0] <= 0:
         return float("inf")
-    fallen = np.flatnonzero(likeness < LEAST_LIKENESS / 2)
+    fallen = np.flatnonzero(likeness < MIN_LIKENESS / 2)
     if fallen.size == 0:
         return float("inf")
     start = max(NEAREST_PX, int(fallen[0]))
     inner = likeness[start:-1]
     peaks = np.flatnonzero((inner > likeness[start - 1 : -2]) & (inner >= likeness[start + 1 :]))
-    high = peaks[inner[peaks] > LEAST_LIKENESS]
+    high = peaks[inner[peaks] > MIN_LIKENESS]
     return float(start + high[0]) if high.size else float("inf")

@@ -1,4 +1,4 @@
-"""Points followed over many frames: new corners where none are, each re-found from the view it began in.
+"""Track points over many frames: new corners where none are, each aligned with the view it began in.
 
 A patch is compared with the view where it was first seen as long as its size hardly changes, so that
 errors don't add up from frame to frame; after that its last view takes over.
@@ -17,14 +17,14 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import RectifiedPair
 from barsight.features.guided_matching import (
     GuidedMatches,
-    Predicted,
+    PredictedProjections,
     match_across,
     match_guided,
-    triangulate,
+    triangulate_stereo,
 )
 from barsight.features.patch_alignment import PatchImage, PatchPair
 
-MOST_VIEWS = 8
+MAX_VIEWS = 8
 TILES = 4
 
 
@@ -40,23 +40,23 @@ class TrackSettings:
     """Corners weaker than this share of the strongest aren't used."""
     sigma_px: float = 0.25
     """The noise of a point's place (1 sigma)."""
-    most_scale: float = 1.3
+    max_scale: float = 1.3
     """A patch that has grown or shrunk by more is taken anew from its last view."""
-    nearest_m: float = 0.5
+    min_range_m: float = 0.5
     """Points nearer than this aren't used."""
-    farthest_baselines: float = 60.0
+    max_range_baselines: float = 60.0
     """Points further than this many baselines aren't used for motion."""
 
     def __post_init__(self) -> None:
         if self.points < 50 or self.spacing_px < 3:
             raise ConfigError("tracks.points must be at least 50 and tracks.spacing_px at least 3")
-        if min(self.sigma_px, self.nearest_m, self.farthest_baselines) <= 0 or self.most_scale <= 1:
-            raise ConfigError("the tracks' distances must be positive and most_scale over 1")
+        if min(self.sigma_px, self.min_range_m, self.max_range_baselines) <= 0 or self.max_scale <= 1:
+            raise ConfigError("the tracks' distances must be positive and max_scale over 1")
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """What is followed. All of N points: track (their names), stereo (N, 3) in the last view (u, v, right u)
+    """Tracked points. All of N points: track (their names), stereo (N, 3) in the last view (u, v, right u)
     and sigma_px (N,) of each, source (index into views of the patch's view), patch (N, 2) its place there,
     patch_depth (N,) m.
 
@@ -74,24 +74,26 @@ class Tracks:
     next_track: int = 0
 
     def chosen(self, kept: Bool) -> Tracks:
-        """The points for which `kept` (N,) is true."""
+        """Select the points for which `kept` (N,) is true."""
         return replace(
             self, track=self.track[kept], stereo=self.stereo[kept], sigma_px=self.sigma_px[kept],
             source=self.source[kept], patch=self.patch[kept], patch_depth=self.patch_depth[kept],
         )  # fmt: skip
 
 
-def find_again(
-    tracks: Tracks, pair: PatchPair, predicted: Predicted, settings: TrackSettings,
+def match_tracks(
+    tracks: Tracks, pair: PatchPair, predicted: PredictedProjections, settings: TrackSettings,
     repeat_px: Float64 | None = None,
 ) -> GuidedMatches:  # fmt: skip
-    """Where the followed points are in a new pair, in which they are `predicted`."""
+    """Match the tracked points in a new pair around their `predicted` projections."""
     count = len(tracks.track)
     stereo, sigma = np.full((count, 3), np.nan), np.full(count, np.nan)
     found, ambiguous = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     for source in np.unique(tracks.source):
         group = np.flatnonzero(tracks.source == source)
-        part = Predicted(predicted.stereo[group], predicted.covariance[group], predicted.inside[group])
+        part = PredictedProjections(
+            predicted.stereo[group], predicted.covariance[group], predicted.inside[group]
+        )
         repeat = None if repeat_px is None else repeat_px[group]
         matches = match_guided(
             tracks.views[source], tracks.patch[group], tracks.patch_depth[group], pair, part,
@@ -102,11 +104,11 @@ def find_again(
     return GuidedMatches(stereo, sigma, found, ambiguous)
 
 
-def carry_on(
+def update_tracks(
     tracks: Tracks, pair: PatchPair, matches: GuidedMatches, kept: Bool, coarse: Float32,
     settings: TrackSettings,
 ) -> Tracks:  # fmt: skip
-    """The tracks after a new pair: those `kept` of the matches at their new places, and new ones between.
+    """Update the tracks after a new pair: those `kept` of the matches at their new places, new ones between.
 
     coarse: the pair's coarse disparity (h, w), in px of the full picture, NaN unknown, for new points.
     """
@@ -116,10 +118,10 @@ def carry_on(
     )  # fmt: skip
     camera = pair.pair.camera
     last = len(followed.views) - 1
-    depth = triangulate(followed.stereo, camera)[:, 2]
+    depth = triangulate_stereo(followed.stereo, camera)[:, 2]
     ratio = depth / followed.patch_depth
-    anew = (ratio > settings.most_scale) | (ratio < 1 / settings.most_scale)
-    anew |= followed.source <= last - MOST_VIEWS
+    anew = (ratio > settings.max_scale) | (ratio < 1 / settings.max_scale)
+    anew |= followed.source <= last - MAX_VIEWS
     followed = replace(
         followed,
         source=np.where(anew, last, followed.source),
@@ -136,14 +138,15 @@ def carry_on(
         sigma_px=np.concatenate([followed.sigma_px, fresh_sigma]),
         source=np.concatenate([followed.source, np.full(count, last)]),
         patch=np.vstack([followed.patch, fresh[:, :2]]),
-        patch_depth=np.concatenate([followed.patch_depth, triangulate(fresh, camera)[:, 2]]),
+        patch_depth=np.concatenate([followed.patch_depth, triangulate_stereo(fresh, camera)[:, 2]]),
         next_track=followed.next_track + count,
     )
     return _without_old_views(grown)
 
 
 def detect_corners(image: UInt8, settings: TrackSettings, taken: Float64) -> Float32:
-    """(N, 2) corners [Shi 1994] at least `spacing_px` from each other and from the places `taken` (M, 2).
+    """Detect corners (N, 2) [Shi 1994] at least `spacing_px` from each other and from the places `taken` (M,
+    2).
 
     The picture is cut into 4 x 4 tiles that yield alike, so that a bright label doesn't take them all.
     """
@@ -176,7 +179,9 @@ def detect_corners(image: UInt8, settings: TrackSettings, taken: Float64) -> Flo
 def _across(
     pair: PatchPair, corners: Float32, coarse: Float32, settings: TrackSettings
 ) -> tuple[Float64, Float64]:
-    """u, v and right u (M, 3) of the corners that the right picture shows too at a useful depth; sigma."""
+    """Match new corners across: u, v and right u (M, 3) of those at a useful depth in the right picture;
+    sigma.
+    """
     camera = pair.pair.camera
     row = (corners[:, 1] * coarse.shape[0] / camera.height).astype(int)
     column = (corners[:, 0] * coarse.shape[1] / camera.width).astype(int)
@@ -185,14 +190,14 @@ def _across(
     places = corners[known].astype(np.float64)
     right = match_across(pair, places, guess[known].astype(np.float64))
     stereo = np.column_stack([places, right.pixels[:, 0]])
-    depth = triangulate(stereo, camera)[:, 2]
+    depth = triangulate_stereo(stereo, camera)[:, 2]
     with np.errstate(invalid="ignore"):
-        kept = right.found & (depth > settings.nearest_m)
-        kept &= depth < settings.farthest_baselines * camera.baseline_m
+        kept = right.found & (depth > settings.min_range_m)
+        kept &= depth < settings.max_range_baselines * camera.baseline_m
     return stereo[kept], right.sigma_px[kept]
 
 
 def _without_old_views(tracks: Tracks) -> Tracks:
-    """Only the last `MOST_VIEWS` views stay in memory."""
-    drop = max(0, len(tracks.views) - MOST_VIEWS)
+    """Keep only the last `MAX_VIEWS` views in memory."""
+    drop = max(0, len(tracks.views) - MAX_VIEWS)
     return replace(tracks, views=tracks.views[drop:], source=tracks.source - drop)

@@ -1,4 +1,4 @@
-"""The IMU's measurement model and its kinematics, written down slowly; `preintegration` is the fast way.
+"""Define the IMU's measurement model and kinematics as a slow reference; `preintegration` is the fast way.
 
 Measured are the turn rate and the specific force in `body`, each with a bias that walks and white noise:
 `a~ = a + b_a + n_a`, `w~ = w + b_g + n_g` [paper Eq. 9-10], where `a` is the acceleration minus gravity.
@@ -33,7 +33,7 @@ class ImuBias:
 
     @classmethod
     def none(cls) -> ImuBias:
-        """Perfect sensors."""
+        """Return zero biases."""
         return cls(np.zeros(3), np.zeros(3))
 
 
@@ -46,13 +46,13 @@ class BodyState:
     velocity_mps: Float64
 
 
-def corrected(imu: ImuSamples, bias: ImuBias) -> ImuSamples:
-    """The samples without their bias [paper Eq. 9-10]."""
+def subtract_bias(imu: ImuSamples, bias: ImuBias) -> ImuSamples:
+    """Subtract the bias from the samples [paper Eq. 9-10]."""
     return ImuSamples(imu.stamp_ns, imu.gyro_radps - bias.gyro_radps, imu.accel_mps2 - bias.accel_mps2)
 
 
 def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
-    """The samples at which no axis stands at its end of scale, and how many left.
+    """Remove the samples at which an axis stands at its end of scale; also how many.
 
     An axis that keeps its highest or lowest value for four samples, far from its usual ones, can't follow.
     """
@@ -69,18 +69,18 @@ def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
     return part, int(wrong.sum())
 
 
-def integrate_slowly(
+def integrate_reference(
     imu: ImuSamples, start_ns: int, end_ns: int, state: BodyState, bias: ImuBias,
     gravity_mps2: float = GRAVITY_MPS2, steps: int = 2000,
 ) -> BodyState:  # fmt: skip
-    """The state at `end_ns` by many small steps of [paper Eq. 11] in the reference frame.
+    """Integrate the state to `end_ns` by many small steps of [paper Eq. 11] in the reference frame.
 
     The readings between samples are interpolated linearly and taken at each step's middle. For tests: it is
     exact as `steps` grows, and slow. Samples must enclose both stamps.
     """
     edges = np.linspace(0, end_ns - start_ns, steps + 1)
     middle = start_ns + ((edges[1:] + edges[:-1]) / 2).round().astype(np.int64)
-    clean = corrected(imu, bias)
+    clean = subtract_bias(imu, bias)
     rate = interpolate_at(middle, imu.stamp_ns, clean.gyro_radps)
     force = interpolate_at(middle, imu.stamp_ns, clean.accel_mps2)
     rotation, position, velocity = state.rotation, state.position_m, state.velocity_mps

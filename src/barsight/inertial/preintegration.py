@@ -1,4 +1,4 @@
-"""Preintegration on the manifold [Forster 2017], GTSAM's, from samples that needn't fall on the stamps."""
+"""Preintegrate IMU samples on the manifold [Forster 2017] with GTSAM, off the samples' stamps too."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
 from barsight.core.types import ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 
-MOST_GAP_S = 0.1
+MAX_GAP_S = 0.1
 INTEGRATION_SIGMA = 1e-5
 """What the discretisation may be off by, m/sqrt(s)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Preintegrated:
-    """The motion between two stamps as the IMU alone knows it, whatever the state at the first.
+    """Relative motion between two stamps by the IMU alone, whatever the state at the first.
 
     rotation (3, 3), velocity_mps (3,), position_m (3,): in the body at `start_ns`, gravity not yet in.
     covariance: (9, 9) of rotation, position, velocity (GTSAM's order, body axes at the end).
@@ -37,28 +37,30 @@ class Preintegrated:
 
     @property
     def seconds(self) -> float:
-        """How long."""
+        """Return the duration."""
         return (self.end_ns - self.start_ns) / NS_PER_S
 
     @property
     def rotation(self) -> Float64:
-        """(3, 3) start_from_end."""
+        """Return start_from_end (3, 3)."""
         return np.asarray(self.measurements.deltaRij().matrix())
 
     @property
     def covariance(self) -> Float64:
-        """(9, 9) of rotation, position and velocity, the biases' own uncertainty left out."""
+        """Return the covariance (9, 9) of rotation, position and velocity without that of the biases."""
         return np.asarray(self.measurements.preintMeasCov())[:9, :9]
 
     def predict(self, state: BodyState, bias: ImuBias | None = None) -> BodyState:
-        """The state at `end_ns`; a bias other than that integrated with enters to first order."""
+        """Predict the state at `end_ns`; another bias enters to first order."""
         pose = gtsam.Pose3(gtsam.Rot3(state.rotation), state.position_m)
         start = gtsam.NavState(pose, state.velocity_mps)
         end = self.measurements.predict(start, _gtsam_bias(bias or self.bias))
         return BodyState(end.attitude().matrix(), np.asarray(end.position()), np.asarray(end.velocity()))
 
     def by_bias(self, state: BodyState) -> Float64:
-        """(9, 6) how rotation, position and velocity (body axes at the end) move with accel and gyro bias."""
+        """Differentiate rotation, position and velocity (body axes at the end) by accel and gyro
+        bias (9, 6).
+        """
         pose = gtsam.Pose3(gtsam.Rot3(state.rotation), state.position_m)
         by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
         start = gtsam.NavState(pose, state.velocity_mps)
@@ -80,14 +82,17 @@ class Preintegrator:
         self._parameters = parameters
 
     def between(self, start_ns: int, end_ns: int, bias: ImuBias) -> Preintegrated | Failed:
-        """Failed `imu-gap` where the samples don't enclose both stamps or leave more than 0.1 s out."""
+        """Preintegrate between two stamps.
+
+        Failed `imu-gap` where samples don't enclose both or leave more than 0.1 s out.
+        """
         stamps = self._imu.stamp_ns
         inside = stamps[(stamps > start_ns) & (stamps < end_ns)]
         edges = np.concatenate([[start_ns], inside, [end_ns]]).astype(np.int64)
         rate = interpolate_at(edges, stamps, self._imu.gyro_radps)
         force = interpolate_at(edges, stamps, self._imu.accel_mps2)
         most = np.diff(edges).max(initial=0)
-        if np.isnan(rate).any() or end_ns <= start_ns or most > seconds_to_ns(MOST_GAP_S):
+        if np.isnan(rate).any() or end_ns <= start_ns or most > seconds_to_ns(MAX_GAP_S):
             return Failed("imu-gap", f"the IMU leaves a gap of {most / NS_PER_S:.2f} s, or ends too early")
         measurements = gtsam.PreintegratedCombinedMeasurements(self._parameters, _gtsam_bias(bias))
         mean_rate, mean_force = (rate[1:] + rate[:-1]) / 2, (force[1:] + force[:-1]) / 2

@@ -1,4 +1,4 @@
-"""When the body stands still, and what its IMU tells then: gravity's direction and the gyro's bias."""
+"""Detect standstill and estimate gravity's direction and the gyro's bias from it."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from barsight.core.types import ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 
 WINDOW_S = 0.6
-LEAST_S = 1.0
+MIN_S = 1.0
 """A shorter stretch without change is a turning point of the sway."""
-MOST_EXCESS = 1.4
+MAX_EXCESS = 1.4
 """Over a window that stands still the deviation isn't over this times the sensor's own noise."""
-MOST_DRIFT_SIGMAS = 5.0
+MAX_DRIFT_SIGMAS = 5.0
 STRENGTH_RANGE_MPS2 = (8.0, 12.0)
 
 
 @dataclass(frozen=True, eq=False)
-class StandingStart:
-    """What a body that stands still shows.
+class RestEstimate:
+    """Gravity and gyro bias of a body at rest.
 
     up_in_body: (3,) unit vector against gravity; an accelerometer bias across it can't be told from a tilt
     (5 mm/s^2 are 0.03 degrees), so bias.accel_mps2 holds the part along it only. gyro_sigma_radps,
@@ -40,8 +40,8 @@ class StandingStart:
 
 
 def stands_still(imu: ImuSamples, noise: ImuNoise) -> Bool:
-    """(N,) samples around which, over 0.6 s, both sensors vary no more than their own noise lets them;
-    stretches under a second are left out.
+    """Detect rest: samples (N,) around which, over 0.6 s, both sensors vary no more than their own noise lets
+    them; stretches under a second are left out.
 
     Constant speed looks the same to an IMU: the caller must know that the body didn't travel (a crane's
     encoders, or that the recording starts before the motion).
@@ -57,19 +57,19 @@ def stands_still(imu: ImuSamples, noise: ImuNoise) -> Bool:
         sigma = density * np.sqrt(rate_hz)
         mean = uniform_filter1d(values, size, axis=0, mode="nearest")
         square = uniform_filter1d((values - mean) ** 2, size, axis=0, mode="nearest")
-        still &= np.sqrt(square.mean(axis=1)) < MOST_EXCESS * sigma
+        still &= np.sqrt(square.mean(axis=1)) < MAX_EXCESS * sigma
         half = uniform_filter1d(values, size // 2, axis=0, mode="nearest")
         drift = np.abs(
             half[np.minimum(index + size // 4, count - 1)] - half[np.maximum(index - size // 4, 0)]
         )
-        still &= drift.max(axis=1) < MOST_DRIFT_SIGMAS * sigma * np.sqrt(4 / size)
-    least = np.ones(round(LEAST_S * rate_hz), dtype=np.bool_)
+        still &= drift.max(axis=1) < MAX_DRIFT_SIGMAS * sigma * np.sqrt(4 / size)
+    least = np.ones(round(MIN_S * rate_hz), dtype=np.bool_)
     opened: Bool = binary_opening(np.pad(still, size, mode="edge"), least)[size:-size]
     return opened
 
 
-def standing_start(imu: ImuSamples, first_ns: int, last_ns: int, noise: ImuNoise) -> StandingStart | Failed:
-    """Gravity and the gyro's bias from the samples in [first_ns, last_ns].
+def estimate_at_rest(imu: ImuSamples, first_ns: int, last_ns: int, noise: ImuNoise) -> RestEstimate | Failed:
+    """Average gravity and the gyro's bias over the samples in [first_ns, last_ns].
 
     Failed `imu-units` where the accelerometer's strength is not gravity's (the reason names g or degrees),
     `not-still` where the body moves or less than 0.2 s are there.
@@ -89,7 +89,7 @@ def standing_start(imu: ImuSamples, first_ns: int, last_ns: int, noise: ImuNoise
         return Failed("not-still", f"the body moves in {100 * (1 - share):.0f} % of the {seconds:.1f} s")
     up = mean / strength
     root = float(np.sqrt(seconds))
-    return StandingStart(
+    return RestEstimate(
         up,
         ImuBias(part.gyro_radps.mean(axis=0), (strength - GRAVITY_MPS2) * up),
         noise.gyro_density / root,

@@ -1,4 +1,4 @@
-"""Agreement of a contour with a laser profile: two methods compared, neither taken as truth."""
+"""Compare a contour with a laser profile: two methods compared, neither taken as truth."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
-from barsight.core.types import Agreement, Contour, LaserProfile, Source
+from barsight.core.types import Agreement, Contour, HeightSource, LaserProfile
 
 JUMP_M = 0.03
 _FURTHEST_M = 0.06
 _FEWEST_SHARED = 50
 
 
-def difference(contour: Contour, laser: LaserProfile) -> Float64:
-    """Vision minus laser (m) at each laser point (N,), NaN where vision measured nothing there."""
+def profile_difference(contour: Contour, laser: LaserProfile) -> Float64:
+    """Subtract the laser from vision (m) at each laser point (N,), NaN where vision measured
+    nothing there.
+    """
     if contour.x_m.size == 0:
         return np.full(laser.x_m.shape, np.nan)
-    measured = np.where(contour.source == Source.VISION, contour.z_m, np.nan)
+    measured = np.where(contour.source == HeightSource.VISION, contour.z_m, np.nan)
     spacing = contour.x_m[1] - contour.x_m[0] if contour.x_m.size > 1 else 0.01
     place = (laser.x_m - contour.x_m[0]) / spacing
     before = np.floor(place + 1e-3).astype(np.int64)
@@ -33,7 +35,9 @@ def difference(contour: Contour, laser: LaserProfile) -> Float64:
 
 
 def smooth_places(z_m: Float64, reach: int = 2) -> Bool:
-    """True along the last axis where no neighbour within `reach` samples lies over 30 mm higher or lower."""
+    """Mark smooth places along the last axis: no neighbour within `reach` samples over 30 mm higher
+    or lower.
+    """
     broken = np.zeros(z_m.shape, dtype=np.bool_)
     for k in range(1, reach + 1):
         jump = np.abs(z_m[..., k:] - z_m[..., :-k]) > JUMP_M
@@ -43,8 +47,8 @@ def smooth_places(z_m: Float64, reach: int = 2) -> Bool:
 
 
 def profile_shift(contour: Contour, laser: LaserProfile) -> tuple[float, float]:
-    """How far the laser's profile lies along x and above the contour, m: the shift of the smallest median of
-    absolute differences, to a fifth of a millimetre in x. NaN where fewer than 50 points can be compared.
+    """Register the laser's profile along x and z, m: the shift of the smallest median of absolute
+    differences, to a fifth of a millimetre in x. NaN where fewer than 50 points can be compared.
 
     A median over all points, so that steps seen from another side and gullies don't pull.
     """
@@ -53,7 +57,7 @@ def profile_shift(contour: Contour, laser: LaserProfile) -> tuple[float, float]:
     centre = 0.0
     for _ in range(2):
         for shift in centre + np.arange(-reach, reach + step / 2, step):
-            error = difference(contour, replace(laser, x_m=laser.x_m - shift))
+            error = profile_difference(contour, replace(laser, x_m=laser.x_m - shift))
             error = error[np.isfinite(error)]
             if error.size < _FEWEST_SHARED:
                 continue
@@ -67,12 +71,15 @@ def profile_shift(contour: Contour, laser: LaserProfile) -> tuple[float, float]:
     return found
 
 
-def agree(contour: Contour, laser: LaserProfile, speed_mps: float = float("nan")) -> Agreement | Failed:
-    """Bias, limits of agreement [Bland 1986], median, MAE, RMSE, P95 and max; coverage of the laser's points.
+def compute_agreement(
+    contour: Contour, laser: LaserProfile, speed_mps: float = float("nan")
+) -> Agreement | Failed:
+    """Compute bias, limits of agreement [Bland 1986], median, MAE, RMSE, P95, max and coverage of the laser's
+    points.
 
     Failed `no-overlap` where fewer than two points can be compared.
     """
-    error = difference(contour, laser)
+    error = profile_difference(contour, laser)
     compared = error[np.isfinite(error)] * 1e3
     if compared.size < 2:
         return Failed(

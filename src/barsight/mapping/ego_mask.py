@@ -1,4 +1,4 @@
-"""What travels along with the crane, such as its magnet: it stands still in the picture while the yard moves.
+"""Mask what travels with the crane, such as its magnet: it stands still in the picture while the yard moves.
 
 A view's depth and pose say where each pixel lies in the picture taken before or after it. Where the neighbour
 shows the same not there but where the pixel itself is, the thing was carried along, and no map takes it.
@@ -16,20 +16,21 @@ from barsight.core.types import RectifiedCamera
 _SHRINK = 4
 _SWING = 2
 """Shrunk pixels by which a thing that hangs may swing from one picture to the next."""
-_LEAST_WAY_PX = 6.0 * _SHRINK
-_WINDOW, _SMOOTH, _LEAST_SIZE, _MARGIN = 9, 15, 5, 7
+_MIN_WAY_PX = 6.0 * _SHRINK
+_WINDOW, _SMOOTH, _MIN_SIZE, _MARGIN = 9, 15, 5, 7
 _ALIKE = 0.6
 """Standing still explains the picture if its difference is at most this share of the motion's."""
-_LEAST_DIFFERENCE = 2.0
+_MIN_DIFFERENCE = 2.0
 
 
-def carried_along(
+def mask_carried(
     left: UInt8, disparity_px: Float32, camera: RectifiedCamera, neighbour: UInt8, neighbour_from_here: Pose
 ) -> Bool:
-    """(H, W) what stands still in the rectified left pictures `left` and `neighbour`, both (H, W).
+    """Detect stationary pixels (H, W) between the rectified left pictures `left` and `neighbour`, both (H,
+    W).
 
     neighbour_from_here: between the two views' rect0. Nothing is found where the yard itself moves by less
-    than `_LEAST_WAY_PX`, nor where the picture shows too little to tell.
+    than `_MIN_WAY_PX`, nor where the picture shows too little to tell.
     """
     here, there = _shrunk(left), _shrunk(neighbour)
     first = _SHRINK // 2
@@ -60,20 +61,20 @@ def carried_along(
         for j in range(2 * _SWING + 1):
             other = edge[i : i + here.shape[0], j : j + here.shape[1]]
             np.minimum(still, _difference(here, other), out=still)
-    found = ahead & (way > _LEAST_WAY_PX) & (by_motion > _LEAST_DIFFERENCE) & (still < _ALIKE * by_motion)
-    least, margin = np.ones((_LEAST_SIZE, _LEAST_SIZE), np.uint8), np.ones((_MARGIN, _MARGIN), np.uint8)
+    found = ahead & (way > _MIN_WAY_PX) & (by_motion > _MIN_DIFFERENCE) & (still < _ALIKE * by_motion)
+    least, margin = np.ones((_MIN_SIZE, _MIN_SIZE), np.uint8), np.ones((_MARGIN, _MARGIN), np.uint8)
     grown = cv2.dilate(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, least), margin)
     whole: Bool = cv2.resize(grown, left.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     return whole
 
 
 def _shrunk(image: UInt8) -> Float32:
-    """A quarter of the size, without what is brighter or darker over a wide area."""
+    """Downsample by four and subtract the local mean."""
     size = (image.shape[1] // _SHRINK, image.shape[0] // _SHRINK)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.asarray(small - cv2.blur(small, (_SMOOTH, _SMOOTH)), np.float32)
 
 
 def _difference(here: Float32, there: Float32) -> Float32:
-    """Mean absolute difference over a window."""
+    """Average the absolute difference over a window."""
     return np.asarray(cv2.blur(cv2.absdiff(here, there), (_WINDOW, _WINDOW)), np.float32)

@@ -56,7 +56,9 @@ class FreeSpace:
             self._merge(key, column, row, bound)
 
     def window(self, column: int, row: int, columns: int, rows: int) -> Float32:
-        """(rows, columns) bounds on the map's own cells from cell (column, row) on; inf where unproven."""
+        """Return (rows, columns): bounds on the map's own cells from cell (column, row) on; inf where
+        unproven.
+        """
         low_x, low_y = column // COARSE_CELLS, row // COARSE_CELLS
         shape = (
             (row + rows - 1) // COARSE_CELLS - low_y + 1,
@@ -93,7 +95,9 @@ class FreeSpace:
 def _overlap(
     key: TileKey, column: int, row: int, shape: tuple[int, ...]
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """The same cells as slices [y, x] of the tile and of an array whose first cell is (column, row)."""
+    """Return the same cells as slices [y, x] of the tile and of an array whose first cell is
+    (column, row).
+    """
     ours, theirs = [], []
     for tile, first, size in ((key[1], row, shape[0]), (key[0], column, shape[1])):
         low, high = max(tile * TILE, first), min((tile + 1) * TILE, first + size)

@@ -1,4 +1,4 @@
-"""Robust fusion: each cell keeps a few heights, every view votes for one, the best supported stays.
+"""Fuse views robustly: each cell keeps a few heights, every view votes for one, the best supported stays.
 
 A view's height joins the kept one within its gate (weighted mean, weighted squares for the scatter) or opens
 another; a wrong match thus stands alone and is outvoted. The work of a view doesn't depend on those before.
@@ -28,7 +28,7 @@ PRIOR_VIEWS = 4.0
 """How many views' worth the stated sigmas weigh against the views' own scatter."""
 
 
-def fuse(store: TileStore, view: CellObservations, settings: MapSettings) -> None:
+def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -> None:
     """Add one view to the tiles in `store`, of which as many more stay in memory as the view has touched."""
     columns, rows = view.x // TILE_CELLS, view.y // TILE_CELLS
     numbers = rows.astype(np.int64) * (1 << 31) + columns
@@ -50,7 +50,7 @@ def fuse(store: TileStore, view: CellObservations, settings: MapSettings) -> Non
             view.intensity,
             view.central,
             settings.gate_sigma,
-            settings.least_gate_m,
+            settings.min_gate_m,
         )
     store.hold(2 * edges.size)
 
@@ -69,7 +69,7 @@ def _vote(
     intensity: Float32,
     central: Bool,
     gate_sigma: float,
-    least_gate: float,
+    min_gate: float,
 ) -> None:
     for m in members:
         slots = tile[y[m] - first_row, x[m] - first_column]
@@ -82,7 +82,7 @@ def _vote(
                 continue
             gap = abs(slots[s, Z] - z[m])
             spread = variance[m] + 1.0 / slots[s, WEIGHT] + shared[m] ** 2 + slots[s, SHARED] ** 2
-            if gap < best_gap and gap <= max(gate_sigma * np.sqrt(spread), least_gate):
+            if gap < best_gap and gap <= max(gate_sigma * np.sqrt(spread), min_gate):
                 best, best_gap = s, gap
             if slots[s, VIEWS] < slots[weakest, VIEWS]:
                 weakest = s
@@ -114,7 +114,7 @@ def _vote(
 
 
 def height_sigma(slots: Float32) -> Float32:
-    """(N, FIELDS) fused heights to one sigma each (N,).
+    """Compute the sigma (N,) of fused heights (N, FIELDS).
 
     The weights' own noise, scaled by how the views really scatter, and the calibration's part whole: it is
     the same in all views and doesn't average out.

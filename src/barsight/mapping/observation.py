@@ -1,4 +1,4 @@
-"""One view's points to one observation per cell and surface: what a view can say about a cell, said once.
+"""Bin one view's points to one observation per cell and surface.
 
 Neighbouring pixels share their matching window, so their errors are nearly the same: the points of one view
 that fall into one cell count as a single observation whose variance is theirs, not theirs over their number.
@@ -37,7 +37,7 @@ class CellObservations:
     intensity: Float32
 
 
-def observe(
+def bin_points(
     points: StereoPoints,
     reference_from_rect0: Pose,
     body_origin_m: Float64,
@@ -45,7 +45,7 @@ def observe(
     cell_m: float,
     spacing_rad: float,
 ) -> CellObservations:
-    """Bring a view's points into the reference frame and gather them by cell.
+    """Transform a view's points to the reference frame and bin them by cell.
 
     body_origin_m: (3,) about which the attitude's error turns. covariance: (6, 6) of the body's pose,
     rotation then translation, reference axes. spacing_rad: angle between neighbouring points.
@@ -79,9 +79,9 @@ def _in_reference(
     xyz: Float32, range_sigma: Float32, shared_sigma: Float32, intensity: UInt8, rotation: Float64,
     translation: Float64, origin: Float64, about: Float64, cell_m: float, half_rad: float,
 ) -> tuple[Int32, Int32, Float32]:  # fmt: skip
-    """Cell numbers (N,) and, side by side in memory, what each point says (N, _SAID): its height, matching
-    variance, pose variance and shared sigma of the height, its grey level and whether it lies within half_rad
-    (half a pixel) of the cell's middle, along x and along y.
+    """Transform and pack: cell numbers (N,) and, side by side in memory, what each point says (N, _SAID): its
+    height, matching variance, pose variance and shared sigma of the height, its grey level and whether it
+    lies within half_rad (half a pixel) of the cell's middle, along x and along y.
 
     The height's error is the range error along the ray times the ray's slope, plus that of the pose:
     dz = dt_z + theta_x * q_y - theta_y * q_x for a point q as seen from the body.
@@ -119,7 +119,7 @@ def _in_reference(
 def _by_cell(
     x: Int32, y: Int32, said: Float32, low_x: int, low_y: int, width: int, height: int
 ) -> tuple[Float32, Int64]:
-    """Counting sort: what is said, cell by cell and row by row, and where each cell starts."""
+    """Sort by counting: what is said, cell by cell and row by row, and where each cell starts."""
     starts = np.zeros(width * height + 1, np.int64)
     for i in range(x.size):
         starts[(y[i] - low_y) * width + x[i] - low_x + 1] += 1
@@ -138,8 +138,9 @@ def _by_cell(
 def _gather(
     said: Float32, starts: Int64, cell_m: float
 ) -> tuple[Int64, Bool, Float32, Float32, Float32, Float32]:
-    """Within each cell, from the top: points no deeper than 4 sigma below the highest are one surface; those
-    below wait at the cell's front."""
+    """Merge within each cell, from the top: points no deeper than 4 sigma below the highest are one surface;
+    those below wait at the cell's front.
+    """
     count = said.shape[0]
     cell, middle = np.empty(count, np.int64), np.zeros(count, np.bool_)
     out = np.empty((4, count), np.float32)

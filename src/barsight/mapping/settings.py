@@ -1,4 +1,4 @@
-"""The settings of the map."""
+"""Define the settings of the map."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ class MapSettings:
     """Side of a cell; 0.01 in the yard, else fitted to the pictures' resolution."""
     min_views: int = 2
     """A cell seen in fewer frames is unknown (one is enough where the recording has only one)."""
-    least_shift: float = 0.0
+    min_shift: float = 0.0
     """A frame is matched once its picture has moved by this share of its shorter side; 0 matches them all."""
-    top_share: float = 0.35
+    top_ratio: float = 0.35
     """What may hide a cell: its highest height that has this share of the best-seen one's views."""
-    own_share: float = 0.7
+    own_ratio: float = 0.7
     """A height stands that has the votes of this share of the views with a free line of sight to it."""
-    along_share: float = 0.3
+    along_ratio: float = 0.3
     """Another stands if, averaged along a bar or an edge, it and its like have the votes of this share."""
     gate_sigma: float = 3.0
     """Heights nearer than this many sigma are one surface."""
-    least_gate_m: float = 0.015
+    min_gate_m: float = 0.015
     """Heights nearer than this are one surface however small their sigma."""
     along_m: float = 0.12
     """Heights are averaged so far to either side, along the direction in which they are most alike (a bar's
@@ -52,14 +52,14 @@ class MapSettings:
             raise ConfigError(f"cell_m must lie in 0.001...10, not {self.cell_m}")
         if self.min_views < 1 or self.resident_tiles < 16:
             raise ConfigError("min_views must be at least 1 and resident_tiles at least 16")
-        if not 0 <= self.least_shift <= 0.5:
-            raise ConfigError(f"least_shift must lie in 0...0.5, not {self.least_shift}")
+        if not 0 <= self.min_shift <= 0.5:
+            raise ConfigError(f"min_shift must lie in 0...0.5, not {self.min_shift}")
         if not 0 <= self.sharpen_px <= 5:
             raise ConfigError(f"sharpen_px must lie in 0...5, not {self.sharpen_px}")
-        for name in ("top_share", "own_share", "along_share"):
+        for name in ("top_ratio", "own_ratio", "along_ratio"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must lie in 0...1, not {getattr(self, name)}")
         if self.gate_sigma <= 0 or self.max_sigma_m <= 0:
             raise ConfigError("gate_sigma and max_sigma_m must be positive")
-        if min(self.least_gate_m, self.along_m, self.fill_m) < 0:
-            raise ConfigError("least_gate_m, along_m and fill_m can't be negative")
+        if min(self.min_gate_m, self.along_m, self.fill_m) < 0:
+            raise ConfigError("min_gate_m, along_m and fill_m can't be negative")

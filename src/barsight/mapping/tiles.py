@@ -1,4 +1,4 @@
-"""Square tiles of the map: a few in memory, the others on disk."""
+"""Store square tiles of the map: a few in memory, the others on disk."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class TileStore:
         self._versions: dict[TileKey, int] = {}
 
     def keys(self) -> list[TileKey]:
-        """All tiles that hold anything, in a fixed order."""
+        """Return all tiles that hold anything, in a fixed order."""
         return sorted(self._versions)
 
     def take(self, key: TileKey) -> Float32:
-        """The tile to read and write; a fresh one where there is none yet."""
+        """Fetch the tile to read and write; a fresh one where there is none yet."""
         tile = self._held.pop(key, None)
         if tile is None:
             self.hold(self._resident - 1)
@@ -57,7 +57,7 @@ class TileStore:
             np.save(self._file(oldest), evicted)
 
     def read(self, key: TileKey) -> Float32:
-        """A tile that holds something, not to be written to: it isn't kept if it lay on disk."""
+        """Read a tile that holds something, not to be written to: it isn't kept if it lay on disk."""
         tile = self._held.get(key)
         return np.load(self._file(key)) if tile is None else tile
 

@@ -1,4 +1,4 @@
-"""One frame's way: rectified pair and disparity, then points and what they say of the map's cells."""
+"""Process one frame: rectified pair and disparity, then points and map-cell observations."""
 
 from __future__ import annotations
 
@@ -11,56 +11,59 @@ from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair, StereoFrame
-from barsight.mapping.ego_mask import carried_along
-from barsight.mapping.observation import CellObservations, observe
-from barsight.stereo.masking import keep, surer_than, without_gaps
+from barsight.mapping.ego_mask import mask_carried
+from barsight.mapping.observation import CellObservations, bin_points
+from barsight.stereo.masking import mask_disparity, mask_gaps, mask_unsure
 from barsight.stereo.method import StereoMethod
-from barsight.stereo.search_range import find_range
+from barsight.stereo.search_range import find_disparity_range
 from barsight.stereo.settings import StereoSettings
-from barsight.stereo.triangulation import triangulate
+from barsight.stereo.triangulation import triangulate_disparity
 
 
 @dataclass(frozen=True, eq=False)
-class Matched:
-    """A frame before anybody knows where it was taken: its rectified pair, and its disparity or why not."""
+class MatchedFrame:
+    """A matched frame without pose: its rectified pair, and its disparity or why not."""
 
     pair: RectifiedPair
     disparity: Disparity | Failed
 
     @property
     def stamp_ns(self) -> int:
-        """The pair's."""
+        """Return the pair's stamp."""
         return self.pair.stamp_ns
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """cells: what the frame says of the map. left, disparity_px: (H, W), for people to look at."""
+class PosedView:
+    """A posed frame.
+
+    cells: its observations of the map. left, disparity_px: (H, W), for people to look at.
+    """
 
     cells: CellObservations
     left: UInt8
     disparity_px: Float32
 
 
-Neighbour = tuple[Matched, PosedFrame]
+Neighbour = tuple[MatchedFrame, PosedFrame]
 
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """From a frame to what it shows by itself: without state, so that frames run side by side."""
+    """Rectify and match a frame: without state, so that frames run side by side."""
 
     stereo: StereoSettings
     method: StereoMethod
     rectifier: Rectifier
     watch: Stopwatch
 
-    def __call__(self, frame: StereoFrame) -> Matched | Failed:
-        """Failed where the images have the wrong size; the disparity Failed where they are swapped or have no
-        texture.
+    def __call__(self, frame: StereoFrame) -> MatchedFrame | Failed:
+        """Rectify and match. Failed where the images have the wrong size; the disparity Failed where they are
+        swapped or have no texture.
         """
         with self.watch("rectify", 1):
             pair = self.rectifier(frame)
-        return pair if isinstance(pair, Failed) else Matched(pair, self._disparity(pair))
+        return pair if isinstance(pair, Failed) else MatchedFrame(pair, self._disparity(pair))
 
     def _disparity(self, pair: RectifiedPair) -> Disparity | Failed:
         candidates = disparity_range(pair, self.stereo)
@@ -71,14 +74,14 @@ class Matcher:
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.watch("stereo", 1):
-            sure = surer_than(self.method(pair, candidates), self.stereo.max_sigma_px)
-            return without_gaps(sure, pair.left, self.stereo.gap_darkness)
+            sure = mask_unsure(self.method(pair, candidates), self.stereo.max_sigma_px)
+            return mask_gaps(sure, pair.left, self.stereo.gap_darkness)
 
 
 @dataclass(frozen=True, eq=False)
-class Placer:
-    """From a matched frame and its pose to what it says of the map. per_pixel, max_sigma_m: see
-    `triangulate`.
+class PointBinner:
+    """Triangulate a matched frame and bin its points at its pose. per_pixel, max_sigma_m: see
+    `triangulate_disparity`.
     """
 
     stereo: StereoSettings
@@ -89,9 +92,10 @@ class Placer:
     watch: Stopwatch
 
     def __call__(
-        self, matched: Matched, posed: PosedFrame, beside: Sequence[Neighbour] = ()
-    ) -> View | Failed:
-        """beside: the frames before and after, against which the crane's own parts stand still.
+        self, matched: MatchedFrame, posed: PosedFrame, beside: Sequence[Neighbour] = ()
+    ) -> PosedView | Failed:
+        """Bin the frame's points. beside: the frames before and after, against which the crane's own parts
+        stand still.
 
         Failed where there is no disparity, or no depth within max_depth_m and max_sigma_m.
         """
@@ -102,13 +106,13 @@ class Placer:
         with self.watch("carried", 1):
             for other, pose in beside:
                 there_from_here = (pose.reference_from_body @ self.body_from_rect0).inverse()
-                still = carried_along(
+                still = mask_carried(
                     pair.left, disparity.disparity_px, pair.camera, other.pair.left,
                     there_from_here @ reference_from_rect0,
                 )  # fmt: skip
-                disparity = keep(disparity, ~still)
+                disparity = mask_disparity(disparity, ~still)
         with self.watch("points", 1):
-            points = triangulate(
+            points = triangulate_disparity(
                 pair,
                 disparity,
                 self.stereo.calibration_sigma_px,
@@ -117,20 +121,20 @@ class Placer:
                 self.per_pixel,
             )
             spacing_rad = 1 / (pair.camera.focal_px * self.per_pixel)
-            cells = observe(
+            cells = bin_points(
                 points, reference_from_rect0, posed.reference_from_body.translation, posed.covariance,
                 self.cell_m, spacing_rad,
             )  # fmt: skip
         if cells.z_m.size == 0:
             return Failed("no-depth", "no pixel has a depth within max_depth_m and max_sigma_m")
-        return View(cells, pair.left, disparity.disparity_px)
+        return PosedView(cells, pair.left, disparity.disparity_px)
 
 
 def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:
-    """The settings' range, its open ends found from the images."""
-    low, high = stereo.lowest_disparity_px, stereo.highest_disparity_px
+    """Complete the settings' disparity range, its open ends found from the images."""
+    low, high = stereo.min_disparity_px, stereo.max_disparity_px
     if low is None or high is None:
-        found = find_range(pair)
+        found = find_disparity_range(pair)
         if isinstance(found, Failed):
             return found
         low = found.lowest_px if low is None else low

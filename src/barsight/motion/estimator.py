@@ -1,4 +1,4 @@
-"""The one shape of every trajectory estimator."""
+"""Define the protocol of every trajectory estimator."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from barsight.recording.base import Recording
 
 
 class TrajectoryEstimator(Protocol):
-    """From a recording to the body's pose at every frame."""
+    """Protocol: estimate the body's pose at every frame of a recording."""
 
     def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """`advance` is called once a frame. Frames that can't be placed are refused with a reason."""
+        """Estimate; `advance` is called once a frame.
+
+        Frames that can't be placed are refused with a reason.
+        """
         ...

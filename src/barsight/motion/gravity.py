@@ -1,4 +1,4 @@
-"""Which way is up at the first frame, for recordings without a crane."""
+"""Align the first frame with gravity, for recordings without a crane."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from barsight.recording.base import Recording
 
 
 @dataclass(frozen=True)
-class Level:
+class GravityAlignment:
     """world_from_body: the first frame's pose, origin there, Z up. from_imu: whether gravity was measured."""
 
     world_from_body: Pose
@@ -22,8 +22,9 @@ class Level:
     warnings: tuple[str, ...]
 
 
-def level_attitude(recording: Recording) -> Level:
-    """Gravity from the IMU, 0.5 s before to 1 s after the first frame, else cam0's rows taken as level.
+def align_with_gravity(recording: Recording) -> GravityAlignment:
+    """Average gravity from the IMU, 0.5 s before to 1 s after the first frame, else take cam0's rows as
+    level.
 
     Without motion the accelerometer shows the reaction to gravity: its mean points up. World's X is cam0's
     viewing direction, or its x axis where the camera looks straight down, made level.
@@ -49,11 +50,15 @@ def level_attitude(recording: Recording) -> Level:
     forward = body_from_cam0[:, 2]
     if abs(forward @ up_in_body) > 0.9:
         forward = body_from_cam0[:, 0]
-    return Level(Pose("world", "body", _levelled(up_in_body, forward), np.zeros(3)), from_imu, warnings)
+    return GravityAlignment(
+        Pose("world", "body", _levelled(up_in_body, forward), np.zeros(3)), from_imu, warnings
+    )
 
 
 def _levelled(up: Float64, forward: Float64) -> Float64:
-    """(3, 3) world_from_body with world's Z along `up` and its X nearest to `forward`, both in `body`."""
+    """Build world_from_body (3, 3) with world's Z along `up` and its X nearest to `forward`, both
+    in `body`.
+    """
     x = forward - (forward @ up) * up
     x /= np.linalg.norm(x)
     rotation = np.vstack([x, np.cross(up, x), up])

@@ -1,14 +1,14 @@
-"""The choice of a trajectory estimator and its settings."""
+"""Define the choice of a trajectory estimator and its settings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
-from barsight.motion.crane.encoder_trajectory import CraneSettings, CraneTrajectory
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
+from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry
 from barsight.motion.estimator import TrajectoryEstimator
-from barsight.motion.fixed_lag.estimator import LiveSettings, LiveTrajectory
+from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
 from barsight.motion.frame_to_frame.stitching import PaperStitching, StitchingSettings
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.stereo_features import OdometrySettings
@@ -23,21 +23,21 @@ class MotionSettings:
     encoders, nominal attitude and the gyro's sway, no picture. odometry: frame to frame from the pictures
     alone, for comparison. paper: the paper's stitching by SVD."""
     fusion: FusionSettings = field(default_factory=FusionSettings)
-    live: LiveSettings = field(default_factory=LiveSettings)
+    live: FixedLagSettings = field(default_factory=FixedLagSettings)
     crane: CraneSettings = field(default_factory=CraneSettings)
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     stitching: StitchingSettings = field(default_factory=StitchingSettings)
 
 
 def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
-    """The estimator that the settings name."""
+    """Make the estimator that the settings name."""
     match settings.estimator:
         case "fused":
-            return FusedTrajectory(settings.fusion, settings.crane)
+            return BatchFusion(settings.fusion, settings.crane)
         case "live":
-            return LiveTrajectory(settings.fusion, settings.live, settings.crane)
+            return FixedLagFusion(settings.fusion, settings.live, settings.crane)
         case "crane":
-            return CraneTrajectory(settings.crane)
+            return EncoderOdometry(settings.crane)
         case "odometry":
             return StereoOdometry(settings.odometry)
         case "paper":

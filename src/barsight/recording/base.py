@@ -1,4 +1,4 @@
-"""What every reader offers: calibration, paired frames one at a time, and the slow sensors as arrays."""
+"""Define the protocol of every reader: calibration, paired frames one at a time, slow sensors as arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedF
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """How a recording is read."""
+    """Settings of reading a recording."""
 
     pair_tolerance_s: float = 0.002
     """How far apart the stamps of a left and a right picture may lie. Triggered cameras' stamps agree
@@ -70,37 +70,42 @@ class Recording(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what the reader had to assume (a frame rate, a missing file), for the result."""
+        """Return sentences on what the reader had to assume (a frame rate, a missing file), for the
+        result.
+        """
         ...
 
     @property
     def index(self) -> FrameIndex:
-        """The frames that `frames` will yield, without reading any image."""
+        """Index the frames that `frames` will yield, without reading any image."""
         ...
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
-        """The paired frames in time's order, decoded one at a time; a torn image yields a `RefusedFrame`.
+        """Yield the paired frames in time's order, decoded one at a time; a torn image yields a
+        `RefusedFrame`.
 
         wanted: the stamps of those to decode; all, if None.
         """
         ...
 
     def imu(self) -> ImuSamples | None:
-        """The IMU in `body`, or None where the recording has none."""
+        """Read the IMU in `body`, or None where the recording has none."""
         ...
 
     def imu_noise(self) -> ImuNoise | None:
-        """The IMU's noise densities and walks as the recording states them, or None."""
+        """Read the IMU's noise densities and walks as the recording states them, or None."""
         ...
 
     def crane(self) -> CraneSamples | None:
-        """The crane's encoders, or None."""
+        """Read the crane's encoders, or None."""
         ...
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """Reference profiles; empty where there are none."""
+        """Read reference profiles; empty where there are none."""
         ...
 
     def digests(self) -> dict[str, str]:
-        """SHA-256 of each input file that isn't an image (calibration, CSVs, bag), by relative name."""
+        """Compute SHA-256 of each input file that isn't an image (calibration, CSVs, bag), by
+        relative name.
+        """
         ...

@@ -1,4 +1,4 @@
-"""SHA-256 of input files, so that a result says which inputs it came from."""
+"""Compute SHA-256 of input files, so that a result says which inputs it came from."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from pathlib import Path
 
 
 def file_digests(root: Path, paths: Iterable[Path]) -> dict[str, str]:
-    """SHA-256 by the name relative to `root` (or the bare name outside it), of those paths that exist."""
+    """Compute SHA-256 by the name relative to `root` (or the bare name outside it), of those paths that
+    exist.
+    """
     digests = {}
     for path in paths:
         if path.is_file():

@@ -1,4 +1,4 @@
-"""Stored pictures to (H, W) uint8 gray, refusing what is torn.
+"""Decode stored pictures to (H, W) uint8 gray, refusing what is torn.
 
 OpenCV fills the missing rows of a cut PNG or JPEG with gray and says so on stderr only, so a picture is
 checked before it is decoded: a PNG chunk by chunk with its checksums, a JPEG by its end marker.
@@ -27,7 +27,7 @@ class TornImageError(ValueError):
 
 
 def decode_gray(data: bytes) -> UInt8:
-    """(H, W) uint8 out of the bytes of a PNG, JPEG or another file OpenCV reads.
+    """Decode the bytes of a PNG, JPEG or another file OpenCV reads to (H, W) uint8.
 
     Raises `TornImageError` for a picture that is cut short, damaged or of an unknown kind.
     """
@@ -35,7 +35,7 @@ def decode_gray(data: bytes) -> UInt8:
 
 
 def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
-    """What `decode_gray` gives, and (H, W, 3) uint8 BGR, None where the picture holds gray values only."""
+    """Decode to gray and to (H, W, 3) uint8 BGR, None where the picture holds gray values only."""
     image = _eight_bits(_decoded(data))
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         return to_gray(image), None
@@ -60,7 +60,7 @@ def _decoded(data: bytes) -> NDArray[Any]:
 
 
 def to_gray(image: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8:
-    """(H, W) uint8 out of (H, W), (H, W, 3) BGR or (H, W, 4) BGRA, 8 or 16 bits.
+    """Convert (H, W), (H, W, 3) BGR or (H, W, 4) BGRA, 8 or 16 bits, to (H, W) uint8.
 
     Raises `TornImageError` for other kinds, and for 16-bit pictures that use the lowest 12 bits only: those
     would come out all but black.

@@ -1,4 +1,4 @@
-"""What a recording holds: sensors, rates, gaps, pairs, calibration. Decodes one pair at most."""
+"""Describe what a recording holds: sensors, rates, gaps, pairs, calibration. Decodes one pair at most."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from barsight.core.arrays import Int64
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import CraneSamples, LaserProfile, RefusedFrame
 from barsight.recording.sensor_samples import imu_hints
-from barsight.recording.stored_images import Source
+from barsight.recording.stored_images import StoredPictures
 
 GAP_FACTOR = 1.5
 LARGE_SHIFT_S = 0.5
@@ -38,7 +38,7 @@ class StreamInfo:
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the last."""
+        """Return the time from the first sample to the last."""
         return (self.last_ns - self.first_ns) / NS_PER_S
 
 
@@ -75,7 +75,7 @@ class ProfileInfo:
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """Everything `barsight info` prints. dropped: pictures without partner, with the reason.
+    """Record of `barsight info`. dropped: pictures without partner, with the reason.
 
     first_refused: why the first pair can't be used, None where it can. notes: what the reader assumed and
     what looks odd.
@@ -94,8 +94,8 @@ class RecordingInfo:
     notes: tuple[str, ...]
 
 
-def describe(recording: Source) -> RecordingInfo:
-    """Look a recording through. Raises `InputError` where a sensor's file is wrong, as measuring would."""
+def describe_recording(recording: StoredPictures) -> RecordingInfo:
+    """Describe a recording. Raises `InputError` where a sensor's file is wrong, as measuring would."""
     stamps = recording.camera_stamps
     streams = [stream_info("cam0", stamps.left_ns), stream_info("cam1", stamps.right_ns)]
     notes = list(recording.notes)
@@ -122,7 +122,7 @@ def describe(recording: Source) -> RecordingInfo:
 
 
 def stream_info(name: str, stamp_ns: Int64) -> StreamInfo:
-    """Count, rate and gaps of increasing stamps (N,), N >= 1."""
+    """Count increasing stamps (N,), N >= 1, their rate and gaps."""
     steps = np.diff(stamp_ns)
     if steps.size == 0:
         return StreamInfo(name, stamp_ns.size, int(stamp_ns[0]), int(stamp_ns[-1]), float("nan"), 0, 0.0)
@@ -154,7 +154,7 @@ def _laser(profiles: Iterable[LaserProfile]) -> tuple[ProfileInfo, ...]:
 
 
 def _unit_notes(rig: StereoRig, crane: CraneSamples | None) -> Iterable[str]:
-    """Milliseconds and millimetres where seconds and metres belong."""
+    """Note milliseconds and millimetres where seconds and metres belong."""
     shift_s = rig.timeshift_cam_imu_ns / NS_PER_S
     if abs(shift_s) > LARGE_SHIFT_S:
         yield f"timeshift_cam_imu is {shift_s:g} s: check that it is not in milliseconds"
@@ -163,7 +163,7 @@ def _unit_notes(rig: StereoRig, crane: CraneSamples | None) -> Iterable[str]:
 
 
 def _time_notes(streams: Iterable[StreamInfo]) -> Iterable[str]:
-    """A sensor whose clock runs elsewhere: its samples don't span the pictures."""
+    """Note a sensor whose clock runs elsewhere: its samples don't span the pictures."""
     cam0, *others = streams
     for stream in others:
         before = (stream.first_ns - cam0.first_ns) / NS_PER_S

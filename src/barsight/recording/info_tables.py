@@ -1,4 +1,4 @@
-"""`RecordingInfo` as tables on a terminal."""
+"""Print `RecordingInfo` as tables on a terminal."""
 
 from __future__ import annotations
 

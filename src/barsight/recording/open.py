@@ -1,4 +1,6 @@
-"""One door for every format: `open_recording` looks at what lies at a path and takes the right reader."""
+"""Open a recording of any format: `open_recording` looks at what lies at a path and takes the right
+reader.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from barsight.recording.formats.bag import BagRecording
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.euroc import EurocRecording
 from barsight.recording.formats.kitti import KittiRecording, is_kitti
-from barsight.recording.stored_images import Source
+from barsight.recording.stored_images import StoredPictures
 
 BAG_KINDS = {".bag": "ros1", ".mcap": "ros2-mcap", ".db3": "ros2-sqlite3"}
 KNOWN = (
@@ -20,8 +22,8 @@ KNOWN = (
 )
 
 
-def open_recording(path: Path, settings: RecordingSettings | None = None) -> Source:
-    """The recording at `path`, of whichever format; calibration and the lists of pictures are checked.
+def open_recording(path: Path, settings: RecordingSettings | None = None) -> StoredPictures:
+    """Open the recording at `path`, of whichever format; calibration and the lists of pictures are checked.
 
     Raises `InputError` for no such folder or an unknown format, and what the readers raise.
     """
@@ -32,7 +34,7 @@ def open_recording(path: Path, settings: RecordingSettings | None = None) -> Sou
         raise InputError(name, "no permission to read it", "ask its owner or copy the recording") from None
 
 
-def _open(path: Path, settings: RecordingSettings) -> Source:
+def _open(path: Path, settings: RecordingSettings) -> StoredPictures:
     if not path.exists():
         raise InputError(path, "no such file or folder", "check the path")
     if path.is_file():
@@ -66,7 +68,7 @@ def _open_bag_folder(path: Path, bags: list[Path], settings: RecordingSettings) 
 
 
 def _hint(path: Path) -> str:
-    """The folder inside, where just one of them is a recording."""
+    """Find the folder inside, where just one of them is a recording."""
     inside = [
         child
         for child in sorted(path.iterdir())

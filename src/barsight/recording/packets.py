@@ -74,34 +74,34 @@ class PacketRecording:
 
     @property
     def index(self) -> FrameIndex:
-        """See `Recording.index`."""
+        """Return the index; see `Recording.index`."""
         return FrameIndex(tuple(self._frames), ())
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
-        """See `Recording.frames`."""
+        """Yield frames; see `Recording.frames`."""
         for stamp, refused in list(self._frames.items()):
             if wanted is None or stamp in wanted:
                 yield self._read(stamp) if refused is None else refused
 
     def imu(self) -> ImuSamples | None:
-        """See `Recording.imu`."""
+        """Read the IMU; see `Recording.imu`."""
         if len(self._imu) > 1:
             self._imu = [ImuSamples(*(_joined(self._imu, name) for name in _IMU))]
         return self._imu[0] if self._imu else None
 
     def imu_noise(self) -> ImuNoise | None:
-        """See `Recording.imu_noise`."""
+        """Read the IMU's noise; see `Recording.imu_noise`."""
         return self._noise
 
     def crane(self) -> CraneSamples | None:
-        """See `Recording.crane`."""
+        """Read the encoders; see `Recording.crane`."""
         if len(self._crane) > 1:
             joined = {name: _joined(self._crane, name) for name in ("stamp_ns", "position_m")}
             self._crane = [replace(self._crane[0], **joined)]
         return self._crane[0] if self._crane else None
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """See `Recording.laser`."""
+        """Read the laser; see `Recording.laser`."""
         return tuple(self._laser)
 
     def digests(self) -> dict[str, str]:
@@ -126,7 +126,7 @@ def _joined(parts: Sequence[ImuSamples | CraneSamples], name: str) -> Any:
 def _between(
     imu: ImuSamples | None, crane: CraneSamples | None, after_ns: int | None, last_ns: int | None
 ) -> Iterator[ImuSamples | CraneSamples]:
-    """The samples after one stamp up to another; None has no bound."""
+    """Return the samples after one stamp up to another; None has no bound."""
     for samples, names in ((imu, _IMU), (crane, ("stamp_ns", "position_m"))):
         if samples is not None:
             stamps = samples.stamp_ns

@@ -1,4 +1,4 @@
-"""Which left picture belongs to which right one, and a stored picture's decoding for its camera."""
+"""Pair left and right pictures by stamp, and decode a stored picture for its camera."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ class PairedStamps:
 
 
 class PairedAtOpening:
-    """What a `Recording` says of its stamps where the reader pairs them, as `_pairs`, when it opens."""
+    """Index of a `Recording` whose reader pairs the stamps, as `_pairs`, when it opens."""
 
     _pairs: PairedStamps
 
     @property
     def index(self) -> FrameIndex:
-        """See `Recording.index`."""
+        """Return the index; see `Recording.index`."""
         return self._pairs.index
 
     @property
     def camera_stamps(self) -> PairedStamps:
-        """All stamps of both cameras, paired or not."""
+        """Return all stamps of both cameras, paired or not."""
         return self._pairs
 
 
@@ -67,7 +67,7 @@ def decode_for(camera: Camera, data: bytes) -> UInt8:
 
 
 def expect_size(camera: Camera, image: UInt8) -> UInt8:
-    """The image itself; `TornImageError` where it does not have the calibration's size."""
+    """Return the image; `TornImageError` where it does not have the calibration's size."""
     height, width = image.shape
     if (width, height) != (camera.width, camera.height):
         raise TornImageError(f"is {width}x{height}, the calibration is for {camera.width}x{camera.height}")

@@ -1,15 +1,15 @@
-"""A recording seen through another calibration than its own."""
+"""View a recording through another calibration than its own."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.recording.wrapper import Forwarded
+from barsight.recording.wrapper import RecordingProxy
 
 
 @dataclass(frozen=True, eq=False)
-class Rigged(Forwarded):
+class RecordingWithRig(RecordingProxy):
     """`whole` with the calibration `own_rig`."""
 
     own_rig: StereoRig

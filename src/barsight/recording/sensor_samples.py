@@ -1,4 +1,4 @@
-"""The slow sensors' numbers, checked the same way whichever format they came from."""
+"""Check the slow sensors' numbers the same way whichever format they came from."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 
 
 def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_from_imu: Pose) -> ImuSamples:
-    """Samples turned into `body`.
+    """Rotate samples into `body`.
 
     gyro (rad/s), accel (m/s^2): (N, 3) in the IMU's axes. Where the IMU sits away from the body's origin the
     acceleration is not carried over (that takes the angular acceleration): lever arms are neglected.
@@ -34,7 +34,7 @@ def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_fr
 
 
 def imu_hints(samples: ImuSamples) -> tuple[str, ...]:
-    """Sentences on what looks odd in an IMU's samples but may be right."""
+    """List what looks odd in an IMU's samples but may be right."""
     hints = []
     gravity = float(np.median(np.linalg.norm(samples.accel_mps2, axis=1)))
     if not 8.0 < gravity < 12.0:
@@ -46,7 +46,10 @@ def imu_hints(samples: ImuSamples) -> tuple[str, ...]:
 
 
 def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> CraneSamples:
-    """The encoders' places with the mounting of the crane's `sensor.yaml`. Raises `CalibrationError`."""
+    """Build the encoders' places with the mounting of the crane's `sensor.yaml`.
+
+    Raises `CalibrationError`.
+    """
     rotation = np.array(document.numbers("R_yard_body", 9)).reshape(3, 3)
     try:
         nominal = Pose("yard", "body", rotation, np.zeros(3)).rotation
@@ -61,7 +64,7 @@ def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> Cran
 
 
 def make_laser(profile: Int64, xyz_m: Float64, range_std_m: float) -> tuple[LaserProfile, ...]:
-    """Profiles in the order of their numbers, each sorted by x. range_std_m is NaN where nobody states it."""
+    """Sort profiles by number and each by x. range_std_m is NaN where nobody states it."""
     profiles = []
     for number in np.unique(profile):
         rows = xyz_m[profile == number]
@@ -72,7 +75,7 @@ def make_laser(profile: Int64, xyz_m: Float64, range_std_m: float) -> tuple[Lase
 
 
 def laser_std(document: Document | None) -> float:
-    """The laser's range sigma (m) of its `sensor.yaml`; NaN where it isn't stated."""
+    """Read the laser's range sigma (m) of its `sensor.yaml`; NaN where it isn't stated."""
     if document is None or document.values.get("range_std_m") is None:
         return float("nan")
     return document.number("range_std_m")

@@ -1,4 +1,4 @@
-"""A recording with some of its sensors left out, as `--use` asks."""
+"""View a recording with some of its sensors left out, as `--use` asks."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.types import CraneSamples, ImuSamples
-from barsight.recording.wrapper import Forwarded
+from barsight.recording.wrapper import RecordingProxy
 
 
 @dataclass(frozen=True, eq=False)
-class SelectedSensors(Forwarded):
+class SelectedSensors(RecordingProxy):
     """`whole` seen through `use` (`stereo`, `imu`, `crane`); what isn't used isn't even read."""
 
     use: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Pictures as they are stored, for copying a recording from one format to another without decoding."""
+"""Define access to pictures as stored, for copying a recording without decoding."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ class StoredImage:
     data: bytes
 
 
-class Source(Recording, Protocol):
-    """A recording that hands out its pictures undecoded: all of Barsight's readers."""
+class StoredPictures(Recording, Protocol):
+    """Protocol of a recording that hands out its pictures undecoded: all of Barsight's readers."""
 
     @property
     def camera_stamps(self) -> PairedStamps:
-        """All pictures' stamps, paired or not."""
+        """Return all pictures' stamps, paired or not."""
         ...
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Every picture's bytes as stored, both cameras in time's order."""
+        """Yield every picture's bytes as stored, both cameras in time's order."""
         ...
 
 
-def merged(pairs: PairedStamps, left: Sequence[T], right: Sequence[T]) -> Iterator[tuple[int, int, T]]:
-    """(camera, stamp, item) of both cameras in time's order, cam0 first where they agree."""
+def merge_cameras(pairs: PairedStamps, left: Sequence[T], right: Sequence[T]) -> Iterator[tuple[int, int, T]]:
+    """Merge (camera, stamp, item) of both cameras in time's order, cam0 first where they agree."""
     both = [(int(stamp), 0, k) for k, stamp in enumerate(pairs.left_ns)]
     both += [(int(stamp), 1, k) for k, stamp in enumerate(pairs.right_ns)]
     for stamp, camera, k in sorted(both):

@@ -1,4 +1,4 @@
-"""A recording seen through something that changes a part of it; the rest is forwarded."""
+"""Forward a recording to a wrapper that changes a part of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from barsight.recording.base import FrameIndex, Recording
 
 
 @dataclass(frozen=True, eq=False)
-class Forwarded:
+class RecordingProxy:
     """`whole` as it is; a subclass answers differently where it must."""
 
     whole: Recording

@@ -1,4 +1,4 @@
-"""The rigid motion between two sets of matched points, with its covariance."""
+"""Align two sets of matched points rigidly, with covariance."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from barsight.core.arrays import Float64, expect_shape
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose, nearest_rotation, skew
 
-LEAST_POINTS = 3
-LEAST_WIDTH = 0.01
+MIN_POINTS = 3
+MIN_WIDTH = 0.01
 """Points that stray less than this share of their length from a line leave the turn about it open."""
 
 
@@ -35,14 +35,14 @@ class Alignment:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Of chi2: the coordinates beyond the six unknowns."""
+        """Return the degrees of freedom of chi2: the coordinates beyond the six unknowns."""
         return self.residuals_m.size - 6
 
 
-def align(
+def align_rigid(
     source: Float64, target: Float64, frames: tuple[str, str], covariance_m2: Float64 | None = None
 ) -> Alignment | Failed:
-    """The motion that brings `source` (N, 3) onto `target` (N, 3), m [paper Eq. 13-20, see below].
+    """Align `source` (N, 3) rigidly with `target` (N, 3), m [paper Eq. 13-20, see below].
 
     frames: (target, source). covariance_m2: (N, 3, 3) of each pair's difference, target axes; points count
     by its trace, and the stated covariance follows from it whole. Without it all count alike and one sigma
@@ -52,8 +52,8 @@ def align(
     """
     expect_shape("source", source, (None, 3))
     expect_shape("target", target, (len(source), 3))
-    if len(source) < LEAST_POINTS:
-        return Failed("few-points", f"{len(source)} pairs of points; {LEAST_POINTS} are the least")
+    if len(source) < MIN_POINTS:
+        return Failed("few-points", f"{len(source)} pairs of points; {MIN_POINTS} are the least")
     weight = np.ones(len(source))
     together = covariance_m2 is not None and covariance_m2.ndim == 2
     if covariance_m2 is not None:
@@ -93,10 +93,10 @@ def align(
 
 
 def _line(centred: Float64, weight: Float64) -> Failed | None:
-    """Failed where the points lie on a line."""
+    """Return Failed where the points lie on a line."""
     spread = np.sqrt(weight / weight.sum())[:, None] * centred
     length, width, _ = np.linalg.svd(spread, full_matrices=False)[1]
-    if length > 0 and width >= LEAST_WIDTH * length:
+    if length > 0 and width >= MIN_WIDTH * length:
         return None
     return Failed(
         "collinear",
@@ -106,12 +106,12 @@ def _line(centred: Float64, weight: Float64) -> Failed | None:
 
 
 def design_rows(turned: Float64) -> Float64:
-    """(N, 3, 6): how points (N, 3), about their centre, move with a small turn and with a shift."""
+    """Compute Jacobians (N, 3, 6) of points (N, 3), about their centre, by a small turn and a shift."""
     return np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2)
 
 
 def _times(spread: Float64, values: Float64) -> Float64:
-    """A covariance, (N, 3, 3) or (N, N), times values (N, 3, ...)."""
+    """Multiply a covariance, (N, 3, 3) or (N, N), by values (N, 3, ...)."""
     if spread.ndim == 2:
         return np.tensordot(spread, values, 1)
     product: Float64 = np.einsum("nij,nj...->ni...", spread, values)
@@ -119,7 +119,10 @@ def _times(spread: Float64, values: Float64) -> Float64:
 
 
 def _covariance(turned: Float64, centre: Float64, weight: Float64, spread: Float64) -> Float64:
-    """(6, 6): A^-1 B A^-1 of weighted least squares. centre: (3,) from the source's origin, target axes."""
+    """Compute A^-1 B A^-1 (6, 6) of weighted least squares.
+
+    centre: (3,) from the source's origin, target axes.
+    """
     design = design_rows(turned)
     weighted = weight[:, None, None] * design
     normal = np.einsum("nki,nkj->ij", weighted, design)

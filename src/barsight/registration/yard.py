@@ -1,4 +1,4 @@
-"""Where the world, or the rig, lies in the yard: an alignment judged, with targets set apart to check it."""
+"""Register the world, or the rig, in the yard and judge it by targets set apart."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
-from barsight.registration.rigid import Alignment, align, design_rows
+from barsight.registration.rigid import Alignment, align_rigid, design_rows
 
 DOUBTFUL = 0.001
 """Residuals rarer than this under the stated sigmas: those are too small, or a point is wrong."""
@@ -35,12 +35,12 @@ class YardCalibration:
 
     @property
     def turn_sigma_deg(self) -> float:
-        """The worst axis' standard deviation."""
+        """Return the worst axis' standard deviation."""
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.alignment.covariance[:3, :3])[-1])))
 
     @property
     def place_sigma_m(self) -> float:
-        """The frame's origin in the yard, worst axis."""
+        """Return the sigma of the frame's origin in the yard, worst axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.alignment.covariance[3:, 3:])[-1]))
 
 
@@ -48,16 +48,16 @@ def calibrate_yard(
     names: tuple[str, ...], measured: Float64, yard: Float64, covariance_m2: Float64 | None, checks: Bool,
     frame: str,
 ) -> YardCalibration | Failed:  # fmt: skip
-    """`yard_from_<frame>` from points measured in `frame` (N, 3) and known in the yard (N, 3), m.
+    """Estimate `yard_from_<frame>` from points measured in `frame` (N, 3) and known in the yard (N, 3), m.
 
-    covariance_m2: as `align` takes it, yard axes; None takes one sigma from the residuals.
+    covariance_m2: as `align_rigid` takes it, yard axes; None takes one sigma from the residuals.
     checks: (N,) points that are only compared. Failed `few-points`, `collinear`.
     """
     used = ~checks
     covariance = covariance_m2
     if covariance is not None:
         covariance = covariance[np.ix_(used, used)] if covariance.ndim == 2 else covariance[used]
-    found = align(measured[used], yard[used], ("yard", frame), covariance)
+    found = align_rigid(measured[used], yard[used], ("yard", frame), covariance)
     if isinstance(found, Failed):
         return found
     doubts: list[str] = []
@@ -91,7 +91,9 @@ def calibrate_yard(
 def _predicted(
     alignment: Alignment, measured: Float64, covariance_m2: Float64 | None, checks: Bool
 ) -> Float64:
-    """(N,) RMS over the axes of a point's own noise and, for checks, of where the alignment puts it."""
+    """Predict the RMS (N,) over the axes of a point's own noise and, for checks, of where the alignment puts
+    it.
+    """
     own = np.full(len(measured), alignment.sigma_m**2)
     if covariance_m2 is not None and covariance_m2.ndim == 2:
         own = np.diag(covariance_m2)

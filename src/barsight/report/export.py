@@ -1,4 +1,4 @@
-"""A measured cloud or map in other programs' formats, chosen by the file's name.
+"""Export a measured cloud or map to other programs' formats, chosen by the file's name.
 
 All keep metres and the reference frame. LAS and PCD keep sigma and view count as fields of their own; E57 has
 no place for them.

@@ -1,4 +1,4 @@
-"""The height map as pictures: read tile by tile, downsampled, coloured, ready for the page's SVG."""
+"""Render the height map as pictures: read tile by tile, downsampled, coloured, ready for the page's SVG."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.result_folder import TORN_TIFF
 
 BANDS = 4
 READ_BYTES = 1 << 22
 """tifffile would read ahead 256 MiB."""
 LONGEST_PX = 2400
-MOST_PIXELS = 3_000_000
-MOST_STRIPS = 12
+MAX_PIXELS = 3_000_000
+MAX_STRIPS = 12
 FOLD_ASPECT = 7.0
 """A map longer than this many times its breadth is folded into strips below each other."""
 
 Codes = dict[int, tuple[int, int, int]]
 SOURCE_RGB: Codes = {
-    Source.VISION: (68, 119, 170),
-    Source.LASER: (34, 136, 51),
-    Source.FILLED: (238, 119, 51),
+    HeightSource.VISION: (68, 119, 170),
+    HeightSource.LASER: (34, 136, 51),
+    HeightSource.FILLED: (238, 119, 51),
 }
 FILLED_TINT_RGB = (255, 90, 160)
 
@@ -64,9 +64,9 @@ class Strip:
 
 
 def strip_count(width: int, height: int) -> int:
-    """Into how many strips along X a map of this shape is folded."""
+    """Choose into how many strips along X a map of this shape is folded."""
     aspect = width / max(height, 1)
-    return 1 if aspect <= FOLD_ASPECT else min(MOST_STRIPS, int(np.ceil(aspect / (FOLD_ASPECT - 1))))
+    return 1 if aspect <= FOLD_ASPECT else min(MAX_STRIPS, int(np.ceil(aspect / (FOLD_ASPECT - 1))))
 
 
 def read_raster(path: Path) -> Raster:
@@ -105,14 +105,14 @@ def _reduce(path: Path, page: tifffile.TiffPage) -> Raster:
             _pool(np.where(known, values, 0), sums[band], row, column, step)
             _pool(known, counts[band], row, column, step)
         else:
-            for code in (Source.VISION, Source.LASER, Source.FILLED):
+            for code in (HeightSource.VISION, HeightSource.LASER, HeightSource.FILLED):
                 _pool(values == code, codes[code], row, column, step)
     with np.errstate(invalid="ignore"):
         z, sigma, views = np.where(counts > 0, sums / counts, np.nan).astype(np.float32)
     source = codes.argmax(axis=0).astype(np.uint8)
-    source[codes.sum(axis=0) == 0] = Source.UNKNOWN
-    views[(source == Source.UNKNOWN) | (views <= 0)] = np.nan
-    z[source == Source.UNKNOWN] = np.nan
+    source[codes.sum(axis=0) == 0] = HeightSource.UNKNOWN
+    views[(source == HeightSource.UNKNOWN) | (views <= 0)] = np.nan
+    z[source == HeightSource.UNKNOWN] = np.nan
     scale = page.tags["ModelPixelScaleTag"].value
     tie = page.tags["ModelTiepointTag"].value
     return Raster(z, sigma, views, source, float(scale[0]) * step, float(tie[3]), float(tie[4]), step)
@@ -121,7 +121,7 @@ def _reduce(path: Path, page: tifffile.TiffPage) -> Raster:
 def _choose_step(width: int, height: int) -> int:
     strip = -(-width // strip_count(width, height))
     longest = max(strip, height)
-    return max(1, -(-longest // LONGEST_PX), int(np.ceil(np.sqrt(width * height / MOST_PIXELS))))
+    return max(1, -(-longest // LONGEST_PX), int(np.ceil(np.sqrt(width * height / MAX_PIXELS))))
 
 
 def _pool(values: NDArray[np.generic], into: NDArray[np.generic], row: int, column: int, step: int) -> None:
@@ -136,26 +136,26 @@ def _pool(values: NDArray[np.generic], into: NDArray[np.generic], row: int, colu
 
 
 def _block_starts(first: int, count: int, step: int) -> NDArray[np.int64]:
-    """Where in a run of cells, the first of which is `first`, new blocks begin."""
+    """Find where in a run of cells, the first of which is `first`, new blocks begin."""
     boundaries = np.arange((first // step + 1) * step, first + count, step) - first
     return np.concatenate([[0], boundaries]).astype(np.int64)
 
 
 def colours(values: Float32, low: float, high: float, scale: int) -> UInt8:
-    """(H, W, 3) RGB on one of OpenCV's uniform colour scales; NaN gets the lowest colour."""
+    """Colour to RGB (H, W, 3) on one of OpenCV's uniform colour scales; NaN gets the lowest colour."""
     share = np.clip((np.nan_to_num(values, nan=low) - low) / max(high - low, 1e-9), 0, 1)
     painted = cv2.applyColorMap(np.round(share * 255).astype(np.uint8), scale)
     return np.asarray(painted[..., ::-1], dtype=np.uint8)
 
 
 def gradient_stops(scale: int, count: int = 9) -> tuple[str, ...]:
-    """The colour scale as CSS colours from low to high."""
+    """Sample the colour scale as CSS colours from low to high."""
     ramp = colours(np.linspace(0, 1, count, dtype=np.float32)[None], 0.0, 1.0, scale)[0]
     return tuple(f"rgb({r},{g},{b})" for r, g, b in ramp.tolist())
 
 
 def hillshade(z_m: Float32, cell_m: float) -> Float32:
-    """(H, W) light of a lamp in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat."""
+    """Shade (H, W) by a lamp in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat."""
     known = np.isfinite(z_m)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
     smooth = cv2.GaussianBlur(np.where(known, z_m, 0).astype(np.float32), (0, 0), 1.0)
@@ -168,26 +168,28 @@ def hillshade(z_m: Float32, cell_m: float) -> Float32:
 
 
 def paint_height(raster: Raster, low_m: float, high_m: float) -> UInt8:
-    """(H, W, 4): colour by height, darkened and lightened by the hillshade; filled cells tinted pink."""
+    """Paint (H, W, 4): colour by height, darkened and lightened by the hillshade; filled cells
+    tinted pink.
+    """
     base = colours(raster.z_m, low_m, high_m, cv2.COLORMAP_VIRIDIS).astype(np.float32)
     light = np.clip(hillshade(raster.z_m, raster.cell_m), 0.0, 1.4)[..., None]
     shaded = np.where(light < 1, base * (0.35 + 0.65 * light), base + (255 - base) * (light - 1) * 0.9)
-    filled = raster.source == Source.FILLED
+    filled = raster.source == HeightSource.FILLED
     shaded[filled] = 0.3 * shaded[filled] + 0.7 * np.array(FILLED_TINT_RGB)
     return _with_alpha(shaded, np.isfinite(raster.z_m))
 
 
 def paint_scale(values: Float32, low: float, high: float, scale: int) -> UInt8:
-    """(H, W, 4): a plain colour scale, transparent where NaN."""
+    """Paint (H, W, 4) by a plain colour scale, transparent where NaN."""
     return _with_alpha(colours(values, low, high, scale), np.isfinite(values))
 
 
 def paint_source(source: UInt8) -> UInt8:
-    """(H, W, 4): a colour per code, transparent where unknown."""
+    """Paint (H, W, 4): a colour per code, transparent where unknown."""
     picture = np.zeros((*source.shape, 3), np.uint8)
     for code, rgb in SOURCE_RGB.items():
         picture[source == code] = rgb
-    return _with_alpha(picture, source != Source.UNKNOWN)
+    return _with_alpha(picture, source != HeightSource.UNKNOWN)
 
 
 def _with_alpha(rgb: NDArray[np.generic], opaque: NDArray[np.bool_]) -> UInt8:
@@ -196,7 +198,7 @@ def _with_alpha(rgb: NDArray[np.generic], opaque: NDArray[np.bool_]) -> UInt8:
 
 
 def cut_strips(picture: UInt8, raster: Raster, *, lossless: bool) -> tuple[Strip, ...]:
-    """The picture in strips that fit a page, each a data URI of a WebP image."""
+    """Cut the picture into strips that fit a page, each a data URI of a WebP image."""
     height, width = picture.shape[:2]
     strips = []
     count = strip_count(width, height)
@@ -216,7 +218,7 @@ def cut_strips(picture: UInt8, raster: Raster, *, lossless: bool) -> tuple[Strip
 
 
 def data_uri(rgba: UInt8, *, lossless: bool) -> str:
-    """A picture (H, W, 4) as a data URI; OpenCV's WebP takes a quality over 100 for lossless."""
+    """Encode a picture (H, W, 4) as a data URI; OpenCV's WebP takes a quality over 100 for lossless."""
     quality = 101 if lossless else 88
     bgra = np.ascontiguousarray(rgba[..., [2, 1, 0, 3]])
     encoded: UInt8 = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, quality])[1]
@@ -224,7 +226,10 @@ def data_uri(rgba: UInt8, *, lossless: bool) -> str:
 
 
 def preview_uri(path: Path) -> str:
-    """preview.png, packed smaller, as a data URI; empty where there is none. InputError where it is torn."""
+    """Encode preview.png, packed smaller, as a data URI; empty where there is none.
+
+    InputError where it is torn.
+    """
     if not path.is_file():
         return ""
     stored = np.frombuffer(path.read_bytes(), dtype=np.uint8)
@@ -236,7 +241,7 @@ def preview_uri(path: Path) -> str:
 
 
 def robust_range(values: Float32 | Float64, low_pct: float, high_pct: float) -> tuple[float, float]:
-    """Percentiles of the finite values; (0, 1) where there are none, never an empty range."""
+    """Compute percentiles of the finite values; (0, 1) where there are none, never an empty range."""
     known = values[np.isfinite(values)]
     if known.size == 0:
         return 0.0, 1.0

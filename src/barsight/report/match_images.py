@@ -1,4 +1,4 @@
-"""Matches drawn on pictures as in the paper's figures 5, 8 and 9: features, raw against filtered, guided."""
+"""Draw matches on pictures as in the paper's figures 5, 8 and 9: features, raw against filtered, guided."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Picture:
 
 
 def match_pictures(example: MatchingExample) -> tuple[Picture, ...]:
-    """Features, raw and filtered matches, guided matches whole and enlarged."""
+    """Draw features, raw and filtered matches, guided matches whole and enlarged."""
     scale = min(1.0, LONGEST_PX / max(example.old.shape))
     wrong = ~example.filtered
     agreed, lost = example.agreed, ~example.agreed & np.isfinite(example.found).all(axis=1)
@@ -108,7 +108,7 @@ def _guided(example: MatchingExample, scale: float, corner: tuple[int, int], sha
 
 
 def _enlarged(example: MatchingExample) -> str:
-    """The window of the new picture that holds the most agreed points."""
+    """Find the window of the new picture that holds the most agreed points."""
     shown = example.found[example.agreed]
     best, most = (0, 0), -1
     height, width = CROP_PX
@@ -121,7 +121,7 @@ def _enlarged(example: MatchingExample) -> str:
 
 
 def _canvas(image: UInt8, scale: float) -> UInt8:
-    """(H, W, 3) the picture, stretched in brightness and a little darkened so that lines show."""
+    """Stretch the picture (H, W, 3) in brightness, a little darkened so that lines show."""
     low, high = np.percentile(image, (1, 99.5))
     light = np.clip((image - low) * (215 / max(high - low, 1.0)), 0, 230).astype(np.uint8)
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC

@@ -1,4 +1,4 @@
-"""The page of `barsight odometry`: path, velocity, biases, residuals, drift, matches; and its JSON."""
+"""Write the page of `barsight odometry`: path, velocity, biases, residuals, drift, matches; and its JSON."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import barsight
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
-from barsight.core.motion_detail import InSigmas
+from barsight.core.motion_detail import NormalisedResiduals
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import Trajectory
 from barsight.evaluation.trajectory_error import Drift, FrameErrors
 from barsight.motion.frontend.matching_example import MatchingExample
 from barsight.report.match_images import match_pictures
-from barsight.report.page import Figure, number, write_summary_page
+from barsight.report.page import KeyFigure, format_number, write_summary_page
 from barsight.report.page_trajectory import path_plots
-from barsight.report.plots import SERIES, Plot, Trace, keep_extremes, numbers
+from barsight.report.plots import SERIES, Plot, Trace, json_numbers, keep_extremes
 from barsight.result_folder import CameraPath
 
-MOST_POINTS = 6000
+MAX_POINTS = 6000
 AXES = "xyz"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OdometryResult:
-    """What the page is made of. frames: of the recording. example: a pair's matches, or why there are none.
+    """Content of the page. frames: of the recording. example: a pair's matches, or why there are none.
     drift, errors: None without truth.
     """
 
@@ -53,7 +53,7 @@ def write_odometry_page(result: OdometryResult, html: Path, data: Path) -> None:
 
 
 def odometry_summary(result: OdometryResult) -> dict[str, Any]:
-    """Everything of the page as JSON values; NaN is null."""
+    """Collect everything of the page as JSON values; NaN is null."""
     trajectory, detail = result.trajectory, result.trajectory.detail
     frames: list[dict[str, Any]] = [
         {
@@ -104,35 +104,35 @@ def odometry_summary(result: OdometryResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _figures(result: OdometryResult) -> list[Figure]:
+def _figures(result: OdometryResult) -> list[KeyFigure]:
     trajectory, drift = result.trajectory, result.drift
     sigma = _sigmas(trajectory)
     turn, place = (
         float(np.sqrt((sigma[:, part] ** 2).sum(axis=1).mean())) for part in (slice(3), slice(3, 6))
     )
     figures = [
-        Figure(
+        KeyFigure(
             "Frames", f"{len(trajectory.frames)} of {result.frames}", f"{len(trajectory.refused)} refused"
         ),
-        Figure("Way", number(trajectory.length_m, 2, "m"), f"in {trajectory.reference}"),
-        Figure(
+        KeyFigure("Way", format_number(trajectory.length_m, 2, "m"), f"in {trajectory.reference}"),
+        KeyFigure(
             "Stated sigma",
-            number(place * 1e3, 2, "mm"),
-            number(math.degrees(turn), 4, "°"),
+            format_number(place * 1e3, 2, "mm"),
+            format_number(math.degrees(turn), 4, "°"),
         ),
     ]
     if drift is not None:
-        figures.append(Figure(
-            "Against truth, aligned", number(drift.aligned_rmse_mm, 2, "mm"),
-            f"{number(drift.aligned_rmse_deg, 3, '°')} RMSE"))  # fmt: skip
+        figures.append(KeyFigure(
+            "Against truth, aligned", format_number(drift.aligned_rmse_mm, 2, "mm"),
+            f"{format_number(drift.aligned_rmse_deg, 3, '°')} RMSE"))  # fmt: skip
         if not math.isnan(drift.reference_rmse_mm):
-            nees = f"{number(drift.nees_position, 2)} and {number(drift.nees_attitude, 2)}"
-            figures.append(Figure(
-                "In the yard", number(drift.reference_rmse_mm, 2, "mm"),
-                f"{number(drift.reference_rmse_deg, 3, '°')} RMSE; NEES {nees}"))  # fmt: skip
+            nees = f"{format_number(drift.nees_position, 2)} and {format_number(drift.nees_attitude, 2)}"
+            figures.append(KeyFigure(
+                "In the yard", format_number(drift.reference_rmse_mm, 2, "mm"),
+                f"{format_number(drift.reference_rmse_deg, 3, '°')} RMSE; NEES {nees}"))  # fmt: skip
         if not math.isnan(drift.drift_percent):
             note = f"over {drift.least_way_m:.0f} m and more"
-            figures.append(Figure("Drift", number(drift.drift_percent, 3, "%"), note))
+            figures.append(KeyFigure("Drift", format_number(drift.drift_percent, 3, "%"), note))
     return figures
 
 
@@ -143,7 +143,7 @@ def _path(trajectory: Trajectory) -> tuple[Plot, ...]:
 
 
 def _states(result: OdometryResult) -> list[Plot]:
-    """Velocity and biases with two sigma to either side."""
+    """Draw velocity and biases with two sigma to either side."""
     detail = result.trajectory.detail
     if detail is None or detail.inertial is None:
         return []
@@ -184,8 +184,8 @@ def _in_sigmas(result: OdometryResult) -> list[Plot]:
     return plots
 
 
-def _innovations(part: InSigmas, trajectory: Trajectory) -> Plot:
-    """With the band in which 99.7 % lie where the prediction's sigma is right."""
+def _innovations(part: NormalisedResiduals, trajectory: Trajectory) -> Plot:
+    """Draw innovations with the band in which 99.7 % lie where the prediction's sigma is right."""
     time = _seconds(part.stamp_ns, trajectory)
     traces = [_line(label, time, part.values[:, k], k) for k, label in enumerate(part.names)]
     for side in (-3.0, 3.0):
@@ -199,7 +199,7 @@ def _innovations(part: InSigmas, trajectory: Trajectory) -> Plot:
     return _over_time("innovations-step", "sigma", traces, caption)
 
 
-def _sensor(name: str, part: InSigmas, caption: str, trajectory: Trajectory) -> Plot:
+def _sensor(name: str, part: NormalisedResiduals, caption: str, trajectory: Trajectory) -> Plot:
     time = _seconds(part.stamp_ns, trajectory)
     traces = [_line(label, time, part.values[:, k], k) for k, label in enumerate(part.names)]
     return _over_time(
@@ -208,7 +208,7 @@ def _sensor(name: str, part: InSigmas, caption: str, trajectory: Trajectory) -> 
 
 
 def _sigma(result: OdometryResult) -> list[Plot]:
-    """Stated sigma of every frame, and where there is truth the errors."""
+    """Draw the stated sigma of every frame, and where there is truth the errors."""
     trajectory = result.trajectory
     time, sigma = _seconds(trajectory.stamp_ns, trajectory), _sigmas(trajectory)
     plots = []
@@ -241,13 +241,13 @@ def _rig_drift(trajectory: Trajectory) -> dict[str, float] | None:
 
 
 def _sigmas(trajectory: Trajectory) -> Float64:
-    """(F, 6) of attitude (rad) and place (m)."""
+    """Compute sigmas (F, 6) of attitude (rad) and place (m)."""
     variances = np.array([np.diag(frame.covariance) for frame in trajectory.frames])
     return np.asarray(np.sqrt(variances), np.float64)
 
 
 def _seconds(stamp_ns: Int64, trajectory: Trajectory) -> Float64:
-    """Since the first placed frame."""
+    """Compute seconds since the first placed frame."""
     result: Float64 = (stamp_ns - trajectory.stamp_ns[0]) / NS_PER_S
     return result
 
@@ -258,12 +258,16 @@ def _over_time(name: str, title: str, traces: list[Trace], caption: str) -> Plot
 
 
 def _line(name: str, x: Float64, y: Float64, colour: int) -> Trace:
-    kept = keep_extremes(y, MOST_POINTS)
+    kept = keep_extremes(y, MAX_POINTS)
     return {
-        "type": "scatter", "mode": "lines+markers" if x.size <= 60 else "lines", "name": name,
-        "x": numbers(x[kept], 3), "y": numbers(y[kept], 5), "line": {"color": SERIES[colour], "width": 1.4},
+        "type": "scatter",
+        "mode": "lines+markers" if x.size <= 60 else "lines",
+        "name": name,
+        "x": json_numbers(x[kept], 3),
+        "y": json_numbers(y[kept], 5),
+        "line": {"color": SERIES[colour], "width": 1.4},
         "marker": {"color": SERIES[colour], "size": 4},
-    }  # fmt: skip
+    }
 
 
 def _or_null(row: Float64) -> list[float] | None:

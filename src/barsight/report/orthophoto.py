@@ -1,4 +1,6 @@
-"""The orthophoto: the grey level of each cell's height, as a GeoTIFF on height.tif's grid and as a PNG."""
+"""Write the orthophoto: the grey level of each cell's height, as a GeoTIFF on height.tif's grid and
+as a PNG.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ _COLUMNS = 1024
 
 
 def georeference(surface: Surface) -> list[tuple[int, str, int, Any, bool]]:
-    """Tags that place a raster of the surface: a projected system of its own (32767), pixels as areas, m."""
+    """Make the tags that place a raster of the surface: a projected system of its own (32767), pixels as
+    areas, m.
+    """
     cell = surface.cell_m
     left, top = (surface.columns[0] - 0.5) * cell, (surface.rows[1] - 0.5) * cell
     keys = (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32767, 3076, 0, 1, 9001)
@@ -31,7 +35,9 @@ def georeference(surface: Surface) -> list[tuple[int, str, int, Any, bool]]:
 
 
 def orthophoto(surface: Surface) -> UInt8:
-    """(rows, columns) grey levels from 1, NO_DATA where no view saw the cell; row 0 at the highest y."""
+    """Render grey levels (rows, columns) from 1, NO_DATA where no view saw the cell; row 0 at the
+    highest y.
+    """
     rows, columns = surface.shape
     picture = np.empty((rows, columns), np.uint8)
     for column in range(0, columns, _COLUMNS):
@@ -42,7 +48,7 @@ def orthophoto(surface: Surface) -> UInt8:
 
 
 def write_orthophoto(surface: Surface, folder: Path) -> None:
-    """ortho.tif and ortho.png, each whole or not at all."""
+    """Write ortho.tif and ortho.png, each whole or not at all."""
     picture = orthophoto(surface)
     with atomic_path(folder / "ortho.tif") as path:
         tifffile.imwrite(

@@ -1,4 +1,4 @@
-"""The report page: one self-contained HTML file from the files of a measured folder."""
+"""Write the report page: one self-contained HTML file from the files of a measured folder."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ import jinja2
 from plotly.offline import get_plotlyjs
 
 from barsight.core.files import atomic_path
-from barsight.core.parallel import beside
+from barsight.core.parallel import in_background
 from barsight.report.map_images import preview_uri, read_raster
 from barsight.report.match_images import Picture
 from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_trajectory import path_plots
 from barsight.report.page_yard import yard_part
-from barsight.report.plots import Plot, compare, contour_plot, histogram_plot, limits_plot
+from barsight.report.plots import Plot, contour_plot, histogram_plot, limits_plot, pair_with_laser
 from barsight.result_folder import read_contours, read_laser, read_path, read_summary
 
 NONE = "–"
 
 
 @dataclass(frozen=True)
-class Figure:
+class KeyFigure:
     """A key figure of the first lines: what it is, its value with unit, and a note in small print."""
 
     label: str
@@ -48,9 +48,14 @@ def write_report(out_dir: Path, target: Path) -> None:
 
 
 def write_summary_page(
-    template: str, summary: dict[str, Any], figures: list[Figure], plots: list[Plot], html: Path, data: Path,
+    template: str,
+    summary: dict[str, Any],
+    figures: list[KeyFigure],
+    plots: list[Plot],
+    html: Path,
+    data: Path,
     pictures: Sequence[Picture] = (),
-) -> None:  # fmt: skip
+) -> None:
     """Write a page of key figures and plots to `html`, and its summary as JSON to `data`, each whole or not
     at all. The template finds the plots in `plots`, by name, and the pictures in `pictures`."""
     with atomic_path(data) as path:
@@ -65,14 +70,14 @@ def write_summary_page(
 
 
 def render_page(out_dir: Path) -> str:
-    """The page's HTML; see `write_report`."""
+    """Render the page's HTML; see `write_report`."""
     result = read_summary(out_dir)
     laser = read_laser(out_dir)
-    compared = compare(read_contours(out_dir), laser)
+    compared = pair_with_laser(read_contours(out_dir), laser)
     path = read_path(out_dir)
     height = out_dir / "height.tif"
     raster = read_raster(height) if height.is_file() else None
-    with beside(lambda: yard_part(out_dir, raster)) as drawn:
+    with in_background(lambda: yard_part(out_dir, raster)) as drawn:
         maps: tuple[MapFigure, ...] = map_figures(raster, laser) if raster else ()
     contours = [contour_plot(item) for item in compared]
     agreement = [
@@ -103,71 +108,79 @@ def render_page(out_dir: Path) -> str:
     )
 
 
-def key_figures(result: dict[str, Any]) -> list[Figure]:
-    """What an operator looks at first."""
+def key_figures(result: dict[str, Any]) -> list[KeyFigure]:
+    """Select the figures that an operator looks at first."""
     frames = result.get("frames") or {}
     trajectory = result.get("trajectory") or {}
     surface = result.get("map") or {}
     refused = len(frames.get("refused") or [])
     figures = [
-        Figure(
+        KeyFigure(
             "Frames used", f"{frames.get('used', NONE)} of {frames.get('total', NONE)}", f"{refused} refused"
         ),
-        Figure(
-            "Way", number(trajectory.get("length_m"), 2, "m"), number(trajectory.get("duration_s"), 1, "s")
+        KeyFigure(
+            "Way",
+            format_number(trajectory.get("length_m"), 2, "m"),
+            format_number(trajectory.get("duration_s"), 1, "s"),
         ),
     ]
     for row in result.get("agreement") or []:
-        everywhere = f"{number(row.get('mae_mm'), 1, 'mm')} with steps and gullies"
-        note = f"{everywhere}, coverage {number(row.get('coverage_pct'), 1, '%')}"
+        everywhere = f"{format_number(row.get('mae_mm'), 1, 'mm')} with steps and gullies"
+        note = f"{everywhere}, coverage {format_number(row.get('coverage_pct'), 1, '%')}"
         label = f"MAE to laser, smooth places, profile {row.get('profile')}"
-        figures.append(Figure(label, number(row.get("smooth_mae_mm"), 1, "mm"), note))
+        figures.append(KeyFigure(label, format_number(row.get("smooth_mae_mm"), 1, "mm"), note))
     cells = {key: surface.get(f"cells_{key}") or 0 for key in ("seen", "filled", "unknown")}
     total = sum(cells.values())
     share = {key: 100 * count / total if total else math.nan for key, count in cells.items()}
-    note = f"filled {number(share['filled'], 1, '%')}, unknown {number(share['unknown'], 1, '%')}"
-    figures.append(Figure("Map seen", number(share["seen"], 1, "%"), note))
+    note = (
+        f"filled {format_number(share['filled'], 1, '%')}, unknown {format_number(share['unknown'], 1, '%')}"
+    )
+    figures.append(KeyFigure("Map seen", format_number(share["seen"], 1, "%"), note))
     sigma = surface.get("median_sigma_m")
     cell = surface.get("cell_m")
     figures.append(
-        Figure(
+        KeyFigure(
             "Median sigma",
-            number(None if sigma is None else sigma * 1e3, 1, "mm"),
-            f"cells of {number(None if cell is None else cell * 1e3, 0, 'mm')}",
+            format_number(None if sigma is None else sigma * 1e3, 1, "mm"),
+            f"cells of {format_number(None if cell is None else cell * 1e3, 0, 'mm')}",
         )
     )
-    each = f"{number((result.get('seconds') or 0.0) / max(frames.get('used') or 1, 1), 2, 's')} per frame"
-    figures.append(Figure("Time to measure", number(result.get("seconds"), 1, "s"), each))
-    figures.append(Figure("Peak memory", number(result.get("peak_memory_mib"), 0, "MiB")))
+    each = (
+        f"{format_number((result.get('seconds') or 0.0) / max(frames.get('used') or 1, 1), 2, 's')} per frame"
+    )
+    figures.append(KeyFigure("Time to measure", format_number(result.get("seconds"), 1, "s"), each))
+    figures.append(KeyFigure("Peak memory", format_number(result.get("peak_memory_mib"), 0, "MiB")))
     return figures
 
 
-def number(value: Any, decimals: int = 1, unit: str = "") -> str:
-    """A number for people, with a narrow space per thousand and the unit; a dash where there is none."""
+def format_number(value: Any, decimals: int = 1, unit: str = "") -> str:
+    """Format a number for people, with a narrow space per thousand and the unit; a dash where there
+    is none.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         return NONE
     text = f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
     return f"{text}\u00a0{unit}" if unit else text
 
 
-def plain(value: Any) -> str:
-    """Any value of result.json in one line."""
+def format_value(value: Any) -> str:
+    """Format any value of result.json in one line."""
     if isinstance(value, float):
         return f"{value:.6g}"
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Nested settings as dotted names with their values."""
+    """Flatten nested settings to dotted names with their values."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from flatten(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}", plain(value)
+            yield f"{prefix}{key}", format_value(value)
 
 
 def _stages(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """The stages with their share of the whole time (%) and, where done by frame, seconds per frame."""
+    """List the stages with their part of the whole time (%) and, where done by frame, seconds per frame."""
     stages = result.get("stages") or []
     whole = sum(stage.get("seconds") or 0.0 for stage in stages)
     rows = []
@@ -189,13 +202,15 @@ def _refused_by_stage(result: dict[str, Any]) -> dict[str, int]:
 
 
 def plot_json(plots: list[Plot]) -> str:
-    """All figures for the script; `<` is escaped so that no text can end the element that carries it."""
+    """Serialise all figures for the script; `<` is escaped so that no text can end the element that carries
+    it.
+    """
     figures = {plot.name: {"data": plot.traces, "layout": plot.layout} for plot in plots}
     return json.dumps(figures, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def environment() -> jinja2.Environment:
-    """What fills the pages' templates: escaping, the package's own files, numbers for people."""
+    """Make the templates' environment: escaping, the package's own files, numbers for people."""
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(resource),
         autoescape=True,
@@ -203,11 +218,11 @@ def environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["number"] = number
-    environment.filters["plain"] = plain
+    environment.filters["number"] = format_number
+    environment.filters["plain"] = format_value
     return environment
 
 
 def resource(name: str) -> str:
-    """The text of one of this package's files."""
+    """Read the text of one of this package's files."""
     return resources.files("barsight.report").joinpath("templates", name).read_text(encoding="utf-8")

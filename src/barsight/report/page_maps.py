@@ -1,4 +1,4 @@
-"""The page's maps: pictures of the height map with axes, a colour bar and a key, laid out for SVG."""
+"""Lay out the page's maps for SVG: pictures of the height map with axes, a colour bar and a key."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import UInt8
-from barsight.core.types import LaserProfile, Source
+from barsight.core.types import HeightSource, LaserProfile
 from barsight.report.map_images import (
     FILLED_TINT_RGB,
     SOURCE_RGB,
@@ -37,7 +37,7 @@ class Tick:
 
 
 @dataclass(frozen=True)
-class Level:
+class MapLine:
     """A dashed line across the map, a laser profile."""
 
     place: float
@@ -56,12 +56,12 @@ class Shape:
 
     @property
     def path(self) -> str:
-        """The points as SVG wants them."""
+        """Format the points as SVG wants them."""
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Where the label goes."""
+        """Return the label's place."""
         low, high = np.min(self.points, axis=0), np.max(self.points, axis=0)
         return float((low[0] + high[0]) / 2), float((low[1] + high[1]) / 2)
 
@@ -79,7 +79,7 @@ class Drawing:
     text_size: float
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
-    levels: tuple[Level, ...]
+    levels: tuple[MapLine, ...]
     scale: float
     corner_m: tuple[float, float]
     shapes: tuple[Shape, ...] = ()
@@ -118,7 +118,7 @@ UNKNOWN_KEY = Key("unknown")
 
 
 def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFigure, ...]:
-    """Height first, then sigma, views and source."""
+    """Draw height first, then sigma, views and source."""
     low, high = robust_range(raster.z_m, 1, 99)
     scaled = f" Each pixel is the mean of {raster.step} × {raster.step} cells." if raster.step > 1 else ""
     levels = tuple((f"profile {p.profile}", float(np.median(p.y_m))) for p in laser if p.y_m.size)
@@ -133,7 +133,7 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         _bar(low * 1e3, high * 1e3, cv2.COLORMAP_VIRIDIS, "mm"),
         (tint, UNKNOWN_KEY),
     )
-    _, worst = robust_range(raster.sigma_m[raster.source == Source.VISION], 1, 95)
+    _, worst = robust_range(raster.sigma_m[raster.source == HeightSource.VISION], 1, 95)
     sigma = MapFigure(
         "sigma",
         "Uncertainty",
@@ -151,7 +151,7 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         _bar(0, most, cv2.COLORMAP_CIVIDIS, "views"),
         (UNKNOWN_KEY,),
     )
-    names = {Source.VISION: "vision", Source.LASER: "laser", Source.FILLED: "filled"}
+    names = {HeightSource.VISION: "vision", HeightSource.LASER: "laser", HeightSource.FILLED: "filled"}
     source = MapFigure(
         "source",
         "Source",
@@ -171,7 +171,10 @@ def draw_map(
     *,
     lossless: bool = False,
 ) -> tuple[Drawing, ...]:
-    """A picture in strips with axes around them. levels: label and y (m) of lines across; text: its size."""
+    """Draw a picture in strips with axes around them.
+
+    levels: label and y (m) of lines across; text: its size.
+    """
     strips = cut_strips(picture, raster, lossless=lossless)
     widest = max(strip.x_max_m - strip.x_min_m for strip in strips)
     tall = raster.z_m.shape[0] * raster.cell_m
@@ -180,7 +183,7 @@ def draw_map(
 
 
 def _drawing(strip: Strip, scale: float, levels: tuple[tuple[str, float], ...], text: float) -> Drawing:
-    """`scale` is drawing units per metre."""
+    """Lay out one strip; `scale` is drawing units per metre."""
     left, top = 4.6 * text, 0.8 * text
     height = (strip.y_max_m - strip.y_min_m) * scale
     return Drawing(
@@ -200,7 +203,7 @@ def _drawing(strip: Strip, scale: float, levels: tuple[tuple[str, float], ...], 
             for value, label in _ticks(strip.y_min_m, strip.y_max_m, 2.5 * text / scale)
         ),
         levels=tuple(
-            Level(top + (strip.y_max_m - y) * scale, label)
+            MapLine(top + (strip.y_max_m - y) * scale, label)
             for label, y in levels
             if strip.y_min_m < y < strip.y_max_m
         ),
@@ -209,10 +212,10 @@ def _drawing(strip: Strip, scale: float, levels: tuple[tuple[str, float], ...], 
     )
 
 
-def _ticks(low: float, high: float, least_step: float) -> list[tuple[float, str]]:
-    """Round values between low and high, at least `least_step` apart."""
-    power = 10.0 ** np.floor(np.log10(least_step))
-    step = next(power * factor for factor in (1, 2, 5, 10, 20) if power * factor >= least_step)
+def _ticks(low: float, high: float, min_step: float) -> list[tuple[float, str]]:
+    """Choose round values between low and high, at least `min_step` apart."""
+    power = 10.0 ** np.floor(np.log10(min_step))
+    step = next(power * factor for factor in (1, 2, 5, 10, 20) if power * factor >= min_step)
     decimals = max(0, int(-np.floor(np.log10(step) + 1e-9)))
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
     return [(k * step, f"{k * step:.{decimals}f}".replace("-", "−")) for k in range(first, last + 1)]

@@ -1,4 +1,4 @@
-"""The page's plots of the trajectory: from above, and position and attitude over time."""
+"""Plot the trajectory for the page: from above, and position and attitude over time."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Float64
 from barsight.core.stamps import NS_PER_S
-from barsight.report.plots import MOST_POINTS, SERIES, Plot, Trace, numbers
+from barsight.report.plots import MAX_POINTS, SERIES, Plot, Trace, json_numbers
 from barsight.result_folder import CameraPath
 
-LEAST_SPAN_MM = 20.0
-LEAST_SPAN_DEG = 0.2
+MIN_SPAN_MM = 20.0
+MIN_SPAN_DEG = 0.2
 
 
 def path_plots(path: CameraPath, reference: str) -> tuple[Plot, ...]:
-    """From above, and over time. Empty where the path has no pose."""
+    """Plot from above, and over time. Empty where the path has no pose."""
     if path.stamp_ns.size == 0:
         return ()
-    step = -(-path.stamp_ns.size // MOST_POINTS)
+    step = -(-path.stamp_ns.size // MAX_POINTS)
     thinned = CameraPath(path.stamp_ns[::step], path.position_m[::step], path.quaternion_xyzw[::step])
     note = f" Every {step}th pose." if step > 1 else ""
     return _from_above(thinned, reference, note), _over_time(thinned, reference, note)
@@ -34,8 +34,8 @@ def _from_above(path: CameraPath, reference: str, note: str) -> Plot:
             "type": "scatter",
             "mode": "lines+markers" if dots else "lines",
             "name": "body",
-            "x": numbers(x, 4),
-            "y": numbers(y, 4),
+            "x": json_numbers(x, 4),
+            "y": json_numbers(y, 4),
             "line": {"color": "--series-0", "width": 1.6},
             "marker": {"color": "--series-0", "size": 5},
         },
@@ -56,8 +56,8 @@ def _over_time(path: CameraPath, reference: str, note: str) -> Plot:
     seconds = (path.stamp_ns - path.stamp_ns[0]) / NS_PER_S
     moved_mm = (path.position_m - path.position_m[0]) * 1e3
     turned_deg = turned_since_start_deg(path)
-    rows = [(f"Δ{axis} / mm", moved_mm[:, [k]], LEAST_SPAN_MM) for k, axis in enumerate("xyz")]
-    rows.append(("turned / °", turned_deg, LEAST_SPAN_DEG))
+    rows = [(f"Δ{axis} / mm", moved_mm[:, [k]], MIN_SPAN_MM) for k, axis in enumerate("xyz")]
+    rows.append(("turned / °", turned_deg, MIN_SPAN_DEG))
     traces: list[Trace] = []
     layout: dict[str, Any] = {"xaxis": {"title": {"text": "time / s"}, "anchor": f"y{len(rows)}"}}
     share = 1 / len(rows)
@@ -77,8 +77,8 @@ def _over_time(path: CameraPath, reference: str, note: str) -> Plot:
                     "mode": "lines",
                     "name": title.split(" ")[0] if single else f"about {'XYZ'[column]}",
                     "showlegend": not single,
-                    "x": numbers(seconds, 3),
-                    "y": numbers(values[:, column], 3),
+                    "x": json_numbers(seconds, 3),
+                    "y": json_numbers(values[:, column], 3),
                     "yaxis": axis,
                     "line": {"color": SERIES[row if single else column], "width": 1.5},
                 }
@@ -91,7 +91,7 @@ def _over_time(path: CameraPath, reference: str, note: str) -> Plot:
 
 
 def turned_since_start_deg(path: CameraPath) -> Float64:
-    """(N, 3) rotation vector from the first attitude to each, reference axes, degrees.
+    """Compute rotation vectors (N, 3) from the first attitude to each, reference axes, degrees.
 
     A rotation has many vectors, 360 degrees apart; each is the one nearest to the one before it.
     """
@@ -119,7 +119,7 @@ def _mark(name: str, x: float, y: float, colour: str) -> Trace:
 
 
 def _range(values: Float64, least: float) -> list[float]:
-    """A range that holds all values and doesn't blow noise up to the panel's height."""
+    """Choose a range that holds all values and doesn't blow noise up to the panel's height."""
     low, high = float(values.min()), float(values.max())
     half = max((high - low) * 0.55, least / 2)
     return [(low + high) / 2 - half, (low + high) / 2 + half]

@@ -1,4 +1,4 @@
-"""The page's yard: bundles and lifts drawn on the orthophoto and on the height map, with their tables."""
+"""Draw bundles and lifts on the orthophoto and on the height map, with their tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FREE_RGB, COVERED_RGB, LIFT_RGB = "#39d353", "#f2b134", "#ff2fb3"
 
 @dataclass(frozen=True)
 class YardPart:
-    """What the page says of bundles and lifts. lifts: lifts.json, None where there is none."""
+    """Part of the page on bundles and lifts. lifts: lifts.json, None where there is none."""
 
     figures: tuple[MapFigure, ...]
     bundles: tuple[Bundle, ...]
@@ -30,7 +30,7 @@ class YardPart:
 
 
 def yard_part(out_dir: Path, raster: Raster | None) -> YardPart | None:
-    """Bundles, lifts and their pictures; None where the folder has no bundles.json."""
+    """Collect bundles, lifts and their pictures; None where the folder has no bundles.json."""
     if not (out_dir / "bundles.json").is_file():
         return None
     bundles = read_bundles(out_dir / "bundles.json")
@@ -62,7 +62,7 @@ def yard_part(out_dir: Path, raster: Raster | None) -> YardPart | None:
 
 
 def _orthophoto(path: Path, raster: Raster) -> UInt8:
-    """(H, W, 4) the orthophoto in the raster's size, transparent where nothing was seen."""
+    """Resample the orthophoto (H, W, 4) to the raster's size, transparent where nothing was seen."""
     grey = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise InputError(path, "is torn", "measure the recording again")
@@ -76,7 +76,7 @@ def _orthophoto(path: Path, raster: Raster) -> UInt8:
 
 
 def _with(drawing: Drawing, shapes: tuple[Shape, ...]) -> Drawing:
-    """The drawing with the shapes that touch it, in its own units."""
+    """Add the shapes that touch the drawing, in its own units."""
     scale, (x0, y1) = drawing.scale, drawing.corner_m
     inside = []
     for shape in shapes:
@@ -88,7 +88,7 @@ def _with(drawing: Drawing, shapes: tuple[Shape, ...]) -> Drawing:
 
 
 def bundle_shapes(bundles: tuple[Bundle, ...]) -> tuple[Shape, ...]:
-    """Outline and axis of each bundle, in m; open ends dashed."""
+    """Draw outline and axis of each bundle, in m; open ends dashed."""
     shapes = []
     for bundle in bundles:
         colour = FREE_RGB if bundle.on_top else COVERED_RGB
@@ -104,7 +104,7 @@ def bundle_shapes(bundles: tuple[Bundle, ...]) -> tuple[Shape, ...]:
 
 
 def lift_shapes(lifts: dict[str, Any]) -> tuple[Shape, ...]:
-    """The magnet's poles at each offered lift, with its rank."""
+    """Draw the magnet's poles at each offered lift, with its rank."""
     shapes = []
     for lift in lifts["lifts"]:
         label = f"#{lift['rank']}"
@@ -117,7 +117,7 @@ def lift_shapes(lifts: dict[str, Any]) -> tuple[Shape, ...]:
 def pole_corners(
     target: dict[str, float], poles: list[dict[str, float]]
 ) -> list[tuple[tuple[float, float], ...]]:
-    """The four corners of each pole, yard axes, m."""
+    """Compute the four corners of each pole, yard axes, m."""
     yaw = np.radians(target["yaw_deg"])
     across, along = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
     found = []
@@ -131,7 +131,7 @@ def pole_corners(
 def rectangle(
     centre: Float64, yaw_rad: float, width: float, length: float
 ) -> tuple[tuple[float, float], ...]:
-    """Corners: low-y end from low to high side, then the high-y end back."""
+    """Compute corners: low-y end from low to high side, then the high-y end back."""
     across = width / 2 * np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
     along = length / 2 * np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
     corners = (centre - along - across, centre - along + across, centre + along + across,

@@ -1,4 +1,4 @@
-"""The page's interactive plots as plotly.js figures: plain data, coloured by the page's script.
+"""Build the page's interactive plots as plotly.js figures: plain data, coloured by the page's script.
 
 A colour that starts with `--` is the name of a CSS variable of page.css.
 """
@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.types import Contour, LaserProfile, Source
-from barsight.mapping.agreement import difference
+from barsight.core.types import Contour, HeightSource, LaserProfile
+from barsight.mapping.agreement import profile_difference
 
-MOST_POINTS = 20_000
-MOST_SCATTER = 3_000
+MAX_POINTS = 20_000
+MAX_SCATTER = 3_000
 BAND_SIGMAS = 1.96
 SERIES = ("--series-0", "--series-1", "--series-2", "--series-3", "--series-4", "--series-5")
 Trace = dict[str, Any]
@@ -33,7 +33,7 @@ class Plot:
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class ComparedContour:
     """A contour, the laser profile beside it where there is one, and vision minus laser at its points (m)."""
 
     contour: Contour
@@ -41,24 +41,26 @@ class Compared:
     error_m: Float64
 
 
-def compare(contours: tuple[Contour, ...], laser: tuple[LaserProfile, ...]) -> tuple[Compared, ...]:
-    """Each contour with the laser profile of the same number."""
+def pair_with_laser(
+    contours: tuple[Contour, ...], laser: tuple[LaserProfile, ...]
+) -> tuple[ComparedContour, ...]:
+    """Pair each contour with the laser profile of the same number."""
     by_number = {profile.profile: profile for profile in laser}
     return tuple(
-        Compared(c, by_number[c.profile], difference(c, by_number[c.profile]))
+        ComparedContour(c, by_number[c.profile], profile_difference(c, by_number[c.profile]))
         if c.profile in by_number
-        else Compared(c, None, np.empty(0))
+        else ComparedContour(c, None, np.empty(0))
         for c in contours
     )
 
 
-def numbers(values: Float64, decimals: int) -> list[float | None]:
-    """Rounded for the page; None, which breaks a line, where not finite."""
+def json_numbers(values: Float64, decimals: int) -> list[float | None]:
+    """Round for the page; None, which breaks a line, where not finite."""
     return [float(v) if np.isfinite(v) else None for v in np.round(values, decimals)]
 
 
 def keep_extremes(values: Float64, most: int) -> Int64:
-    """Indices of at most `most` samples that draw the same line: the lowest and the highest of each bin."""
+    """Thin to at most `most` samples that draw the same line: the lowest and the highest of each bin."""
     count = values.size
     if count <= most:
         return np.arange(count)
@@ -73,15 +75,17 @@ def keep_extremes(values: Float64, most: int) -> Int64:
     return np.unique(np.concatenate([edges[:-1] + low, edges[:-1] + high]))
 
 
-def contour_plot(compared: Compared) -> Plot:
-    """Heights along X with their band over the laser's; below it the difference, where there is a laser."""
+def contour_plot(compared: ComparedContour) -> Plot:
+    """Plot heights along X with their band over the laser's; below it the difference, where there
+    is a laser.
+    """
     contour, laser = compared.contour, compared.laser
-    kept = keep_extremes(contour.z_m, MOST_POINTS)
+    kept = keep_extremes(contour.z_m, MAX_POINTS)
     x, z, sigma = contour.x_m[kept], contour.z_m[kept] * 1e3, contour.sigma_m[kept] * 1e3
     source = contour.source[kept]
-    seen = np.where(source == Source.VISION, z, np.nan)
+    seen = np.where(source == HeightSource.VISION, z, np.nan)
     traces = [_band(x, seen, BAND_SIGMAS * sigma), _line("vision", x, seen, "--series-0", 1.4)]
-    filled = source == Source.FILLED
+    filled = source == HeightSource.FILLED
     if filled.any():
         traces.append(_markers("filled", x[filled], z[filled], "--filled", 5))
     layout: dict[str, Any] = {
@@ -93,10 +97,10 @@ def contour_plot(compared: Compared) -> Plot:
         caption += f" The plot shows the extremes of {contour.x_m.size} samples; contour.csv has them all."
     if laser is None:
         return Plot(f"contour-{contour.profile}", traces, layout, 340, caption)
-    of_laser = keep_extremes(laser.z_m, MOST_POINTS)
+    of_laser = keep_extremes(laser.z_m, MAX_POINTS)
     traces.append(_line("laser", laser.x_m[of_laser], laser.z_m[of_laser] * 1e3, "--laser", 1.2))
     error = compared.error_m * 1e3
-    of_error = keep_extremes(error, MOST_POINTS)
+    of_error = keep_extremes(error, MAX_POINTS)
     shown = _line("vision − laser", laser.x_m[of_error], error[of_error], "--series-1", 1.2)
     traces.append({**shown, "yaxis": "y2"})
     known = np.abs(error[np.isfinite(error)])
@@ -117,8 +121,8 @@ def contour_plot(compared: Compared) -> Plot:
     return Plot(f"contour-{contour.profile}", traces, layout, 560, caption)
 
 
-def histogram_plot(compared: tuple[Compared, ...]) -> Plot | None:
-    """How often each difference occurs, a step line per profile; None without a difference."""
+def histogram_plot(compared: tuple[ComparedContour, ...]) -> Plot | None:
+    """Plot how often each difference occurs, a step line per profile; None without a difference."""
     errors = {c.contour.profile: c.error_m[np.isfinite(c.error_m)] * 1e3 for c in compared}
     together = np.abs(np.concatenate([*errors.values(), np.empty(0)]))
     if together.size == 0:
@@ -142,8 +146,8 @@ def histogram_plot(compared: tuple[Compared, ...]) -> Plot | None:
     return Plot("histogram", traces, layout, 340, caption)
 
 
-def limits_plot(compared: tuple[Compared, ...], agreement: list[dict[str, Any]]) -> Plot | None:
-    """Difference over mean height, bias, 95 % limits of agreement [Bland 1986]; None without a laser."""
+def limits_plot(compared: tuple[ComparedContour, ...], agreement: list[dict[str, Any]]) -> Plot | None:
+    """Plot difference over mean height, bias, 95 % limits of agreement [Bland 1986]; None without a laser."""
     traces: list[Trace] = []
     shapes: list[dict[str, Any]] = []
     rows = {row.get("profile"): row for row in agreement}
@@ -154,8 +158,8 @@ def limits_plot(compared: tuple[Compared, ...], agreement: list[dict[str, Any]])
             continue
         colour = SERIES[order % len(SERIES)]
         known = np.flatnonzero(np.isfinite(item.error_m))
-        if known.size > MOST_SCATTER:
-            known, decimated = np.sort(draw.choice(known, MOST_SCATTER, replace=False)), True
+        if known.size > MAX_SCATTER:
+            known, decimated = np.sort(draw.choice(known, MAX_SCATTER, replace=False)), True
         error = item.error_m[known] * 1e3
         mean = item.laser.z_m[known] * 1e3 + error / 2
         traces.append(_markers(f"profile {item.contour.profile}", mean, error, colour, 3))
@@ -172,17 +176,17 @@ def limits_plot(compared: tuple[Compared, ...], agreement: list[dict[str, Any]])
     }
     caption = "Solid lines: bias; dashed lines: 95 % limits of agreement (bias ± 1.96 standard deviations)."
     if decimated:
-        caption += f" {MOST_SCATTER} samples of each profile, drawn at random."
+        caption += f" {MAX_SCATTER} samples of each profile, drawn at random."
     return Plot("limits", traces, layout, 340, caption)
 
 
 def _reach(sizes: Float64) -> float:
-    """Where the bulk of the sizes ends: almost four sigma of a normal distribution, unmoved by outliers."""
+    """Estimate where the bulk of the sizes ends: almost four sigma of a normal distribution, robust."""
     return 3 * float(np.percentile(sizes, 80)) if sizes.size else 0.0
 
 
 def _band(x: Float64, z: Float64, half: Float64) -> Trace:
-    """The band as one closed polygon per run of known samples, so that gaps stay open."""
+    """Draw the band as one closed polygon per run of known samples, so that gaps stay open."""
     known = np.isfinite(z) & np.isfinite(half)
     steps = np.diff(np.concatenate([[0], known.astype(np.int8), [0]]))
     gap = np.array([np.nan])
@@ -196,8 +200,8 @@ def _band(x: Float64, z: Float64, half: Float64) -> Trace:
         "type": "scatter",
         "mode": "lines",
         "name": f"± {BAND_SIGMAS} sigma",
-        "x": numbers(np.concatenate([*outline_x, np.empty(0)]), 4),
-        "y": numbers(np.concatenate([*outline_z, np.empty(0)]), 1),
+        "x": json_numbers(np.concatenate([*outline_x, np.empty(0)]), 4),
+        "y": json_numbers(np.concatenate([*outline_z, np.empty(0)]), 1),
         "fill": "toself",
         "fillcolor": "--band",
         "line": {"width": 0, "color": "--band"},
@@ -210,8 +214,8 @@ def _line(name: str, x: Float64, y: Float64, colour: str, width: float) -> Trace
         "type": "scatter",
         "mode": "lines",
         "name": name,
-        "x": numbers(x, 4),
-        "y": numbers(y, 2),
+        "x": json_numbers(x, 4),
+        "y": json_numbers(y, 2),
         "line": {"color": colour, "width": width},
     }
 
@@ -221,8 +225,8 @@ def _markers(name: str, x: Float64, y: Float64, colour: str, size: float) -> Tra
         "type": "scatter",
         "mode": "markers",
         "name": name,
-        "x": numbers(x, 4),
-        "y": numbers(y, 2),
+        "x": json_numbers(x, 4),
+        "y": json_numbers(y, 2),
         "marker": {"color": colour, "size": size, "opacity": 0.6},
     }
 

@@ -1,4 +1,4 @@
-"""The result files of formats.md, each written whole or not at all; tiles stream, memory stays bounded."""
+"""Write the result files of formats.md, each whole or not at all; tiles stream, memory stays bounded."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def write_surface(surface: Surface, free: FreeSpace, folder: Path) -> None:
 
 
 def write_results(measurement: Measurement, folder: Path) -> None:
-    """All other files that a measurement fills but result.json, into an existing folder."""
+    """Write all other files that a measurement fills but result.json, into an existing folder."""
     write_trajectory(measurement.trajectory, folder / "trajectory.tum")
     write_contours(measurement.contours, folder / "contour.csv")
     reference = measurement.trajectory.reference
@@ -60,7 +60,7 @@ def write_results(measurement: Measurement, folder: Path) -> None:
 
 
 def write_trajectory(trajectory: Trajectory, target: Path) -> None:
-    """TUM: seconds with nine decimals, x y z qx qy qz qw of `yard_from_body` (or `world_from_body`)."""
+    """Write TUM: seconds with nine decimals, x y z qx qy qz qw of `yard_from_body` (or `world_from_body`)."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write(f"# {trajectory.reference}_from_body: timestamp_s x y z qx qy qz qw\n")
         for frame in trajectory.frames:
@@ -70,9 +70,9 @@ def write_trajectory(trajectory: Trajectory, target: Path) -> None:
 
 
 def write_relative(trajectory: Trajectory, target: Path) -> None:
-    """CSV, a row for each frame but the first: its pose in the body's axes of the frame before, x y z (m) and
-    quaternion, and the upper triangle of its covariance row by row (rotation in rad, then translation in m,
-    of a small motion that follows it); nan where it isn't known.
+    """Write CSV, a row for each frame but the first: its pose in the body's axes of the frame before, x y z
+    (m) and quaternion, and the upper triangle of its covariance row by row (rotation in rad, then translation
+    in m, of a small motion that follows it); nan where it isn't known.
     """
     detail = trajectory.detail
     if detail is None or detail.relative is None:
@@ -90,7 +90,7 @@ def write_relative(trajectory: Trajectory, target: Path) -> None:
 
 
 def write_cloud(surface: Surface, target: Path) -> None:
-    """Binary little-endian PLY of every height that enough views support."""
+    """Write binary little-endian PLY of every height that enough views support."""
     count = sum(len(part.views) for part in surface.cloud())
     fields = "".join(
         f"property {kind} {name}\n"
@@ -114,7 +114,9 @@ def write_cloud(surface: Surface, target: Path) -> None:
 
 
 def write_height(surface: Surface, target: Path) -> None:
-    """Tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is no data."""
+    """Write a tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is
+    no data.
+    """
     rows, columns = surface.shape
     bands = "".join(
         f'<Item name="DESCRIPTION" sample="{i}" role="description">{name}</Item>'
@@ -190,7 +192,7 @@ def _band(window: Layers, band: str) -> Float32:
 
 
 def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
-    """`profile,x_m,y_m,z_m,sigma_m,source`; z and sigma are empty where nothing is known."""
+    """Write `profile,x_m,y_m,z_m,sigma_m,source`; z and sigma are empty where nothing is known."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write("profile,x_m,y_m,z_m,sigma_m,source\n")
         for contour in contours:
@@ -202,7 +204,7 @@ def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
 
 
 def write_laser(laser: tuple[LaserProfile, ...], target: Path) -> None:
-    """The reference profiles as they were read: `profile,x_m,y_m,z_m`."""
+    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m`."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write("profile,x_m,y_m,z_m\n")
         for profile in laser:
@@ -211,7 +213,7 @@ def write_laser(laser: tuple[LaserProfile, ...], target: Path) -> None:
 
 
 def write_preview(preview: Preview, target: Path) -> None:
-    """The rectified left picture beside its disparity in colours; black where there is none."""
+    """Write the rectified left picture beside its disparity in colours; black where there is none."""
     known = np.isfinite(preview.disparity_px)
     low, high = np.percentile(preview.disparity_px[known], (1, 99)) if known.any() else (0.0, 1.0)
     scaled = (preview.disparity_px - low) / max(high - low, 1e-6) * 255
@@ -227,13 +229,13 @@ def write_preview(preview: Preview, target: Path) -> None:
 
 
 def write_summary(content: dict[str, Any], target: Path) -> None:
-    """result.json from what `summary` says."""
+    """Write result.json from what `summary` says."""
     with atomic_path(target) as path:
         path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def summary(measurement: Measurement) -> dict[str, Any]:
-    """What result.json says; rounded for people, NaN as null."""
+    """Build the content of result.json; rounded for people, NaN as null."""
     trajectory, surface = measurement.trajectory, measurement.surface
     stamps = trajectory.stamp_ns
     rows, columns = surface.shape

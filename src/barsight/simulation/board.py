@@ -1,4 +1,4 @@
-"""Calibration boards drawn: to print, and as a camera would see them held well and badly."""
+"""Draw calibration boards: to print, and as a camera would see them held well and badly."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VIEWS = (
 
 
 def draw_board(board: Board, px_per_m: float, margin_m: float) -> UInt8:
-    """(H, W) the board seen straight on with a white margin.
+    """Draw the board (H, W) seen straight on with a white margin.
 
     A point (x, y) lies at (margin + x, margin + y), y up for an AprilGrid. A checkerboard's points are its
     inner corners: one more square lies around them.
@@ -55,7 +55,7 @@ def draw_board(board: Board, px_per_m: float, margin_m: float) -> UInt8:
 
 
 def draw_views(board: Board) -> UInt8:
-    """(H, W) pictures of a board held well, and one of how not to, each with its caption."""
+    """Draw pictures (H, W) of a board held well, and one of how not to, each with its caption."""
     px_per_m, margin_m = 60 / board.size_m, board.size_m
     flat = draw_board(board, px_per_m, margin_m)
     width_m, height_m = flat.shape[1] / px_per_m, flat.shape[0] / px_per_m

@@ -1,4 +1,4 @@
-"""The files of a simulated recording in the EuRoC layout, one writer per sensor."""
+"""Write the files of a simulated recording in the EuRoC layout, one writer per sensor."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from barsight.simulation.settings import SensorSettings
 
 
 def write_yaml(path: Path, content: dict[str, Any]) -> None:
-    """One YAML file, keys in the given order."""
+    """Write one YAML file, keys in the given order."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 
 def write_csv(path: Path, header: str, rows: Iterable[str]) -> None:
-    """One CSV file with EuRoC's commented header."""
+    """Write one CSV file with EuRoC's commented header."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
 
 
 def write_png(path: Path, image: UInt8) -> None:
-    """One image; OSError where it can't be written."""
+    """Write one image; OSError where it can't be written."""
     done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise OSError(f"{path}: the image can't be encoded")
@@ -39,7 +39,7 @@ def write_png(path: Path, image: UInt8) -> None:
 
 
 def write_body(folder: Path) -> None:
-    """`mav0/body.yaml`, which says that nothing of this is real."""
+    """Write `mav0/body.yaml`, which says that nothing of this is real."""
     comment = "simulated bar yard: rendered images and computed sensors, not a real recording"
     write_yaml(folder / "body.yaml", {"comment": comment, "is_simulated": True})
 
@@ -47,7 +47,7 @@ def write_body(folder: Path) -> None:
 def write_camera(
     folder: Path, camera: Camera, body_from_cam: Pose, stamp_ns: Int64, timeshift_s: float
 ) -> None:
-    """`camN/sensor.yaml` and `camN/data.csv`; the images come one by one."""
+    """Write `camN/sensor.yaml` and `camN/data.csv`; the images come one by one."""
     (folder / "data").mkdir(parents=True, exist_ok=True)
     span_s = max(float(stamp_ns[-1] - stamp_ns[0]) / NS_PER_S, 1e-9)
     content = {
@@ -63,7 +63,7 @@ def write_camera(
 
 
 def write_imu(folder: Path, imu: ImuRecord, settings: SensorSettings) -> None:
-    """`imu0`."""
+    """Write `imu0`."""
     content = {
         "sensor_type": "imu", "comment": "imu0", "T_BS": _matrix(Pose.identity("body", "imu")),
         "rate_hz": settings.imu_rate_hz,
@@ -84,7 +84,7 @@ def write_crane(
     folder: Path, stamp_ns: Int64, place_m: Float64, lever_m: Float64, nominal: Float64,
     settings: SensorSettings,
 ) -> None:  # fmt: skip
-    """`crane0`."""
+    """Write `crane0`."""
     std_m = float(np.hypot(settings.encoder_std_m, settings.encoder_step_m / 12**0.5))
     content = {
         "sensor_type": "crane",
@@ -99,7 +99,7 @@ def write_crane(
 
 
 def write_laser(folder: Path, x_m: Float64, y_m: Float64, z_m: Float64, std_m: float) -> None:
-    """`laser0`: x_m (N,), y_m (K,), z_m (K, N) as measured."""
+    """Write `laser0`: x_m (N,), y_m (K,), z_m (K, N) as measured."""
     content = {
         "sensor_type": "laser", "comment": "single points along X, yard frame; reference profiles",
         "spacing_m": round(float(x_m[1] - x_m[0]), 6), "range_std_m": std_m,
@@ -112,7 +112,7 @@ def write_laser(folder: Path, x_m: Float64, y_m: Float64, z_m: Float64, std_m: f
 
 
 def write_ground_truth(folder: Path, stamp_ns: Int64, place_m: Float64, quaternion_wxyz: Float64) -> None:
-    """`state_groundtruth_estimate0`: stamps on the IMU's clock."""
+    """Write `state_groundtruth_estimate0`: stamps on the IMU's clock."""
     header = "#timestamp," + ",".join([f"p_RS_R_{a} [m]" for a in "xyz"] + [f"q_RS_{a} []" for a in "wxyz"])
     write_csv(folder / "data.csv", header, _rows(stamp_ns, np.column_stack([place_m, quaternion_wxyz]), 9))
 

@@ -1,4 +1,6 @@
-"""What hangs from the crane into the pictures: a plate, level, that travels along and sways like the rig."""
+"""Render what hangs from the crane into the pictures: a level plate that travels along and sways like the
+rig.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +17,32 @@ ALBEDO = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Plate:
+class MagnetPlate:
     """A level rectangle of one frame. centre_m: (3,) in the yard. half_m: (2,) along x and y."""
 
     centre_m: Float64
     half_m: Float64
 
     def covers(self, origin: Float64, directions: Float64) -> tuple[Bool, Float64, Float64]:
-        """Whether rays (..., 3) from `origin` hit, at which multiple of theirs, and where: (..., 2) m from
-        the centre. A hit beyond 1 lies behind what the ray reaches."""
+        """Intersect rays (..., 3) from `origin`: whether they hit, at which multiple of theirs, and where:
+        (..., 2) m from the centre. A hit beyond 1 lies behind what the ray reaches.
+        """
         share = (self.centre_m[2] - origin[2]) / np.minimum(directions[..., 2], -1e-9)
         place = origin[:2] + share[..., None] * directions[..., :2] - self.centre_m[:2]
         hit: Bool = (np.abs(place) <= self.half_m).all(axis=-1) & (directions[..., 2] < -1e-9) & (share > 0)
         return hit, share, place
 
 
-def plate_at(settings: MagnetSettings, share: float, yard_from_body: Pose) -> Plate | None:
-    """The plate at `share` of the frames, None while it is drawn up."""
-    if min(settings.size_m) == 0 or not settings.first_share <= share <= settings.last_share:
+def plate_at(settings: MagnetSettings, share: float, yard_from_body: Pose) -> MagnetPlate | None:
+    """Place the plate at `share` of the frames, None while it is drawn up."""
+    if min(settings.size_m) == 0 or not settings.first_ratio <= share <= settings.last_ratio:
         return None
     offset = np.array([*settings.offset_m, -settings.below_body_m])
-    return Plate(yard_from_body.translation + offset, np.array(settings.size_m) / 2)
+    return MagnetPlate(yard_from_body.translation + offset, np.array(settings.size_m) / 2)
 
 
-def cover(
-    radiance: Float32, plate: Plate, rays: Float32, side: int, yard_from_cam: Pose, tile: Float32
+def paint_plate(
+    radiance: Float32, plate: MagnetPlate, rays: Float32, side: int, yard_from_cam: Pose, tile: Float32
 ) -> None:
     """Paint the plate over a view in place; `rays` and `side` as `render` takes them."""
     directions = np.dstack([rays, np.ones(rays.shape[:2])]) @ yard_from_cam.rotation.T

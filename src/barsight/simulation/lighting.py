@@ -1,4 +1,4 @@
-"""The hall's lamps, and what of their light reaches each surface: baked once, as nothing in the yard moves.
+"""Bake the light of the hall's lamps on each surface: once, as nothing in the yard moves.
 
 A lamp hangs at every `spacing` along X in each of two rows; its beam ends 1.5 spacings away, so at most
 three lamps of a row reach a place, and lamp number i of row r has slot (i mod 3) + 3 r there.
@@ -23,7 +23,7 @@ FLOOR_MARGIN_M = 5.0
 
 
 class Lamps(NamedTuple):
-    """Where the lamps hang (m): spacing and offset along X, the rows' y, height z; half length along Y."""
+    """Lamp positions (m): spacing and offset along X, the rows' y, height z; half length along Y."""
 
     spacing: float
     offset: float
@@ -51,7 +51,7 @@ class Lightmap(NamedTuple):
 
 
 def hall_lamps(above_floor_m: float) -> Lamps:
-    """Two rows of lamps over a crane whose cameras hang `above_floor_m` high."""
+    """Make two rows of lamps over a crane whose cameras hang `above_floor_m` high."""
     z = above_floor_m + 3.5
     return Lamps(5.0, 1.7, np.array([-4.2, 4.6]), z, 0.5, 0.75 * z * z, 0.34)
 
@@ -84,7 +84,7 @@ def bake(scene: Scene, lamps: Lamps, rng: np.random.Generator) -> Lightmap:
 
 
 def _ceiling_directions() -> Float64:
-    """(16, 3) unit directions into the upper half space, three rings and the zenith."""
+    """Compute unit directions (16, 3) into the upper half space, three rings and the zenith."""
     rings = ((15, 5), (35, 5), (60, 5))
     directions = [(0.0, 0.0, 1.0)]
     for number, (elevation_deg, count) in enumerate(rings):
@@ -135,7 +135,7 @@ def _bake(
 
 @kernel()
 def lamp_beam(lamps: Lamps, along_x: float) -> float:
-    """The lamp's power towards a place `along_x` away along X; zero from 1.5 spacings on."""
+    """Compute the lamp's power towards a place `along_x` away along X; zero from 1.5 spacings on."""
     u = along_x / (1.5 * lamps.spacing)
     return lamps.power * (1 - u * u) ** 2 if u * u < 1 else 0.0
 
@@ -145,7 +145,9 @@ def _hall_light(
     shape: Float64, cylinders: int, grid: Grid, ceiling: Float64, x: float, y: float, z: float,
     nx: float, ny: float, nz: float,
 ) -> float:  # fmt: skip
-    """Irradiance from the hall itself, 1 for an open level surface, with a little that bounces anywhere."""
+    """Compute irradiance from the hall itself, 1 for an open level surface, with a little that bounces
+    anywhere.
+    """
     total, norm = 0.0, 0.0
     for k in range(ceiling.shape[0]):
         cx, cy, cz = ceiling[k, 0], ceiling[k, 1], ceiling[k, 2]
@@ -163,7 +165,7 @@ def _hall_light(
 def _texel(
     shape: Float64, cylinders: int, lightmap: Lightmap, p: int, s: int, a: int
 ) -> tuple[float, float, float, float, float, float]:
-    """Middle of a texel, lifted 1 mm off the surface, and its normal."""
+    """Compute the middle of a texel, lifted 1 mm off the surface, and its normal."""
     lift = 1e-3
     if p == shape.shape[0]:
         step = lightmap.floor[2]
@@ -197,7 +199,7 @@ def _texel(
 
 @kernel()
 def longest_axis(shape: Float64, p: int) -> int:
-    """The axis (0, 1, 2) along which a box is longest."""
+    """Find the axis (0, 1, 2) along which a box is longest."""
     k = 0
     for axis in (1, 2):
         if shape[p, 12 + axis] > shape[p, 12 + k]:

@@ -1,4 +1,4 @@
-"""The cameras: the rig, each raw pixel's ray through the distorted lens, and the image sensor."""
+"""Model the cameras: the rig, each raw pixel's ray through the distorted lens, and the image sensor."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ class MountedRig:
 
 
 def mount_rig(settings: SimulationSettings, rng: np.random.Generator) -> MountedRig:
-    """cam0 looks down (but for the tilt), its rows along X (but for the heading); angles drawn by chance."""
+    """Mount cam0 looking down (but for the tilt), its rows along X (but for the heading); angles drawn by
+    chance.
+    """
     camera = settings.camera
     spread = np.radians(camera.misalignment_deg)
     crooked = Rotation.from_rotvec(rng.normal(0, 2 * spread, 3)).as_matrix()
@@ -64,7 +66,7 @@ def _camera(settings: CameraSettings, focal: float, spot: Float64) -> Camera:
 
 
 def sample_rays(camera: Camera, side: int) -> Float32:
-    """(side H, side W, 2) x and y of the directions with z = 1 of side^2 samples on each raw pixel.
+    """Compute x and y (side H, side W, 2) of the directions with z = 1 of side^2 samples on each raw pixel.
 
     The lens is inverted on a lattice of 8 px and interpolated by cubic splines, to 1e-4 px.
     """
@@ -81,7 +83,7 @@ def sample_rays(camera: Camera, side: int) -> Float32:
 
 
 def vignette(camera: Camera, loss: float) -> Float32:
-    """(H, W) share of light that reaches each pixel, 1 - loss in the farthest corner."""
+    """Compute the vignetting (H, W) of each pixel, 1 - loss in the farthest corner."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     square = ((u - camera.cx_px) ** 2 + (v - camera.cy_px) ** 2).astype(np.float32)
     share: Float32 = (1 - loss * square / square.max()).astype(np.float32)
@@ -91,7 +93,7 @@ def vignette(camera: Camera, loss: float) -> Float32:
 def expose(
     radiance: Float32, share: Float32, gain: float, settings: CameraSettings, rng: np.random.Generator
 ) -> UInt8:
-    """What the sensor makes of the light: blur, vignetting, gain, shot and read noise, 8 bits."""
+    """Simulate the sensor: blur, vignetting, gain, shot and read noise, 8 bits."""
     sigma = settings.psf_sigma_px
     blurred = (
         cv2.GaussianBlur(radiance, (5, 5), sigma, borderType=cv2.BORDER_REPLICATE) if sigma > 0 else radiance

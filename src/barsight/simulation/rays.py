@@ -1,4 +1,4 @@
-"""Rays against the scene: exact intersections with capped cylinders and boxes, found by walking the grid."""
+"""Cast rays against the scene: exact intersections with capped cylinders and boxes, by walking the grid."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAR = 1e30
 def hit_cylinder(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """The first ray parameter over `near` at which the ray enters the capped cylinder, else FAR."""
+    """Find the first ray parameter over `near` at which the ray enters the capped cylinder, else FAR."""
     cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
     da = dx * shape[p, 3] + dy * shape[p, 4] + dz * shape[p, 5]
     ca = cx * shape[p, 3] + cy * shape[p, 4] + cz * shape[p, 5]
@@ -43,7 +43,7 @@ def hit_cylinder(
 def hit_box(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """The first ray parameter over `near` at which the ray enters the box, else FAR."""
+    """Find the first ray parameter over `near` at which the ray enters the box, else FAR."""
     cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
     enter: float = -FAR
     leave: float = FAR
@@ -66,7 +66,7 @@ def hit_box(
 def _inside(
     grid: Grid, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float, far: float
 ) -> tuple[float, float]:
-    """The part of near .. far that lies in the grid; empty (first over second) where the ray misses it."""
+    """Clip near .. far to the grid; empty (first over second) where the ray misses it."""
     enter, leave = near, far
     for k in range(3):
         o = ox if k == 0 else (oy if k == 1 else oz)
@@ -86,7 +86,7 @@ def trace(
     shape: Float64, cylinders: int, grid: Grid, ox: float, oy: float, oz: float,
     dx: float, dy: float, dz: float, near: float, far: float, any_hit: bool,
 ) -> tuple[float, int]:  # fmt: skip
-    """The first hit between `near` and `far`: (ray parameter, primitive), or (FAR, -1).
+    """Find the first hit between `near` and `far`: (ray parameter, primitive), or (FAR, -1).
 
     The floor z = 0 answers with the number of primitives as its id. With `any_hit` the first hit found is
     good enough (shadows). [Amanatides 1987]
@@ -159,7 +159,7 @@ def _cast(
 
 
 def cast_rays(scene: Scene, origins: Float64, directions: Float64) -> tuple[Float64, Int32]:
-    """The first hit of each ray.
+    """Find the first hit of each ray.
 
     origins: (N, 3) or (1, 3) in `yard`. directions: (N, 3), any length. Returns the ray parameter (N,), inf
     where nothing is hit, and the primitive (N,), -1 for nothing and the number of primitives for the floor.

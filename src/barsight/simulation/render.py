@@ -1,4 +1,4 @@
-"""A camera's view of the yard as linear grey levels: four rays a pixel, shaded from textures and lightmap."""
+"""Render a camera's view of the yard as linear grey levels: four rays a pixel, textured and lightmapped."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ HIGHLIGHT = 0.28
 MASK = TILE - 1
 
 
-class Look(NamedTuple):
-    """What the shading reads besides the geometry."""
+class Shading(NamedTuple):
+    """Shading inputs besides the geometry."""
 
     lamps: Lamps
     lightmap: Lightmap
     tile: Float32
 
 
-def render(scene: Scene, look: Look, rays: Float32, side: int, yard_from_cam: Pose) -> Float32:
-    """(H, W) float32 radiance, 1 about white paper under the lamps.
+def render_view(scene: Scene, look: Shading, rays: Float32, side: int, yard_from_cam: Pose) -> Float32:
+    """Render radiance (H, W) float32, 1 about white paper under the lamps.
 
     rays: (side H, side W, 2) float32, x and y of each sample's direction with z = 1: side^2 samples a pixel,
     of which a pixel inside one primitive takes the diagonal ones only.
@@ -80,7 +80,7 @@ def shade(
     primitives: Primitives, lamps: Lamps, lightmap: Lightmap, tile: Float32, p: int,
     ox: float, oy: float, oz: float, rx: float, ry: float, rz: float,
 ) -> float:  # fmt: skip
-    """Radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz)."""
+    """Shade radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz)."""
     x, y, z = ox + rx, oy + ry, oz + rz
     if p == primitives.shape.shape[0]:
         return _shade_floor(lightmap, tile, p, x, y)
@@ -131,7 +131,9 @@ def _shine(
     shape: Float64, p: int, lamps: Lamps, seen: UInt8, place: tuple[int, int, int, int, float, float],
     point: tuple[float, float, float], eye: tuple[float, float, float], turn: tuple[float, float],
 ) -> float:  # fmt: skip
-    """Light of the lamps that bar `p` mirrors to the eye; `turn`: cosine and sine of the normal's angle."""
+    """Compute the lamps' highlight that bar `p` mirrors to the eye; `turn`: cosine and sine of the normal's
+    angle.
+    """
     t00, t01, t10, t11, ws, wa = place
     x, y, z = point
     c, d = turn
@@ -209,7 +211,7 @@ def _shade_box(
 def _lightmap_place(
     lightmap: Lightmap, p: int, share: float, angle: float
 ) -> tuple[int, int, int, int, float, float]:
-    """The four texels around a place on a bar, and the weights of the second along and around it."""
+    """Find the four texels around a place on a bar, and the weights of the second along and around it."""
     n, m = lightmap.along[p], lightmap.around[p]
     i = min(max(share * n - 0.5, 0.0), n - 1.0)
     i0 = min(int(i), n - 1)
@@ -223,7 +225,7 @@ def _lightmap_place(
 
 @kernel()
 def _texels(tile: Float32, a: float, b: float) -> tuple[float, float, float, float]:
-    """The tile's four channels at texel (a, b), bilinear, repeated without end."""
+    """Interpolate the tile's four channels at texel (a, b), bilinear, repeated without end."""
     fa, fb = math.floor(a), math.floor(b)
     wa, wb = a - fa, b - fb
     i, j = int(fa) & MASK, int(fb) & MASK

@@ -1,4 +1,4 @@
-"""The stock as primitives: capped cylinders and boxes, with their materials, in a grid of cells.
+"""Build the stock as primitives, capped cylinders and boxes with materials, in a grid of cells.
 
 Primitives 0 .. cylinders-1 are cylinders, the rest boxes. Rows of `shape` (float64, `yard`, metres):
 cylinder: centre 0:3, axis 3:6 (unit), direction of angle 0 6:9, of angle 90 degrees 9:12, radius 12,
@@ -15,7 +15,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int32, Int64, kernel
 from barsight.simulation.settings import SimulationSettings
-from barsight.simulation.stock import Beam, Bundle, Stock
+from barsight.simulation.stock import DunnageBeam, StackedBundle, Stock
 
 STRAP_WIDTH_M = 0.032
 STRAP_THICKNESS_M = 0.0012
@@ -41,7 +41,7 @@ class Grid(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What a ray can meet: primitives and, under them, the floor z = 0 (its id is their number)."""
+    """Geometry that a ray can meet: primitives and, under them, the floor z = 0 (its id is their number)."""
 
     primitives: Primitives
     grid: Grid
@@ -73,7 +73,7 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
 
 
 def build_grid(primitives: Primitives, cell_m: tuple[float, float]) -> Grid:
-    """Cells of cell_m[0] across (X, Z) and cell_m[1] along (Y), the way the bars run."""
+    """Build cells of cell_m[0] across (X, Z) and cell_m[1] along (Y), the way the bars run."""
     low, high = _bounds(primitives)
     margin = 1e-3
     low_corner = low.min(axis=0) - margin if len(low) else np.zeros(3)
@@ -92,7 +92,7 @@ def build_grid(primitives: Primitives, cell_m: tuple[float, float]) -> Grid:
 
 
 def _bounds(primitives: Primitives) -> tuple[Float64, Float64]:
-    """(P, 3) lower and upper corners of the primitives' boxes."""
+    """Compute lower and upper corners (P, 3) of the primitives' boxes."""
     shape, n = primitives.shape, primitives.cylinders
     reach = np.empty((len(shape), 3))
     axis = np.abs(shape[:n, 3:6])
@@ -104,7 +104,7 @@ def _bounds(primitives: Primitives) -> tuple[Float64, Float64]:
 
 @kernel()
 def _fill(shape: Float64, cylinders: int, grid: Grid) -> None:
-    """Without items: count each cell's primitives into first[c + 1]. With items: write them, in order.
+    """Count each cell's primitives into first[c + 1] without items; with items write them, in order.
 
     While writing, first[c] runs up to first[c + 1]; the caller's offsets are put back at the end.
     """
@@ -137,7 +137,7 @@ def _fill(shape: Float64, cylinders: int, grid: Grid) -> None:
 
 @kernel()
 def _slab_extent(s: Float64, round_bar: bool, y0: float, y1: float) -> tuple[float, float, float, float]:
-    """Bounds in x and z of the part of a primitive that can lie between y0 and y1."""
+    """Bound in x and z the part of a primitive that can lie between y0 and y1."""
     if not round_bar:
         rx = abs(s[3]) * s[12] + abs(s[6]) * s[13] + abs(s[9]) * s[14]
         rz = abs(s[5]) * s[12] + abs(s[8]) * s[13] + abs(s[11]) * s[14]
@@ -155,7 +155,7 @@ def _slab_extent(s: Float64, round_bar: bool, y0: float, y1: float) -> tuple[flo
 
 
 def _bars(
-    bundle: Bundle, settings: SimulationSettings, rng: np.random.Generator
+    bundle: StackedBundle, settings: SimulationSettings, rng: np.random.Generator
 ) -> tuple[list[Float64], list[list[float]]]:
     sideways, along, up = bundle.axes
     radius = bundle.kind.diameter_m / 2
@@ -179,16 +179,18 @@ def _plain(albedo: float, gloss: float, rng: np.random.Generator, weight: float 
     return [albedo * float(np.exp(rng.normal(0, 0.08))), gloss, *rng.uniform(0, 10, 2), 0.0, 1.0, 0.0, weight]
 
 
-def _beam_shape(beam: Beam) -> Float64:
+def _beam_shape(beam: DunnageBeam) -> Float64:
     c, s = np.cos(beam.yaw_rad), np.sin(beam.yaw_rad)
     axes = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return np.concatenate([beam.centre_m, axes.ravel(), beam.half_m])
 
 
 def _straps(
-    bundle: Bundle, spacing: float, rng: np.random.Generator
+    bundle: StackedBundle, spacing: float, rng: np.random.Generator
 ) -> list[tuple[list[Float64], list[Float64], Float64]]:
-    """Per strap: arcs on the corner bars (thin cylinders), flat runs between them (boxes), one label."""
+    """Build per strap: arcs on the corner bars (thin cylinders), flat runs between them (boxes),
+    one label.
+    """
     if spacing == 0 or bundle.kind.rings == 0:
         return []
     count = max(2, round(bundle.length_m / spacing))
@@ -197,7 +199,7 @@ def _straps(
 
 
 def _strap(
-    bundle: Bundle, place: float, rng: np.random.Generator
+    bundle: StackedBundle, place: float, rng: np.random.Generator
 ) -> tuple[list[Float64], list[Float64], Float64]:
     sideways, along, up = bundle.axes
     radius, half_width, thick = bundle.kind.diameter_m / 2, STRAP_WIDTH_M / 2, STRAP_THICKNESS_M

@@ -1,4 +1,4 @@
-"""What IMU, encoders and laser write down of the exact motion and the exact surface."""
+"""Record IMU, encoders and laser of the exact motion and the exact surface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
 from barsight.simulation.settings import SensorSettings
-from barsight.simulation.trajectory import CraneTrajectory
+from barsight.simulation.trajectory import SimulatedTrajectory
 
 GRAVITY_MPS2 = 9.80665
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -31,25 +31,27 @@ class ImuRecord:
 
 
 def stamps(duration_s: float, rate_hz: int) -> Int64:
-    """(N,) stamps from EPOCH_NS on, evenly spaced to the nanosecond, over `duration_s`."""
+    """Space stamps (N,) from EPOCH_NS on evenly to the nanosecond, over `duration_s`."""
     count = int(duration_s * rate_hz) + 1
     return EPOCH_NS + np.arange(count, dtype=np.int64) * NS_PER_S // rate_hz
 
 
 def seconds(stamp_ns: Int64) -> Float64:
-    """Stamps as seconds since the IMU's first sample."""
+    """Convert stamps to seconds since the IMU's first sample."""
     return (stamp_ns - EPOCH_NS) / NS_PER_S
 
 
-def exact_imu(trajectory: CraneTrajectory, stamp_ns: Int64) -> tuple[Float64, Float64]:
-    """Turn rate (rad/s) and specific force (m/s^2) in `body`, each (N, 3), without any error."""
+def exact_imu(trajectory: SimulatedTrajectory, stamp_ns: Int64) -> tuple[Float64, Float64]:
+    """Compute turn rate (rad/s) and specific force (m/s^2) in `body`, each (N, 3), without any error."""
     motion = trajectory.at(seconds(stamp_ns))
     force = motion.acceleration_mps2 + np.array([0.0, 0.0, GRAVITY_MPS2])
     return motion.body_rate_radps, np.einsum("nij,ni->nj", motion.yard_from_body, force)
 
 
-def record_imu(trajectory: CraneTrajectory, settings: SensorSettings, rng: np.random.Generator) -> ImuRecord:
-    """The IMU with white noise and biases that walk, both of the stated densities."""
+def record_imu(
+    trajectory: SimulatedTrajectory, settings: SensorSettings, rng: np.random.Generator
+) -> ImuRecord:
+    """Record the IMU with white noise and biases that walk, both of the stated densities."""
     stamp_ns = stamps(trajectory.duration_s, settings.imu_rate_hz)
     gyro, accel = exact_imu(trajectory, stamp_ns)
     gyro_bias = _walk(rng, len(stamp_ns), settings.gyro_bias_radps, settings.gyro_random_walk, settings)
@@ -70,9 +72,9 @@ def _walk(
 
 
 def record_encoders(
-    trajectory: CraneTrajectory, settings: SensorSettings, lever_m: Float64, rng: np.random.Generator
+    trajectory: SimulatedTrajectory, settings: SensorSettings, lever_m: Float64, rng: np.random.Generator
 ) -> tuple[Int64, Float64]:
-    """Stamps (N,) and the crane point's place (N, 3) as read: late, noisy and in whole steps."""
+    """Record stamps (N,) and the crane point's place (N, 3) as read: late, noisy and in whole steps."""
     stamp_ns = stamps(trajectory.duration_s, settings.encoder_rate_hz)
     place = trajectory.at(seconds(stamp_ns) - settings.encoder_latency_s).position_m - lever_m
     place = place + rng.normal(0, 1, place.shape) * settings.encoder_std_m
@@ -82,7 +84,7 @@ def record_encoders(
 
 
 def heights(scene: Scene, x_m: Float64, y_m: Float64) -> Float64:
-    """(N,) exact height of the highest surface over each place (x, y), by rays straight down."""
+    """Cast rays straight down: exact height (N,) of the highest surface over each place (x, y)."""
     origins = np.column_stack([x_m, y_m, np.full(len(x_m), SKY_M)])
     distance, _ = cast_rays(scene, origins, np.tile([0.0, 0.0, -1.0], (len(x_m), 1)))
     return SKY_M - distance

@@ -1,4 +1,4 @@
-"""What can be set of a simulated recording: one frozen dataclass, checked once, units in the names."""
+"""Define the settings of a simulated recording: one frozen dataclass, checked once, units in the names."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class BarKind:
 
     @property
     def rings(self) -> int:
-        """Rings of bars around the middle one."""
+        """Return the rings of bars around the middle one."""
         return BARS_OF_RINGS.index(self.count)
 
 
 def parse_bars(text: str) -> tuple[BarKind, ...]:
-    """`"90mm:7,40mm:37"` to kinds of bundles. Raises ConfigError where it can't be read."""
+    """Parse `"90mm:7,40mm:37"` to kinds of bundles. Raises ConfigError where it can't be read."""
     kinds = []
     for part in text.split(","):
         match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*mm\s*:\s*(\d+)\s*", part)
@@ -47,7 +47,7 @@ def parse_bars(text: str) -> tuple[BarKind, ...]:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """The stereo pair and how it hangs under the crane."""
+    """Stereo pair and its mounting under the crane."""
 
     width_px: int = 1280
     """Image width."""
@@ -111,15 +111,15 @@ class YardSettings:
     """Standard deviation of the bundles' yaw; they stay within 1 degree, or within twice this."""
     uneven_ends_m: float = 0.03
     """How far the ends of a bundle's bars stand apart."""
-    missing_share: float = 0.08
+    missing_ratio: float = 0.08
     """Share of places on the lowest layer that are empty (gullies)."""
-    crossed_share: float = 0.0
+    crossed_ratio: float = 0.0
     """Share of sections with a bundle lying across the others, or over them turned by 6 to 20 degrees."""
     dunnage_m: float = 0.09
     """Height and width of the wooden beams between the layers."""
     strap_spacing_m: float = 1.7
     """Distance between a bundle's straps; 0 leaves them out."""
-    ribbed_share: float = 0.25
+    ribbed_ratio: float = 0.25
     """Share of sections that hold ribbed bars."""
     gloss: float = 1.0
     """Strength of the highlights; 0 is matt steel."""
@@ -128,10 +128,10 @@ class YardSettings:
         _expect(1 <= self.max_layers <= 5, "yard max_layers must lie between 1 and 5")
         _expect(1 <= self.bar_length_m <= 20, "yard bar_length_m must lie between 1 and 20 m")
         _expect(0 <= self.skew_deg <= 2, "yard skew_deg must lie between 0 and 2")
-        _expect(0 <= self.missing_share <= 0.6, "yard missing_share must lie between 0 and 0.6")
-        _expect(0 <= self.crossed_share <= 1, "yard crossed_share must lie between 0 and 1")
+        _expect(0 <= self.missing_ratio <= 0.6, "yard missing_ratio must lie between 0 and 0.6")
+        _expect(0 <= self.crossed_ratio <= 1, "yard crossed_ratio must lie between 0 and 1")
         _expect(0.02 <= self.dunnage_m <= 0.3, "yard dunnage_m must lie between 0.02 and 0.3 m")
-        _expect(0 <= self.ribbed_share <= 1, "yard ribbed_share must lie between 0 and 1")
+        _expect(0 <= self.ribbed_ratio <= 1, "yard ribbed_ratio must lie between 0 and 1")
         _expect(0 <= self.gap_m <= 1, "yard gap_m must lie between 0 and 1 m")
         _expect(0 <= self.uneven_ends_m <= 0.5, "yard uneven_ends_m must lie between 0 and 0.5 m")
         _expect(self.gloss >= 0, "yard gloss can't be negative")
@@ -142,8 +142,8 @@ class YardSettings:
 
 
 @dataclass(frozen=True)
-class MotionSettings:
-    """How the crane travels along X."""
+class TravelSettings:
+    """Travel of the crane along X."""
 
     speed_mps: float = 0.6
     """Speed of the bridge between accelerating and braking."""
@@ -229,15 +229,15 @@ class MagnetSettings:
     """How far it hangs under the body."""
     offset_m: tuple[float, float] = (0.6, 0.3)
     """Where its middle hangs from the body, along the travel and across."""
-    first_share: float = 0.3
+    first_ratio: float = 0.3
     """Share of the frames from which it hangs there."""
-    last_share: float = 0.6
+    last_ratio: float = 0.6
     """Share of the frames until which it hangs there."""
 
     def __post_init__(self) -> None:
         _expect(min(self.size_m) >= 0, "magnet size_m can't be negative")
         _expect(self.below_body_m > 0.2, "magnet below_body_m must be over 0.2 m")
-        _expect(0 <= self.first_share <= self.last_share <= 1, "magnet shares must rise within 0 and 1")
+        _expect(0 <= self.first_ratio <= self.last_ratio <= 1, "magnet shares must rise within 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ class SimulationSettings:
     """Pairs whose true depth is stored."""
     camera: CameraSettings = field(default_factory=CameraSettings)
     yard: YardSettings = field(default_factory=YardSettings)
-    motion: MotionSettings = field(default_factory=MotionSettings)
+    motion: TravelSettings = field(default_factory=TravelSettings)
     sensors: SensorSettings = field(default_factory=SensorSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 
@@ -266,7 +266,7 @@ class SimulationSettings:
         _expect(2 <= self.frames <= 100_000, "frames must lie between 2 and 100000")
         _expect(self.seed >= 0, "seed can't be negative")
         _expect(0 <= self.depth_views <= self.frames, "depth_views must lie between 0 and frames")
-        layers = self.yard.max_layers + (self.yard.crossed_share > 0)
+        layers = self.yard.max_layers + (self.yard.crossed_ratio > 0)
         tallest = max(2 * k.diameter_m * (k.rings + 0.5) for k in self.kinds) + self.yard.dunnage_m
         _expect(
             self.camera.above_floor_m > layers * tallest + 1,
@@ -275,12 +275,12 @@ class SimulationSettings:
 
     @property
     def kinds(self) -> tuple[BarKind, ...]:
-        """The kinds of bundles that `bars` names."""
+        """Parse the kinds of bundles that `bars` names."""
         return parse_bars(self.bars)
 
     @classmethod
     def demo(cls) -> SimulationSettings:
-        """A small yard for `barsight demo`: 3 m of stack, 10 pairs of 640x512."""
+        """Make a small yard for `barsight demo`: 3 m of stack, 10 pairs of 640x512."""
         camera = CameraSettings(width_px=640, height_px=512, focal_px=625.0)
         return cls(
             length_m=3.0, frames=10, seed=1, camera=camera, yard=YardSettings(max_layers=3, bar_length_m=5.0)

@@ -1,4 +1,4 @@
-"""From settings to a recording on disk: stack a yard, drive over it, render, write the truth beside."""
+"""Simulate a recording on disk: stack a yard, drive over it, render, write the truth beside."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.simulation import euroc_files
-from barsight.simulation.hanging_plate import cover, plate_at
+from barsight.simulation.hanging_plate import paint_plate, plate_at
 from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
-from barsight.simulation.render import Look, render
+from barsight.simulation.render import Shading, render_view
 from barsight.simulation.scene import Scene, build_scene
 from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, record_imu, seconds, stamps
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.stock import Stock, stack_yard
 from barsight.simulation.textures import surface_tile
-from barsight.simulation.trajectory import CraneTrajectory
+from barsight.simulation.trajectory import SimulatedTrajectory
 from barsight.simulation.truth import SurfaceTruth, true_depth, write_bundles, write_rig
 
 CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
@@ -39,7 +39,7 @@ class World:
     stock: Stock
     scene: Scene
     mounted: MountedRig
-    trajectory: CraneTrajectory
+    trajectory: SimulatedTrajectory
     frame_stamp_ns: Int64
 
     @classmethod
@@ -48,14 +48,14 @@ class World:
         stock = stack_yard(settings, _stream(settings, 0))
         scene = build_scene(stock, settings, _stream(settings, 1))
         mounted = mount_rig(settings, _stream(settings, 2))
-        trajectory = CraneTrajectory.plan(
+        trajectory = SimulatedTrajectory.plan(
             settings.length_m, settings.camera, settings.motion, mounted.nominal_yard_from_body,
             _stream(settings, 3),
         )  # fmt: skip
         return cls(settings, stock, scene, mounted, trajectory, frame_stamps(settings, trajectory))
 
     def yard_from_body(self, camera_stamp_ns: int) -> Pose:
-        """The exact pose at a camera stamp: t_imu = t_cam + timeshift."""
+        """Compute the exact pose at a camera stamp: t_imu = t_cam + timeshift."""
         imu_stamp = camera_stamp_ns + self.mounted.rig.timeshift_cam_imu_ns
         motion = self.trajectory.at(seconds(np.array([imu_stamp], dtype=np.int64)))
         return Pose("yard", "body", motion.yard_from_body[0], motion.position_m[0])
@@ -84,8 +84,10 @@ def simulate(
         )  # fmt: skip
 
 
-def frame_stamps(settings: SimulationSettings, trajectory: CraneTrajectory) -> Int64:
-    """(frames,) stamps on the camera's clock: the first and the last at rest, the others evenly along X."""
+def frame_stamps(settings: SimulationSettings, trajectory: SimulatedTrajectory) -> Int64:
+    """Place stamps (frames,) on the camera's clock: the first and the last at rest, the others evenly along
+    X.
+    """
     distance = settings.length_m + 2 * settings.motion.overrun_m
     inner = trajectory.begin_x_m + distance * np.arange(1, settings.frames - 1) / (settings.frames - 1)
     times = [trajectory.start_s - REST_BEFORE_FRAME_S]
@@ -131,7 +133,7 @@ def _write_pictures(
     settings, rig = world.settings, world.mounted.rig
     lamps = hall_lamps(settings.camera.above_floor_m)
     tile = surface_tile(_stream(settings, 7), settings.camera.above_floor_m / settings.camera.focal_px)
-    look = Look(lamps, bake(world.scene, lamps, _stream(settings, 8)), tile)
+    look = Shading(lamps, bake(world.scene, lamps, _stream(settings, 8)), tile)
     side = settings.camera.samples_per_side
     cameras = (
         ("cam0", rig.cam0, rig.body_from_cam0, 1.0),
@@ -146,9 +148,9 @@ def _write_pictures(
         surface.count_frame(rig, yard_from_body, plate)
         for k, (name, camera, mounting, gain) in enumerate(cameras):
             yard_from_cam = yard_from_body @ mounting
-            radiance = render(world.scene, look, rays[k], side, yard_from_cam)
+            radiance = render_view(world.scene, look, rays[k], side, yard_from_cam)
             if plate is not None:
-                cover(radiance, plate, rays[k], side, yard_from_cam, tile)
+                paint_plate(radiance, plate, rays[k], side, yard_from_cam, tile)
             noise = _stream(settings, 9, 2 * number + k)
             image = expose(radiance, shares[k], gain, settings.camera, noise)
             euroc_files.write_png(folder / "mav0" / name / "data" / f"{stamp}.png", image)
@@ -160,13 +162,13 @@ def _write_pictures(
 
 
 def depth_views(settings: SimulationSettings) -> set[int]:
-    """Numbers of the frames whose true depth is stored, evenly spread."""
+    """Choose the frames whose true depth is stored, evenly spread."""
     views = (np.arange(settings.depth_views) + 0.5) / max(settings.depth_views, 1) * settings.frames
     return {int(v) for v in views}
 
 
 def _quaternions(rotations: Float64) -> Float64:
-    """(N, 4) w x y z, without jumps of sign."""
+    """Convert to quaternions (N, 4) w x y z, without jumps of sign."""
     q = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
     flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1, 1))
     q[1:] *= flips[:, None]

@@ -1,4 +1,4 @@
-"""What lies in the yard: sections of bundles in layers, dunnage between them, straps around them."""
+"""Stack the yard: sections of bundles in layers, dunnage between them, straps around them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ PACKING = 1.003
 END_CLEARANCE_M = 0.004
 OVER_EDGE_M = 0.25
 """How far a crossed bundle may reach beyond those that carry it: sections lie further apart."""
-LEAST_CROSSED_M = 0.8
+MIN_CROSSED_M = 0.8
 
 
 @dataclass(frozen=True, eq=False)
-class Bundle:
+class StackedBundle:
     """One bundle. Its axis is level, turned by yaw_rad from Y towards -X; all lengths in `yard`, metres.
 
     centre_m: (3,) middle of the axis. cross_m: (count, 2) the bars' axes in the bundle's cross-section
@@ -39,23 +39,23 @@ class Bundle:
 
     @property
     def radius_m(self) -> float:
-        """Radius of the circle around its bars."""
+        """Return the radius of the circle around its bars."""
         return _radius(self.kind)
 
     @property
     def top_z_m(self) -> float:
-        """The highest point of its bars."""
+        """Return the highest point of its bars."""
         return float(self.centre_m[2] + self.cross_m[:, 1].max() + self.kind.diameter_m / 2)
 
     @property
     def axes(self) -> Float64:
-        """(3, 3) rows: sideways, along, up, in `yard`."""
+        """Return rows (3, 3): sideways, along, up, in `yard`."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
-class Beam:
+class DunnageBeam:
     """A wooden beam of dunnage: centre_m (3,), half_m (3,) along itself, across, up; yaw_rad from X."""
 
     centre_m: Float64
@@ -67,14 +67,14 @@ class Beam:
 class Stock:
     """Everything that lies on the floor."""
 
-    bundles: tuple[Bundle, ...]
-    beams: tuple[Beam, ...]
+    bundles: tuple[StackedBundle, ...]
+    beams: tuple[DunnageBeam, ...]
 
 
 def stack_yard(settings: SimulationSettings, rng: np.random.Generator) -> Stock:
     """Fill `length_m` of the yard with sections of different height, kind of bar and length."""
-    bundles: list[Bundle] = []
-    beams: list[Beam] = []
+    bundles: list[StackedBundle] = []
+    beams: list[DunnageBeam] = []
     x, section = 0.0, 0
     while x < settings.length_m - 0.3:
         kinds = settings.kinds
@@ -91,8 +91,8 @@ def stack_yard(settings: SimulationSettings, rng: np.random.Generator) -> Stock:
     return Stock(tuple(bundles), tuple(beams))
 
 
-def hexagon(kind: BarKind) -> Float64:
-    """(count, 2) the bars' axes in a hexagonal packing, a row lying level, the middle bar first."""
+def hexagonal_packing(kind: BarKind) -> Float64:
+    """Compute the bars' axes (count, 2) in a hexagonal packing, a row lying level, the middle bar first."""
     rings, pitch = kind.rings, kind.diameter_m * PACKING
     cells = [
         (q + r / 2, r * np.sqrt(0.75))
@@ -111,21 +111,21 @@ def _radius(kind: BarKind) -> float:
 def _section(
     settings: SimulationSettings, rng: np.random.Generator, section: int, kind: BarKind,
     span_m: tuple[float, float],
-) -> tuple[list[Bundle], list[Beam]]:  # fmt: skip
+) -> tuple[list[StackedBundle], list[DunnageBeam]]:  # fmt: skip
     yard = settings.yard
     length = yard.bar_length_m * (1.0 if section % 3 != 1 else 0.8)
-    ribbed = bool(rng.random() < yard.ribbed_share)
+    ribbed = bool(rng.random() < yard.ribbed_ratio)
     columns = _columns(settings, rng, kind, span_m, length)
-    heights = _heights(len(columns), yard.max_layers, yard.missing_share, rng)
-    layers: list[list[Bundle]] = []
-    beams: list[Beam] = []
+    heights = _heights(len(columns), yard.max_layers, yard.missing_ratio, rng)
+    layers: list[list[StackedBundle]] = []
+    beams: list[DunnageBeam] = []
     base = 0.0
     for layer in range(max(heights, default=0)):
         present = [c for c, height in enumerate(heights) if height > layer]
         extent = (columns[present[0]][0] - _radius(kind), columns[present[-1]][0] + _radius(kind))
         beams += _dunnage(yard.dunnage_m, base, extent, length, rng)
         base += yard.dunnage_m
-        placed: list[Bundle] = []
+        placed: list[StackedBundle] = []
         for column in present:
             x, yaw = columns[column] if layer == 0 else _above(columns[column], yard.skew_deg, rng)
             x, yaw = _clear(x, yaw, placed, kind, length)
@@ -134,7 +134,7 @@ def _section(
         layers.append(placed)
         base = max(bundle.top_z_m for bundle in placed)
     bundles = [_covered(b, layers) for placed in layers for b in placed]
-    if yard.crossed_share > 0 and rng.random() < yard.crossed_share:
+    if yard.crossed_ratio > 0 and rng.random() < yard.crossed_ratio:
         over = _crossed(layers[-1], base, rng)
         bundles = [replace(b, on_top=b.on_top and not _overlap(b, over)) for b in bundles] + [over]
     return bundles, beams
@@ -144,7 +144,7 @@ def _columns(
     settings: SimulationSettings, rng: np.random.Generator, kind: BarKind, span_m: tuple[float, float],
     length: float,
 ) -> list[tuple[float, float]]:  # fmt: skip
-    """(x, yaw) of the lowest layer's places, so far apart that skewed neighbours don't meet."""
+    """Place the lowest layer's (x, yaw), so far apart that skewed neighbours don't meet."""
     columns: list[tuple[float, float]] = []
     radius, yard = _radius(kind), settings.yard
     x = span_m[0] + radius
@@ -176,13 +176,15 @@ def _limit(skew_deg: float) -> float:
 
 
 def _above(below: tuple[float, float], skew_deg: float, rng: np.random.Generator) -> tuple[float, float]:
-    """A place on the column below, a little beside it and turned a little otherwise."""
+    """Place a bundle on the column below, a little beside it and turned a little otherwise."""
     limit = np.radians(_limit(skew_deg))
     yaw = np.clip(below[1] + rng.normal(0, 0.3) * np.radians(skew_deg), -limit, limit)
     return below[0] + float(rng.normal(0, 0.006)), float(yaw)
 
 
-def _clear(x: float, yaw: float, placed: list[Bundle], kind: BarKind, length: float) -> tuple[float, float]:
+def _clear(
+    x: float, yaw: float, placed: list[StackedBundle], kind: BarKind, length: float
+) -> tuple[float, float]:
     """Shift the bundle so far along X that it clears the one before it on its layer."""
     if placed:
         last = placed[-1]
@@ -190,15 +192,15 @@ def _clear(x: float, yaw: float, placed: list[Bundle], kind: BarKind, length: fl
     return x, yaw
 
 
-def _heights(columns: int, max_layers: int, missing_share: float, rng: np.random.Generator) -> list[int]:
-    """Layers per column: runs of random height, single columns lower or empty."""
+def _heights(columns: int, max_layers: int, missing_ratio: float, rng: np.random.Generator) -> list[int]:
+    """Draw layers per column: runs of random height, single columns lower or empty."""
     heights: list[int] = []
     while len(heights) < columns:
         run = int(rng.integers(1, max_layers + 1))
         heights += [run] * int(rng.integers(1, 4))
     heights = heights[:columns]
     for column in range(columns):
-        if rng.random() < missing_share:
+        if rng.random() < missing_ratio:
             heights[column] = 0
         elif rng.random() < 0.15:
             heights[column] = max(1, heights[column] - 1)
@@ -210,34 +212,36 @@ def _heights(columns: int, max_layers: int, missing_share: float, rng: np.random
 def _bundle(
     number: tuple[int, int, int], kind: BarKind, place: tuple[float, float, float], yaw: float, length: float,
     ribbed: bool, rng: np.random.Generator,
-) -> Bundle:  # fmt: skip
-    """`place`: x, y of the middle and z of what the bundle lies on."""
+) -> StackedBundle:  # fmt: skip
+    """Make a bundle; `place`: x, y of the middle and z of what the bundle lies on."""
     roll = rng.uniform(0, np.pi / 3) if kind.count <= 7 else np.radians(rng.normal(0, 1.5))
     c, s = np.cos(roll), np.sin(roll)
-    cross = hexagon(kind) @ np.array([[c, s], [-s, c]])
+    cross = hexagonal_packing(kind) @ np.array([[c, s], [-s, c]])
     lowest = cross[:, 1].min() - kind.diameter_m / 2
     centre = np.array([place[0], place[1], place[2] - lowest])
-    return Bundle(*number, kind, centre, yaw, float(roll), cross, length, ribbed)
+    return StackedBundle(*number, kind, centre, yaw, float(roll), cross, length, ribbed)
 
 
-def _crossed(carriers: list[Bundle], base: float, rng: np.random.Generator) -> Bundle:
-    """A bundle of the same bars over the highest layer: across it, or turned by 6 to 20 degrees."""
+def _crossed(carriers: list[StackedBundle], base: float, rng: np.random.Generator) -> StackedBundle:
+    """Make a bundle of the same bars over the highest layer: across it, or turned by 6 to 20 degrees."""
     first = carriers[0]
     low, high = (float(b.centre_m[0]) + s * b.radius_m for b, s in ((first, -1), (carriers[-1], 1)))
     reach = (high - low) / 2 + OVER_EDGE_M
     yaw = float(rng.choice([-1, 1]) * np.radians(rng.uniform(6, 20)))
     length = min(rng.uniform(0.5, 0.9) * first.length_m, 2 * (reach - first.radius_m) / np.sin(abs(yaw)))
-    if rng.random() < 0.5 or length < LEAST_CROSSED_M:
+    if rng.random() < 0.5 or length < MIN_CROSSED_M:
         yaw = float(np.pi / 2 - abs(rng.normal(0, np.radians(3))))
-        length = min(max(2 * reach - rng.uniform(0, OVER_EDGE_M), LEAST_CROSSED_M), first.length_m)
+        length = min(max(2 * reach - rng.uniform(0, OVER_EDGE_M), MIN_CROSSED_M), first.length_m)
     y = float(rng.uniform(-0.2, 0.2)) * first.length_m
     number = (first.section, first.layer + 1, -1)
     place = ((low + high) / 2, y, base)
     return replace(_bundle(number, first.kind, place, yaw, length, first.ribbed, rng), on_top=True)
 
 
-def _overlap(one: Bundle, other: Bundle) -> bool:
-    """Whether their middle halves, which touch, meet seen from above: no axis of either separates them."""
+def _overlap(one: StackedBundle, other: StackedBundle) -> bool:
+    """Check whether the middle halves, which touch, meet seen from above: no axis of either
+    separates them.
+    """
     away = one.centre_m - other.centre_m
     for axis in (*one.axes[:2], *other.axes[:2]):
         reach = sum(
@@ -249,7 +253,7 @@ def _overlap(one: Bundle, other: Bundle) -> bool:
     return True
 
 
-def _covered(bundle: Bundle, layers: list[list[Bundle]]) -> Bundle:
+def _covered(bundle: StackedBundle, layers: list[list[StackedBundle]]) -> StackedBundle:
     above = layers[bundle.layer + 1] if bundle.layer + 1 < len(layers) else []
     reach = bundle.radius_m
     covered = any(abs(other.centre_m[0] - bundle.centre_m[0]) < reach for other in above)
@@ -258,12 +262,12 @@ def _covered(bundle: Bundle, layers: list[list[Bundle]]) -> Bundle:
 
 def _dunnage(
     size: float, base: float, extent: tuple[float, float], length: float, rng: np.random.Generator
-) -> list[Beam]:
-    """Three beams along X under a layer."""
+) -> list[DunnageBeam]:
+    """Place three beams along X under a layer."""
     beams = []
     for share in (-0.36, 0.0, 0.36):
         begin, end = extent[0] - rng.uniform(0.05, 0.3), extent[1] + rng.uniform(0.05, 0.3)
         centre = np.array([(begin + end) / 2, share * length + rng.normal(0, 0.06), base + size / 2])
         half = np.array([(end - begin) / 2, size / 2, size / 2])
-        beams.append(Beam(centre, half, float(np.radians(rng.normal(0, 0.3)))))
+        beams.append(DunnageBeam(centre, half, float(np.radians(rng.normal(0, 0.3)))))
     return beams

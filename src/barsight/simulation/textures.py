@@ -1,4 +1,4 @@
-"""The surface's pattern: tiles of noise whose spectrum ends where the image sensor's does."""
+"""Synthesise surface texture: tiles of noise whose spectrum ends where the image sensor's does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ALONG_M = 0.002
 
 
 def surface_tile(rng: np.random.Generator, footprint_m: float) -> Float32:
-    """(TILE, TILE, 4) periodic float32, first axis around the bar, second along it.
+    """Synthesise a (TILE, TILE, 4) periodic float32 tile, first axis around the bar, second along it.
 
     Channels: albedo factor (mean 1), gloss factor (mean 1), slope of the surface around the bar (rad),
     isotropic albedo factor in texels of ALONG_M for floor and wood (mean 1).
@@ -40,7 +40,7 @@ def surface_tile(rng: np.random.Generator, footprint_m: float) -> Float32:
 
 
 def _noise(rng: np.random.Generator, around_m: float, along_m: float) -> Float64:
-    """(TILE, TILE) periodic Gaussian noise, zero mean, unit variance, smoothed with these sigmas."""
+    """Draw (TILE, TILE) periodic Gaussian noise, zero mean, unit variance, smoothed with these sigmas."""
     spectrum = np.fft.rfft2(rng.standard_normal((TILE, TILE)))
     f_around = np.fft.fftfreq(TILE, AROUND_M)[:, None]
     f_along = np.fft.rfftfreq(TILE, ALONG_M)[None, :]

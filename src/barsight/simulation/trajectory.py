@@ -1,4 +1,6 @@
-"""The crane's way as exact functions of time: travel with acceleration and braking, sway, vibration."""
+"""Define the crane's motion as exact functions of time: travel with acceleration and braking, sway,
+vibration.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.simulation.settings import CameraSettings, MotionSettings
+from barsight.simulation.settings import CameraSettings, TravelSettings
 
 SMOOTHSTEP_PEAK_SLOPE = 1.875
 
@@ -31,16 +33,16 @@ class Jet:
         )
 
     def scaled(self, factor: float) -> Jet:
-        """This times a constant."""
+        """Scale by a constant."""
         return Jet(factor * self.value, factor * self.rate, factor * self.rate2)
 
     def shifted(self, offset: float) -> Jet:
-        """This plus a constant."""
+        """Add a constant."""
         return Jet(self.value + offset, self.rate, self.rate2)
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class BodyMotion:
     """The body at N instants. All (N, ...) in `yard` unless named.
 
     position_m, velocity_mps, acceleration_mps2: (N, 3). yard_from_body: (N, 3, 3). body_rate_radps: (N, 3) in
@@ -55,14 +57,14 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class CraneTrajectory:
+class SimulatedTrajectory:
     """The body's way, defined for every instant (s on the IMU's clock, 0 at its first sample).
 
     The crane rests until `start_s`, ramps up for `ramp_s`, brakes from `brake_s` for `ramp_s` and settles.
     """
 
     camera: CameraSettings
-    motion: MotionSettings
+    motion: TravelSettings
     nominal_yard_from_body: Float64
     phases_rad: Float64
     begin_x_m: float
@@ -75,10 +77,10 @@ class CraneTrajectory:
 
     @classmethod
     def plan(
-        cls, length_m: float, camera: CameraSettings, motion: MotionSettings,
+        cls, length_m: float, camera: CameraSettings, motion: TravelSettings,
         nominal_yard_from_body: Float64, rng: np.random.Generator,
-    ) -> CraneTrajectory:  # fmt: skip
-        """Travel from `overrun_m` before the stack to as far behind it."""
+    ) -> SimulatedTrajectory:  # fmt: skip
+        """Plan the travel from `overrun_m` before the stack to as far behind it."""
         distance = length_m + 2 * motion.overrun_m
         acceleration = motion.acceleration_mps2
         speed = min(motion.speed_mps, float(np.sqrt(distance * acceleration / SMOOTHSTEP_PEAK_SLOPE)))
@@ -91,8 +93,8 @@ class CraneTrajectory:
             motion.standstill_s, ramp, brake, settled, settled + motion.standstill_s,
         )  # fmt: skip
 
-    def at(self, time_s: Float64) -> Motion:
-        """The exact motion at (N,) instants."""
+    def at(self, time_s: Float64) -> BodyMotion:
+        """Evaluate the exact motion at (N,) instants."""
         t = np.asarray(time_s, dtype=np.float64)
         x, y, z = self._place(t)
         roll, pitch, yaw = self._turn(t)
@@ -105,7 +107,7 @@ class CraneTrajectory:
             + roll.rate[:, None] * (yawed @ _about_y(pitch.value) @ e_x)
         )
         yard_from_body = turn @ self.nominal_yard_from_body
-        return Motion(
+        return BodyMotion(
             np.stack([x.value, y.value, z.value], axis=1),
             np.stack([x.rate, y.rate, z.rate], axis=1),
             np.stack([x.rate2, y.rate2, z.rate2], axis=1),
@@ -114,7 +116,7 @@ class CraneTrajectory:
         )
 
     def time_at_x(self, x_m: float) -> float:
-        """When the travel (sway aside) has reached `x_m`, by bisection."""
+        """Find when the travel (sway aside) has reached `x_m`, by bisection."""
         low, high = self.start_s, self.brake_s + self.ramp_s
         for _ in range(60):
             middle = (low + high) / 2
@@ -127,7 +129,7 @@ class CraneTrajectory:
         return up.scaled(self.speed_mps) + down.scaled(-self.speed_mps)
 
     def _envelope(self, t: Float64) -> Jet:
-        """0 at rest, 1 under way; the sway dies down while the crane brakes and settles."""
+        """Fade 0 at rest to 1 under way; the sway dies down while the crane brakes and settles."""
         fade = _smoothstep(t, self.brake_s, self.settled_s - self.brake_s)
         return _smoothstep(t, self.start_s, self.ramp_s) * fade.scaled(-1).shifted(1)
 
@@ -164,7 +166,7 @@ class CraneTrajectory:
 
 
 def _smoothstep(t: Float64, begin_s: float, span_s: float) -> Jet:
-    """From 0 to 1 with two continuous derivatives: 6u^5 - 15u^4 + 10u^3."""
+    """Step from 0 to 1 with two continuous derivatives: 6u^5 - 15u^4 + 10u^3."""
     u = np.clip((t - begin_s) / span_s, 0, 1)
     rate = 30 * u**2 * (u - 1) ** 2 / span_s
     rate2 = 60 * u * (u - 1) * (2 * u - 1) / span_s**2
@@ -172,7 +174,7 @@ def _smoothstep(t: Float64, begin_s: float, span_s: float) -> Jet:
 
 
 def _ramp(t: Float64, begin_s: float, span_s: float) -> Jet:
-    """The integral of the smooth step over time (s), and its derivatives."""
+    """Integrate the smooth step over time (s), with its derivatives."""
     step = _smoothstep(t, begin_s, span_s)
     u = np.clip((t - begin_s) / span_s, 0, 1)
     beyond = np.maximum(t - begin_s - span_s, 0)

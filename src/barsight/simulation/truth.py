@@ -1,4 +1,6 @@
-"""The exact truth beside a recording: heights, what the cameras see, depth of some views, bundles, rig."""
+"""Write the exact truth beside a recording: heights, what the cameras see, depth of some views,
+bundles, rig.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,13 @@ from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.pose import Pose
-from barsight.simulation.hanging_plate import Plate
+from barsight.simulation.hanging_plate import MagnetPlate
 from barsight.simulation.optics import sample_rays
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
 from barsight.simulation.sensors import heights
 from barsight.simulation.settings import SimulationSettings
-from barsight.simulation.stock import Bundle
+from barsight.simulation.stock import StackedBundle
 
 CELL_X_M, CELL_Y_M = 0.01, 0.02
 HALF_WIDTH_M = 3.8
@@ -54,7 +56,7 @@ class SurfaceTruth:
         self.profile_z_m = self._points[gx.size :, 2].reshape(px.shape)
         self.profile_visible = self._seen[gx.size :].reshape(px.shape)
 
-    def count_frame(self, rig: StereoRig, yard_from_body: Pose, plate: Plate | None = None) -> None:
+    def count_frame(self, rig: StereoRig, yard_from_body: Pose, plate: MagnetPlate | None = None) -> None:
         """Add one to every cell that both cameras see in this frame."""
         low, high = _floor_reach(rig.cam0, yard_from_body @ rig.body_from_cam0)
         rows = np.flatnonzero((self._points[:, 0] >= low) & (self._points[:, 0] <= high))
@@ -68,7 +70,7 @@ class SurfaceTruth:
         self._seen[rows] += 1
 
     def _sees(self, camera: Camera, yard_from_cam: Pose, points: Float64) -> Bool:
-        """(N,) whether a camera sees the points: in its image, and nothing between."""
+        """Check which points (N,) a camera sees: in its image, and nothing between."""
         in_camera = yard_from_cam.inverse().apply(points)
         plane = in_camera[:, :2] / in_camera[:, 2:]
         limit = 0.75 * np.hypot(camera.width, camera.height) / camera.fx_px
@@ -84,7 +86,7 @@ class SurfaceTruth:
         return seen
 
     def write(self, folder: Path) -> None:
-        """`height.npz`."""
+        """Write `height.npz`."""
         arrays: dict[str, Any] = {"x": self.x_m, "y": self.y_m, "z": self.z_m.astype(np.float32)}
         arrays |= {"visible": self.visible, "profile_x": self.profile_x_m, "profile_ys": self.profile_y_m}
         for k in range(len(self.profile_y_m)):
@@ -94,7 +96,7 @@ class SurfaceTruth:
 
 
 def _floor_reach(camera: Camera, yard_from_cam: Pose) -> tuple[float, float]:
-    """Bounds in x (m) of all that a camera over the floor can see, with a margin; infinite at the horizon."""
+    """Bound in x (m) all that a camera over the floor can see, with a margin; infinite at the horizon."""
     half = 0.65 * np.array([camera.width / camera.fx_px, camera.height / camera.fy_px])
     corners = [[i * half[0], j * half[1], 1.0] for i in (-1, 1) for j in (-1, 1)]
     rays = np.array(corners) @ yard_from_cam.rotation.T
@@ -105,8 +107,12 @@ def _floor_reach(camera: Camera, yard_from_cam: Pose) -> tuple[float, float]:
     return float(reached.min()), float(reached.max())
 
 
-def true_depth(scene: Scene, camera: Camera, yard_from_cam: Pose, plate: Plate | None = None) -> Float32:
-    """(H, W) depth along the raw camera's optical axis at each pixel's centre, m; inf where nothing is."""
+def true_depth(
+    scene: Scene, camera: Camera, yard_from_cam: Pose, plate: MagnetPlate | None = None
+) -> Float32:
+    """Compute depth (H, W) along the raw camera's optical axis at each pixel's centre, m; inf where nothing
+    is.
+    """
     plane = sample_rays(camera, 1).reshape(-1, 2).astype(np.float64)
     directions = np.column_stack([plane, np.ones(len(plane))]) @ yard_from_cam.rotation.T
     depth, _ = cast_rays(scene, yard_from_cam.translation[None], directions)
@@ -116,8 +122,8 @@ def true_depth(scene: Scene, camera: Camera, yard_from_cam: Pose, plate: Plate |
     return depth.reshape(camera.height, camera.width).astype(np.float32)
 
 
-def write_bundles(bundles: tuple[Bundle, ...], folder: Path) -> None:
-    """`bundles.json`."""
+def write_bundles(bundles: tuple[StackedBundle, ...], folder: Path) -> None:
+    """Write `bundles.json`."""
     rows = [
         {
             "sec": b.section, "lay": b.layer, "col": b.column, "center": b.centre_m.tolist(),
@@ -134,7 +140,7 @@ def write_rig(
     rig: StereoRig, gyro_bias: Float64, accel_bias: Float64, lever_m: Float64, settings: SimulationSettings,
     folder: Path,
 ) -> None:  # fmt: skip
-    """`rig.json`."""
+    """Write `rig.json`."""
     content = {
         "gyro_bias0": gyro_bias.tolist(),
         "accel_bias0": accel_bias.tolist(),

@@ -1,4 +1,4 @@
-"""Disparity in files: PFM [Middlebury], 16-bit PNG [KITTI] and float TIFF with both bands.
+"""Read and write disparities: PFM [Middlebury], 16-bit PNG [KITTI] and float TIFF with both bands.
 
 PFM and PNG hold the disparity alone; a TIFF holds disparity and sigma as two float32 bands.
 """

@@ -1,4 +1,4 @@
-"""The one shape that every stereo method has."""
+"""Define the protocol of every stereo method."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 
 
 class StereoMethod(Protocol):
-    """From a rectified pair to the left image's disparity. A method keeps no state between calls, so that two
-    pairs can be matched side by side.
+    """Protocol: match a rectified pair to the left image's disparity. A method keeps no state between calls,
+    so that two pairs can be matched side by side.
     """
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:

@@ -1,4 +1,4 @@
-"""What a pair's images carry: texture at all, and the limit that their noise sets."""
+"""Check texture and compute the Cramer-Rao bound of a match from the images' noise."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.types import RectifiedPair
 
 _VISIBLE_STEP = 4
-_LEAST_SHARE = 1e-3
+_MIN_RATIO = 1e-3
 _FEWEST_ROWS = 3
 
 
 def has_texture(pair: RectifiedPair) -> bool:
-    """Whether in either image at least one pixel in a thousand differs from its neighbour but one by more
+    """Check that in either image at least one pixel in a thousand differs from its neighbour but one by more
     than 4 gray levels: a black, a burnt out or an all gray image has none, nor one of fewer than 3 rows.
     """
     if pair.left.shape[0] < _FEWEST_ROWS:
@@ -23,8 +23,8 @@ def has_texture(pair: RectifiedPair) -> bool:
 
 
 def noise_sigma(image: UInt8, radius_px: int) -> Float32:
-    """(H, W) float32 px, the Cramer-Rao bound of a match over a window of 2 r + 1: sqrt(2) image sigma over
-    the root of the window's summed squared gradients; 1 px at most.
+    """Compute the Cramer-Rao bound (H, W) float32 px of a match over a window of 2 r + 1: sqrt(2) image sigma
+    over the root of the window's summed squared gradients; 1 px at most.
     """
     gradient = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     side = 2 * radius_px + 1
@@ -37,11 +37,11 @@ def noise_sigma(image: UInt8, radius_px: int) -> Float32:
 def _is_textured(image: UInt8, valid: Bool) -> bool:
     steps = np.abs(image[:, 2:].astype(np.int16) - image[:, :-2]) > _VISIBLE_STEP
     usable = valid[:, 2:] & valid[:, :-2]
-    return int(np.count_nonzero(steps & usable)) > _LEAST_SHARE * image.size
+    return int(np.count_nonzero(steps & usable)) > _MIN_RATIO * image.size
 
 
 def image_noise(image: UInt8 | Float32) -> float:
-    """The image's noise, one sigma in grey levels: robust, from a Laplacian that planes don't excite
+    """Estimate the image's noise, one sigma in grey levels: robust, from a Laplacian that planes don't excite
     [Immerkaer 1996], with the median instead of the mean so that texture counts less.
     """
     response = _bends(_bends(image.astype(np.float32)).T)
@@ -50,6 +50,6 @@ def image_noise(image: UInt8 | Float32) -> float:
 
 
 def _bends(image: Float32) -> Float32:
-    """Second differences down the columns at every third row."""
+    """Compute second differences down the columns at every third row."""
     bends: Float32 = image[:-2:3] - 2 * image[1:-1:3] + image[2::3]
     return bends

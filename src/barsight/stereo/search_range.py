@@ -1,4 +1,4 @@
-"""The disparity range found from the images, and left and right swapped found on the way.
+"""Find the disparity range from the images, and swapped left and right on the way.
 
 A coarse match at a quarter of the size over every disparity that could be; its consistent part gives the
 range. A swapped pair has disparities of the wrong sign: the coarse match of the exchanged images is then far
@@ -15,55 +15,57 @@ from barsight.core.errors import Failed
 from barsight.core.types import DisparityRange, RectifiedPair
 
 _SCALE = 4
-_USUAL_SHARE = 0.4
-_WIDEST_SHARE = 0.8
+_USUAL_RATIO = 0.4
+_WIDEST_RATIO = 0.8
 _TOP_PX = 16
 _POOR = 0.6
-_MARGIN_SHARE = 0.12
+_MARGIN_RATIO = 0.12
 _MARGIN_PX = 6
-_LEAST_CONSISTENT = 0.03
+_MIN_CONSISTENT = 0.03
 
 
-def find_range(pair: RectifiedPair) -> DisparityRange | Failed:
-    """The range of disparities that a pair shows, widened by a margin.
+def find_disparity_range(pair: RectifiedPair) -> DisparityRange | Failed:
+    """Find the range of disparities that a pair shows, widened by a margin.
 
     Failed `no-texture` where too little matches either way, `swapped` where left and right are exchanged; see
-    also `nothing_to_match`.
+    also `check_matchable`.
     """
-    nothing = nothing_to_match(pair)
+    nothing = check_matchable(pair)
     if nothing is not None:
         return nothing
     doffs = pair.camera.doffs_px
     disparity = coarse_disparity(pair.left, pair.right, doffs)
-    share = _finite_share(disparity)
-    top = _USUAL_SHARE * pair.camera.width - doffs - _TOP_PX
+    share = _finite_ratio(disparity)
+    top = _USUAL_RATIO * pair.camera.width - doffs - _TOP_PX
     ends_at_top = share > 0 and np.nanpercentile(disparity, 99) > top
     if ends_at_top or share < _POOR:
         # The surface may be nearer than the usual search reaches.
-        wider = coarse_disparity(pair.left, pair.right, doffs, _WIDEST_SHARE)
-        found = _finite_share(wider)
+        wider = coarse_disparity(pair.left, pair.right, doffs, _WIDEST_RATIO)
+        found = _finite_ratio(wider)
         if found >= (share if ends_at_top else max(1.4 * share, 0.1)):
             disparity, share = wider, found
     if share < _POOR:
-        exchanged = _finite_share(coarse_disparity(pair.right, pair.left, -doffs))
+        exchanged = _finite_ratio(coarse_disparity(pair.right, pair.left, -doffs))
         if exchanged > 1.5 * share and exchanged > 0.1:
             return Failed(
                 "swapped",
                 f"left and right images are swapped: {100 * exchanged:.0f} % of the pixels match "
                 f"when they are exchanged, {100 * share:.0f} % as given",
             )
-    if share < _LEAST_CONSISTENT:
+    if share < _MIN_CONSISTENT:
         return Failed("no-texture", f"too little can be matched: {100 * share:.1f} % of the pixels")
     low, high = np.nanpercentile(disparity, (0.1, 99.9))
-    margin = _MARGIN_PX + _MARGIN_SHARE * (high - low)
+    margin = _MARGIN_PX + _MARGIN_RATIO * (high - low)
     ceiling = int(pair.camera.width * 0.9)
     lowest = int(np.floor(min(max(low - margin, -doffs), ceiling - 16)))
     highest = int(np.ceil(min(high + margin, ceiling)))
     return DisparityRange(lowest, lowest + max(16, -(-(highest - lowest) // 16) * 16))
 
 
-def nothing_to_match(pair: RectifiedPair) -> Failed | None:
-    """Failed `no-texture` where an image is one grey all over, `same-image` where both are the same one."""
+def check_matchable(pair: RectifiedPair) -> Failed | None:
+    """Return Failed `no-texture` where an image is one grey all over, `same-image` where both are the same
+    one.
+    """
     for name, image in (("left", pair.left), ("right", pair.right)):
         grey = int(image[0, 0])
         if (image == grey).all():
@@ -75,12 +77,12 @@ def nothing_to_match(pair: RectifiedPair) -> Failed | None:
 
 
 def coarse_disparity(
-    left: UInt8, right: UInt8, doffs_px: float = 0.0, width_share: float = _USUAL_SHARE,
+    left: UInt8, right: UInt8, doffs_px: float = 0.0, width_ratio: float = _USUAL_RATIO,
     known: tuple[float, float] | None = None, both_ways: bool = True,
 ) -> Float32:  # fmt: skip
-    """Left-right consistent disparities of a quarter-size match, else NaN, also where nothing changes.
+    """Match at quarter size with left-right check; NaN elsewhere, also where nothing changes.
 
-    From 1 px above -doffs_px, which is infinitely far, over `width_share` of the width, and within that from
+    From 1 px above -doffs_px, which is infinitely far, over `width_ratio` of the width, and within that from
     the lowest to the highest disparity `known` beforehand, px. Without `both_ways` the match from right to
     left is left out, half of the time: for guesses whose places are looked for in both pictures anyhow.
     Returns (H / 4, W / 4) float32 in full-size px.
@@ -88,7 +90,7 @@ def coarse_disparity(
     size = (max(left.shape[1] // _SCALE, 32), max(left.shape[0] // _SCALE, 32))
     small_left = cv2.resize(left, size, interpolation=cv2.INTER_AREA)
     small_right = cv2.resize(right, size, interpolation=cv2.INTER_AREA)
-    count = max(16, int(size[0] * width_share) // 16 * 16)
+    count = max(16, int(size[0] * width_ratio) // 16 * 16)
     scale = left.shape[1] / size[0]
     infinity = -doffs_px / scale
     lowest = int(np.floor(infinity))
@@ -129,11 +131,11 @@ def _match(left: UInt8, right: UInt8, lowest: int, count: int) -> Float32:
 
 
 def _changes(image: UInt8) -> Bool:
-    """(H, W): whether there is any gradient along the row in a 5 x 5 block; blank places match anything."""
+    """Check (H, W) for any gradient along the row in a 5 x 5 block; blank places match anything."""
     steps = cv2.convertScaleAbs(cv2.Sobel(image, cv2.CV_16S, 1, 0, ksize=3))
     changes: Bool = cv2.dilate(steps, np.ones((5, 5), np.uint8)) > 0
     return changes
 
 
-def _finite_share(disparity: Float32) -> float:
+def _finite_ratio(disparity: Float32) -> float:
     return float(np.isfinite(disparity).mean())

@@ -1,4 +1,4 @@
-"""The choice of a stereo method and its settings."""
+"""Define the choice of a stereo method and its settings."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ METHODS: tuple[MethodName, ...] = get_args(MethodName)
 
 @dataclass(frozen=True)
 class StereoSettings:
-    """Dense stereo."""
+    """Settings of dense stereo."""
 
     method: MethodName = "barsight"
     """Which method matches the pairs."""
-    lowest_disparity_px: int | None = None
+    min_disparity_px: int | None = None
     """First candidate; found from the images when not given."""
-    highest_disparity_px: int | None = None
+    max_disparity_px: int | None = None
     """End of the candidates; found from the images when not given."""
     calibration_sigma_px: float = 0.05
     """Disparity error that the calibration may cause everywhere alike (1 sigma), where no rig file's
@@ -46,7 +46,7 @@ class StereoSettings:
     barsight: BarsightSettings = field(default_factory=BarsightSettings)
 
     def __post_init__(self) -> None:
-        low, high = self.lowest_disparity_px, self.highest_disparity_px
+        low, high = self.min_disparity_px, self.max_disparity_px
         if low is not None and high is not None and high <= low:
             raise ConfigError(f"the disparity range {low}:{high} is empty")
         if self.calibration_sigma_px < 0 or self.max_depth_m <= 0:
@@ -57,14 +57,16 @@ class StereoSettings:
             raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
 
     def for_map(self) -> StereoSettings:
-        """The same without guesses, which no map takes, and as sure of a pixel's side as if there were no
-        edge: a map holds the views' sides against each other.
+        """Drop guesses, which no map takes, and be as sure of a pixel's side as if there were no edge: a map
+        holds the views' sides against each other.
         """
-        return replace(self, barsight=replace(self.barsight, fill_occlusions=False, other_side_share=0.0))
+        return replace(
+            self, barsight=replace(self.barsight, fill_occlusions=False, other_side_error_ratio=0.0)
+        )
 
 
 def make_method(settings: StereoSettings) -> StereoMethod:
-    """The method that the settings name."""
+    """Make the method that the settings name."""
     match settings.method:
         case "barsight":
             return BarsightStereo(settings.barsight)

@@ -1,4 +1,4 @@
-"""OpenCV's semi-global block matching [Hirschmueller 2008] as a stereo method."""
+"""Match by OpenCV's semi-global block matching [Hirschmueller 2008]."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _MODES = {
 }
 _SUBPIXEL_STEPS = 16
 _CANDIDATE_STEP = 16
-_LEAST_TEXTURE = 1e-3
+_MIN_TEXTURE = 1e-3
 
 
 @dataclass(frozen=True)
 class SgbmSettings:
-    """OpenCV's SGBM."""
+    """Settings of OpenCV's SGBM."""
 
     mode: Literal["3way", "5path", "8path", "hh4"] = "hh4"
     """Paths along which costs are summed; 8path is the slowest and needs the whole cost volume."""
@@ -58,7 +58,7 @@ class Sgbm:
     settings: SgbmSettings
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`."""
+        """Match; see `StereoMethod`."""
         settings = self.settings
         block = settings.block_px
         count = -(-candidates.count // _CANDIDATE_STEP) * _CANDIDATE_STEP
@@ -88,7 +88,7 @@ class Sgbm:
         disparity[~pair.left_valid] = np.nan
         disparity[~_lands_on_valid(disparity, pair)] = np.nan
         texture = _texture(pair.left, block)
-        disparity[texture < _LEAST_TEXTURE] = np.nan
+        disparity[texture < _MIN_TEXTURE] = np.nan
         noise_sigma = _noise_sigma(texture, image_noise(pair.left))
         sigma = np.hypot(noise_sigma, np.float32(settings.subpixel_sigma_px))
         sigma[np.isnan(disparity)] = np.nan
@@ -105,13 +105,15 @@ def _lands_on_valid(disparity: Float32, pair: RectifiedPair) -> Bool:
 
 
 def _texture(image: UInt8, block: int) -> Float32:
-    """(H, W) squared gradients along the row, grey levels per px, summed over each block."""
+    """Sum squared gradients along the row (H, W), grey levels per px, over each block."""
     gradient = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     texture: Float32 = cv2.boxFilter(gradient * gradient, -1, (block, block), normalize=False)
     return texture
 
 
 def _noise_sigma(texture: Float32, noise: float) -> Float32:
-    """(H, W) Cramer-Rao bound of a block match: sqrt(2) image sigma over the root of the summed gradients."""
-    sigma: Float32 = np.sqrt(2 * noise**2 / np.maximum(texture, _LEAST_TEXTURE), dtype=np.float32)
+    """Compute the Cramer-Rao bound (H, W) of a block match: sqrt(2) image sigma over the root of the summed
+    gradients.
+    """
+    sigma: Float32 = np.sqrt(2 * noise**2 / np.maximum(texture, _MIN_TEXTURE), dtype=np.float32)
     return sigma.clip(max=1)

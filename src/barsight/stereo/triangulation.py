@@ -1,4 +1,4 @@
-"""Disparity to points: triangulation with the noise and the shared part of the uncertainty apart."""
+"""Triangulate disparity with the noise and the shared part of the uncertainty apart."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.core.types import Disparity, RectifiedPair, StereoPoints
 
-_LEAST_NOISE_PX = 0.02
+_MIN_NOISE_PX = 0.02
 _JUMP_PX = 1.0
 
 
-def triangulate(
+def triangulate_disparity(
     pair: RectifiedPair,
     disparity: Disparity,
     shared_sigma_px: float,
@@ -24,7 +24,7 @@ def triangulate(
     max_sigma_m: float = float("inf"),
     per_pixel: int = 1,
 ) -> StereoPoints:
-    """Points in `rect0` of all pixels that have a disparity.
+    """Triangulate points in `rect0` of all pixels that have a disparity.
 
     depth = f b / (d + doffs); along the ray its sigma is depth^2 / (f b) * sigma_d * |ray|.
     shared_sigma_px is the disparity error that the calibration may cause, the same in every view; the
@@ -54,7 +54,7 @@ def _points(
     max_depth_m: float,
     max_sigma_m: float,
 ) -> tuple[Float32, Float32, Float32, UInt8]:
-    """Points, noise and shared sigma along the ray, and grey levels, row by row."""
+    """Compute points, noise and shared sigma along the ray, and grey levels, row by row."""
     focal, strength = lens[0], lens[0] * lens[3]
     xyz = np.empty((shift.size, 3), np.float32)
     noise, shared = np.empty(shift.size, np.float32), np.empty(shift.size, np.float32)
@@ -73,7 +73,7 @@ def _points(
             ray_x = ((j + 0.5) / per_pixel - 0.5 - lens[1]) / focal
             along_ray = per_px * np.sqrt(1 + ray_x * ray_x + ray_y * ray_y)
             xyz[n, 0], xyz[n, 1], xyz[n, 2] = ray_x * depth, ray_y * depth, depth
-            noise[n] = along_ray * np.sqrt(max(sigma * sigma - bias_px * bias_px, _LEAST_NOISE_PX**2))
+            noise[n] = along_ray * np.sqrt(max(sigma * sigma - bias_px * bias_px, _MIN_NOISE_PX**2))
             shared[n] = along_ray * shared_px
             intensity[n] = left[i // per_pixel, j // per_pixel]
             n += 1
@@ -81,7 +81,9 @@ def _points(
 
 
 def refine_grid(disparity: Float32, per_pixel: int) -> Float32:
-    """(H, W) to (H * per_pixel, W * per_pixel), bilinear inside a surface, nearest at jumps and gaps."""
+    """Upsample (H, W) to (H * per_pixel, W * per_pixel), bilinear inside a surface, nearest at jumps and
+    gaps.
+    """
     if per_pixel == 1:
         return disparity
     nearest = _repeat(disparity, per_pixel)
@@ -91,7 +93,7 @@ def refine_grid(disparity: Float32, per_pixel: int) -> Float32:
 
 
 def _is_smooth(disparity: Float32) -> Bool:
-    """(H, W): no neighbour, oblique ones included, is unknown or further than a jump away."""
+    """Check (H, W) that no neighbour, oblique ones included, is unknown or further than a jump away."""
     around = np.pad(disparity, 1, mode="edge")
     height, width = disparity.shape
     smooth = np.ones(disparity.shape, dtype=np.bool_)

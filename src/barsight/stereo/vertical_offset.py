@@ -1,4 +1,4 @@
-"""Are the matches of a pair on the same rows? The vertical offset, measured on corner points."""
+"""Measure the vertical offset between a pair's rows on corner points."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from barsight.core.arrays import UInt8
 from barsight.core.errors import Failed
 from barsight.stereo.search_range import coarse_disparity
 
-MOST_OFFSET_PX = 1.8
-_LEAST_MATCHES = 20
-_REACH_SHARE = 0.1
-_COARSE_SHARE = 0.3
+MAX_OFFSET_PX = 1.8
+_MIN_MATCHES = 20
+_REACH_RATIO = 0.1
+_COARSE_RATIO = 0.3
 _COARSE_TOLERANCE_PX = 6.0
 
 
 def vertical_offset(left: UInt8, right: UInt8) -> float | Failed:
-    """The 75th percentile of |y_left - y_right| over matched corners, px: below about 1 in a rectified pair.
+    """Compute the 75th percentile of |y_left - y_right| over matched corners, px: below about 1 in a
+    rectified pair.
 
     Mutual nearest ORB descriptors whose rows differ by at most a tenth of the height; the percentile finds
     turned images too, whose offsets average out. Where a coarse dense match succeeds, corners that contradict
@@ -38,13 +39,13 @@ def vertical_offset(left: UInt8, right: UInt8) -> float | Failed:
     pairs = np.array(near)
     found, partner = places[0][pairs[:, 0]], places[1][pairs[:, 1]]
     offset = np.abs(found[:, 1] - partner[:, 1])
-    kept = offset <= _REACH_SHARE * left.shape[0]
+    kept = offset <= _REACH_RATIO * left.shape[0]
     coarse = coarse_disparity(left, right)
-    if np.isfinite(coarse).mean() > _COARSE_SHARE:
+    if np.isfinite(coarse).mean() > _COARSE_RATIO:
         row = (found[:, 1] * coarse.shape[0] / left.shape[0]).astype(int)
         column = (found[:, 0] * coarse.shape[1] / left.shape[1]).astype(int)
         kept &= np.abs(found[:, 0] - partner[:, 0] - coarse[row, column]) <= _COARSE_TOLERANCE_PX
     offset = offset[kept]
-    if offset.size < _LEAST_MATCHES:
+    if offset.size < _MIN_MATCHES:
         return Failed("no-texture", f"only {offset.size} corners match between the images")
     return float(np.percentile(offset, 75))

@@ -1,4 +1,4 @@
-"""What the viewer shows as points: every height seen or the elected surface, coloured by a property."""
+"""Build the viewer's points: every height seen or the elected surface, coloured by a property."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.result_folder import Cloud
 from barsight.yard.sections import patches
 from barsight.yard.types import YardMap
 
 SOURCE_RGB = {
-    Source.VISION: ("vision", (46, 125, 190)),
-    Source.LASER: ("laser", (90, 170, 60)),
-    Source.FILLED: ("filled", (230, 120, 30)),
+    HeightSource.VISION: ("vision", (46, 125, 190)),
+    HeightSource.LASER: ("laser", (90, 170, 60)),
+    HeightSource.FILLED: ("filled", (230, 120, 30)),
 }
 
 
@@ -44,7 +44,7 @@ class Colouring:
 
 
 def seen_layer(cloud: Cloud) -> Layer:
-    """Every height that enough views support: sides and lower surfaces too."""
+    """Collect every height that enough views support: sides and lower surfaces too."""
     values = {
         "height": cloud.xyz_m[:, 2] * 1e3,
         "intensity": cloud.intensity,
@@ -54,19 +54,19 @@ def seen_layer(cloud: Cloud) -> Layer:
     return Layer(cloud.xyz_m, values, cloud.total)
 
 
-def surface_layer(yard: YardMap, most_points: int) -> Layer:
-    """The known cells of the map, filled ones too, at most `most_points` of them, evenly drawn."""
+def surface_layer(yard: YardMap, max_points: int) -> Layer:
+    """Collect the known cells of the map, filled ones too, at most `max_points` of them, evenly drawn."""
     cuts = list(patches(yard, _PATCH_CELLS))
-    known = np.cumsum([0, *((yard.part(*cut).source != Source.UNKNOWN).sum() for cut in cuts)])
+    known = np.cumsum([0, *((yard.part(*cut).source != HeightSource.UNKNOWN).sum() for cut in cuts)])
     total = int(known[-1])
-    count = min(total, most_points)
+    count = min(total, max_points)
     drawn = np.arange(count) * total // max(count, 1)
     parts = [np.empty((6, 0), np.float32)]
     for cut, first, last in zip(cuts, known, known[1:], strict=False):
         if first == last:
             continue
         part = yard.part(*cut)
-        row, column = np.nonzero(part.source != Source.UNKNOWN)
+        row, column = np.nonzero(part.source != HeightSource.UNKNOWN)
         own = drawn[(drawn >= first) & (drawn < last)] - first
         cells = row[own], column[own]
         x, y = part.x0_m + part.cell_m * column[own], part.y0_m + part.cell_m * row[own]
@@ -77,7 +77,7 @@ def surface_layer(yard: YardMap, most_points: int) -> Layer:
     return Layer(np.column_stack([x, y, z]), values, total)
 
 
-def colour(layer: Layer, by: str) -> Colouring:
+def colour_layer(layer: Layer, by: str) -> Colouring:
     """Colour the points by one of their properties; the ends of a scale leave out 1 % of outliers."""
     values = layer.properties[by]
     if by == "source":
@@ -110,7 +110,7 @@ def _by_source(codes: Float32) -> Colouring:
 
 
 def _ramp(scale: int | None) -> UInt8:
-    """(256, 3) RGB from low to high on one of OpenCV's scales; None is grey."""
+    """Sample (256, 3) RGB from low to high on one of OpenCV's scales; None is grey."""
     levels = np.arange(256, dtype=np.uint8)[:, None]
     painted = np.repeat(levels, 3, axis=1) if scale is None else cv2.applyColorMap(levels, scale)[:, 0, ::-1]
     return np.ascontiguousarray(painted, dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""`barsight view`: surface, cloud, camera's way and contours in the browser, served by this machine."""
+"""Serve `barsight view`: surface, cloud, camera's way and contours in the browser, by this machine."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from barsight.result_folder import (
     read_path,
     read_summary,
 )
-from barsight.viewer.cloud import Layer, colour, seen_layer, surface_layer
+from barsight.viewer.cloud import Layer, colour_layer, seen_layer, surface_layer
 from barsight.viewer.yard_lines import yard_lines
 
 HOST = "127.0.0.1"
-MOST_POINTS = 2_000_000
-MOST_AXES = 200
-MOST_LINE_POINTS = 20_000
+MAX_POINTS = 2_000_000
+MAX_AXES = 200
+MAX_LINE_POINTS = 20_000
 YARD_RGB = {
     "free": (57, 211, 83),
     "covered": (242, 177, 52),
@@ -43,13 +43,13 @@ YARD_RGB = {
 LASER_RGB, CONTOUR_RGB, PATH_RGB = (230, 40, 40), (255, 140, 0), (30, 110, 200)
 
 
-def view(out_dir: Path, port: int = 8080, open_browser: bool = True, most_points: int = MOST_POINTS) -> None:
+def view(out_dir: Path, port: int = 8080, open_browser: bool = True, max_points: int = MAX_POINTS) -> None:
     """Serve the folder until Ctrl-C and print where. Port 0 takes a free one.
 
     Raises InputError for a folder without a readable result.json and cloud.ply, OutputError where the port
     is taken or may not be used.
     """
-    with serving(out_dir, port, most_points) as url:
+    with serving(out_dir, port, max_points) as url:
         print(f"{out_dir}: {url} (Ctrl-C ends it)", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             if open_browser:
@@ -58,14 +58,14 @@ def view(out_dir: Path, port: int = 8080, open_browser: bool = True, most_points
 
 
 @contextlib.contextmanager
-def serving(out_dir: Path, port: int, most_points: int = MOST_POINTS) -> Iterator[str]:
+def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[str]:
     """Serve the folder to this machine's browsers as long as the context is open; yields the URL."""
     summary = read_summary(out_dir)
-    cloud = read_cloud(out_dir / "cloud.ply", most_points)
+    cloud = read_cloud(out_dir / "cloud.ply", max_points)
     path, laser, contours = read_path(out_dir), read_laser(out_dir), read_contours(out_dir)
     yard = yard_lines(out_dir)
     layers = {
-        "surface": surface_layer(read_heights(out_dir), most_points),
+        "surface": surface_layer(read_heights(out_dir), max_points),
         "everything seen": seen_layer(cloud),
     }
     _expect_free(port)
@@ -91,12 +91,12 @@ def serving(out_dir: Path, port: int, most_points: int = MOST_POINTS) -> Iterato
 
 
 def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
-    """viser announces itself in a box and says good-bye; the command line prints its own line."""
+    """Silence viser, which announces itself in a box; the command line prints its own line."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def _expect_free(port: int) -> None:
-    """viser silently takes the next port where the wanted one is taken; here that is an error."""
+    """Refuse a taken port: viser silently takes the next one; here that is an error."""
     if not 0 <= port <= 65535:
         raise OutputError(f"port {port} does not exist; name one from 1024 to 65535 with --port")
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -125,7 +125,7 @@ def _aim(server: viser.ViserServer, cloud: Cloud, path: CameraPath | None) -> No
 
 
 def _show_points(server: viser.ViserServer, layers: dict[str, Layer]) -> None:
-    """One of the layers at a time, and what colours it."""
+    """Show one of the layers at a time, and what colours it."""
     shown = server.gui.add_dropdown("Show", tuple(layers))
     by = server.gui.add_dropdown("Colour by", tuple(layers[shown.value].properties))
     scale = server.gui.add_image(_legend(np.zeros((256, 3), np.uint8)))
@@ -135,7 +135,7 @@ def _show_points(server: viser.ViserServer, layers: dict[str, Layer]) -> None:
 
     def place() -> viser.PointCloudHandle:
         layer = layers[shown.value]
-        painted = colour(layer, by.value)
+        painted = colour_layer(layer, by.value)
         scale.image, caption.content = _legend(painted.ramp), painted.caption
         return server.scene.add_point_cloud(
             "/points", layer.xyz_m, painted.rgb,
@@ -152,7 +152,7 @@ def _show_points(server: viser.ViserServer, layers: dict[str, Layer]) -> None:
 
     @by.on_update
     def _recolour(_: object) -> None:
-        painted = colour(layers[shown.value], by.value)
+        painted = colour_layer(layers[shown.value], by.value)
         node.colors = painted.rgb
         scale.image, caption.content = _legend(painted.ramp), painted.caption
 
@@ -162,12 +162,12 @@ def _show_points(server: viser.ViserServer, layers: dict[str, Layer]) -> None:
 
 
 def _legend(ramp: UInt8) -> UInt8:
-    """(12, 256, 3): the colours as a picture, low at the left."""
+    """Draw the colours as a picture (12, 256, 3), low at the left."""
     return np.tile(ramp, (12, 1, 1))
 
 
 def _spacing_m(xyz_m: Float32) -> float:
-    """About the distance of neighbouring points: the bulk's area shared by the points, 2 mm to 100 mm."""
+    """Estimate the distance of neighbouring points: the bulk's area shared by the points, 2 mm to 100 mm."""
     low, high = np.percentile(xyz_m[:, :2], (2, 98), axis=0)
     area = float(np.prod(np.maximum(high - low, 0.01)))
     return float(np.clip(np.sqrt(area / len(xyz_m)), 0.002, 0.1))
@@ -179,11 +179,11 @@ def _show_lines(
     laser: tuple[LaserProfile, ...],
     contours: tuple[Contour, ...],
 ) -> None:
-    """Each kind of line under one name, with a checkbox that hides it."""
+    """Show each kind of line under one name, with a checkbox that hides it."""
     if path is not None and path.stamp_ns.size:
         _checkbox(server, "Camera path", "/path", True)
         _line(server, "/path/line", path.position_m, PATH_RGB)
-        step = -(-path.stamp_ns.size // MOST_AXES)
+        step = -(-path.stamp_ns.size // MAX_AXES)
         server.scene.add_batched_axes(
             "/path/frames",
             batched_wxyzs=path.quaternion_xyzw[::step][:, [3, 0, 1, 2]],
@@ -206,7 +206,7 @@ def _show_lines(
 
 
 def _show_yard(server: viser.ViserServer, yard: dict[str, Float32]) -> None:
-    """Boxes and axes of the bundles, the magnet's poles at offered lifts."""
+    """Show boxes and axes of the bundles, the magnet's poles at offered lifts."""
     if {"free", "covered"} & set(yard):
         _checkbox(server, "Bundles", "/bundles", True)
     if "poles" in yard:
@@ -234,10 +234,10 @@ def _line(server: viser.ViserServer, name: str, points_m: Float64, rgb: tuple[in
 
 
 def line_segments(points_m: Float64) -> Float32:
-    """(M, 2, 3): the joints of consecutive points of (N, 3), open where a point is unknown.
+    """Join consecutive points of (N, 3) to segments (M, 2, 3), open where a point is unknown.
 
-    A line of more than MOST_LINE_POINTS points is thinned.
+    A line of more than MAX_LINE_POINTS points is thinned.
     """
-    thinned = points_m[:: max(1, -(-len(points_m) // MOST_LINE_POINTS))]
+    thinned = points_m[:: max(1, -(-len(points_m) // MAX_LINE_POINTS))]
     joints = np.stack([thinned[:-1], thinned[1:]], axis=1)
     return joints[np.isfinite(joints).all(axis=(1, 2))].astype(np.float32)

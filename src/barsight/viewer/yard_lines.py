@@ -1,4 +1,4 @@
-"""Bundles as boxes with axes, and the magnet's poles at each offered lift, as line segments."""
+"""Draw bundles as boxes with axes, and the magnet's poles at each offered lift, as line segments."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ _EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4)
 
 
 def yard_lines(out_dir: Path) -> dict[str, Float32]:
-    """(N, 2, 3) segments by name: free and covered bundles' boxes, axes, poles; without what isn't there."""
+    """Collect segments (N, 2, 3) by name: free and covered bundles' boxes, axes, poles; without what isn't
+    there.
+    """
     lines: dict[str, list[Float64]] = {"free": [], "covered": [], "axes": [], "poles": []}
     if (out_dir / "bundles.json").is_file():
         for bundle in read_bundles(out_dir / "bundles.json"):
@@ -31,7 +33,9 @@ def yard_lines(out_dir: Path) -> dict[str, Float32]:
 
 
 def bundle_box(bundle: Bundle) -> Float64:
-    """(12, 2, 3) edges of the box around a bundle: its width, its length, from its top down by its width."""
+    """Compute edges (12, 2, 3) of the box around a bundle: its width, its length, from its top down by its
+    width.
+    """
     along = bundle.direction
     across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
     up = np.cross(across, along)
@@ -41,7 +45,7 @@ def bundle_box(bundle: Bundle) -> Float64:
 
 
 def pole_boxes(lift: dict[str, Any], poles: list[dict[str, float]]) -> Float64:
-    """(12 * P, 2, 3) edges of the poles as they lie."""
+    """Compute edges (12 * P, 2, 3) of the poles as they lie."""
     target = lift["target"]
     yaw, pitch = np.radians(target["yaw_deg"]), np.radians(lift["pitch_deg"])
     roll = np.radians(lift["roll_deg"])
@@ -62,7 +66,7 @@ def pole_boxes(lift: dict[str, Any], poles: list[dict[str, float]]) -> Float64:
 
 
 def _box(middle: Float64, a: Float64, b: Float64, c: Float64) -> Float64:
-    """(12, 2, 3) edges of a box by its middle and half sides."""
+    """Compute edges (12, 2, 3) of a box by its middle and half sides."""
     corners = np.array([middle + s * c + p for s in (-1, 1) for p in (-a - b, a - b, a + b, b - a)])
     edges: Float64 = corners[np.array(_EDGES)]
     return edges

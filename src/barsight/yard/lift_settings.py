@@ -1,4 +1,4 @@
-"""The settings of lift targets and of the pile's stability."""
+"""Define the settings of lift targets and of the pile's stability."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from barsight.core.errors import ConfigError
 
 @dataclass(frozen=True)
 class LiftSettings:
-    """What a lift must fulfil, beside the magnet's own limits."""
+    """Limits of a lift, beside the magnet's own."""
 
     bundles: int = 1
     """Bundles to be taken by one lift."""
-    least_count_probability: float = 0.999
+    min_count_probability: float = 0.999
     """How sure the count under the footprint must be."""
-    max_unknown_share: float = 0.1
+    max_unknown_ratio: float = 0.1
     """Of the cells under a pole that were not seen; filled ones count as not seen."""
-    max_unexplained_share: float = 0.03
+    max_unexplained_ratio: float = 0.03
     """Of the poles' area over something that belongs to no bundle."""
-    least_confidence: float = 0.5
+    min_confidence: float = 0.5
     """A bundle less sure than this is not lifted."""
     contact_gap_m: float = 0.003
     """A face nearer than this to steel lies on it."""
-    max_refused_share: float = 0.5
+    max_refused_ratio: float = 0.5
     """Of the frames that see the place of the lift."""
     max_age_s: float = 600.0
     """A place that was last seen longer ago than this is not lifted from."""
-    max_overhang_share: float = 0.25
+    max_overhang_ratio: float = 0.25
     """Of its width that a bundle may stand over the edge of what carries it."""
     max_lean_deg: float = 5.0
     """How far a side of the pile may lean outwards."""
@@ -37,7 +37,7 @@ class LiftSettings:
     """Its length."""
     stanchions: tuple[tuple[float, float, float], ...] = ()
     """x, y and height (m) of the stanchions, where there are any."""
-    least_freeboard_m: float = 0.05
+    min_freeboard_m: float = 0.05
     """How far a stanchion must stand above the bundles beside it."""
     beside_stanchion_m: float = 1.0
     """A bundle nearer than this to a stanchion is held by it."""
@@ -46,11 +46,11 @@ class LiftSettings:
         if not 1 <= self.bundles <= 10:
             raise ConfigError(f"lift bundles must lie in 1...10, not {self.bundles}")
         shares = (
-            self.max_unknown_share, self.max_unexplained_share, self.least_confidence,
-            self.max_overhang_share, self.least_count_probability, self.max_refused_share,
+            self.max_unknown_ratio, self.max_unexplained_ratio, self.min_confidence,
+            self.max_overhang_ratio, self.min_count_probability, self.max_refused_ratio,
         )  # fmt: skip
         if not all(0 <= share <= 1 for share in shares):
-            raise ConfigError("lift shares, least_confidence and least_count_probability lie in 0...1")
+            raise ConfigError("lift shares, min_confidence and min_count_probability lie in 0...1")
         if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
             raise ConfigError("lift contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
         if min(self.set_down_width_m, self.set_down_length_m) <= 0:

@@ -15,7 +15,9 @@ _WIDEST_PX = 900
 
 
 def picture_html(heights: HeightMap) -> str:
-    """An `img` element of the heights in colours, y upwards, unknown cells white, with its scale beneath."""
+    """Return an `img` element of the heights in colours, y upwards, unknown cells white, with its scale
+    beneath.
+    """
     known = np.isfinite(heights.z_m)
     if not known.any():
         return "<p>height map: nothing is known</p>"

@@ -1,4 +1,4 @@
-"""Long yards in stretches: what is held of a map at once doesn't grow with its length."""
+"""Divide long yards into stretches: what is held of a map at once doesn't grow with its length."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class PartedMap:
         self._last: tuple[slice, slice, HeightMap] | None = None
 
     def part(self, rows: slice, columns: slice) -> HeightMap:
-        """A rectangle of the map, by cells from start to stop."""
+        """Read a rectangle of the map, by cells from start to stop."""
         if self._last is None or self._last[:2] != (rows, columns):
             self._last = None
             self._last = rows, columns, self._read(rows, columns)
@@ -43,7 +43,7 @@ class PartedMap:
 
 
 def surface_map(surface: Surface, free: FreeSpace | None = None) -> PartedMap:
-    """All that a surface knows, read from its tiles; free: what lines of sight prove free."""
+    """Return all that a surface knows, read from its tiles; free: what lines of sight prove free."""
     cell_m = surface.cell_m
 
     def read(rows: slice, columns: slice) -> HeightMap:
@@ -60,7 +60,7 @@ def surface_map(surface: Surface, free: FreeSpace | None = None) -> PartedMap:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class MapStretch:
     """A part of a map, by rows and columns, that is worked on as if it were all. What lies in the rectangle
     from low_m to high_m (x and y, infinite where the map ends) is its own, the rest its neighbours'."""
 
@@ -70,22 +70,24 @@ class Stretch:
     high_m: tuple[float, float]
 
     def owns(self, place_m: Float64, slack_m: float = 0.0) -> bool:
-        """Whether a place (2 or more figures, x and y first) is its own, or no further off than slack_m."""
+        """Check whether a place (2 or more figures, x and y first) is its own, or no further off than
+        slack_m.
+        """
         return all(
             low - slack_m <= at < high + slack_m
             for low, at, high in zip(self.low_m, place_m[:2], self.high_m, strict=True)
         )
 
     def reaches(self, place_m: Float64) -> bool:
-        """Whether a place is its own or in its margin."""
+        """Check whether a place is its own or in its margin."""
         return self.owns(place_m, MARGIN_M)
 
 
-def stretches(yard: YardMap) -> list[Stretch]:
-    """A map's stretches; one for a map of up to WHOLE_M."""
+def split_map(yard: YardMap) -> list[MapStretch]:
+    """Divide a map into stretches; one for a map of up to WHOLE_M."""
     rows, columns = (_cuts(cells, yard.cell_m) for cells in yard.shape)
     return [
-        Stretch(
+        MapStretch(
             held_rows, held_columns,
             (yard.x0_m + first_x, yard.y0_m + first_y), (yard.x0_m + last_x, yard.y0_m + last_y),
         )
@@ -94,7 +96,7 @@ def stretches(yard: YardMap) -> list[Stretch]:
 
 
 def _cuts(cells: int, cell_m: float) -> list[tuple[slice, float, float]]:
-    """Along one axis: the cells that each stretch holds, and where its own begin and end from the first."""
+    """Divide one axis: the cells that each stretch holds, and where its own begin and end from the first."""
     count = 1 if cells * cell_m <= WHOLE_M else int(np.ceil(cells * cell_m / OWN_M))
     edges = np.linspace(0, cells, count + 1).round().astype(int).tolist()
     margin = round(MARGIN_M / cell_m)
@@ -106,7 +108,7 @@ def _cuts(cells: int, cell_m: float) -> list[tuple[slice, float, float]]:
 
 
 def patches(yard: YardMap, cells: int) -> Iterator[tuple[slice, slice]]:
-    """Rows and columns of squares of so many cells that cover a map; smaller at its far ends."""
+    """Divide a map into squares of so many cells, as rows and columns; smaller at its far ends."""
     for first, other in product(*(range(0, size, cells) for size in yard.shape)):
         yield (
             slice(first, min(first + cells, yard.shape[0])),
@@ -115,7 +117,7 @@ def patches(yard: YardMap, cells: int) -> Iterator[tuple[slice, slice]]:
 
 
 def part_about(yard: YardMap, x_m: Float64, y_m: Float64) -> HeightMap:
-    """The part that holds these places, or the nearest cells where they lie beyond the map."""
+    """Read the part that holds these places, or the nearest cells where they lie beyond the map."""
     cuts = []
     for at, first, size in ((y_m, yard.y0_m, yard.shape[0]), (x_m, yard.x0_m, yard.shape[1])):
         cell = (np.array([at.min(), at.max()]) - first) / yard.cell_m

@@ -1,4 +1,4 @@
-"""What the yard's stages pass on: bars, bundles and how sure they are.
+"""Define the records that the yard's stages pass on: bars, bundles and how sure they are.
 
 All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, counter-clockwise, in
 (-pi/2, pi/2]: the axis runs along (-sin yaw, cos yaw).
@@ -37,22 +37,22 @@ class HeightMap:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns)."""
+        """Return (rows, columns)."""
         rows, columns = self.z_m.shape
         return rows, columns
 
     @property
     def x_m(self) -> Float64:
-        """(columns,) the cells' centres."""
+        """Return (columns,): the cells' centres."""
         return np.asarray(self.x0_m + self.cell_m * np.arange(self.shape[1]), np.float64)
 
     @property
     def y_m(self) -> Float64:
-        """(rows,) the cells' centres."""
+        """Return (rows,): the cells' centres."""
         return np.asarray(self.y0_m + self.cell_m * np.arange(self.shape[0]), np.float64)
 
     def to_xarray(self) -> Any:
-        """The same as an xarray.Dataset with coordinates `y` and `x` and units as attributes.
+        """Return the same as an xarray.Dataset with coordinates `y` and `x` and units as attributes.
 
         Raises ConfigError where xarray isn't installed.
         """
@@ -66,13 +66,13 @@ class HeightMap:
         return Dataset(layers, centres, {"cell_m": self.cell_m})
 
     def _repr_html_(self) -> str:
-        """A picture of the heights for a notebook."""
+        """Return a picture of the heights for a notebook."""
         from barsight.yard.map_picture import picture_html
 
         return picture_html(self)
 
     def part(self, rows: slice, columns: slice) -> HeightMap:
-        """A rectangle of the map, by cells from start to stop; the arrays are shared."""
+        """Cut a rectangle of the map, by cells from start to stop; the arrays are shared."""
         x0_m, y0_m = (
             first + self.cell_m * part.start for first, part in ((self.x0_m, columns), (self.y0_m, rows))
         )
@@ -169,7 +169,7 @@ class Bundle:
 
     @property
     def direction(self) -> Float64:
-        """(3,) unit vector of the axis towards +y."""
+        """Return the unit vector (3,) of the axis towards +y."""
         cos_pitch = np.cos(self.pitch_rad)
         return np.array(
             [-np.sin(self.yaw_rad) * cos_pitch, np.cos(self.yaw_rad) * cos_pitch, np.sin(self.pitch_rad)]

@@ -1,4 +1,4 @@
-"""All reasons not to lift: one table of codes, and the record that carries one with its figures."""
+"""Define all reasons not to lift: one table of codes, and the record that carries one with its figures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ VETOES = {
 
 @dataclass(frozen=True)
 class Veto:
-    """Why not to lift: a code of `VETOES` and a sentence with the figures."""
+    """Reason not to lift: a code of `VETOES` and a sentence with the figures."""
 
     code: str
     reason: str

@@ -1,4 +1,4 @@
-"""What a bundle weighs, and how sure that is."""
+"""Estimate what a bundle weighs, and how sure that is."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class Mass:
 
     @property
     def upper_kg(self) -> float:
-        """A bound that holds in 95 % of cases."""
+        """Return a bound that holds in 95 % of cases."""
         return self.kg + UPPER * self.sigma_kg
 
     def __add__(self, other: Mass) -> Mass:
-        """Both together; their errors are taken as common, which is the careful sum."""
+        """Add both; their errors are taken as common, which is the careful sum."""
         return Mass(self.kg + other.kg, self.sigma_kg + other.sigma_kg)
 
 
-def mass_of(bundle: Bundle) -> Mass:
-    """Steel's section x length x 7850 kg/m3; NaN where width or length is unknown.
+def bundle_mass(bundle: Bundle) -> Mass:
+    """Compute steel's section x length x 7850 kg/m3; NaN where width or length is unknown.
 
     The section is the bars' number times one bar's where the number is known, else a share of the circle
     around the bundle. Of a bundle with an open end it is the mass of what was seen.

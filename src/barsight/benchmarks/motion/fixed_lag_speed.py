@@ -1,4 +1,4 @@
-"""How long the live estimate takes a keyframe, and how much memory it holds, over a long way."""
+"""Time the live estimate per keyframe, and its memory, over a long way."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.fixed_lag.sensor_buffer import Readings
-from barsight.motion.fixed_lag.smoother import LiveEstimator
+from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 from barsight.motion.frontend.tracking import Sighting
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
-from barsight.simulation.settings import CameraSettings, MotionSettings, SensorSettings
-from barsight.simulation.trajectory import CraneTrajectory
+from barsight.simulation.settings import CameraSettings, SensorSettings, TravelSettings
+from barsight.simulation.trajectory import SimulatedTrajectory
 
 STEP_S = 0.4
 SIGMA_PX = 0.1
 POINTS_PER_M2 = 20.0
-MOST_POINTS = 900
+MAX_POINTS = 900
 DOWN = np.diag([1.0, -1.0, -1.0])
 LEVER_M = np.array([0.35, -0.2, -0.55])
 
@@ -54,14 +54,15 @@ class LiveSpeed:
 
 
 def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed:
-    """A crane's way over points without pictures: noise of 0.1 px, IMU and encoders as they are simulated.
+    """Simulate a crane's way over points without pictures: noise of 0.1 px, IMU and encoders as they are
+    simulated.
     The front end is left out; `keyframes` is a multiple of ten.
     """
     if keyframes < 20 or keyframes % 10:
         raise ConfigError("keyframes must be a multiple of ten, at least 20")
     rng = np.random.default_rng(seed)
-    camera, motion = CameraSettings(), MotionSettings()
-    way = CraneTrajectory.plan(keyframes * STEP_S * motion.speed_mps, camera, motion, DOWN, rng)
+    camera, motion = CameraSettings(), TravelSettings()
+    way = SimulatedTrajectory.plan(keyframes * STEP_S * motion.speed_mps, camera, motion, DOWN, rng)
     rig = _rig()
     imu = record_imu(way, SensorSettings(), rng)
     crane_ns, place = record_encoders(way, SensorSettings(), LEVER_M, rng)
@@ -72,8 +73,8 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
     poses = [Pose("yard", "body", r, p) for r, p in zip(true.yard_from_body, true.position_m, strict=True)]
     rectifier = Rectifier(rig)
     samples = ImuSamples(imu.stamp_ns, imu.gyro_radps, imu.accel_mps2)
-    readings = Readings(crane, samples, ORDINARY_NOISE)
-    estimator = LiveEstimator(FusionSettings(), CraneSettings(), held, rectifier, 0, readings, None)
+    readings = ReadingsSoFar(crane, samples, ORDINARY_NOISE)
+    estimator = FixedLagEstimator(FusionSettings(), CraneSettings(), held, rectifier, 0, readings, None)
     clocks, memory, seen, found = [], [], [], []
     for sighting in _sightings(poses, stamps, rectifier, rng):
         begin = time.perf_counter(), time.process_time()
@@ -96,7 +97,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
 
 
 def live_table(bench: LiveSpeed) -> Table:
-    """As a table for the terminal."""
+    """Tabulate for the terminal."""
     table = Table(
         title=f"{bench.keyframes} keyframes of {bench.points:.0f} points; {bench.rmse_mm:.2f} mm RMSE, "
         f"NEES {bench.nees:.2f}; peak {bench.peak_mib:.0f} MiB"
@@ -113,7 +114,7 @@ def live_table(bench: LiveSpeed) -> Table:
 def _sightings(
     poses: list[Pose], stamps: Int64, rectifier: Rectifier, rng: np.random.Generator
 ) -> Iterator[Sighting]:
-    """Of points on a strip of floor and stacks under the way; those in view, `MOST_POINTS` at most."""
+    """Project points on a strip of floor and stacks under the way; those in view, `MAX_POINTS` at most."""
     camera = rectifier.camera
     x = np.array([pose.translation[0] for pose in poses])
     low, high = x.min() - 5, x.max() + 5
@@ -131,7 +132,7 @@ def _sightings(
         in_left = (pose @ rectifier.body_from_rect0).inverse().apply(points[near])
         stereo = project_stereo(in_left, camera)
         kept = _inside(stereo, camera.width, camera.height)
-        index = np.flatnonzero(kept)[:MOST_POINTS]
+        index = np.flatnonzero(kept)[:MAX_POINTS]
         noisy = stereo[index] + rng.normal(0, SIGMA_PX, (len(index), 3))
         yield Sighting(stamp, near.start + index, noisy, np.full(len(index), SIGMA_PX), None, 0)
 
@@ -149,6 +150,6 @@ def _rig() -> StereoRig:
 
 
 def _resident_mib() -> float:
-    """What the process holds now, from the kernel's own count of its pages."""
+    """Read the resident memory from the kernel's own count of its pages."""
     with open("/proc/self/statm") as file:  # noqa: PTH123
         return int(file.read().split()[1]) * resource.getpagesize() / 2**20

@@ -1,4 +1,4 @@
-"""`bench front-end`: how many pairs a second are read, rectified and followed, decoding included."""
+"""Time the front end (`bench front-end`): pairs read, rectified and followed a second, decoding included."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from barsight.benchmarks.provenance import Provenance, Timing, provenance, timing
+from barsight.benchmarks.provenance import Provenance, Timing, provenance, summarise_times
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, follow
+from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, track_recording
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 
@@ -43,7 +43,7 @@ class FrontEndBench:
 
 
 def bench_front_end(paths: tuple[Path, ...], repeats: int = 3) -> FrontEndBench:
-    """Each recording whole, `repeats` times after a first run that compiles."""
+    """Time each recording whole, `repeats` times after a first run that compiles."""
     rows = []
     for path in paths:
         recording = open_recording(path)
@@ -65,19 +65,19 @@ def _row(recording: Recording, name: str, predictor: Predictor, repeats: int) ->
     walls, cpus = [], []
     for _ in range(repeats + 1):
         wall, cpu = time.perf_counter(), time.process_time()
-        seen, refused = follow(recording, rectifier, predictor, FrontEndSettings(), lambda: None)
+        seen, refused = track_recording(recording, rectifier, predictor, FrontEndSettings(), lambda: None)
         walls.append((time.perf_counter() - wall) / pairs)
         cpus.append((time.process_time() - cpu) / pairs)
     camera = rectifier.camera
     points = float(np.mean([len(s.track) for s in seen])) if seen else 0.0
     return FrontEndRow(
         recording.path.resolve().name, (camera.width, camera.height), name, pairs, len(refused), points,
-        timing(walls[1:]), 1e3 * float(np.median(cpus[1:])),
+        summarise_times(walls[1:]), 1e3 * float(np.median(cpus[1:])),
     )  # fmt: skip
 
 
 def front_end_table(bench: FrontEndBench) -> Table:
-    """For the terminal."""
+    """Tabulate for the terminal."""
     table = Table(title=f"Front end on {bench.made.cores} cores ({bench.made.machine})", title_justify="left")
     for column in ("recording", "size", "predicted by", "pairs", "points", "ms a pair", "CPU ms", "pairs/s"):
         table.add_column(column)

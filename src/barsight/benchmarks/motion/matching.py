@@ -1,4 +1,4 @@
-"""`bench features` and `bench matching`: the paper's tables 2 and 3 with every filter's precision and recall.
+"""Reproduce the paper's tables 2 and 3 (`bench features`, `bench matching`) with precision and recall.
 
 Truth is the true depth of a view and the true poses: a match is true within 2 px of where the feature's
 point truly reprojects. Needs a recording with encoders, IMU and stored true depth.
@@ -15,8 +15,8 @@ import numpy as np
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from barsight.benchmarks.motion.matching_truth import TrueStep, reprojected, true_steps
-from barsight.benchmarks.provenance import Provenance, Timing, provenance, timed, timing
+from barsight.benchmarks.motion.matching_truth import TrueStep, reproject, true_steps
+from barsight.benchmarks.provenance import Provenance, Timing, provenance, summarise_times, time_repeats
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.core.errors import Failed, InputError
 from barsight.core.pose import Pose
@@ -26,18 +26,24 @@ from barsight.features.guided_matching import (
     PredictedMotion,
     match_across,
     match_left,
-    predict_places,
-    triangulate,
+    predict_projections,
+    triangulate_stereo,
 )
-from barsight.features.matching import follows_trend, is_mutual, nearest, on_one_plane, passes_ratio
+from barsight.features.matching import (
+    homography_inliers,
+    is_mutual,
+    motion_inliers,
+    nearest_neighbours,
+    ratio_test,
+)
 from barsight.features.patch_alignment import PatchPair
-from barsight.features.self_similarity import repeat_px
+from barsight.features.self_similarity import texture_period_px
 from barsight.features.tracks import Tracks
 from barsight.inertial.model import GRAVITY_MPS2, ORDINARY_NOISE, BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrator
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.tracking import FrontEndSettings, consensus
+from barsight.motion.frontend.tracking import FrontEndSettings, motion_consensus
 from barsight.stereo.search_range import coarse_disparity
 
 TRUE_PX = 2.0
@@ -86,13 +92,13 @@ def bench_features(
     paths: tuple[Path, ...], detectors: tuple[DetectorName, ...] = DETECTORS, count: int = 2000,
     repeats: int = 5,
 ) -> MatchingBench:  # fmt: skip
-    """[paper Table 2]: how many features, how fast, on the first view with true depth of each recording."""
+    """Count and time features on the first view with true depth of each recording [paper Table 2]."""
     rows = []
     for path in paths:
         image = true_steps(path)[0].old.pair.left
         for name in detectors:
-            found, seconds = timed(_detecting(name, image, count), repeats)
-            rows.append(FeatureRow(path.name, name, len(found), timing(seconds)))
+            found, seconds = time_repeats(_detecting(name, image, count), repeats)
+            rows.append(FeatureRow(path.name, name, len(found), summarise_times(seconds)))
     return MatchingBench(provenance(), tuple(rows), ())
 
 
@@ -103,7 +109,9 @@ def _detecting(name: DetectorName, image: UInt8, count: int) -> Callable[[], Key
 def bench_matching(
     paths: tuple[Path, ...], detectors: tuple[DetectorName, ...] = DETECTORS, count: int = 2000
 ) -> MatchingBench:
-    """[paper Table 3], with precision and recall; the rows of a recording's steps are added up."""
+    """Measure precision and recall of matching [paper Table 3]; the rows of a recording's steps are
+    added up.
+    """
     rows: list[MatchRow] = []
     for path in paths:
         steps = true_steps(path)
@@ -124,16 +132,16 @@ def bench_matching(
 
 
 def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, int, int, int, int, float]]:
-    """Of every step: name, judged pairs, true ones, true initial ones, true initial ones kept, seconds."""
+    """Count per step: name, judged pairs, true ones, true initial ones, true initial ones kept, seconds."""
     detector = make_detector(name)
     begin = time.perf_counter()
     first, second = detector(step.old.pair.left, count), detector(step.new.pair.left, count)
     places = first.pixels.astype(np.float64)
-    forward = nearest(first.descriptors, second.descriptors)
-    backward = nearest(second.descriptors, first.descriptors)
+    forward = nearest_neighbours(first.descriptors, second.descriptors)
+    backward = nearest_neighbours(second.descriptors, first.descriptors)
     start = time.perf_counter() - begin
     target = second.pixels[forward.index].astype(np.float64)
-    true_place = reprojected(step, places)
+    true_place = reproject(step, places)
     judged = np.isfinite(true_place).all(axis=1)
     initial_true = judged & (np.linalg.norm(target - true_place, axis=1) < TRUE_PX)
 
@@ -152,18 +160,18 @@ def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, in
     row("initial", everything, target, start)
     mutual = is_mutual(forward, backward)
     row("mutual", mutual, target, start)
-    clear = mutual & passes_ratio(forward)
+    clear = mutual & ratio_test(forward)
     row("ratio, mutual", clear, target, start)
     begin = time.perf_counter()
     plane = np.zeros(len(places), np.bool_)
-    plane[mutual] = on_one_plane(places[mutual], target[mutual])
+    plane[mutual] = homography_inliers(places[mutual], target[mutual])
     plane_s = time.perf_counter() - begin
     row("homography", plane, target, start + plane_s)
     begin = time.perf_counter()
     stereo, sigma, known = _stereo(step.old, places)
-    points = triangulate(np.where(known[:, None], stereo, [1e3, 0, 0]), step.rectifier.camera)
+    points = triangulate_stereo(np.where(known[:, None], stereo, [1e3, 0, 0]), step.rectifier.camera)
     moved = _trend(step)
-    trend = plane & known & follows_trend(points, target, *moved, step.rectifier.camera, TREND_PX)
+    trend = plane & known & motion_inliers(points, target, *moved, step.rectifier.camera, TREND_PX)
     row("homography, trend", trend, target, start + plane_s + time.perf_counter() - begin)
     begin = time.perf_counter()
     kept, found = _ours(step, stereo, sigma, known)
@@ -172,7 +180,7 @@ def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, in
 
 
 def _stereo(pair: PatchPair, places: Float64) -> tuple[Float64, Float64, Bool]:
-    """u, v, right u (N, 3), sigma (N,) and which features have a depth."""
+    """Match left to right: u, v, right u (N, 3), sigma (N,) and which features have a depth."""
     camera = pair.pair.camera
     coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px)
     row = (places[:, 1] * coarse.shape[0] / camera.height).astype(int)
@@ -184,7 +192,9 @@ def _stereo(pair: PatchPair, places: Float64) -> tuple[Float64, Float64, Bool]:
 
 
 def _trend(step: TrueStep) -> tuple[Float64, Float64]:
-    """new_from_old of rect0 by [paper Eq. 11]: the IMU from nominal attitude and the encoders' speed."""
+    """Predict new_from_old of rect0 by [paper Eq. 11]: the IMU from nominal attitude and the
+    encoders' speed.
+    """
     recording, shift = step.recording, step.recording.rig.timeshift_cam_imu_ns
     imu, crane = recording.imu(), recording.crane()
     if imu is None or crane is None:
@@ -212,7 +222,7 @@ def _trend(step: TrueStep) -> tuple[Float64, Float64]:
 
 
 def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple[Bool, Float64]:
-    """(N,) and (N, 2): which features are found again in their ellipses and agree in 3D, and where."""
+    """Match features (N,) inside their predicted ellipses with 3D consensus, and their places (N, 2)."""
     recording, settings = step.recording, FrontEndSettings()
     crane, imu = recording.crane(), recording.imu()
     assert crane is not None and imu is not None
@@ -224,12 +234,12 @@ def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple
     if prediction is None:
         return kept, found
     index = np.flatnonzero(known)
-    depth = triangulate(stereo[index], step.rectifier.camera)[:, 2]
+    depth = triangulate_stereo(stereo[index], step.rectifier.camera)[:, 2]
     tracks = Tracks(
         (step.old.left,), step.old.pair, index, stereo[index], sigma[index], np.zeros(len(index), np.int64),
         stereo[index, :2], depth,
     )  # fmt: skip
-    agreed = consensus(tracks, step.new, prediction, settings)
+    agreed = motion_consensus(tracks, step.new, prediction, settings)
     if isinstance(agreed, Failed):
         return kept, found
     kept[index[agreed[0]]] = True
@@ -241,17 +251,17 @@ def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple
 def _alone(
     step: TrueStep, stereo: Float64, known: Bool, motion: PredictedMotion, kept: Bool, found: Float64
 ) -> None:
-    """Adds to `kept` and `found` what only the left pictures show: features without a partner in the new
-    right picture, and those that had none in the old one, at the depth on which their neighbours agree.
+    """Add to `kept` and `found` what only the left pictures show: features without a partner in the new right
+    picture, and those that had none in the old one, at the depth on which their neighbours agree.
     """
     camera, sigma_px = step.rectifier.camera, FrontEndSettings().tracks.sigma_px
     nearest_known = cKDTree(stereo[known, :2]).query(stereo[:, :2], k=NEIGHBOURS)[1]
     around = (stereo[known, 0] - stereo[known, 2])[nearest_known]
     disparity = np.where(known, stereo[:, 0] - stereo[:, 2], np.median(around, axis=1))
-    points = triangulate(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
+    points = triangulate_stereo(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
     sigmas = np.where(known[:, None], sigma_px, [sigma_px, sigma_px, GUESSED_PX])
-    predicted = predict_places(points, sigmas, motion, camera)
-    repeats = repeat_px(step.old.pair.left, stereo[:, :2])
+    predicted = predict_projections(points, sigmas, motion, camera)
+    repeats = texture_period_px(step.old.pair.left, stereo[:, :2])
     pixels, seen = match_left(
         step.old.left, stereo[:, :2], points[:, 2], step.new, predicted, sigma_px, repeats
     )
@@ -261,7 +271,7 @@ def _alone(
 
 
 def feature_table(bench: MatchingBench) -> Table:
-    """For the terminal."""
+    """Tabulate for the terminal."""
     table = Table(title="Features (paper, Table 2)", title_justify="left")
     for column in ("recording", "detector", "features", "ms"):
         table.add_column(column)
@@ -275,7 +285,7 @@ def feature_table(bench: MatchingBench) -> Table:
 
 
 def match_table(bench: MatchingBench) -> Table:
-    """For the terminal."""
+    """Tabulate for the terminal."""
     table = Table(title="Matches (paper, Table 3); true within 2 px", title_justify="left")
     for column in ("recording", "detector", "step", "pairs", "precision %", "true kept %", "ms"):
         table.add_column(column)

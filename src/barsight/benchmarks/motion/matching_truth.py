@@ -1,4 +1,4 @@
-"""Where features truly are in the next view: true poses and depth, for evaluation only."""
+"""Compute true feature positions in the next view from true poses and depth, for evaluation only."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TrueStep:
 
 
 def true_steps(path: Path) -> list[TrueStep]:
-    """Of every view with stored true depth and a view after it. Raises InputError where there is none."""
+    """Yield every view with stored true depth and a view after it. Raises InputError where there is none."""
     recording = open_recording(path)
     rectifier = Rectifier(recording.rig)
     truth = read_ground_truth(path, np.array(recording.index.stamps_ns, np.int64), reference="yard")
@@ -66,8 +66,8 @@ def true_steps(path: Path) -> list[TrueStep]:
     return steps
 
 
-def reprojected(step: TrueStep, pixels: Float64) -> Float64:
-    """(N, 2) where the features' points truly are in the new left picture, NaN at depth steps and outside."""
+def reproject(step: TrueStep, pixels: Float64) -> Float64:
+    """Reproject features' true points (N, 2) to the new left picture, NaN at depth steps and outside."""
     camera = step.rectifier.camera
     rig = step.recording.rig
     cam0_from_rect0 = rig.body_from_cam0.inverse() @ step.rectifier.body_from_rect0

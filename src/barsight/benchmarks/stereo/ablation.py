@@ -1,4 +1,4 @@
-"""`bench ablation`: our own stereo with one part left out at a time."""
+"""Ablate our own stereo (`bench ablation`): one part left out at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from barsight.stereo.method import StereoMethod
 
 
 def without_one_part() -> dict[str, StereoMethod]:
-    """The whole method, and each variant under the name of what it lacks."""
+    """Build the whole method, and each variant under the name of what it lacks."""
     whole = BarsightSettings()
     refinement = whole.refinement
     variants = {

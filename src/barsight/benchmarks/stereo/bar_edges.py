@@ -1,4 +1,4 @@
-"""The diameter of a bar from its two outlines in each image and its disparities.
+"""Measure a bar's diameter from its two outlines in each image and its disparities.
 
 An outline is a plane through the camera; the two planes give the bar's direction and the ratio of its radius
 to its distance, and the disparities of the bar's points give the distance.
@@ -17,9 +17,9 @@ from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
 from barsight.core.types import Disparity, RectifiedCamera, RectifiedPair
 
-_LEAST_REACH_PX = 4.0
+_MIN_REACH_PX = 4.0
 _REACH_RADII = 0.4
-_INSIDE_SHARE = 0.7
+_INSIDE_RATIO = 0.7
 _FEWEST_PIXELS = 200
 
 
@@ -31,7 +31,8 @@ class Outlines:
 
 
 def bar_diameter(disparity: Disparity, pair: RectifiedPair, start: BarFit) -> float | Failed:
-    """Metres; the mean of what the outlines in either image say at the distance that the disparities say.
+    """Measure the diameter (m): the mean over both images' outlines at the distance that the disparities
+    give.
 
     start: the fit to the map, which says where to look: outlines are searched around its own, as far
     as 4 px or four tenths of the radius.
@@ -60,7 +61,7 @@ def bar_diameter(disparity: Disparity, pair: RectifiedPair, start: BarFit) -> fl
 
 
 def _cone(outlines: Outlines) -> tuple[Float64, Float64, float]:
-    """The axis's direction, the direction across it towards the axis, and radius over distance."""
+    """Intersect the outline planes: axis direction, direction towards the axis, and radius over distance."""
     first, second = outlines.normals
     axis = np.cross(first, second)
     axis /= np.linalg.norm(axis)
@@ -70,9 +71,9 @@ def _cone(outlines: Outlines) -> tuple[Float64, Float64, float]:
 
 
 def find_outlines(image: UInt8, camera: RectifiedCamera, start: BarFit) -> Outlines | Failed:
-    """The two outlines near those of `start`."""
+    """Find the two outlines near those of `start`."""
     radius_px = camera.focal_px * start.radius_m / float(start.centre_m[2])
-    reach = max(_LEAST_REACH_PX, _REACH_RADII * radius_px)
+    reach = max(_MIN_REACH_PX, _REACH_RADII * radius_px)
     searches = (OutlineSearch(reach, 0.2, 5.0, 5.0), OutlineSearch(1.0, 0.1, 4.0, min(4.0, 0.6 * radius_px)))
     planes = []
     for normal in tangent_planes(start.centre_m, start.axis, start.radius_m):
@@ -88,7 +89,7 @@ def find_outlines(image: UInt8, camera: RectifiedCamera, start: BarFit) -> Outli
 
 
 def _plane_through(points_px: Float64, camera: RectifiedCamera) -> Float64:
-    """(3,) the unit normal of the plane through the camera and two points of the image."""
+    """Compute the unit normal (3,) of the plane through the camera and two points of the image."""
     rays = (np.column_stack([points_px, np.zeros(2)]) - [camera.cx_px, camera.cy_px, 0]) / camera.focal_px
     rays[:, 2] = 1
     plane: Float64 = np.cross(rays[0], rays[1])
@@ -96,7 +97,9 @@ def _plane_through(points_px: Float64, camera: RectifiedCamera) -> Float64:
 
 
 def tangent_planes(centre_m: Float64, axis: Float64, radius_m: float) -> Float64:
-    """(2, 3) unit normals of the planes through the camera that touch the cylinder, towards its axis."""
+    """Compute unit normals (2, 3) of the planes through the camera tangent to the cylinder, towards
+    its axis.
+    """
     across = centre_m - axis * float(axis @ centre_m)
     distance = float(np.linalg.norm(across))
     towards = across / distance
@@ -107,7 +110,9 @@ def tangent_planes(centre_m: Float64, axis: Float64, radius_m: float) -> Float64
 
 
 def _image_line(normal: Float64, camera: RectifiedCamera) -> Float64:
-    """(3,) a, b, c with a x + b y + c the distance in px from the plane's line, positive towards the bar."""
+    """Project a plane to its image line (3,): a x + b y + c is the distance in px, positive towards
+    the bar.
+    """
     a, b = normal[0] / camera.focal_px, normal[1] / camera.focal_px
     c = normal[2] - a * camera.cx_px - b * camera.cy_px
     line: Float64 = np.array([a, b, c]) / math.hypot(a, b)
@@ -117,7 +122,7 @@ def _image_line(normal: Float64, camera: RectifiedCamera) -> Float64:
 def _distance(
     disparity: Disparity, camera: RectifiedCamera, axis: Float64, towards: Float64, sine: float
 ) -> float | None:
-    """Metres from the camera to the axis: the robust mean of what each of the bar's inner points says.
+    """Estimate metres from the camera to the axis: the robust mean over the bar's inner points.
 
     A point on a ray r at depth z lies on the cylinder of distance D and radius D sine when D solves
     |z r_perp - D towards|^2 = (D sine)^2, where r_perp is the ray without its part along the axis.
@@ -134,7 +139,7 @@ def _distance(
     length = np.linalg.norm(rays, axis=1)
     front = rays @ towards
     aside = np.sqrt((length**2 - front**2).clip(0, None)) / length
-    inner = aside < _INSIDE_SHARE * sine
+    inner = aside < _INSIDE_RATIO * sine
     if inner.sum() < _FEWEST_PIXELS:
         return None
     shift = disparity.disparity_px[rows, columns][inner] + camera.doffs_px

@@ -1,4 +1,4 @@
-"""The diameter of a bar out of a disparity map: one cylinder over one floor, fitted to the whole map at once.
+"""Fit one cylinder over one floor to a whole disparity map for the bar's diameter.
 
 The floor is a plane, whose disparity is linear in the image; it is fitted away from the bar. Then a cylinder
 (place, direction, radius) in front of it predicts each pixel's disparity near the bar: the bar's points hold
@@ -32,7 +32,7 @@ _Problem = tuple[Float64, float, Float64, Float64, float, float, Float64, Float6
 
 @dataclass(frozen=True, eq=False)
 class BarGuess:
-    """Where the bar lies about, in `rect0`: a point of its axis, its direction, its radius."""
+    """Rough bar in `rect0`: a point of its axis, its direction, its radius."""
 
     centre_m: Float64
     axis: Float64
@@ -89,7 +89,7 @@ def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> B
 
 
 def _beside_the_axis(camera: RectifiedCamera, guess: BarGuess) -> Float64:
-    """(H, W) metres: how far each pixel's ray passes beside the guessed axis, at its depth; signed."""
+    """Compute the signed distance (H, W) m of each pixel's ray from the guessed axis, at its depth."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [
@@ -106,7 +106,9 @@ def _beside_the_axis(camera: RectifiedCamera, guess: BarGuess) -> Float64:
 
 
 def _fit_floor(disparity: Disparity, where: Bool) -> Float64 | None:
-    """(3,) the disparity as a * column + b * row + c, by reweighted least squares; None where too few."""
+    """Fit the floor's disparity (3,), a * column + b * row + c, by reweighted least squares; None where too
+    few.
+    """
     rows, columns = np.nonzero(where)
     if rows.size < _FEWEST_PIXELS:
         return None
@@ -124,21 +126,25 @@ def _fit_floor(disparity: Disparity, where: Bool) -> Float64 | None:
 
 
 def _frame(guess: BarGuess) -> Float64:
-    """(4, 3): the guess's centre, axis, and the two directions across it: sideways and towards the camera."""
+    """Build the guess's frame (4, 3): centre, axis, and the directions sideways and towards the camera."""
     sideways = np.cross(guess.axis, guess.centre_m)
     sideways = sideways / np.linalg.norm(sideways)
     return np.array([guess.centre_m, guess.axis, sideways, np.cross(sideways, guess.axis)])
 
 
 def _placed(place: Float64, frame: Float64, radius_m: float) -> tuple[Float64, Float64, float]:
-    """place: (5,) shifts sideways and towards the camera, turns likewise, growth: in radii of the guess."""
+    """Apply place (5,): shifts sideways and towards the camera, turns likewise, growth, in radii of the
+    guess.
+    """
     centre = frame[0] + radius_m * (place[0] * frame[2] + place[1] * frame[3])
     axis = frame[1] + radius_m * (place[2] * frame[2] + place[3] * frame[3])
     return centre, axis / np.linalg.norm(axis), radius_m * math.exp(place[4])
 
 
 def _descend(start: Float64, problem: _Problem) -> Float64:
-    """Nelder and Mead's simplex: the loss has small steps where pixels change from floor to bar."""
+    """Minimise by Nelder and Mead's simplex: the loss has small steps where pixels change from
+    floor to bar.
+    """
     simplex = np.vstack([start, start + 0.1 * np.eye(5)])
     best: Float64 = fmin(
         _loss,
@@ -195,7 +201,7 @@ def _disparity_of_ray(
     scale: float,
     doffs: float,
 ) -> float:
-    """The nearer of the cylinder (where the ray (x, y, 1) hits it) and the floor behind."""
+    """Intersect ray (x, y, 1) with the cylinder and the floor behind; the nearer's disparity."""
     slide = axis[0] * x + axis[1] * y + axis[2]
     lift = axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]
     ex, ey, ez = x - slide * axis[0], y - slide * axis[1], 1 - slide * axis[2]

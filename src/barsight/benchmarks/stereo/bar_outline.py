@@ -1,4 +1,4 @@
-"""A straight outline of a round bar in an image, below a pixel.
+"""Locate a straight outline of a round bar in an image, below a pixel.
 
 The outline of a round bar is no step: shading falls towards the limb like cos(angle), whose slope there is
 endless. The profile across the outline is therefore fitted whole, stretch by stretch along the bar: floor
@@ -27,7 +27,7 @@ _PARTS = 5
 
 @dataclass(frozen=True, eq=False)
 class OutlineSearch:
-    """Where to look. reach_px: how far from the line the outline is looked for, in steps of step_px.
+    """Search window. reach_px: how far from the line the outline is looked for, in steps of step_px.
     outside_px, inside_px: how far the profile goes beyond that, over the floor and over the bar.
     """
 
@@ -42,7 +42,8 @@ class OutlineSearch:
 
 
 def find_outline(image: UInt8, line: Float64, radius_px: float, search: OutlineSearch) -> Float64 | Failed:
-    """(2, 2) two points x, y of the outline near the line a x + b y + c = 0 (unit normal towards the bar).
+    """Find two points x, y (2, 2) of the outline near the line a x + b y + c = 0 (unit normal towards the
+    bar).
 
     radius_px: of the bar in the image, about. Failed `no-outline` where too little of it is in the image.
     """
@@ -66,7 +67,7 @@ class _Stretches:
 
 
 def _stretches(image: UInt8, line: Float64, radius_px: float, search: OutlineSearch) -> _Stretches:
-    """The stretches of the line that lie in the image with all their profiles."""
+    """Cut the line into stretches that lie in the image with all their profiles."""
     height, width = image.shape
     margin = search.reach_px + max(search.outside_px, search.inside_px) + 1
     foot, along = _foot_and_direction(line)
@@ -93,7 +94,9 @@ def _foot_and_direction(line: Float64) -> tuple[Float64, Float64]:
 
 
 def _profile(image: UInt8, core: Float64, line: Float64, search: OutlineSearch) -> tuple[Float64, Float64]:
-    """Gray values of the pixels beside a stretch and their distances from the line, px towards the bar."""
+    """Sample gray values of the pixels beside a stretch and their distances from the line, px towards the
+    bar.
+    """
     across = np.arange(-search.reach_px - search.outside_px, search.reach_px + search.inside_px + 0.5, 1.0)
     columns = np.rint(core[:, :1] + across * line[0]).astype(np.intp)
     rows = np.rint(core[:, 1:] + across * line[1]).astype(np.intp)
@@ -103,7 +106,7 @@ def _profile(image: UInt8, core: Float64, line: Float64, search: OutlineSearch) 
 
 
 def _best_line(stretches: _Stretches, line: Float64) -> Float64:
-    """(2, 2) two points of the outline: the line, shifted and turned, whose stretches fit best together."""
+    """Fit two points (2, 2) of the outline: the shifted, turned line whose stretches fit best together."""
     place = stretches.place_px
     centre, half = (place.max() + place.min()) / 2, max((place.max() - place.min()) / 2, 1.0)
     along = (place - centre) / half
@@ -128,8 +131,8 @@ def _best_line(stretches: _Stretches, line: Float64) -> Float64:
 def _total_misfit(
     stretches: _Stretches, curves: list[CubicSpline], along: Float64, shifts: Float64, turns: Float64
 ) -> Float64:
-    """(len(shifts), len(turns)) the sum of the stretches' misfits, each read from its curve; outside the
-    search the worst.
+    """Sum the stretches' misfits (len(shifts), len(turns)), each read from its curve; outside the search the
+    worst.
     """
     total = np.zeros((len(shifts), len(turns)))
     low, high = stretches.shifts_px[[0, -1]]
@@ -141,8 +144,8 @@ def _total_misfit(
 
 
 def _basis(radius_px: float, half_px: float) -> Float64:
-    """(M, 5) the profile's parts through the lens, on a fine grid from -half_px to half_px: floor 1 and x,
-    bar 1, cos and sin.
+    """Build the profile's basis (M, 5) through the lens, on a fine grid from -half_px to half_px: floor 1 and
+    x, bar 1, cos and sin.
     """
     margin = 4 * _LENS_SIGMA_PX
     half = half_px + margin
@@ -162,7 +165,7 @@ def _basis(radius_px: float, half_px: float) -> Float64:
 
 @kernel()
 def _misfits(gray: Float64, away: Float64, shifts: Float64, basis: Float64, misfit: Float64) -> None:
-    """The logarithm of the profile's likelihood, negative and per pixel, with the outline at each shift.
+    """Compute the profile's negative log-likelihood per pixel, with the outline at each shift.
 
     Floor and bar have each their own texture, hence their own variance; the pixels are always the same.
     """
@@ -195,7 +198,7 @@ def _misfits(gray: Float64, away: Float64, shifts: Float64, basis: Float64, misf
 
 @kernel()
 def _solve(design: Float64, gray: Float64, bar_variance: float, floor_variance: float) -> Float64:
-    """Weighted least squares with a trace of damping: (5,)."""
+    """Solve weighted least squares (5,) with a trace of damping."""
     normal = np.zeros((_PARTS, _PARTS))
     right = np.zeros(_PARTS)
     for pixel in range(design.shape[0]):

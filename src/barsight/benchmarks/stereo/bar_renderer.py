@@ -1,4 +1,4 @@
-"""An exact renderer for one bar over a floor, or the floor alone, seen by a rectified pair.
+"""Render one bar over a floor, or the floor alone, exactly for a rectified pair.
 
 Rays are cast at 25 places of each pixel's neighbourhood, weighted by a Gaussian of 0.5 px (lens and pixel),
 so that images are those of continuous surfaces, not of shifted pixels. Albedo is band-limited noise fixed to
@@ -27,7 +27,7 @@ _LAMP_HALF_WIDTH = 0.2  # radians, a field of lamps under a hall's roof
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class Material:
     """brightness: mean albedo in gray levels under full light. contrast: albedo's spread per octave of
     detail, relative. finest_m: size of the finest detail. stretch: how much longer details are along the
     bar's axis (the floor's x). gloss: strength of the highlight in gray levels. sharpness: its Blinn-Phong
@@ -43,13 +43,13 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Bar:
+class RenderedBar:
     """An endless round bar. centre_m: (3,) a point of its axis in `rect0`. axis: (3,) unit."""
 
     centre_m: Float64
     axis: Float64
     radius_m: float
-    surface: Surface
+    surface: Material
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +62,8 @@ class BarScene:
     camera: RectifiedCamera
     normal: Float64
     offset_m: float
-    floor: Surface
-    bar: Bar | None
+    floor: Material
+    bar: RenderedBar | None
     lamp: Float64
     ambient: float = 0.5
     read_noise: float = 0.8
@@ -82,8 +82,8 @@ class Rendered:
     visible: Bool
 
 
-def render(scene: BarScene, seed: int) -> Rendered:
-    """Both images with noise, and the truth. The same seed gives the same texture and noise."""
+def render_pair(scene: BarScene, seed: int) -> Rendered:
+    """Render both images with noise, and the truth. The same seed gives the same texture and noise."""
     rng = np.random.default_rng(seed)
     camera = scene.camera
     table = rng.standard_normal((_TABLE, _TABLE)).astype(np.float32)
@@ -110,7 +110,7 @@ def render(scene: BarScene, seed: int) -> Rendered:
 
 
 def _shape(scene: BarScene) -> Float64:
-    """(4, 3): normal; offset, radius (0: no bar), 0; centre; axis."""
+    """Pack the geometry (4, 3): normal; offset, radius (0: no bar), 0; centre; axis."""
     bar = scene.bar
     if bar is None:
         return np.array([scene.normal, [scene.offset_m, 0, 0], [0, 0, 0], [0, 1, 0]], dtype=np.float64)
@@ -119,7 +119,9 @@ def _shape(scene: BarScene) -> Float64:
 
 
 def _looks(scene: BarScene) -> Float64:
-    """(3, 6): floor's and bar's brightness, contrast, finest, stretch, gloss, sharpness; lamp and ambient."""
+    """Pack the materials (3, 6): floor's and bar's brightness, contrast, finest, stretch, gloss, sharpness;
+    lamp and ambient.
+    """
     bar = scene.floor if scene.bar is None else scene.bar.surface
     rows = [
         [s.brightness, s.contrast, s.finest_m, s.stretch, s.gloss, s.sharpness] for s in (scene.floor, bar)
@@ -129,7 +131,9 @@ def _looks(scene: BarScene) -> Float64:
 
 @kernel()
 def _hit(x: float, dx: float, dy: float, shape: Float64) -> tuple[float, int]:
-    """Depth z and surface of the first hit of the ray (x, 0, 0) + z (dx, dy, 1); inf and 0 where none."""
+    """Intersect the ray (x, 0, 0) + z (dx, dy, 1): depth z and surface of the first hit; inf and 0 where
+    none.
+    """
     normal, centre, axis = shape[0], shape[2], shape[3]
     along = normal[0] * dx + normal[1] * dy + normal[2]
     depth, surface = math.inf, 0
@@ -154,7 +158,7 @@ def _hit(x: float, dx: float, dy: float, shape: Float64) -> tuple[float, int]:
 
 @kernel()
 def _light_left(px: float, py: float, pz: float, lamp: Float64, shape: Float64) -> float:
-    """The share of the lamp that a point of the floor sees past the bar: a shadow with soft edges."""
+    """Compute the fraction of the lamp that a floor point sees past the bar: a shadow with soft edges."""
     centre, axis, radius = shape[2], shape[3], shape[1, 1]
     if radius <= 0:
         return 1.0
@@ -174,7 +178,7 @@ def _light_left(px: float, py: float, pz: float, lamp: Float64, shape: Float64) 
 
 @kernel()
 def _spline(t: float) -> tuple[float, float, float, float]:
-    """The four weights of the uniform cubic B-spline at 0 <= t < 1."""
+    """Compute the four weights of the uniform cubic B-spline at 0 <= t < 1."""
     u = 1 - t
     return (
         u * u * u / 6,
@@ -186,7 +190,9 @@ def _spline(t: float) -> tuple[float, float, float, float]:
 
 @kernel()
 def _noise(table: Float32, x: float, y: float) -> float:
-    """Cubic B-spline through random numbers on a unit lattice: smooth, little above half a cycle per unit."""
+    """Interpolate random numbers on a unit lattice by a cubic B-spline: little above half a cycle
+    per unit.
+    """
     column, row = math.floor(x), math.floor(y)
     across, down = _spline(x - column), _spline(y - row)
     total = 0.0
@@ -201,7 +207,7 @@ def _noise(table: Float32, x: float, y: float) -> float:
 
 @kernel()
 def _albedo(table: Float32, x: float, y: float, looks: Float64) -> float:
-    """Octaves of detail, each twice as coarse as the one before, of equal strength."""
+    """Sum octaves of detail, each twice as coarse as the one before, of equal strength."""
     size = looks[2]
     detail = 0.0
     for octave in range(_OCTAVES):
@@ -214,7 +220,7 @@ def _albedo(table: Float32, x: float, y: float, looks: Float64) -> float:
 def _shade(
     x: float, dx: float, dy: float, depth: float, surface: int, shape: Float64, looks: Float64, table: Float32
 ) -> float:
-    """The gray value that one ray brings back."""
+    """Shade the gray value that one ray brings back."""
     px, py, pz = x + depth * dx, depth * dy, depth
     lamp, ambient = looks[2, :3], looks[2, 3]
     if surface == FLOOR:
@@ -261,7 +267,7 @@ def _expose(
     table: Float32,
     image: Float64,
 ) -> None:
-    """One camera at (x, 0, 0): (H, W) gray values without noise."""
+    """Expose one camera at (x, 0, 0): (H, W) gray values without noise."""
     height, width = image.shape
     reach = _SAMPLES // 2
     weights = np.empty(_SAMPLES)
@@ -294,7 +300,7 @@ def _measure(
     surface: UInt8,
     visible: Bool,
 ) -> None:
-    """The left image's true disparity, whose pixel it is, and whether the right camera sees the point."""
+    """Compute the left image's true disparity, surface, and visibility in the right camera."""
     height, width = truth.shape
     reach = _SAMPLES // 2
     for row in numba.prange(height):

@@ -1,4 +1,4 @@
-"""The rendered scenes of `bench subpixel` and `bench target-size`: a tilted floor, a bar lying on it.
+"""Render the scenes of `bench subpixel` and `bench target-size`: a tilted floor, a bar lying on it.
 
 The camera is the one of the crane: 1250 px focal length, 0.5 m baseline; the paper doesn't say what its own
 was. Only a window of the image is rendered. The right image's window is moved by a whole number of pixels
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.benchmarks.stereo.bar_renderer import Bar, BarScene, Surface
+from barsight.benchmarks.stereo.bar_renderer import BarScene, Material, RenderedBar
 from barsight.core.arrays import Float64
 from barsight.core.types import DisparityRange, RectifiedCamera
 
@@ -24,7 +24,7 @@ _MARGIN_PX = 12
 
 @dataclass(frozen=True)
 class PoseSpread:
-    """How far the poses of a benchmark differ; each is drawn evenly from plus or minus these."""
+    """Spread of a benchmark's poses; each is drawn evenly from plus or minus these."""
 
     roll_deg: float = 20.0
     """The bar's direction in the image against the columns."""
@@ -53,7 +53,8 @@ def bar_over_floor(
     raised_m: float = 0.0,
     spread: PoseSpread | None = None,
 ) -> PosedScene:
-    """A bar of 90 mm whose top is range_m deep at the window's middle; pose, light and texture by chance.
+    """Draw a bar of 90 mm whose top is range_m deep at the window's middle; pose, light and texture by
+    chance.
 
     gloss: gray levels of the strongest highlight. raised_m: the free space between bar and floor.
     """
@@ -69,7 +70,7 @@ def bar_over_floor(
     axis = column / np.linalg.norm(column)
     offset = float(normal @ (centre - normal * (radius + raised_m)))
     pixel_m = range_m / FOCAL_PX
-    steel = Surface(
+    steel = Material(
         brightness=rng.uniform(45, 75),
         contrast=0.12,
         finest_m=2 * pixel_m,
@@ -77,12 +78,12 @@ def bar_over_floor(
         gloss=gloss,
         sharpness=rng.uniform(20, 60),
     )
-    bar = Bar(centre, axis, radius, steel)
+    bar = RenderedBar(centre, axis, radius, steel)
     return _finish(rng, normal, offset, bar, range_m, math.degrees(roll))
 
 
 def tilted_floor(rng: np.random.Generator, range_m: float, tilt_deg: float) -> PosedScene:
-    """The floor alone, its normal tilted by tilt_deg in a direction by chance."""
+    """Draw the floor alone, its normal tilted by tilt_deg in a random direction."""
     turn = rng.uniform(0, 2 * math.pi)
     lean = math.tan(math.radians(tilt_deg))
     normal = np.array([lean * math.cos(turn), lean * math.sin(turn), -1.0])
@@ -98,21 +99,26 @@ def _tilted(rng: np.random.Generator, tilt_deg: float) -> Float64:
 
 
 def _finish(
-    rng: np.random.Generator, normal: Float64, offset: float, bar: Bar | None, range_m: float, roll_deg: float
+    rng: np.random.Generator,
+    normal: Float64,
+    offset: float,
+    bar: RenderedBar | None,
+    range_m: float,
+    roll_deg: float,
 ) -> PosedScene:
-    """Light, floor, window and range round the geometry."""
+    """Add light, floor, window and range to the geometry."""
     camera, candidates = _window(normal, offset, range_m)
     side = rng.uniform(0, 2 * math.pi)
     height = math.radians(rng.uniform(35, 75))
     lamp = np.array([math.cos(side) * math.cos(height), math.sin(side) * math.cos(height), -math.sin(height)])
-    floor = Surface(rng.uniform(100, 140), 0.09, 2 * range_m / FOCAL_PX)
+    floor = Material(rng.uniform(100, 140), 0.09, 2 * range_m / FOCAL_PX)
     ambient = float(rng.uniform(0.5, 0.8))
     scene = BarScene(camera, normal, offset, floor, bar, lamp, ambient)
     return PosedScene(scene, candidates, range_m, roll_deg)
 
 
 def _window(normal: Float64, offset: float, range_m: float) -> tuple[RectifiedCamera, DisparityRange]:
-    """The camera of the window, whose disparities begin a margin above zero, and their range.
+    """Build the window's camera, whose disparities begin a margin above zero, and their range.
 
     The floor's disparity is f b (normal . ray) / offset; the bar's top is the nearest there is.
     """

@@ -1,4 +1,4 @@
-"""The limit that the images' noise sets to a match [Cramer 1946, Rao 1945]."""
+"""Compute the Cramer-Rao bound of a match from the images' noise [Cramer 1946, Rao 1945]."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _WINDOW_PX = 21
 
 
 def noise_limit_px(pair: RectifiedPair, where: Bool) -> float:
-    """Sigma (px) that no estimate over our long support can beat: the root of twice the noise's variance over
+    """Compute the Cramer-Rao bound (px) over our long support: the root of twice the noise's variance over
     the squared gradients that the support sums up; the median over `where`.
 
     Noise is measured in the images; what it adds to the gradients' power is taken off. A Gaussian support of

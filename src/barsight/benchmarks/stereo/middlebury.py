@@ -1,4 +1,4 @@
-"""`bench stereo`: every method on Middlebury-style folders, side by side in one run."""
+"""Run every stereo method on Middlebury-style folders (`bench stereo`), side by side in one run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from barsight.benchmarks.provenance import LEAST_REPEATS, Provenance, Timing, provenance, timed, timing
+from barsight.benchmarks.provenance import (
+    MIN_REPEATS,
+    Provenance,
+    Timing,
+    provenance,
+    summarise_times,
+    time_repeats,
+)
 from barsight.benchmarks.stereo.middlebury_scenes import StereoScene, load_scenes
 from barsight.benchmarks.stereo.scores import StereoScore, score_disparity
 from barsight.stereo.method import StereoMethod
@@ -69,9 +76,7 @@ _HEADINGS = (
 )
 
 
-def bench_stereo(
-    data: Path, methods: Mapping[str, StereoMethod], repeats: int = LEAST_REPEATS
-) -> StereoBench:
+def bench_stereo(data: Path, methods: Mapping[str, StereoMethod], repeats: int = MIN_REPEATS) -> StereoBench:
     """Run every method on every scene in `data`; candidates as `load_scene` says. Raises `InputError`."""
     scenes = load_scenes(data)
     results = tuple(_bench_method(name, method, scenes, repeats) for name, method in methods.items())
@@ -79,7 +84,7 @@ def bench_stereo(
 
 
 def stereo_table(bench: StereoBench) -> Table:
-    """The means over the scenes, one row per method."""
+    """Tabulate the means over the scenes, one row per method."""
     table = Table(title=f"{bench.data}: mean of {len(bench.methods[0].scenes)} scenes", caption=_CAPTION)
     table.add_column("method")
     for heading in _HEADINGS:
@@ -90,7 +95,7 @@ def stereo_table(bench: StereoBench) -> Table:
 
 
 def scene_table(bench: StereoBench) -> Table:
-    """Every method on every scene."""
+    """Tabulate every method on every scene."""
     table = Table(title=f"{bench.data}: scene by scene", caption=_CAPTION)
     table.add_column("method")
     table.add_column("scene")
@@ -108,13 +113,13 @@ def _bench_method(
 ) -> MethodResult:
     results, seconds = [], []
     for scene in scenes:
-        disparity, taken = timed(lambda scene=scene: method(scene.pair, scene.candidates), repeats)  # type: ignore[misc]
+        disparity, taken = time_repeats(lambda scene=scene: method(scene.pair, scene.candidates), repeats)  # type: ignore[misc]
         score = score_disparity(disparity, scene.truth_px, scene.counted)
-        per_mp = timing([one / scene.megapixels for one in taken])
+        per_mp = summarise_times([one / scene.megapixels for one in taken])
         results.append(SceneResult(scene.name, scene.mask, scene.megapixels, score, per_mp))
         seconds.append(taken)
     pixels = sum(scene.megapixels for scene in scenes)
-    whole = timing([sum(run) / pixels for run in zip(*seconds, strict=True)])
+    whole = summarise_times([sum(run) / pixels for run in zip(*seconds, strict=True)])
     return MethodResult(name, tuple(results), _mean([one.score for one in results]), whole)
 
 

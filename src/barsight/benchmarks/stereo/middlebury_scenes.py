@@ -1,4 +1,4 @@
-"""Rectified pairs with true disparity, from Middlebury-style folders."""
+"""Load rectified pairs with true disparity from Middlebury-style folders."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class StereoScene:
 
     @property
     def megapixels(self) -> float:
-        """The left image's size."""
+        """Return the left image's size."""
         return self.truth_px.size / 1e6
 
 
 def load_scenes(data: Path) -> tuple[StereoScene, ...]:
-    """The scenes in `data`: a folder of folders, or one scene's own folder. Raises `InputError`."""
+    """Load the scenes in `data`: a folder of folders, or one scene's own folder. Raises `InputError`."""
     if (data / "disp.pfm").is_file():
         return (load_scene(data),)
     if not data.is_dir():
@@ -52,7 +52,7 @@ def load_scenes(data: Path) -> tuple[StereoScene, ...]:
 
 
 def load_scene(folder: Path) -> StereoScene:
-    """One folder: left.png, right.png, disp.pfm [nonocc.png, white where both see it].
+    """Load one folder: left.png, right.png, disp.pfm [nonocc.png, white where both see it].
 
     Without nonocc.png every pixel with known truth counts. The candidates run from 0 (or the truth's lowest
     where that is negative) to the next multiple of 16 above the truth's highest.
@@ -88,7 +88,7 @@ def load_scene(folder: Path) -> StereoScene:
 def pair_from_images(
     left: UInt8, right: UInt8, left_colour: UInt8 | None = None, right_colour: UInt8 | None = None
 ) -> RectifiedPair:
-    """A pair without a known rig: unit focal length and baseline, everything valid."""
+    """Build a pair without a known rig: unit focal length and baseline, everything valid."""
     height, width = left.shape
     everywhere = np.ones((height, width), dtype=np.bool_)
     camera = RectifiedCamera(float(width), (width - 1) / 2, (height - 1) / 2, 1.0, 0.0, width, height)

@@ -1,4 +1,4 @@
-"""How a disparity agrees with the truth, by Middlebury's measures."""
+"""Score a disparity against the truth by Middlebury's measures."""
 
 from __future__ import annotations
 

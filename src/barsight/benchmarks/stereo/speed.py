@@ -1,4 +1,4 @@
-"""`bench stereo-speed`: every method's time on 1280x1024 with 96 candidates, against OpenCV's 5-path SGBM."""
+"""Time every method on 1280x1024 with 96 candidates (`bench stereo-speed`), against OpenCV's 5-path SGBM."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from barsight.benchmarks.provenance import LEAST_REPEATS, Provenance, Timing, provenance, timing
+from barsight.benchmarks.provenance import MIN_REPEATS, Provenance, Timing, provenance, summarise_times
 from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import DisparityRange, RectifiedPair
@@ -45,7 +45,7 @@ class SpeedBench:
     methods: tuple[SpeedResult, ...]
 
 
-def bench_speed(methods: Mapping[str, StereoMethod], repeats: int = LEAST_REPEATS) -> SpeedBench:
+def bench_speed(methods: Mapping[str, StereoMethod], repeats: int = MIN_REPEATS) -> SpeedBench:
     """Time every method on the same textured pair, two tilted planes with a step between them: in each of
     `repeats` rounds SGBM and all methods in turn, after one round that gives the errors.
     """
@@ -62,14 +62,16 @@ def bench_speed(methods: Mapping[str, StereoMethod], repeats: int = LEAST_REPEAT
     rounds = np.array([[_seconds(work) for work in works] for _ in range(repeats)])
     ratios = np.median(rounds / rounds[:, :1], axis=0)
     results = tuple(
-        SpeedResult(name, timing(rounds[:, i, 0]), float(ratios[i, 0]), float(ratios[i, 1]), errors[i])
+        SpeedResult(
+            name, summarise_times(rounds[:, i, 0]), float(ratios[i, 0]), float(ratios[i, 1]), errors[i]
+        )
         for i, name in enumerate(methods, start=1)
     )
-    return SpeedBench(provenance(), timing(rounds[:, 0, 0]), errors[0], results)
+    return SpeedBench(provenance(), summarise_times(rounds[:, 0, 0]), errors[0], results)
 
 
 def speed_pair() -> tuple[RectifiedPair, DisparityRange, Float32]:
-    """A textured 1280x1024 pair with sensor noise; its disparities, which run from 20 to 80 px."""
+    """Draw a textured 1280x1024 pair with sensor noise; its disparities run from 20 to 80 px."""
     rng = np.random.default_rng(0)
     wide = rng.normal(0, 1, (HEIGHT_PX, WIDTH_PX + CANDIDATES)).astype(np.float32)
     texture = (
@@ -87,7 +89,7 @@ def speed_pair() -> tuple[RectifiedPair, DisparityRange, Float32]:
 
 
 def speed_table(bench: SpeedBench) -> Table:
-    """One row per method."""
+    """Tabulate one row per method."""
     table = Table(
         title=f"{WIDTH_PX}x{HEIGHT_PX}, {CANDIDATES} candidates, {bench.provenance.cores} cores",
         caption=f"Median (range) of {bench.reference.repeats} rounds, all in turn. times SGBM: wall time "
@@ -106,7 +108,7 @@ def speed_table(bench: SpeedBench) -> Table:
 
 
 def _seconds(work: Callable[[], object]) -> tuple[float, float]:
-    """Wall time, and processor time of all cores."""
+    """Measure wall time, and processor time of all cores."""
     wall, processor = time.perf_counter(), time.process_time()
     work()
     return time.perf_counter() - wall, time.process_time() - processor

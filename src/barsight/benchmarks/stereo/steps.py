@@ -1,4 +1,4 @@
-"""`bench stereo-steps`: a picture of what each step of our own stereo does to a rendered glossy bar."""
+"""Draw each step of our own stereo on a rendered glossy bar (`bench stereo-steps`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from barsight.benchmarks.stereo.bar_renderer import render
+from barsight.benchmarks.stereo.bar_renderer import render_pair
 from barsight.benchmarks.stereo.bar_scenes import bar_over_floor
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import OutputError
@@ -23,18 +23,18 @@ _ERROR_PX, _SIGMA_PX = 0.5, 0.5
 
 
 def steps_picture(seed: int = 3) -> UInt8:
-    """(0.9 H, 1.35 W, 3) BGR. Above: left image; disparity; sigma. Below, error of the disparity: as
-    started, as refined, with edges sharpened and guesses.
+    """Draw the steps, (0.9 H, 1.35 W, 3) BGR. Above: left image; disparity; sigma. Below, error of the
+    disparity: as started, as refined, with edges sharpened and guesses.
     """
     posed = bar_over_floor(np.random.default_rng(seed), _RANGE_M, _GLOSS, raised_m=0.15)
-    rendered = render(posed.scene, seed)
+    rendered = render_pair(posed.scene, seed)
     whole = BarsightSettings()
 
     def matched(settings: BarsightSettings) -> Disparity:
         return BarsightStereo(settings)(rendered.pair, posed.candidates)
 
     no_guess = replace(
-        whole, fill_occlusions=False, max_sigma_px=math.inf, wrong_side_px=0.0, other_side_share=0.0
+        whole, fill_occlusions=False, max_sigma_px=math.inf, wrong_side_px=0.0, other_side_error_ratio=0.0
     )
     start = matched(replace(no_guess, refinement=replace(whole.refinement, steps=0)))
     refined, final = matched(no_guess), matched(whole)
@@ -49,7 +49,7 @@ def steps_picture(seed: int = 3) -> UInt8:
 
 
 def write_steps(target: Path) -> None:
-    """`steps_picture` as PNG."""
+    """Write `steps_picture` as PNG."""
     if target.suffix.lower() != ".png":
         raise OutputError(f"{target}: the picture is written as .png")
     with atomic_path(target) as temporary:
@@ -57,7 +57,7 @@ def write_steps(target: Path) -> None:
 
 
 def _coloured(values: Float32, low: float, high: float) -> UInt8:
-    """Viridis in 32 steps from low to high, black where there is none."""
+    """Colour values by viridis in 32 steps from low to high, black where there is none."""
     known = np.isfinite(values)
     share = np.where(known, (values - low) / (high - low), 0).clip(0, 1)
     coloured: UInt8 = cv2.applyColorMap((np.rint(share * 31) * 8).astype(np.uint8), cv2.COLORMAP_VIRIDIS)

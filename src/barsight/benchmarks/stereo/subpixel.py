@@ -1,4 +1,4 @@
-"""`bench subpixel`: bias against the fractional part of the true disparity, and whether sigma is right.
+"""Measure bias against the fractional part of the true disparity (`bench subpixel`), and check sigma.
 
 Scenes are rendered (`bar_scenes`): tilted floors, matt bars, glossy bars. Counted are pixels well
 inside one surface that the right image sees. Per tenth of a pixel of the true disparity's fraction the bias
@@ -17,7 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance, provenance
-from barsight.benchmarks.stereo.bar_renderer import BAR, FLOOR, Rendered, render
+from barsight.benchmarks.stereo.bar_renderer import BAR, FLOOR, Rendered, render_pair
 from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, tilted_floor
 from barsight.benchmarks.stereo.cramer_rao_bound import noise_limit_px
 from barsight.benchmarks.stereo.middlebury_scenes import load_scene
@@ -81,8 +81,8 @@ def bench_subpixel(
         for index in range(scenes):
             rng = np.random.default_rng([seed, index, len(kind)])
             posed = make(rng)
-            rendered = render(posed.scene, seed=1000 * seed + index)
-            where = inner(rendered, BAR if posed.scene.bar else FLOOR)
+            rendered = render_pair(posed.scene, seed=1000 * seed + index)
+            where = inner_pixels(rendered, BAR if posed.scene.bar else FLOOR)
             limits[kind].append(noise_limit_px(rendered.pair, where))
             for name, method in methods.items():
                 found = method(rendered.pair, posed.candidates)
@@ -101,8 +101,8 @@ def bench_subpixel(
     return SubpixelBench(provenance(), scenes, limit_px, results)
 
 
-def inner(rendered: Rendered, surface: int) -> Bool:
-    """(H, W) bool: pixels of the surface that the right image sees, away from its edges."""
+def inner_pixels(rendered: Rendered, surface: int) -> Bool:
+    """Select pixels (H, W) of the surface that the right image sees, away from its edges."""
     margin = _BAR_MARGIN_PX if surface == BAR else _FLOOR_MARGIN_PX
     window = np.ones((2 * margin + 1,) * 2, dtype=np.uint8)
     usable: UInt8 = ((rendered.surface == surface) & rendered.visible).astype(np.uint8)
@@ -111,7 +111,7 @@ def inner(rendered: Rendered, surface: int) -> Bool:
 
 
 def subpixel_table(bench: SubpixelBench) -> Table:
-    """One row per method and kind of scene."""
+    """Tabulate one row per method and kind of scene."""
     table = Table(
         title="Below the pixel",
         caption="bias: median error per tenth of a pixel of the true disparity's fraction; "
@@ -156,14 +156,14 @@ class PixelErrors:
 
 
 def pixel_errors(found: Disparity, truth_px: Float64, where: Bool) -> PixelErrors:
-    """Of the pixels in `where`, (H, W) bool."""
+    """Collect errors of the pixels in `where`, (H, W) bool."""
     truth = truth_px[where]
     error = found.disparity_px[where] - truth
     return PixelErrors(truth - np.floor(truth), error, error / found.sigma_px[where])
 
 
 def fraction_bias(parts: list[PixelErrors]) -> FractionBias:
-    """The figures of all pixels together; NaN where there is none."""
+    """Summarise all pixels together; NaN where there is none."""
     fraction = np.concatenate([part.fraction for part in parts])
     error = np.concatenate([part.error_px for part in parts])
     ratio = np.abs(np.concatenate([part.ratio for part in parts]))

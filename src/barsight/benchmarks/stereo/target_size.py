@@ -1,4 +1,4 @@
-"""`bench target-size`: the paper's Table 1, a bar of 90 mm measured at eight ranges by each method.
+"""Measure a 90 mm bar at eight ranges by each method (`bench target-size`, the paper's Table 1).
 
 The paper says neither what its camera was nor how it measured. Assumed here: the crane's camera (1250 px,
 0.5 m, `bar_scenes`); one round bar on supports 0.3 m above a floor, darker than the floor, glossy to a
@@ -22,7 +22,7 @@ from rich.table import Table
 from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.stereo.bar_edges import bar_diameter
 from barsight.benchmarks.stereo.bar_fit import BarGuess, fit_bar
-from barsight.benchmarks.stereo.bar_renderer import Bar, render
+from barsight.benchmarks.stereo.bar_renderer import RenderedBar, render_pair
 from barsight.benchmarks.stereo.bar_scenes import BAR_DIAMETER_M, bar_over_floor
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
@@ -31,9 +31,9 @@ from barsight.core.types import Disparity, RectifiedPair
 from barsight.stereo.method import StereoMethod
 
 RANGES_MM = (1800, 2500, 3000, 3600, 4500, 5000, 5600, 8500)
-LEAST_POSES = 10
+MIN_POSES = 10
 _RAISED_M = 0.3
-_MOST_GLOSS = 40.0
+_MAX_GLOSS = 40.0
 _GUESS_ERROR = 0.15
 
 
@@ -78,7 +78,7 @@ class TargetSizeBench:
 
 def bench_target_size(
     methods: Mapping[str, StereoMethod],
-    poses: int = LEAST_POSES,
+    poses: int = MIN_POSES,
     ranges_mm: Sequence[int] = RANGES_MM,
     seed: int = 1,
 ) -> TargetSizeBench:
@@ -104,18 +104,20 @@ def bench_target_size(
 def _matched(
     methods: Mapping[str, StereoMethod], range_mm: int, pose: int, seed: int
 ) -> Iterator[tuple[Disparity, RectifiedPair, BarGuess]]:
-    """One pose's disparities by each method, its pair and the guess that the fit starts from."""
+    """Match one pose by each method; its pair and the guess that the fit starts from."""
     rng = np.random.default_rng([seed, range_mm, pose])
-    posed = bar_over_floor(rng, range_mm / 1000, rng.uniform(0, _MOST_GLOSS), _RAISED_M)
+    posed = bar_over_floor(rng, range_mm / 1000, rng.uniform(0, _MAX_GLOSS), _RAISED_M)
     assert posed.scene.bar is not None
-    pair = render(posed.scene, seed=seed * 100_000 + range_mm + pose).pair
+    pair = render_pair(posed.scene, seed=seed * 100_000 + range_mm + pose).pair
     guess = _rough_guess(rng, posed.scene.bar)
     for method in methods.values():
         yield method(pair, posed.candidates), pair, guess
 
 
 def measure_bar(disparity: Disparity, pair: RectifiedPair, guess: BarGuess) -> tuple[float, float]:
-    """The diameter from outlines and disparities, and from the map alone; metres, NaN where it failed."""
+    """Measure the diameter from outlines and disparities, and from the map alone; metres, NaN where it
+    failed.
+    """
     fitted = fit_bar(disparity, pair.camera, guess)
     if isinstance(fitted, Failed):
         return math.nan, math.nan
@@ -124,7 +126,9 @@ def measure_bar(disparity: Disparity, pair: RectifiedPair, guess: BarGuess) -> t
 
 
 def target_size_table(bench: TargetSizeBench) -> Table:
-    """Ranges down, methods across: mean absolute error and spread of `size`, and of `map` in brackets."""
+    """Tabulate ranges down, methods across: mean absolute error and spread of `size`, and of `map` in
+    brackets.
+    """
     table = Table(
         title=f"A bar of {bench.diameter_mm:.0f} mm: mean |error| ± spread, %",
         caption=f"{bench.poses} poses each. First line: outlines in the images at the distance that the "
@@ -141,8 +145,8 @@ def target_size_table(bench: TargetSizeBench) -> Table:
     return table
 
 
-def _rough_guess(rng: np.random.Generator, bar: Bar) -> BarGuess:
-    """The bar as a person would point at it: place and radius up to 15 % of the radius off."""
+def _rough_guess(rng: np.random.Generator, bar: RenderedBar) -> BarGuess:
+    """Draw a rough bar as a person would point at it: place and radius up to 15 % of the radius off."""
     shift = bar.radius_m * _GUESS_ERROR * rng.uniform(-1, 1, 3)
     radius = bar.radius_m * (1 + _GUESS_ERROR * rng.uniform(-1, 1))
     return BarGuess(bar.centre_m + shift, bar.axis, radius)

@@ -1,4 +1,4 @@
-"""Bundles found in many degraded maps of drawn yards, against the truth."""
+"""Find bundles in many degraded maps of drawn yards and score them against the truth."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.benchmarks.yard.bundle_scores import BundleErrors, TrueBundle, joined, score_bundles
+from barsight.benchmarks.yard.bundle_scores import BundleErrors, TrueBundle, join_scores, score_bundles
 from barsight.benchmarks.yard.degraded_map import Defects, degraded_map
 from barsight.simulation.scene import build_scene
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
-from barsight.simulation.stock import Bundle, stack_yard
+from barsight.simulation.stock import StackedBundle, stack_yard
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.types import HeightMap
@@ -45,11 +45,13 @@ def bench_bundles(yards: int, seed: int, length_m: float) -> BundleBench:
         found = find_bundles(height_map, BundleSettings())
         seconds.append(time.process_time() - start)
         parts.append(score_bundles(found, true))
-    return BundleBench(yards, length_m, joined(parts), tuple(seconds[1:]))
+    return BundleBench(yards, length_m, join_scores(parts), tuple(seconds[1:]))
 
 
 def drawn_yards(yards: int, seed: int, length_m: float) -> Iterator[SimulationSettings]:
-    """Yards of 1 to 5 layers with all kinds of bars: gaps, skews, missing and crossed bundles, dunnage."""
+    """Draw yards of 1 to 5 layers with all kinds of bars: gaps, skews, missing and crossed bundles,
+    dunnage.
+    """
     rng = np.random.default_rng(seed)
     for k in range(yards):
         bars = _KINDS[k % len(_KINDS)]
@@ -57,16 +59,17 @@ def drawn_yards(yards: int, seed: int, length_m: float) -> Iterator[SimulationSe
             max_layers=1 + k % 5 if "mm:7" in bars else 1 + k % 4,
             gap_m=float(rng.choice([0, 0.01, 0.03, 0.1])),
             skew_deg=float(rng.choice([0, 0.3, 0.6, 1.5])),
-            missing_share=float(rng.choice([0, 0.1, 0.3])),
+            missing_ratio=float(rng.choice([0, 0.1, 0.3])),
             dunnage_m=float(rng.choice([0.05, 0.09, 0.12])),
             bar_length_m=float(rng.choice([4, 5, 6, 7.5])),
-            crossed_share=0.5 if k % 3 == 2 else 0.0,
+            crossed_ratio=0.5 if k % 3 == 2 else 0.0,
         )
         yield SimulationSettings(length_m=length_m, seed=1000 * seed + k, bars=bars, yard=yard)
 
 
 def rendered_yards(yards: int, seed: int) -> Iterator[SimulationSettings]:
-    """Short yards for small pictures, half a minute each to render and measure; of as many sorts as drawn.
+    """Choose short yards for small pictures, half a minute each to render and measure; of as many sorts as
+    drawn.
 
     The pictures are cut to a quarter, the resolution stays. Short bars have both ends in view, long ones one.
     """
@@ -79,10 +82,10 @@ def rendered_yards(yards: int, seed: int) -> Iterator[SimulationSettings]:
             max_layers=1 + k % 5,
             gap_m=float(rng.choice([0, 0.01, 0.03, 0.1])),
             skew_deg=float(rng.choice([0, 0.3, 0.6, 1.5])),
-            missing_share=float(rng.choice([0, 0.1, 0.3])),
+            missing_ratio=float(rng.choice([0, 0.1, 0.3])),
             dunnage_m=float(rng.choice([0.05, 0.09, 0.12])),
             bar_length_m=bar_length,
-            crossed_share=1.0 if k % 3 == 2 else 0.0,
+            crossed_ratio=1.0 if k % 3 == 2 else 0.0,
         )
         camera = CameraSettings(width_px=640, height_px=512, trolley_y_m=-1.0 if bar_length > 3 else 0.0)
         yield SimulationSettings(
@@ -92,7 +95,7 @@ def rendered_yards(yards: int, seed: int) -> Iterator[SimulationSettings]:
 
 
 def drawn_map(settings: SimulationSettings) -> tuple[HeightMap, tuple[TrueBundle, ...]]:
-    """The degraded map of a yard and its true bundles."""
+    """Draw the degraded map of a yard and its true bundles."""
     stock = stack_yard(settings, np.random.default_rng((settings.seed, 0)))
     scene = build_scene(stock, settings, np.random.default_rng((settings.seed, 1)))
     rng = np.random.default_rng((settings.seed, 20))
@@ -100,7 +103,7 @@ def drawn_map(settings: SimulationSettings) -> tuple[HeightMap, tuple[TrueBundle
     return height_map, tuple(_true(bundle) for bundle in stock.bundles)
 
 
-def _true(bundle: Bundle) -> TrueBundle:
+def _true(bundle: StackedBundle) -> TrueBundle:
     return TrueBundle(
         bundle.centre_m, bundle.yaw_rad, bundle.length_m, 2 * bundle.radius_m, bundle.top_z_m,
         bundle.kind.diameter_m, bundle.kind.count, bundle.layer, bundle.on_top,

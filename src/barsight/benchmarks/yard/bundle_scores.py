@@ -1,4 +1,4 @@
-"""Found bundles against the true ones of a simulated yard."""
+"""Score found bundles against the true ones of a simulated yard."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class BundleErrors:
 
 
 def read_true_bundles(recording: Path) -> tuple[TrueBundle, ...]:
-    """truth/bundles.json of a simulated recording."""
+    """Read truth/bundles.json of a simulated recording."""
     path = recording / "truth" / "bundles.json"
     if not path.is_file():
         raise InputError(path, "no such file", "give a simulated recording")
@@ -101,8 +101,8 @@ def score_bundles(found: tuple[Bundle, ...], true: tuple[TrueBundle, ...]) -> Bu
     )
 
 
-def joined(parts: list[BundleErrors]) -> BundleErrors:
-    """Several yards as one."""
+def join_scores(parts: list[BundleErrors]) -> BundleErrors:
+    """Join the scores of several yards."""
     names = sorted({name for part in parts for name in part.errors})
     none = np.empty(0)
 
@@ -123,8 +123,10 @@ def joined(parts: list[BundleErrors]) -> BundleErrors:
     )
 
 
-def figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
-    """By figure: count, bias, median and P95 of the size (mm; yaw in degrees), share in the 95 % interval."""
+def score_figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
+    """Summarise each figure: count, bias, median, P95 of the size (mm; yaw in degrees), ratio in the 95 %
+    interval.
+    """
     out = {}
     for name, error in scores.errors.items():
         sigma = scores.sigmas[name]
@@ -146,7 +148,7 @@ def figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True)
 class BundleReport:
-    """What a benchmark of bundles says, for a file. cpu_seconds: per yard, none for a measured folder."""
+    """A bundle benchmark's record, for a file. cpu_seconds: per yard, none for a measured folder."""
 
     provenance: Provenance
     counts: dict[str, int]
@@ -155,13 +157,13 @@ class BundleReport:
 
 
 def bundle_report(scores: BundleErrors, cpu_seconds: tuple[float, ...]) -> BundleReport:
-    """Counts and figures with commit and machine."""
+    """Build counts and figures with commit and machine."""
     counts = {name: int(getattr(scores, name)) for name in _COUNTS}
-    return BundleReport(provenance(), counts, figures(scores), cpu_seconds)
+    return BundleReport(provenance(), counts, score_figures(scores), cpu_seconds)
 
 
 def bundle_table(scores: BundleErrors) -> Table:
-    """The figures for people; lengths in mm, yaw in degrees."""
+    """Tabulate the figures for people; lengths in mm, yaw in degrees."""
     title = (
         f"{scores.found} of {scores.free} free bundles found, {scores.wrong} of {scores.claimed} false; "
         f"bars counted right in {scores.right_count} of {scores.said_count}"
@@ -169,7 +171,7 @@ def bundle_table(scores: BundleErrors) -> Table:
     table = Table("figure", title=title, box=SIMPLE_HEAD)
     for head in ("n", "bias", "median", "P95", "max", "in 95 %"):
         table.add_column(head, justify="right")
-    for name, row in figures(scores).items():
+    for name, row in score_figures(scores).items():
         digits = 3 if name == "yaw" else 1
         numbers = (f"{row[key]:.{digits}f}" for key in ("bias", "median", "p95", "max"))
         table.add_row(name, f"{row['samples']:.0f}", *numbers, f"{row['within_95_pct']:.1f}")
@@ -177,7 +179,7 @@ def bundle_table(scores: BundleErrors) -> Table:
 
 
 def reliability(scores: BundleErrors) -> str:
-    """Stated confidence of the bundles said to be free against the share that is right."""
+    """Compare stated confidence of the bundles said to be free with the ratio that is right."""
     out = []
     for name, part in (("0.9 or more", scores.confidence >= 0.9), ("less", scores.confidence < 0.9)):
         if part.any():
@@ -192,7 +194,7 @@ def _axes(true: TrueBundle) -> tuple[Float64, Float64]:
 
 
 def _offset(found: Bundle, true: TrueBundle) -> tuple[float, float]:
-    """Sideways of the true axis at the found middle, and along it."""
+    """Compute the offset sideways of the true axis at the found middle, and along it."""
     across, along = _axes(true)
     step = found.centre_m - true.centre_m
     return float(step @ across), float(step @ along)

@@ -1,4 +1,4 @@
-"""A height map as the cameras would measure it, drawn from the exact surface: a minute for thirty yards.
+"""Draw a height map as the cameras would measure it from the exact surface: a minute for thirty yards.
 
 What goes wrong in a measured map is put on the exact heights: the cameras' field, places that no pair sees,
 edges that grow over what they hide, smoothing by the matching window, noise that is alike along the bars,
@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float64, kernel
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.simulation.scene import Scene
 from barsight.simulation.sensors import heights
 from barsight.simulation.settings import CameraSettings
@@ -46,14 +46,14 @@ class Defects:
     """Mean growth of an edge over what it hides."""
     frame_step_m: float = 0.4
     """Travel from frame to frame: a gully must be open to a pair somewhere along it."""
-    flying_share: float = 0.008
-    hole_share: float = 0.01
+    flying_ratio: float = 0.008
+    hole_ratio: float = 0.01
 
 
 def degraded_map(
     scene: Scene, length_m: float, camera: CameraSettings, rng: np.random.Generator, defects: Defects
 ) -> HeightMap:
-    """The map of a yard `length_m` long in X, 10 mm cells."""
+    """Draw the map of a yard `length_m` long in X, 10 mm cells."""
     xs = CELL_M * np.arange(round(-_MARGIN_M / CELL_M), round((length_m + _MARGIN_M) / CELL_M) + 1)
     ys = CELL_M * np.arange(round(-_HALF_WIDTH_M / CELL_M), round(_HALF_WIDTH_M / CELL_M) + 1)
     x, y = np.meshgrid(xs, ys)
@@ -63,7 +63,7 @@ def degraded_map(
     z, seen = _grown(z, seen, rng, defects)
     z = z + _noise(z.shape, rng, defects)
     z, seen = _flying(z, seen, rng, defects)
-    seen &= ~_patches(z.shape, rng, defects.hole_share)
+    seen &= ~_patches(z.shape, rng, defects.hole_ratio)
     beside = rng.normal(0, defects.placed_m, 2)
     sigma = np.where(seen, defects.stated_m * rng.uniform(0.9, 1.2, z.shape), np.nan)
     return HeightMap(
@@ -73,12 +73,14 @@ def degraded_map(
         z_m=np.where(seen, z, np.nan).astype(np.float32),
         sigma_m=sigma.astype(np.float32),
         views=np.where(seen, 6, 0).astype(np.float32),
-        source=np.where(seen, Source.VISION, Source.UNKNOWN).astype(np.uint8),
+        source=np.where(seen, HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8),
     )
 
 
 def _seen(exact: Float64, y: Float64, camera: CameraSettings, defects: Defects) -> Bool:
-    """Cells in the field of view that nothing hides: towards the trolley's line, and from two places on X."""
+    """Mark cells in the field of view that nothing hides: towards the trolley's line, and from two places on
+    X.
+    """
     depth = camera.above_floor_m - exact
     side = (y - camera.trolley_y_m) / depth
     field = np.abs(side) < 0.5 * camera.height_px / camera.focal_px
@@ -92,7 +94,7 @@ def _seen(exact: Float64, y: Float64, camera: CameraSettings, defects: Defects) 
 
 @kernel()
 def _opening(exact: Float64, cell: float) -> Float64:
-    """How wide each cell sees the sky along X: the sum of the tangents to either side, at most 4."""
+    """Compute how wide each cell sees the sky along X: the sum of the tangents to either side, at most 4."""
     rows, columns = exact.shape
     opening = np.empty((rows, columns))
     for j in range(rows):
@@ -113,7 +115,7 @@ def _opening(exact: Float64, cell: float) -> Float64:
 
 
 def _windowed(exact: Float64, seen: Bool, window_m: tuple[float, float]) -> Float64:
-    """The mean of seen heights under the matching window, of the same surface (within 80 mm) only."""
+    """Average seen heights under the matching window, of the same surface (within 80 mm) only."""
     z = np.where(seen, exact, np.nan)
     total, weight = np.zeros_like(z), np.zeros_like(z)
     across, along = (int(2 * s / CELL_M + 0.5) for s in window_m)
@@ -128,7 +130,7 @@ def _windowed(exact: Float64, seen: Bool, window_m: tuple[float, float]) -> Floa
 
 
 def _grown(z: Float64, seen: Bool, rng: np.random.Generator, defects: Defects) -> tuple[Float64, Bool]:
-    """Edges grow over hidden cells and lower ones beside them, ends of bars half as far."""
+    """Grow edges over hidden cells and lower ones beside them, ends of bars half as far."""
     steps = rng.poisson(defects.growth_cells, (z.shape[0] // 8 + 1, z.shape[1])).repeat(8, axis=0)[
         : z.shape[0]
     ]
@@ -152,13 +154,13 @@ def _noise(shape: tuple[int, ...], rng: np.random.Generator, defects: Defects) -
 
 
 def _flying(z: Float64, seen: Bool, rng: np.random.Generator, defects: Defects) -> tuple[Float64, Bool]:
-    wrong = _patches(z.shape, rng, defects.flying_share) & seen
+    wrong = _patches(z.shape, rng, defects.flying_ratio) & seen
     rise = ndimage.gaussian_filter(rng.normal(0, 1, z.shape), 2.0)
     return np.where(wrong, z + 0.3 * rise / rise.std(), z), seen
 
 
 def _patches(shape: tuple[int, ...], rng: np.random.Generator, share: float) -> Bool:
-    """Blobs of about 3 x 3 cells over a share of the map."""
+    """Draw blobs of about 3 x 3 cells over a fraction of the map."""
     field = ndimage.gaussian_filter(rng.normal(0, 1, shape), 1.5)
     blobs: Bool = field > np.quantile(field[::3, ::3], 1 - share)
     return blobs

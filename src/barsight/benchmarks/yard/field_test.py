@@ -1,4 +1,4 @@
-"""The paper's field test, simulated: methods side by side on one recording, against truth and noisy laser."""
+"""Simulate the paper's field test: methods side by side on one recording, against truth and noisy laser."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance
-from barsight.evaluation.score import Figures, score
+from barsight.evaluation.score import Figures, score_folder
 from barsight.recording.base import Recording
 
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -20,7 +20,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "ours": (),
     "ours fast": ("--preset", "fast"),
     "ours crane-only": ("--motion.estimator", "crane"),
-    "ours votes-alone": ("--map.own-share", "0.01", "--map.along-m", "0"),
+    "ours votes-alone": ("--map.own-ratio", "0.01", "--map.along-m", "0"),
     "ours self-calibrated": ("--self-calibrate", "yaw"),
     "ours paper-contours": ("--map.contours", "paper"),
 }
@@ -59,7 +59,7 @@ class YardBench:
 
 
 def laser_error_mm(recording: Recording, folder: Path) -> tuple[float, float]:
-    """Bias and MAE of the recording's laser against its truth."""
+    """Compute bias and MAE of the recording's laser against its truth."""
     with np.load(folder / "truth" / "height.npz") as truth:
         errors = [p.z_m - truth[f"profile_y{p.profile}"] for p in recording.laser()]
     if not errors:
@@ -71,7 +71,7 @@ def laser_error_mm(recording: Recording, folder: Path) -> tuple[float, float]:
 def yard_row(method: str, flags: tuple[str, ...], recording: Path, out: Path) -> YardRow:
     """Score a measured folder."""
     content = json.loads((out / "result.json").read_text(encoding="utf-8"))
-    figures = score(recording, out)
+    figures = score_folder(recording, out)
     agreed = content["agreement"]
     return YardRow(
         method,
@@ -87,7 +87,7 @@ def yard_row(method: str, flags: tuple[str, ...], recording: Path, out: Path) ->
 
 
 def yard_table(bench: YardBench) -> Table:
-    """Like the paper's Table 4, with what it leaves out.
+    """Tabulate like the paper's Table 4, with what it leaves out.
 
     seen, in 95: % of visible places claimed, of errors inside the stated 95 %. all, cells, laser: MAE of
     whole contours, of all cells that two frames see, and against the laser on smooth places.

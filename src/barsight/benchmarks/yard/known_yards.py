@@ -1,4 +1,4 @@
-"""Simulated yards as the yard's stages would get them, without rendering: a height map and its bundles.
+"""Simulate yards as the yard's stages would get them, without rendering: a height map and its bundles.
 
 Both are the truth with drawn errors of a stated sigma, or the truth itself (`error=0`).
 """
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.simulation import stock as truth
 from barsight.simulation.scene import build_scene
 from barsight.simulation.sensors import heights
@@ -40,7 +40,7 @@ class KnownYard:
 
 
 def known_yard(stock: truth.Stock, settings: SimulationSettings, rng: np.random.Generator) -> KnownYard:
-    """The exact map of all that lies there, straps included, and all bundles, covered ones too."""
+    """Build the exact map of all that lies there, straps included, and all bundles, covered ones too."""
     scene = build_scene(stock, settings, rng)
     ends = np.array(
         [b.centre_m[:2] + s * b.length_m / 2 * b.axes[1, :2] for b in stock.bundles for s in (-1, 1)]
@@ -53,13 +53,13 @@ def known_yard(stock: truth.Stock, settings: SimulationSettings, rng: np.random.
     z = heights(scene, xx.ravel(), yy.ravel()).reshape(xx.shape).astype(np.float32)
     exact = HeightMap(
         float(x[0]), float(y[0]), CELL_M, z, np.full_like(z, 1e-4), np.full_like(z, 5.0),
-        np.full(z.shape, Source.VISION, np.uint8),
+        np.full(z.shape, HeightSource.VISION, np.uint8),
     )  # fmt: skip
     found = tuple(_bundle(number, bundle, stock) for number, bundle in enumerate(stock.bundles))
     return KnownYard(stock, exact, found)
 
 
-def _bundle(number: int, bundle: truth.Bundle, stock: truth.Stock) -> Bundle:
+def _bundle(number: int, bundle: truth.StackedBundle, stock: truth.Stock) -> Bundle:
     along = bundle.axes[1]
     nothing = BundleSigma(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     beside = [
@@ -80,7 +80,7 @@ def _bundle(number: int, bundle: truth.Bundle, stock: truth.Stock) -> Bundle:
 
 
 def seen_bundles(yard: KnownYard, rng: np.random.Generator, sigma: BundleSigma = SIGMA) -> tuple[Bundle, ...]:
-    """The bundles on which nothing lies, with errors drawn from `sigma`, which they state."""
+    """Draw errors from `sigma`, which they state, onto the bundles on which nothing lies."""
     return tuple(_seen(bundle, rng, sigma) for bundle in yard.bundles if bundle.on_top)
 
 
@@ -102,7 +102,7 @@ def _seen(bundle: Bundle, rng: np.random.Generator, sigma: BundleSigma) -> Bundl
 
 
 def seen_heights(exact: HeightMap, rng: np.random.Generator) -> HeightMap:
-    """The map with noise that neighbours share, an error that changes slowly along it, and unknown cells."""
+    """Add noise that neighbours share, an error that changes slowly along the map, and unknown cells."""
     z, shape = exact.z_m, exact.z_m.shape
     noise = _smooth(rng, shape, CORRELATION_CELLS) * CELL_SIGMA_M
     noise += _smooth(rng, shape, SHARED_CELLS) * SHARED_SIGMA_M
@@ -111,13 +111,13 @@ def seen_heights(exact: HeightMap, rng: np.random.Generator) -> HeightMap:
     lost = steep & (rng.random(shape) < STEEP_UNKNOWN)
     seen = np.where(lost, np.nan, z + noise).astype(np.float32)
     sigma = np.where(lost, np.nan, np.hypot(CELL_SIGMA_M, SHARED_SIGMA_M)).astype(np.float32)
-    source = np.where(lost, Source.UNKNOWN, Source.VISION).astype(np.uint8)
+    source = np.where(lost, HeightSource.UNKNOWN, HeightSource.VISION).astype(np.uint8)
     views = np.where(lost, 0, exact.views).astype(np.float32)
     return HeightMap(exact.x0_m, exact.y0_m, exact.cell_m, seen, sigma, views, source)
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, int], cells: float) -> Float32:
-    """White noise smoothed over `cells`, of variance 1."""
+    """Smooth white noise over `cells`, of variance 1."""
     shrink = max(1, int(cells / 4))
     rows, columns = -(-shape[0] // shrink) + 8, -(-shape[1] // shrink) + 8
     smooth: Float64 = cv2.GaussianBlur(rng.normal(0, 1, (rows, columns)), (0, 0), cells / shrink)

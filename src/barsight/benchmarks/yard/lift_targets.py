@@ -1,4 +1,4 @@
-"""`barsight bench lifts`: random placements of the magnet on simulated yards, against exact knowledge.
+"""Judge random placements of the magnet on simulated yards (`barsight bench lifts`) against exact knowledge.
 
 The yard's stages get maps and bundles with errors; the truth says how many bundles the magnet would take and
 whether the lift is truly fine: judged by the same limits on the exact map and the exact bundles there is no
@@ -24,8 +24,8 @@ from barsight.core.arrays import Float64
 from barsight.simulation.settings import SimulationSettings, YardSettings
 from barsight.simulation.stock import stack_yard
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift, Yard, assess
-from barsight.yard.lifting.contact import touch
+from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
+from barsight.yard.lifting.contact import set_down
 from barsight.yard.lifting.footprint import BundleTable, Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.stability.stability import footings
@@ -57,13 +57,13 @@ class LiftBench:
 
 
 def bench_yard(number: int) -> tuple[KnownYard, np.random.Generator]:
-    """The numbered yard: 1 to 5 layers, seven mixes of bars, gaps of 15 to 60 mm, missing places."""
+    """Draw the numbered yard: 1 to 5 layers, seven mixes of bars, gaps of 15 to 60 mm, missing places."""
     rng = np.random.default_rng([7, number])
     settings = SimulationSettings(
         length_m=LENGTH_M, seed=number, bars=KINDS[number % len(KINDS)],
         yard=YardSettings(
             max_layers=1 + number % 5, gap_m=float(rng.uniform(0.015, 0.06)),
-            missing_share=float(rng.uniform(0.0, 0.25)), skew_deg=float(rng.uniform(0.0, 0.4)),
+            missing_ratio=float(rng.uniform(0.0, 0.25)), skew_deg=float(rng.uniform(0.0, 0.4)),
         ),
     )  # fmt: skip
     return known_yard(stack_yard(settings, rng), settings, rng), rng
@@ -89,7 +89,7 @@ def bench_lifts(
         for _ in range(number, placements, yards):
             place = random_place(known, rng)
             start = time.perf_counter()
-            lift = assess(place, measured, magnet, settings)
+            lift = assess_placement(place, measured, magnet, settings)
             seconds += time.perf_counter() - start
             true_count = count_truly(place, known, magnet)
             wrong += not lift.vetoes and lift.count != true_count
@@ -106,12 +106,14 @@ def bench_lifts(
     )  # fmt: skip
 
 
-def _judged(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> Yard:
-    return Yard(heights, BundleTable.of(bundles), footings(heights, bundles, settings), ())
+def _judged(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> LiftScene:
+    return LiftScene(heights, BundleTable.of(bundles), footings(heights, bundles, settings), ())
 
 
 def random_place(known: KnownYard, rng: np.random.Generator) -> Placement:
-    """Three in five well over a free bundle, one in five beside one, one in five anywhere."""
+    """Draw a placement: three in five well over a free bundle, one in five beside one, one in five
+    anywhere.
+    """
     free = [b for b in known.bundles if b.on_top]
     bundle = free[int(rng.integers(len(free)))]
     kind = rng.random()
@@ -132,8 +134,10 @@ def random_place(known: KnownYard, rng: np.random.Generator) -> Placement:
 
 
 def count_truly(place: Placement, known: KnownYard, magnet: Magnet) -> int:
-    """Bundles within whose true outline a pole has a part, and whose top lies within the magnet's reach."""
-    contact = touch(known.heights, place, magnet, 0.003)
+    """Count bundles within whose true outline a pole has a part, and whose top lies within the magnet's
+    reach.
+    """
+    contact = set_down(known.heights, place, magnet, 0.003)
     if contact is None:
         return 0
     taken: set[int] = set()
@@ -157,10 +161,12 @@ def _inside(points: Float64, bundle: Bundle) -> bool:
 
 
 def truly_fine(
-    place: Placement, known: KnownYard, exact: Yard, magnet: Magnet, settings: LiftSettings
+    place: Placement, known: KnownYard, exact: LiftScene, magnet: Magnet, settings: LiftSettings
 ) -> bool:
-    """Whether exact knowledge finds nothing against the lift, and the right count all over the tolerance."""
-    lift: Lift = assess(place, exact, magnet, settings)
+    """Check that exact knowledge finds nothing against the lift, and the right count all over the
+    tolerance.
+    """
+    lift: Lift = assess_placement(place, exact, magnet, settings)
     if lift.vetoes:
         return False
     box = magnet.tolerance
@@ -175,7 +181,7 @@ def truly_fine(
 
 
 def lift_table(bench: LiftBench) -> Table:
-    """The bench for people."""
+    """Tabulate the bench for people."""
     table = Table("figure", "value", title=f"{bench.placements} placements on {bench.yards} yards")
     share = 100 * bench.vetoed_fine / bench.fine if bench.fine else math.nan
     for name, value in (

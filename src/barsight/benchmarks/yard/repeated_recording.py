@@ -1,4 +1,4 @@
-"""A recording driven several times end to end: a long yard without rendering every metre of it.
+"""Repeat a recording end to end: a long yard without rendering every metre of it.
 
 Each lap goes on where the crane stopped; the pictures are the first lap's. At a joint the picture changes
 while the crane stands, as if the yard had been exchanged under it: what is measured there is wrong, and no
@@ -73,6 +73,6 @@ def _write(folder: Path, head: str, rows: Iterable[tuple[object, ...]]) -> None:
 
 
 def _table(folder: Path) -> tuple[str, list[list[str]]]:
-    """The first line of a data.csv and its rows."""
+    """Read the first line of a data.csv and its rows."""
     lines = (folder / "data.csv").read_text(encoding="ascii").splitlines()
     return lines[0], [[field.strip() for field in line.split(",")] for line in lines[1:] if line.strip()]

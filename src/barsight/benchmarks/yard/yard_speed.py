@@ -1,4 +1,4 @@
-"""How long a whole yard of 35 m takes: its bundles found, its lifts chosen."""
+"""Time a whole yard of 35 m: its bundles found, its lifts chosen."""
 
 from __future__ import annotations
 

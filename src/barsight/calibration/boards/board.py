@@ -1,4 +1,4 @@
-"""Calibration boards: what a `--board` text means, and where the board's points lie on it."""
+"""Parse `--board` texts and place the board's points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 
-MOST_PER_SIDE = 100
+MAX_PER_SIDE = 100
 LARGEST_M = 2.0
 BOARD_FORMS = (
     "checkerboard:9x6:0.025 (inner corners, square in m), charuco:11x8:0.03:0.022[:DICT_5X5_250] (squares, "
@@ -19,7 +19,7 @@ BOARD_FORMS = (
 
 
 class BoardKind(StrEnum):
-    """What the board shows."""
+    """Patterns of a board."""
 
     CHECKERBOARD = "checkerboard"
     CHARUCO = "charuco"
@@ -46,7 +46,7 @@ class Board:
 
     def __post_init__(self) -> None:
         least = {BoardKind.CHECKERBOARD: 3, BoardKind.CHARUCO: 3, BoardKind.APRILGRID: 1}[self.kind]
-        if not (least <= self.columns <= MOST_PER_SIDE and least <= self.rows <= MOST_PER_SIDE):
+        if not (least <= self.columns <= MAX_PER_SIDE and least <= self.rows <= MAX_PER_SIDE):
             raise ConfigError(f"a {self.kind} of {self.columns}x{self.rows} can't be; {BOARD_FORMS}")
         if not 0 < self.size_m <= LARGEST_M:
             raise ConfigError(f"a size of {self.size_m} m can't be; sizes are in metres: {BOARD_FORMS}")
@@ -57,7 +57,7 @@ class Board:
 
     @property
     def points_m(self) -> Float64:
-        """(N, 3) the board's points at z = 0, indexed by the ids that detections carry.
+        """Return the board's points (N, 3) at z = 0, indexed by the ids that detections carry.
 
         Checkerboard and ChArUco: inner corners row by row. AprilGrid: four corners a tag, tag after tag, from
         the lower left counter-clockwise, tags row by row from below [Kalibr].
@@ -81,7 +81,7 @@ class Board:
 
 
 def parse_board(text: str) -> Board:
-    """The board of a text such as `checkerboard:9x6:0.025`. Raises ConfigError naming the forms."""
+    """Parse a text such as `checkerboard:9x6:0.025`. Raises ConfigError naming the forms."""
     kind, *rest = text.strip().split(":")
     counts = {"checkerboard": (2,), "charuco": (3, 4), "aprilgrid": (3,)}
     try:

@@ -1,4 +1,4 @@
-"""What the cameras saw of a board: corners per picture, pairs of pictures, and those left out."""
+"""Hold corners per picture, pairs of pictures, and removed ones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Corners:
         expect_shape("pixels", self.pixels, (self.ids.size, 2))
 
     def keep(self, mask: Bool) -> Corners:
-        """Only the corners where `mask` (N,) is true."""
+        """Select the corners where `mask` (N,) is true."""
         return Corners(self.ids[mask], self.pixels[mask], self.edge_px)
 
 
@@ -38,7 +38,7 @@ class BoardView:
 
     @property
     def cameras(self) -> tuple[Corners | None, Corners | None]:
-        """Both cameras' corners."""
+        """Return both cameras' corners."""
         return self.cam0, self.cam1
 
 
@@ -52,7 +52,7 @@ class Removed:
 
 
 def common_corners(view: BoardView) -> tuple[Int64, Float64, Float64]:
-    """ids (N,) seen by both cameras, and their pixels (N, 2) in cam0 and in cam1."""
+    """Intersect both cameras' corners: ids (N,) and their pixels (N, 2) in cam0 and in cam1."""
     if view.cam0 is None or view.cam1 is None:
         return np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2))
     ids, first, second = np.intersect1d(view.cam0.ids, view.cam1.ids, return_indices=True)

@@ -1,4 +1,4 @@
-"""The shape of a board that is neither flat nor printed quite as stated, in a few numbers [mrcal].
+"""Model a board's deviation from flat and from its stated size by a few parameters [mrcal].
 
 A parabola along each of its axes, zero at the ends; the print's stretch and skew; for an AprilGrid the tags'
 size about their centres. The mean pitch from tag to tag (square to square) stays the stated one: it is the
@@ -43,7 +43,7 @@ class BoardShape:
 
     @property
     def sigma(self) -> Float64:
-        """(S,) one standard deviation each."""
+        """Return one standard deviation (S,) of each."""
         return np.sqrt(np.diag(self.covariance))
 
     def __str__(self) -> str:
@@ -62,7 +62,7 @@ class BentBoard(Board):
 
     @property
     def points_m(self) -> Float64:
-        """(N, 3) as a flat board's, moved by the shape."""
+        """Return the points (N, 3) of the flat board, moved by the shape."""
         flat = super().points_m
         moved: Float64 = flat + _basis(self.kind, flat) @ np.array(self.shape)
         return moved
@@ -75,8 +75,8 @@ class BentBoard(Board):
         return ", ".join((super().__str__(), *words))
 
 
-def bent(board: Board, shape: Mapping[str, float]) -> BentBoard:
-    """The same board with the numbers of a shape by name. Raises KeyError where one is missing."""
+def apply_shape(board: Board, shape: Mapping[str, float]) -> BentBoard:
+    """Apply shape parameters by name to a board. Raises KeyError where one is missing."""
     values = tuple(shape[name] for name in _names(board))
     return BentBoard(
         board.kind, board.columns, board.rows, board.size_m, board.marker_m, board.spacing, board.dictionary,
@@ -85,18 +85,20 @@ def bent(board: Board, shape: Mapping[str, float]) -> BentBoard:
 
 
 def board_shape(board: Board, steps: Float64, covariance: Float64) -> BoardShape:
-    """The shape of (S,) steps along `shape_basis` and their covariance (S, S)."""
+    """Build the shape of (S,) steps along `shape_basis` and their covariance (S, S)."""
     unit = _units(board)
     return BoardShape(_names(board), unit * steps, covariance * unit[:, None] * unit)
 
 
 def shape_basis(board: Board) -> Float64:
-    """(N, 3, S) m: how the board's points move with each number of its shape, by what is expected of it."""
+    """Compute the displacement (N, 3, S) m of the board's points by each shape parameter, in its
+    prior sigma.
+    """
     return _basis(board.kind, board.points_m) * _units(board)
 
 
 def _basis(kind: BoardKind, points: Float64) -> Float64:
-    """(N, 3, S) m per unit of each number, for flat points (N, 3)."""
+    """Compute displacements (N, 3, S) m per unit of each parameter, for flat points (N, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
     across = (2 * points - low - high)[:, :2] / (high - low)[:2]
     basis = np.zeros((len(points), 3, len(WORDS) if kind is BoardKind.APRILGRID else len(WORDS) - 1))

@@ -1,4 +1,4 @@
-"""Finding a board's corners in a picture, below a pixel, and saying how blurred its edges are."""
+"""Detect a board's corners to sub-pixel accuracy and measure edge blur."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from barsight.calibration.boards.marker_detection import detect_aprilgrid, detec
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
 
-MOST_WINDOW_PX = 11
-EDGE_SHARE = 0.35
-MOST_CROSSINGS, LEAST_ALIKE = 0.75, 0.6
+MAX_WINDOW_PX = 11
+EDGE_RATIO = 0.35
+MAX_CROSSINGS, MIN_ALIKE = 0.75, 0.6
 
 
 def detect(board: Board, image: UInt8) -> Corners | Failed:
-    """The board's corners in one gray picture (H, W).
+    """Detect the board's corners in one gray picture (H, W).
 
     Failed `no-board` where it isn't found; for a checkerboard the reason says which other one the picture
     shows. AprilGrid and ChArUco boards count when half seen, checkerboards only whole.
@@ -53,12 +53,14 @@ def _detect_checkerboard(board: Board, image: UInt8) -> Corners | Failed:
 
 
 def _refine(image: UInt8, grid: Float64) -> Float64:
-    """Corners where the gradients point past [Foerstner 1987], in a window that stays inside the squares."""
+    """Refine corners by gradient orthogonality [Foerstner 1987], in a window that stays inside the
+    squares.
+    """
     steps = np.concatenate([
         np.linalg.norm(np.diff(grid, axis=0), axis=2).ravel(),
         np.linalg.norm(np.diff(grid, axis=1), axis=2).ravel(),
     ])  # fmt: skip
-    half = int(np.clip(0.4 * steps.min(), 2, MOST_WINDOW_PX))
+    half = int(np.clip(0.4 * steps.min(), 2, MAX_WINDOW_PX))
     start = grid.reshape(-1, 1, 2).astype(np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), criteria)
@@ -68,7 +70,7 @@ def _refine(image: UInt8, grid: Float64) -> Float64:
 
 
 def _is_grid(grid: Float64) -> bool:
-    """Neighbours' steps change slowly; a false find jumps."""
+    """Check that neighbouring grid steps change slowly; a false detection jumps."""
     for axis in (0, 1):
         steps = np.diff(grid, axis=axis)
         bends = np.linalg.norm(np.diff(steps, axis=axis), axis=2)
@@ -78,7 +80,7 @@ def _is_grid(grid: Float64) -> bool:
 
 
 def _goes_on(image: UInt8, grid: Float64) -> bool:
-    """Whether the squares go on past a side of the grid: the places one step out are crossings too."""
+    """Check whether the squares go on past a side of the grid: the places one step out are crossings too."""
     for side in (grid, grid[::-1], grid.transpose(1, 0, 2), grid.transpose(1, 0, 2)[::-1]):
         outward = side[0] - side[1]
         steps = np.linalg.norm(outward, axis=1)
@@ -90,13 +92,13 @@ def _goes_on(image: UInt8, grid: Float64) -> bool:
         if known.sum() < max(3, side.shape[1] // 2):
             continue
         crossings = [_is_crossing(image, p, s) for p, s in zip(place[known], steps[known], strict=True)]
-        if np.mean(crossings) > MOST_CROSSINGS:
+        if np.mean(crossings) > MAX_CROSSINGS:
             return True
     return False
 
 
 def _is_crossing(image: UInt8, place: Float64, step: float) -> bool:
-    """Dark and light change four times on a ring about the corner near a place, and opposite sides agree."""
+    """Check for a saddle: four changes on a ring about the corner near a place, opposite sides alike."""
     half = max(int(0.25 * step), 2)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
     start = place.reshape(1, 1, 2).astype(np.float32)
@@ -111,11 +113,11 @@ def _is_crossing(image: UInt8, place: Float64, step: float) -> bool:
     light = ring > level
     changes = int((light != np.roll(light, 1)).sum())
     alike = float(np.corrcoef(ring, np.roll(ring, 16))[0, 1]) if np.ptp(ring) > 40 else 0.0
-    return changes == 4 and alike > LEAST_ALIKE
+    return changes == 4 and alike > MIN_ALIKE
 
 
 def _canonical(board: Board, grid: Float64, image: UInt8) -> Float64:
-    """The one order of the corners that both cameras agree on.
+    """Order the corners the way both cameras agree on.
 
     Mirrored orders are turned right-handed. Where columns + rows is odd the colours tell the ends apart (the
     square inside the first corner is dark); elsewhere the board looks the same turned by half, and the order
@@ -138,7 +140,7 @@ def _square_brightness(image: UInt8, grid: Float64) -> float:
 
 
 def edge_width(image: UInt8, grid: Float64) -> float:
-    """The width (px) of the edges between a checkerboard's squares: brightness step over steepest slope.
+    """Measure the edge width (px) between a checkerboard's squares: brightness step over steepest slope.
 
     grid: (rows, columns, 2) corners. The larger of both directions' medians, so that a smear along one of
     them shows; NaN where no edge has contrast.
@@ -150,7 +152,7 @@ def edge_width(image: UInt8, grid: Float64) -> float:
         along = (ends[1] - ends[0]).reshape(-1, 2)
         length = np.linalg.norm(along, axis=1)
         normal = np.column_stack([-along[:, 1], along[:, 0]]) / length[:, None]
-        reach = np.linspace(-EDGE_SHARE, EDGE_SHARE, 41)
+        reach = np.linspace(-EDGE_RATIO, EDGE_RATIO, 41)
         place = middle[:, None] + normal[:, None] * (length[:, None] * reach)[:, :, None]
         profile = cv2.remap(
             image.astype(np.float32), place[..., 0].astype(np.float32), place[..., 1].astype(np.float32),
@@ -168,7 +170,7 @@ def edge_width(image: UInt8, grid: Float64) -> float:
 
 
 def _shown_size(board: Board, image: UInt8) -> tuple[int, int] | None:
-    """Columns and rows of the checkerboard that the picture shows; None for none or the wanted one."""
+    """Find columns and rows of the checkerboard shown; None for none or the wanted one."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
     if not found or corners is None:

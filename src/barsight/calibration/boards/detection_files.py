@@ -1,4 +1,4 @@
-"""Corners that were detected elsewhere: `cam0_detections.npz` and `cam1_detections.npz`.
+"""Read corners detected elsewhere: `cam0_detections.npz` and `cam1_detections.npz`.
 
 Each holds `detections`, a structured array of stamp_ns, tag, corner, u, v (px) and x, y, z (m, on the board).
 """
@@ -22,19 +22,22 @@ SAME_POINT = 0.02
 
 
 def has_detections(folder: Path) -> bool:
-    """Whether `folder` holds detections of both cameras."""
+    """Check whether `folder` holds detections of both cameras."""
     return all((folder / name).is_file() for name in NAMES)
 
 
 def read_detections(folder: Path, board: Board) -> list[BoardView]:
-    """One view per stamp that either camera has. Raises CalibrationError for files that don't fit."""
+    """Read one view per stamp that either camera has. Raises CalibrationError for files that don't fit."""
     cameras = [_read(folder / name, board) for name in NAMES]
     stamps = sorted({*cameras[0], *cameras[1]})
     return [BoardView(str(stamp), cameras[0].get(stamp), cameras[1].get(stamp)) for stamp in stamps]
 
 
 def read_rows(path: Path, fields: tuple[str, ...] = FIELDS) -> Any:
-    """The structured array of one camera. Raises CalibrationError where a field is missing or not finite."""
+    """Read the structured array of one camera.
+
+    Raises CalibrationError where a field is missing or not finite.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             rows = archive["detections"]

@@ -1,4 +1,4 @@
-"""AprilGrid and ChArUco boards: markers carry numbers, so a half-seen board counts."""
+"""Detect AprilGrid and ChArUco boards: markers carry numbers, so a half-seen board counts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BORDER_BITS = (2, 1)
 
 
 def detect_charuco(board: Board, image: UInt8) -> Corners | Failed:
-    """The inner corners of a ChArUco board, new or legacy pattern. Failed `no-board`."""
+    """Detect the inner corners of a ChArUco board, new or legacy pattern. Failed `no-board`."""
     dictionary = _dictionary(board.dictionary)
     size = (board.columns, board.rows)
     best: tuple[Int64, Float64] | None = None
@@ -38,7 +38,7 @@ def detect_charuco(board: Board, image: UInt8) -> Corners | Failed:
 
 
 def detect_aprilgrid(board: Board, image: UInt8) -> Corners | Failed:
-    """The tags' corners of an AprilGrid (36h11). Failed `no-board` with fewer than four tags not in a row.
+    """Detect tag corners of an AprilGrid (36h11). Failed `no-board` with fewer than four tags not in a row.
 
     How each tag is turned on its place differs between printers, so it is taken from the places of the tags'
     centres, not from the tags.
@@ -61,7 +61,7 @@ def detect_aprilgrid(board: Board, image: UInt8) -> Corners | Failed:
 
 
 def _tags(image: UInt8, border_bits: int) -> tuple[Int64, Float64]:
-    """numbers (N,), quads (N, 4, 2); a number seen twice is dropped."""
+    """Detect tags: numbers (N,), quads (N, 4, 2); a number seen twice is dropped."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     parameters.minMarkerPerimeterRate = 0.01
@@ -78,7 +78,7 @@ def _tags(image: UInt8, border_bits: int) -> tuple[Int64, Float64]:
 
 
 def _turn(corners: Float64, quads: Float64) -> Float64 | Failed:
-    """quads (N, 4, 2) with each tag's corners in the order of the board's `corners` (N, 4, 2)."""
+    """Reorder each quad's corners (N, 4, 2) to the order of the board's `corners` (N, 4, 2)."""
     homography, _ = cv2.findHomography(corners.mean(axis=1), quads.mean(axis=1), cv2.RANSAC, 5.0)
     if homography is None or abs(np.linalg.det(homography)) < 1e-12:
         return Failed("no-board", "the tags in sight lie on one line")

@@ -1,4 +1,4 @@
-"""An IMU's noise from a log at rest: Allan deviation and the densities, walks and instability it shows.
+"""Fit an IMU's noise model to a log at rest by Allan deviation.
 
 The overlapping Allan variance of a rate with white noise N, flicker B and random walk K is
 N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 [IEEE Std 952]; the three are fitted to all octaves of tau at
@@ -23,7 +23,7 @@ FLICKER = 2 * np.log(2) / np.pi
 GAP_STEPS = 1.5
 FEWEST_SAMPLES = 2000
 FIT_ROUNDS = 12
-MOST_GYRO_CHANGE, MOST_ACCEL_CHANGE = 0.05, 0.5
+MAX_GYRO_CHANGE, MAX_ACCEL_CHANGE = 0.05, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class AxisNoise:
     instability_sigma: float
 
     def model(self, tau_s: Float64) -> Float64:
-        """(T,) the fitted Allan deviation."""
+        """Evaluate the fitted Allan deviation (T,)."""
         curve: Float64 = np.sqrt(_terms(tau_s) @ np.square([self.density, self.instability, self.walk]))
         return curve
 
@@ -62,7 +62,7 @@ class ImuNoiseFit:
 
     @property
     def noise(self) -> ImuNoise:
-        """Kalibr's four numbers: of the three axes the noisiest, so that no axis is trusted too far.
+        """Return Kalibr's four numbers, of the noisiest axis each, so that no axis is trusted too far.
 
         A walk that the log doesn't show is given its sigma, the least that would show, not 0.
         """
@@ -100,7 +100,7 @@ def fit_imu_noise(samples: ImuSamples) -> ImuNoiseFit | Failed:
 
 
 def _stretches(stamp_ns: Int64, step_s: float) -> Int64:
-    """Indices where the log begins, goes on after a gap, and ends."""
+    """Find the indices where the log begins, goes on after a gap, and ends."""
     gaps = np.flatnonzero(np.diff(stamp_ns) > GAP_STEPS * step_s * NS_PER_S) + 1
     return np.concatenate([[0], gaps, [stamp_ns.size]]).astype(np.int64)
 
@@ -108,8 +108,8 @@ def _stretches(stamp_ns: Int64, step_s: float) -> Int64:
 def _moving(samples: ImuSamples, kept: list[slice], step_s: float) -> Failed | None:
     window = max(round(1 / step_s), 1)
     for name, values, most, unit in (
-        ("gyroscope", samples.gyro_radps, MOST_GYRO_CHANGE, "rad/s"),
-        ("accelerometer", samples.accel_mps2, MOST_ACCEL_CHANGE, "m/s^2"),
+        ("gyroscope", samples.gyro_radps, MAX_GYRO_CHANGE, "rad/s"),
+        ("accelerometer", samples.accel_mps2, MAX_ACCEL_CHANGE, "m/s^2"),
     ):
         for stretch in kept:
             part = values[stretch]
@@ -144,7 +144,7 @@ def _fit_axis(name: str, stretches: list[Float64], rate: float) -> AxisNoise:
 
 
 def _allan(stretches: list[Float64], rate: float) -> tuple[Float64, Float64, Float64]:
-    """tau (s), Allan variance and samples over which it was taken, octave by octave, of all stretches."""
+    """Compute tau (s), Allan variance and sample count, octave by octave, of all stretches."""
     total: dict[int, list[float]] = {}
     for values in stretches:
         octaves = 2 ** np.arange(int(np.log2(values.size / 5)) + 1)
@@ -158,7 +158,8 @@ def _allan(stretches: list[Float64], rate: float) -> tuple[Float64, Float64, Flo
 
 
 def overlapping_allan_variance(values: Float64, steps: Int64) -> Float64:
-    """(T,) overlapping Allan variance of evenly sampled values at averaging times of `steps` samples each.
+    """Return (T,): overlapping Allan variance of evenly sampled values at averaging times of `steps` samples
+    each.
 
     Half the mean square of the difference of neighbouring averages [NIST SP 1065]. steps: (T,), each
     at most half of the samples.
@@ -171,12 +172,14 @@ def overlapping_allan_variance(values: Float64, steps: Int64) -> Float64:
 
 
 def _terms(tau_s: Float64) -> Float64:
-    """(T, 3) the Allan variance's parts per unit of N^2, B^2 and K^2."""
+    """Compute the design (T, 3): Allan variance per unit of N^2, B^2 and K^2."""
     return np.column_stack([1 / tau_s, np.full(tau_s.size, FLICKER), tau_s / 3])
 
 
 def _freedom(count: Float64, steps: Float64, walking: Float64 | np.typing.NDArray[np.bool_]) -> Float64:
-    """Degrees of freedom of the overlapping estimate for white noise and for a random walk [NIST SP 1065]."""
+    """Compute degrees of freedom of the overlapping estimate for white noise and random walk [NIST
+    SP 1065].
+    """
     white = (3 * (count - 1) / (2 * steps) - 2 * (count - 2) / count) * 4 * steps**2 / (4 * steps**2 + 5)
     walk = (
         (count - 2) / steps * ((count - 1) ** 2 - 3 * steps * (count - 1) + 4 * steps**2) / (count - 3) ** 2

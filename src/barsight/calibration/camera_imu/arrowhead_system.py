@@ -1,4 +1,4 @@
-"""Least squares whose unknowns form a chain in time plus a few common ones: banded, with an arrow's head.
+"""Solve block-tridiagonal least squares with dense common unknowns (an arrowhead matrix).
 
 Every sample has ROWS whitened residuals that depend on the unknowns of ORDER neighbouring control points and
 on the common parameters. The chain is eliminated by a banded Cholesky factor; what is left, the Schur
@@ -15,7 +15,7 @@ from barsight.calibration.camera_imu.pose_spline import STATE
 from barsight.calibration.camera_imu.spline_kernels import ORDER
 from barsight.core.arrays import Float64, Int64, kernel
 from barsight.core.linalg import skyline
-from barsight.core.linalg.skyline import Band
+from barsight.core.linalg.skyline import Skyline
 
 ROWS = 6
 LOCAL = STATE * ORDER
@@ -35,7 +35,7 @@ class Samples:
 
 
 @dataclass(frozen=True, eq=False)
-class Walks:
+class RandomWalks:
     """The prior on the biases: neighbouring control points differ by `sigma` (6,), gyro then accelerometer.
 
     difference: (M - 1, 6) the next control point's biases minus this one's.
@@ -46,9 +46,9 @@ class Walks:
 
 
 @dataclass(frozen=True, eq=False)
-class ArrowSystem:
-    """The normal equations. chain: (N, LOCAL) the lower band as `skyline.even`; border (N, P); common (P, P);
-    chain_gradient (N,), common_gradient (P,), both downhill."""
+class ArrowheadSystem:
+    """The normal equations. chain: (N, LOCAL) the lower band as `skyline.uniform_band`; border (N, P); common
+    (P, P); chain_gradient (N,), common_gradient (P,), both downhill."""
 
     chain: Float64
     border: Float64
@@ -58,11 +58,11 @@ class ArrowSystem:
 
 
 @dataclass(frozen=True, eq=False)
-class Eliminated:
+class EliminatedChain:
     """The chain's factor; what it takes off: through (N, P) = chain^-1 border;
     information (P, P)."""
 
-    factor: Band
+    factor: Skyline
     through: Float64
     information: Float64
 
@@ -70,12 +70,12 @@ class Eliminated:
         """chain^-1 right, (N,)."""
         solved = right.reshape(-1, 1).copy()
         skyline.solve_forward(self.factor, solved)
-        skyline.solve_back(self.factor, solved)
+        skyline.solve_back_dense(self.factor, solved)
         return solved[:, 0]
 
 
-def assemble(samples: Samples, walks: Walks, control_points: int) -> ArrowSystem:
-    """The normal equations of all samples and the walks."""
+def assemble(samples: Samples, walks: RandomWalks, control_points: int) -> ArrowheadSystem:
+    """Assemble the normal equations J^T J dx = -J^T r of all samples and random walks."""
     count, width = control_points * STATE, samples.by_common.shape[2]
     chain, border = np.zeros((count, LOCAL)), np.zeros((count, width))
     gradient, common, common_gradient = np.zeros(count), np.zeros((width, width)), np.zeros(width)
@@ -93,29 +93,29 @@ def assemble(samples: Samples, walks: Walks, control_points: int) -> ArrowSystem
     slope = gradient.reshape(control_points, STATE)
     slope[:-1, 6:] += pull
     slope[1:, 6:] -= pull
-    return ArrowSystem(chain, border, common, gradient, common_gradient)
+    return ArrowheadSystem(chain, border, common, gradient, common_gradient)
 
 
-def eliminate(system: ArrowSystem, damping: float = 0.0) -> Eliminated:
-    """Take the chain out, its diagonal and the common one's raised by the share `damping`.
+def eliminate(system: ArrowheadSystem, damping: float = 0.0) -> EliminatedChain:
+    """Form the Schur complement of the common unknowns; `damping` scales both diagonals.
 
     Raises LinAlgError where the chain is not determined.
     """
     chain = system.chain.copy()
     diagonal = system.chain[:, -1].reshape(-1, STATE)
     chain[:, -1] += (damping * diagonal + RIDGE * np.median(diagonal, axis=0)).ravel()
-    factor = skyline.even(chain)
-    if not skyline.factorise(factor):
+    factor = skyline.uniform_band(chain)
+    if not skyline.factorise_skyline(factor):
         raise np.linalg.LinAlgError("the chain is not determined")
     through = system.border.copy()
     skyline.solve_forward(factor, through)
-    skyline.solve_back(factor, through)
+    skyline.solve_back_dense(factor, through)
     common = system.common + damping * np.diag(np.diag(system.common))
-    return Eliminated(factor, through, common - np.einsum("np,nq->pq", system.border, through))
+    return EliminatedChain(factor, through, common - np.einsum("np,nq->pq", system.border, through))
 
 
-def step(system: ArrowSystem, eliminated: Eliminated) -> tuple[Float64, Float64]:
-    """The Newton step: chain (N,) and common (P,)."""
+def step(system: ArrowheadSystem, eliminated: EliminatedChain) -> tuple[Float64, Float64]:
+    """Solve for the Newton step: chain (N,) and common (P,)."""
     alone = eliminated.chain_solve(system.chain_gradient)
     target = system.common_gradient - np.einsum("np,n->p", system.border, alone)
     scale = 1 / np.sqrt(np.maximum(np.diag(eliminated.information), 1e-300))
@@ -126,22 +126,22 @@ def step(system: ArrowSystem, eliminated: Eliminated) -> tuple[Float64, Float64]
     return alone - np.einsum("np,p->n", eliminated.through, common), common
 
 
-def projected(samples: Samples, through: Float64) -> Float64:
-    """(K, ROWS, P): derivatives by the common parameters with the chain following as it is pulled along."""
+def project_out_chain(samples: Samples, through: Float64) -> Float64:
+    """Project the common Jacobian (K, ROWS, P) off the chain: B - A chain^-1 border."""
     out = samples.by_common.copy()
     _project(samples.first, samples.by_chain, through, out)
     return out
 
 
-def predicted(samples: Samples, chain: Float64, common: Float64) -> Float64:
-    """(K, ROWS): how a step of the unknowns changes the predictions."""
+def apply_jacobian(samples: Samples, chain: Float64, common: Float64) -> Float64:
+    """Multiply the Jacobian by a step of the unknowns: change of the predictions (K, ROWS)."""
     change: Float64 = np.einsum("krp,p->kr", samples.by_common, common)
     _predict(samples.first, samples.by_chain, chain, change)
     return change
 
 
-def pulled(samples: Samples, residual: Float64, count: int) -> tuple[Float64, Float64]:
-    """The gradient, chain (count,) and common (P,), that other whitened residuals (K, ROWS) would give."""
+def gradient_of(samples: Samples, residual: Float64, count: int) -> tuple[Float64, Float64]:
+    """Compute the gradient, chain (count,) and common (P,), of other whitened residuals (K, ROWS)."""
     gradient = np.zeros(count)
     _pull(samples.first, samples.by_chain, residual, gradient)
     return gradient, np.einsum("krp,kr->p", samples.by_common, residual)

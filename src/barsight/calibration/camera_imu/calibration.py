@@ -1,4 +1,4 @@
-"""Calibrating cameras against an IMU from a recording in front of a board [Furgale 2013; paper Eq. 8-10].
+"""Calibrate cameras against an IMU from a recording in front of a board [Furgale 2013; paper Eq. 8-10].
 
 Corners, gyro and accelerometer are weighted by their own scatter: the corners of one picture share errors
 (board, lens, blur), so a picture is given the weight by which whole pictures scatter, not single corners.
@@ -15,9 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.boards.board import Board
 from barsight.calibration.boards.board_views import BoardView
-from barsight.calibration.camera_imu.problem import MOUNT, Problem, Sightings, State
+from barsight.calibration.camera_imu.problem import (
+    MOUNT,
+    CameraImuProblem,
+    CameraImuState,
+    CornerObservations,
+)
 from barsight.calibration.camera_imu.setup import prepare
-from barsight.calibration.camera_imu.solver import Solution, Spread, sensor_spreads, solve
+from barsight.calibration.camera_imu.solver import ResidualSpread, Solution, sensor_spreads, solve_camera_imu
 from barsight.calibration.camera_imu.uncertainty import Uncertainty, uncertainty
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
@@ -32,7 +37,7 @@ CORNER_SIGMAS = 4.5
 KNOCK_SAMPLES, KNOCK_FACTOR = 15, 2.0
 WEIGHT_ROUNDS = 5
 SETTLED = 0.03
-LEAST_INFLATION = 1.02
+MIN_INFLATION = 1.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +54,9 @@ class CameraImuCalibration:
     board: Board
     rig: StereoRig
     stated: ImuNoise
-    problem: Problem
+    problem: CameraImuProblem
     solution: Solution
-    spreads: tuple[Spread, Spread, Spread]
+    spreads: tuple[ResidualSpread, ResidualSpread, ResidualSpread]
     uncertainty: Uncertainty
     corner_px: float
     removed_corners: int
@@ -59,7 +64,7 @@ class CameraImuCalibration:
 
     @property
     def sigma(self) -> Float64:
-        """(P,) one standard deviation of each common parameter, all causes together."""
+        """Return one standard deviation (P,) of each common parameter, all causes together."""
         return np.sqrt(np.diag(self.uncertainty.covariance))
 
     @property
@@ -83,7 +88,7 @@ def calibrate_camera_imu(
     setup = prepare(views, imu, rig, board, noise, source)
     problem = replace(setup.problem, scales=scales)
     try:
-        solution = solve(problem, setup.start, HUBER)
+        solution = solve_camera_imu(problem, setup.start, HUBER)
         problem, corner_px, removed = _without_outliers(problem, solution)
         problem, knocks = _without_knocks(problem, solution)
         problem, solution, spreads = _weighted(problem, solution.state, corner_px)
@@ -115,8 +120,8 @@ def calibrate_camera_imu(
     )
 
 
-def _without_outliers(problem: Problem, solution: Solution) -> tuple[Problem, float, int]:
-    """Without the corners beyond 4.5 robust sigma; that sigma (px) and how many they were."""
+def _without_outliers(problem: CameraImuProblem, solution: Solution) -> tuple[CameraImuProblem, float, int]:
+    """Remove corners beyond 4.5 robust sigma; also that sigma (px) and their number."""
     lengths = [np.linalg.norm(residual, axis=1) for residual in solution.linearised.residuals_px]
     sigma = float(np.median(np.concatenate(lengths)) / np.sqrt(2 * np.log(2)))
     kept, removed = [], 0
@@ -128,8 +133,10 @@ def _without_outliers(problem: Problem, solution: Solution) -> tuple[Problem, fl
     return replace(problem, sightings=tuple(kept), sigmas=sigmas), sigma, removed
 
 
-def _without_knocks(problem: Problem, solution: Solution) -> tuple[Problem, tuple[str, ...]]:
-    """With the IMU's readings loosened where they scatter twice as much as usual; a sentence on where."""
+def _without_knocks(
+    problem: CameraImuProblem, solution: Solution
+) -> tuple[CameraImuProblem, tuple[str, ...]]:
+    """Down-weight IMU readings that scatter twice as much as usual; a sentence on where."""
     track = problem.imu
     rows = solution.linearised.samples.residual[-track.time_s.size :]
     window = np.ones(KNOCK_SAMPLES) / KNOCK_SAMPLES
@@ -148,7 +155,7 @@ def _without_knocks(problem: Problem, solution: Solution) -> tuple[Problem, tupl
     return problem, (note,)
 
 
-def _chosen(sightings: Sightings, good: np.typing.NDArray[np.bool_]) -> Sightings:
+def _chosen(sightings: CornerObservations, good: np.typing.NDArray[np.bool_]) -> CornerObservations:
     return replace(
         sightings, frame=sightings.frame[good], ids=sightings.ids[good], points_m=sightings.points_m[good],
         pixels=sightings.pixels[good],
@@ -156,15 +163,15 @@ def _chosen(sightings: Sightings, good: np.typing.NDArray[np.bool_]) -> Sighting
 
 
 def _weighted(
-    problem: Problem, state: State, corner_px: float
-) -> tuple[Problem, Solution, tuple[Spread, Spread, Spread]]:
-    """Solve with each sensor's sigma set to what its residuals show, until these agree.
+    problem: CameraImuProblem, state: CameraImuState, corner_px: float
+) -> tuple[CameraImuProblem, Solution, tuple[ResidualSpread, ResidualSpread, ResidualSpread]]:
+    """Solve with each sensor's sigma re-estimated from its residuals until both agree.
 
     The IMU's are only ever raised above what was stated, and no picture counts more than its corners' noise.
     """
     stated = problem.sigmas
     for _ in range(WEIGHT_ROUNDS):
-        solution = solve(problem, state, None)
+        solution = solve_camera_imu(problem, state, None)
         spreads = sensor_spreads(problem, solution)
         sigmas = problem.sigmas
         wanted = replace(
@@ -184,11 +191,11 @@ def _weighted(
 
 
 def _raised(stated: float, shown: float) -> float:
-    """The stated noise, unless the residuals clearly show more."""
-    return shown if shown > LEAST_INFLATION * stated else stated
+    """Raise the stated noise where the residuals clearly show more."""
+    return shown if shown > MIN_INFLATION * stated else stated
 
 
-def _rig(rig: StereoRig, state: State) -> StereoRig:
+def _rig(rig: StereoRig, state: CameraImuState) -> StereoRig:
     first, second = state.mounts
     poses = [
         Pose("body", name, mount.rotation, mount.place_m)
@@ -197,8 +204,8 @@ def _rig(rig: StereoRig, state: State) -> StereoRig:
     return StereoRig(rig.cam0, rig.cam1, poses[0], poses[1], seconds_to_ns(first.shift_s))
 
 
-def mount_differences(state: State, other: State) -> Float64:
-    """(14,) `state`'s mountings minus `other`'s, as the common parameters count them."""
+def subtract_mounts(state: CameraImuState, other: CameraImuState) -> Float64:
+    """Subtract `other`'s mountings from `state`'s (14,), as the common parameters count them."""
     parts: list[Float64] = []
     for own, their in zip(state.mounts, other.mounts, strict=True):
         turn = Rotation.from_matrix(own.rotation @ their.rotation.T).as_rotvec()

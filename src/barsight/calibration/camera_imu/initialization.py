@@ -1,4 +1,4 @@
-"""Start values of a camera-IMU calibration, found without a guess.
+"""Estimate start values of a camera-IMU calibration without a prior guess.
 
 The board's pose by each camera alone gives the camera's way; the time shift is where the camera's and the
 gyro's angular speeds correlate best, the mounting's rotation aligns their turn rates, and the gyro's integral
@@ -20,20 +20,20 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import nearest_rotation
 
-MOST_SHIFT_S = 1.0
-MOST_STEP_S = 0.35
-LEAST_CORRELATION = 0.5
+MAX_SHIFT_S = 1.0
+MAX_STEP_S = 0.35
+MIN_CORRELATION = 0.5
 FEWEST_STEPS = 20
-LEAST_RATE_RADPS = 0.05
-MOST_PNP_PX = 5.0
+MIN_RATE_RADPS = 0.05
+MAX_PNP_PX = 5.0
 REFIT_PX = 1.0
 UNIT_RATIO = (0.8, 1.25)
 DEGREES = 180 / np.pi
 
 
 @dataclass(frozen=True, eq=False)
-class CameraWay:
-    """A camera's poses by the board alone. stamp_s: (F,). rotation (F, 3, 3), place_m (F, 3): board_from_cam.
+class CameraPoses:
+    """Camera poses by the board alone. stamp_s: (F,). rotation (F, 3, 3), place_m (F, 3): board_from_cam.
     error_px: (F,) root mean square."""
 
     stamp_s: Float64
@@ -43,8 +43,9 @@ class CameraWay:
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
-    """How the gyro fits a camera's turns. rotation: (3, 3) body_from_cam. shift_s: t_imu = t_cam + shift.
+class GyroAlignment:
+    """Fit of the gyro to a camera's turn rates. rotation: (3, 3) body_from_cam. shift_s: t_imu = t_cam +
+    shift.
     gyro_bias_radps: (3,). correlation: of the turn rates, 1 where they agree."""
 
     rotation: Float64
@@ -53,16 +54,18 @@ class Alignment:
     correlation: float
 
 
-def camera_way(camera: Camera, stamp_s: Float64, corners: Sequence[Corners], points_m: Float64) -> CameraWay:
-    """The camera's way by the board's pose in each picture; a few bad corners don't hurt."""
+def camera_poses(
+    camera: Camera, stamp_s: Float64, corners: Sequence[Corners], points_m: Float64
+) -> CameraPoses:
+    """Estimate the camera's poses by PnP on the board in each picture, robust to a few bad corners."""
     poses = [_robust_pose(camera, own, points_m) for own in corners]
     turn = np.array([pose[0] for pose in poses]).transpose(0, 2, 1)
     place = -np.einsum("nij,nj->ni", turn, np.array([pose[1] for pose in poses]))
-    return CameraWay(stamp_s, turn, place, np.array([pose[2] for pose in poses]))
+    return CameraPoses(stamp_s, turn, place, np.array([pose[2] for pose in poses]))
 
 
 def _robust_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[Float64, Float64, float]:
-    """`board_pose`, a second time without the corners that lie off where the first fits badly."""
+    """Run `board_pose` again without outlying corners where the first fit is bad."""
     pose = board_pose(camera, corners, points_m)
     if not REFIT_PX < pose[2] < np.inf:
         return pose
@@ -72,24 +75,24 @@ def _robust_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[F
     return board_pose(camera, corners.keep(good), points_m) if good.sum() >= 4 else pose
 
 
-def align(way: CameraWay, time_s: Float64, gyro_radps: Float64) -> Alignment | Failed:
-    """Mounting and time shift from turn rates alone.
+def align_gyro(way: CameraPoses, time_s: Float64, gyro_radps: Float64) -> GyroAlignment | Failed:
+    """Estimate mounting rotation and time shift from turn rates alone.
 
     Failed `too-few`, `still` (hardly a turn), `no-overlap`, `degrees` (the gyro reads 57 times too much),
     `ratio`, `no-match` (the turns don't agree).
     """
     step = np.diff(way.stamp_s)
-    good = (step < MOST_STEP_S) & _near(way)[1:] & _near(way)[:-1]
+    good = (step < MAX_STEP_S) & _near(way)[1:] & _near(way)[:-1]
     if good.sum() < FEWEST_STEPS:
         return Failed("too-few", f"only {int(good.sum())} pairs of neighbouring pictures show the board")
     turn = Rotation.from_matrix(way.rotation[:-1].transpose(0, 2, 1) @ way.rotation[1:])
     rate = (turn.as_rotvec() / step[:, None])[good]
     early, late = way.stamp_s[:-1][good], way.stamp_s[1:][good]
-    if float(np.sqrt((rate**2).sum(axis=1).mean())) < LEAST_RATE_RADPS:
+    if float(np.sqrt((rate**2).sum(axis=1).mean())) < MIN_RATE_RADPS:
         return Failed("still", "the camera hardly turns")
     integral = _integral(time_s, gyro_radps)
     shift = _by_speed(rate, early, late, time_s, integral)
-    best: Alignment | None = None
+    best: GyroAlignment | None = None
     for span in (0.05, 0.01, 0.002):
         for trial in shift + span * np.linspace(-1, 1, 11):
             found = _turned(rate, early + trial, late + trial, time_s, integral, trial)
@@ -101,7 +104,7 @@ def align(way: CameraWay, time_s: Float64, gyro_radps: Float64) -> Alignment | F
     mean = _mean_rate(early + shift, late + shift, time_s, integral)
     spread = np.nanstd(mean, axis=0), rate.std(axis=0)
     ratio = float(np.linalg.norm(spread[0]) / np.linalg.norm(spread[1]))
-    if best.correlation < LEAST_CORRELATION:
+    if best.correlation < MIN_CORRELATION:
         return Failed(
             "no-match", f"the gyro's turns don't match the pictures' (correlation {best.correlation:.2f})"
         )
@@ -112,10 +115,11 @@ def align(way: CameraWay, time_s: Float64, gyro_radps: Float64) -> Alignment | F
     return best
 
 
-def body_way(
-    way: CameraWay, alignment: Alignment, time_s: Float64, gyro_radps: Float64
+def body_poses(
+    way: CameraPoses, alignment: GyroAlignment, time_s: Float64, gyro_radps: Float64
 ) -> tuple[Float64, Float64, Float64]:
-    """Times (K,) of the IMU, rotation (K, 3, 3) world_from_body and place (K, 3), the lever arm left out.
+    """Interpolate body poses at IMU times (K,): rotation (K, 3, 3) world_from_body, place (K, 3) without
+    lever arm.
 
     The gyro's integral, turned at each picture onto the picture's pose.
     """
@@ -137,22 +141,22 @@ def body_way(
     return time_s, (mended * carried).as_matrix(), place
 
 
-def _near(way: CameraWay) -> Bool:
-    """Pictures whose board pose can be believed."""
+def _near(way: CameraPoses) -> Bool:
+    """Select pictures with a credible board pose."""
     finite = np.isfinite(way.error_px)
     usual = float(np.median(way.error_px[finite])) if finite.any() else np.inf
-    near: Bool = way.error_px < max(3 * usual, MOST_PNP_PX)
+    near: Bool = way.error_px < max(3 * usual, MAX_PNP_PX)
     return near
 
 
 def _integral(time_s: Float64, gyro_radps: Float64) -> Float64:
-    """(S, 3) the gyro summed over time: mean rates are its differences, whatever the pictures' spacing."""
+    """Integrate the gyro over time (S, 3): mean rates are its differences, whatever the pictures' spacing."""
     steps = np.diff(time_s)[:, None] * (gyro_radps[1:] + gyro_radps[:-1]) / 2
     return np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
 
 
 def _mean_rate(early: Float64, late: Float64, time_s: Float64, integral: Float64) -> Float64:
-    """(N, 3) the gyro's mean between two times; NaN outside its log."""
+    """Average the gyro between two times (N, 3); NaN outside its log."""
     ends = [
         np.column_stack([np.interp(at, time_s, integral[:, i], np.nan, np.nan) for i in range(3)])
         for at in (early, late)
@@ -162,11 +166,11 @@ def _mean_rate(early: Float64, late: Float64, time_s: Float64, integral: Float64
 
 
 def _by_speed(rate: Float64, early: Float64, late: Float64, time_s: Float64, integral: Float64) -> float:
-    """The shift at which the angular speeds correlate best, to about half a picture's step."""
+    """Find the shift that maximises the correlation of angular speeds, to about half a picture's step."""
     speed = np.linalg.norm(rate, axis=1)
     step = float(np.median(late - early)) / 4
     best, best_shift = -np.inf, 0.0
-    for shift in np.arange(-MOST_SHIFT_S, MOST_SHIFT_S + step, step):
+    for shift in np.arange(-MAX_SHIFT_S, MAX_SHIFT_S + step, step):
         other = np.linalg.norm(_mean_rate(early + shift, late + shift, time_s, integral), axis=1)
         known = np.isfinite(other)
         if known.sum() < max(FEWEST_STEPS, speed.size // 2):
@@ -179,8 +183,8 @@ def _by_speed(rate: Float64, early: Float64, late: Float64, time_s: Float64, int
 
 def _turned(
     rate: Float64, early: Float64, late: Float64, time_s: Float64, integral: Float64, shift_s: float
-) -> Alignment | None:
-    """The rotation that aligns both turn rates [Arun 1987], bad pairs left out in a second round."""
+) -> GyroAlignment | None:
+    """Estimate the rotation that aligns both turn rates [Arun 1987], outliers removed in a second round."""
     mean = _mean_rate(early, late, time_s, integral)
     kept = np.isfinite(mean).all(axis=1)
     for _ in range(2):
@@ -194,4 +198,4 @@ def _turned(
         correlation = float((b * (a @ turn.T)).sum()) / max(size, 1e-12)
         off = np.linalg.norm(mean - bias - scale * rate @ turn.T, axis=1)
         kept &= off <= 6 * np.median(off[kept]) + 1e-9
-    return Alignment(turn, shift_s, bias, correlation)
+    return GyroAlignment(turn, shift_s, bias, correlation)

@@ -1,4 +1,4 @@
-"""A body's way in continuous time: a cumulative B-spline of its pose, and piecewise linear IMU biases.
+"""Model a body's trajectory as a cumulative B-spline of its pose with piecewise linear IMU biases.
 
 Furgale et al. 2013 with the rotation on SO(3) instead of as a rotation vector. Times are seconds since the
 spline's `start_ns`, on the IMU's clock.
@@ -44,16 +44,18 @@ class PoseSpline:
 
     @property
     def segments(self) -> int:
-        """How many steps of time the spline covers."""
+        """Return the number of segments."""
         return len(self.places_m) - DEGREE
 
     def turned_steps(self) -> tuple[Float64, Float64]:
-        """(M - 1, 3) the control points' turns d_j, and (M - 1, 3, 3) their inverse right Jacobians."""
+        """Compute the control points' turns d_j (M - 1, 3) and their inverse right Jacobians (M -
+        1, 3, 3).
+        """
         steps = Rotation.from_matrix(self.rotations[:-1].transpose(0, 2, 1) @ self.rotations[1:]).as_rotvec()
         return steps, inverse_right_jacobian(steps)
 
     def moved(self, step: Float64) -> PoseSpline:
-        """After a step (M, STATE) of the unknowns."""
+        """Retract a step (M, STATE) of the unknowns."""
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return replace(
             self, rotations=self.rotations @ turn, places_m=self.places_m + step[:, 3:6],
@@ -61,8 +63,8 @@ class PoseSpline:
             accel_bias_mps2=self.accel_bias_mps2 + step[:, 9:],
         )  # fmt: skip
 
-    def at(self, times_s: Float64) -> Motion:
-        """The motion at times within the spline (those outside are moved to its ends)."""
+    def at(self, times_s: Float64) -> SplineMotion:
+        """Evaluate the motion at times within the spline (those outside are moved to its ends)."""
         steps, inverse = self.turned_steps()
         segment, u = locate(times_s, self.step_s, self.segments)
         rotation, rate, place = _evaluate(
@@ -73,11 +75,11 @@ class PoseSpline:
             (1 - share) * bias[k] + share * bias[k + 1]
             for bias in (self.gyro_bias_radps, self.accel_bias_mps2)
         ]
-        return Motion(rotation, rate, place[:, 0], place[:, 1], place[:, 2], biases[0], biases[1])
+        return SplineMotion(rotation, rate, place[:, 0], place[:, 1], place[:, 2], biases[0], biases[1])
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class SplineMotion:
     """At N times: rotation (N, 3, 3) world_from_body, rate_radps (N, 3) in body axes; place_m, velocity_mps,
     acceleration_mps2 (N, 3) in the world; gyro_bias_radps, accel_bias_mps2 (N, 3)."""
 
@@ -90,10 +92,10 @@ class Motion:
     accel_bias_mps2: Float64
 
 
-def spline_through(
+def fit_spline(
     start_ns: int, end_s: float, step_s: float, times_s: Float64, rotations: Float64, places_m: Float64
 ) -> PoseSpline:
-    """A spline from time 0 to end_s near poses given at increasing times; biases are zero.
+    """Fit a spline from time 0 to end_s to poses at increasing times; biases are zero.
 
     Control points take the pose interpolated at their own times (the middle of where they weigh most); the
     spline then cuts corners as a B-spline does, which a least squares that starts here mends.
@@ -110,14 +112,14 @@ def spline_through(
 
 
 def locate(times_s: Float64, step_s: float, segments: int) -> tuple[Int64, Float64]:
-    """(N,) segments and (N,) places u in them, in [0, 1]; times outside are moved to the ends."""
+    """Find segments (N,) and places u (N,) in them, in [0, 1]; times outside are moved to the ends."""
     scaled = np.clip(times_s / step_s, 0.0, segments)
     segment = np.minimum(scaled.astype(np.int64), segments - 1)
     return segment, scaled - segment
 
 
 def inverse_right_jacobian(turns: Float64) -> Float64:
-    """(N, 3, 3) of rotation vectors (N, 3) shorter than pi."""
+    """Compute inverse right Jacobians (N, 3, 3) of rotation vectors (N, 3) shorter than pi."""
     square = (turns**2).sum(axis=1)
     angle = np.sqrt(np.maximum(square, 1e-12))
     factor = np.where(square < 1e-8, 1 / 12, 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle)))

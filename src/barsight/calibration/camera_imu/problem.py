@@ -1,4 +1,4 @@
-"""The residuals of a camera-IMU calibration and their derivatives [Furgale 2013; paper Eq. 8].
+"""Linearise the residuals of a camera-IMU calibration [Furgale 2013; paper Eq. 8].
 
 Unknown are the body's way as a spline, the IMU's biases, and the common parameters: per camera where it is
 mounted and its time shift, the direction of gravity in the board's frame, and if asked for the IMU's scales
@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.camera_imu.arrowhead_system import Samples, Walks
+from barsight.calibration.camera_imu.arrowhead_system import RandomWalks, Samples
 from barsight.calibration.camera_imu.pose_spline import PoseSpline, locate
 from barsight.calibration.camera_imu.residual_kernels import frame_rows, imu_rows, sum_corners
 from barsight.calibration.geometry.camera import Camera, Distortion
-from barsight.calibration.geometry.projection import Lens, project
+from barsight.calibration.geometry.projection import Lens, project_lens
 from barsight.core.arrays import Float64, Int64
 
 NEAREST_Z_M = 1e-3
@@ -25,7 +25,7 @@ MOUNT = 7
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class CornerObservations:
     """One camera's corners. stamp_s: (F,) on the camera's clock, since the spline's start. frame: (N,) into
     it, rising. ids: (N,). points_m: (N, 3) on the board. pixels: (N, 2)."""
 
@@ -73,7 +73,7 @@ class Mount:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class CameraImuState:
     """mounts: per camera. gravity_mps2: (3,) in the board's frame, pointing down. gyro_matrix, accel_matrix:
     (3, 3) what is read = matrix @ truth + bias."""
 
@@ -85,11 +85,13 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """What was measured. scales, lenses: whether the IMU's scales and misalignments, and the cameras' lenses
-    are unknown too."""
+class CameraImuProblem:
+    """Measurements of a camera-IMU calibration.
 
-    sightings: tuple[Sightings, ...]
+    scales, lenses: whether the IMU's scales and misalignments, and the cameras' lenses are unknown too.
+    """
+
+    sightings: tuple[CornerObservations, ...]
     imu: ImuTrack
     sigmas: Sigmas
     scales: bool = False
@@ -97,14 +99,14 @@ class Problem:
 
     @property
     def lens_at(self) -> tuple[int, ...]:
-        """Where each camera's lens begins among the common parameters."""
+        """Return the index of each camera's lens among the common parameters."""
         begin = MOUNT * len(self.sightings) + 2 + (15 if self.scales else 0)
         sizes = [len(lens_of(sightings.camera)[1]) for sightings in self.sightings]
         return tuple(begin + sum(sizes[:n]) for n in range(len(sizes)))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """The common parameters in order."""
+        """Return the common parameters in order."""
         parts = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m", "timeshift_s")
         names = [f"body_from_cam{c}.{part}" for c in range(len(self.sightings)) for part in parts]
         names += ["gravity.a_rad", "gravity.b_rad"]
@@ -127,12 +129,15 @@ class Linearised:
 
     residuals_px: tuple[Float64, ...]
     samples: Samples
-    walks: Walks
+    walks: RandomWalks
     cost: float
 
 
-def linearise(problem: Problem, state: State, huber: float | None) -> Linearised:
-    """Residuals and derivatives at a state. huber: the length in sigmas from which a corner counts less."""
+def linearise_camera_imu(problem: CameraImuProblem, state: CameraImuState, huber: float | None) -> Linearised:
+    """Compute residuals and Jacobians at a state.
+
+    huber: the length in sigmas from which a corner counts less.
+    """
     spline, sigmas = state.spline, problem.sigmas
     width = len(problem.parameter_names)
     steps, inverse = spline.turned_steps()
@@ -142,7 +147,7 @@ def linearise(problem: Problem, state: State, huber: float | None) -> Linearised
     for number, (sightings, mount) in enumerate(zip(problem.sightings, state.mounts, strict=True)):
         points, residual = corner_residuals(sightings, mount, spline)
         lens, parameters = lens_of(sightings.camera)
-        seen = project(lens, parameters, points)
+        seen = project_lens(lens, parameters, points)
         by_lens = seen.by_lens if problem.lenses else seen.by_lens[:, :, :0]
         length = np.linalg.norm(residual, axis=1) / sigmas.corner_px
         weight = np.ones_like(length) if huber is None else np.minimum(1, huber / np.maximum(length, 1e-9))
@@ -163,7 +168,7 @@ def linearise(problem: Problem, state: State, huber: float | None) -> Linearised
     gravity_at = MOUNT * len(problem.sightings)
     rows = imu_rows(
         segment, u, *chain, spline.gyro_bias_radps, spline.accel_bias_mps2, problem.imu.gyro_radps,
-        problem.imu.accel_mps2, state.gravity_mps2, tangent(state.gravity_mps2), state.gyro_matrix,
+        problem.imu.accel_mps2, state.gravity_mps2, tangent_basis(state.gravity_mps2), state.gyro_matrix,
         state.accel_matrix, sigmas.gyro_radps * problem.imu.gyro_loose,
         sigmas.accel_mps2 * problem.imu.accel_loose, gravity_at, problem.scales, width,
     )  # fmt: skip
@@ -171,13 +176,15 @@ def linearise(problem: Problem, state: State, huber: float | None) -> Linearised
     samples = Samples(*(np.concatenate([part[k] for part in parts]) for k in range(4)))
     bias = np.hstack([spline.gyro_bias_radps, spline.accel_bias_mps2])
     walk = np.repeat([sigmas.gyro_walk, sigmas.accel_walk], 3) * np.sqrt(spline.step_s)
-    walks = Walks(np.diff(bias, axis=0), walk)
+    walks = RandomWalks(np.diff(bias, axis=0), walk)
     cost += float((rows[1] ** 2).sum()) + float(((walks.difference / walk) ** 2).sum())
     return Linearised(tuple(residuals), samples, walks, cost)
 
 
-def corner_residuals(sightings: Sightings, mount: Mount, spline: PoseSpline) -> tuple[Float64, Float64]:
-    """(N, 3) the corners in the camera's frame, and (N, 2) px: seen minus projected."""
+def corner_residuals(
+    sightings: CornerObservations, mount: Mount, spline: PoseSpline
+) -> tuple[Float64, Float64]:
+    """Compute the corners (N, 3) in the camera's frame and residuals (N, 2) px, seen minus projected."""
     motion = spline.at(sightings.stamp_s + mount.shift_s)
     body = np.einsum(
         "nji,nj->ni", motion.rotation[sightings.frame], sightings.points_m - motion.place_m[sightings.frame]
@@ -185,18 +192,18 @@ def corner_residuals(sightings: Sightings, mount: Mount, spline: PoseSpline) -> 
     points = (body - mount.place_m) @ mount.rotation
     points[:, 2] = np.maximum(points[:, 2], NEAREST_Z_M)
     lens, parameters = lens_of(sightings.camera)
-    return points, sightings.pixels - project(lens, parameters, points).pixels
+    return points, sightings.pixels - project_lens(lens, parameters, points).pixels
 
 
-def moved(state: State, chain: Float64, common: Float64) -> State:
-    """`state` after a step: chain (M, 12) and common (P,)."""
+def retract_state(state: CameraImuState, chain: Float64, common: Float64) -> CameraImuState:
+    """Retract a step, chain (M, 12) and common (P,), onto `state`."""
     mounts = []
     for number, mount in enumerate(state.mounts):
         own = common[number * MOUNT : (number + 1) * MOUNT]
         turn = Rotation.from_rotvec(own[:3]).as_matrix()
         mounts.append(Mount(turn @ mount.rotation, mount.place_m + own[3:6], mount.shift_s + float(own[6])))
     rest = common[MOUNT * len(mounts) :]
-    turn = Rotation.from_rotvec(tangent(state.gravity_mps2) @ rest[:2]).as_matrix()
+    turn = Rotation.from_rotvec(tangent_basis(state.gravity_mps2) @ rest[:2]).as_matrix()
     state = replace(
         state, spline=state.spline.moved(chain), mounts=tuple(mounts), gravity_mps2=turn @ state.gravity_mps2
     )
@@ -209,8 +216,8 @@ def moved(state: State, chain: Float64, common: Float64) -> State:
     return state
 
 
-def tangent(direction: Float64) -> Float64:
-    """(3, 2) two axes square to a direction, about which it can turn."""
+def tangent_basis(direction: Float64) -> Float64:
+    """Compute two axes (3, 2) orthogonal to a direction, about which it can turn."""
     least = np.eye(3)[int(np.abs(direction).argmin())]
     first = np.cross(direction, least)
     first /= np.linalg.norm(first)
@@ -219,7 +226,7 @@ def tangent(direction: Float64) -> Float64:
 
 
 def lens_of(camera: Camera) -> tuple[Lens, Float64]:
-    """The lens model of a camera and its parameters, as `project` takes them."""
+    """Convert a camera to its lens model and parameters, as `project_lens` takes them."""
     coefficients = camera.coefficients or (0.0,) * 4
     lens = (
         Lens.EQUIDISTANT

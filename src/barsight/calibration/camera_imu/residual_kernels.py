@@ -1,4 +1,4 @@
-"""The rows of camera-IMU calibration, compiled: what a picture and a reading say of pose and mounting."""
+"""Compile the Jacobian rows of camera-IMU calibration for pictures and IMU readings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def sum_corners(
     frame: Int64, points: Float64, by_point: Float64, by_lens: Float64, residual: Float64, weight: Float64,
     frames: int,
 ) -> tuple[Float64, Float64]:  # fmt: skip
-    """Each frame's information (F, 6 + L, 6 + L) and pull (F, 6 + L) on its pose and the lens.
+    """Sum each frame's information (F, 6 + L, 6 + L) and gradient (F, 6 + L) on its pose and the lens.
 
     The first six are (a, b): a point X in the camera's frame moves by X x a + b. points (N, 3), by_point
     (N, 2, 3); by_lens (N, 2, L), with L zero where the lens is fixed.
@@ -58,7 +58,9 @@ def _cross(v: Float64, out: Float64) -> None:
 
 @kernel()
 def _whiten(whole: Float64, pull: Float64, factor: Float64, residual: Float64) -> None:
-    """factor (C, C) upper with factor^T factor = whole; residual (C,) = factor^-T pull."""
+    """Whiten normal equations: factor (C, C) upper with factor^T factor = whole; residual =
+    factor^-T pull.
+    """
     factor[:] = 0.0
     residual[:] = 0.0
     for i in range(pull.size):
@@ -85,7 +87,7 @@ def frame_rows(
     inverse: Float64, whole: Float64, pull: Float64, mount: Float64, mount_place: Float64, at: int,
     lens_at: int, width: int,
 ) -> Rows:  # fmt: skip
-    """Samples of one camera's frames; `at` and `lens_at`: where its parameters begin among the common ones.
+    """Form the rows of one camera's frames; `at`, `lens_at`: indices of its parameters among the common ones.
 
     A frame whose lens is unknown too has more than six rows and becomes several samples.
     """
@@ -146,7 +148,7 @@ def imu_rows(
     gravity: Float64, axes: Float64, gyro_matrix: Float64, accel_matrix: Float64, gyro_sigmas: Float64,
     accel_sigmas: Float64, at: int, scales: bool, width: int,
 ) -> Rows:  # fmt: skip
-    """Samples of the IMU's readings: three rows of the gyro, then three of the accelerometer [Eq. 9-10]."""
+    """Form the rows of the IMU's readings: three of the gyro, then three of the accelerometer [Eq. 9-10]."""
     count = segment.size
     residual, by_chain = np.zeros((count, ROWS)), np.zeros((count, ROWS, LOCAL))
     by_common = np.zeros((count, ROWS, width))

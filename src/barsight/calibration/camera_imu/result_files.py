@@ -1,4 +1,4 @@
-"""What a camera-IMU calibration leaves beside its report: our rig file and Kalibr's camchain-imucam."""
+"""Write a camera-IMU calibration: our rig file and Kalibr's camchain-imucam."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def write_camera_imu(
 
 
 def mounting_covariance(calibration: CameraImuCalibration) -> tuple[tuple[str, ...], Float64]:
-    """Names and covariance of both mountings and time shifts, and of cam1_from_cam0 that follows from them.
+    """Compute names and covariance of both mountings, time shifts and the resulting cam1_from_cam0.
 
     Turns are small, from the left: of body_from_cam in body axes, of cam1_from_cam0 in cam1's.
     """

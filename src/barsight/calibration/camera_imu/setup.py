@@ -1,4 +1,4 @@
-"""From views and IMU samples to a camera-IMU problem with start values, or one line on why it can't be."""
+"""Prepare a camera-IMU problem with start values from views and IMU samples, or say why it can't be."""
 
 from __future__ import annotations
 
@@ -11,9 +11,22 @@ from scipy.interpolate import make_lsq_spline
 
 from barsight.calibration.boards.board import Board
 from barsight.calibration.boards.board_views import BoardView, Corners
-from barsight.calibration.camera_imu.initialization import Alignment, CameraWay, align, body_way, camera_way
-from barsight.calibration.camera_imu.pose_spline import spline_through
-from barsight.calibration.camera_imu.problem import ImuTrack, Mount, Problem, Sightings, Sigmas, State
+from barsight.calibration.camera_imu.initialization import (
+    CameraPoses,
+    GyroAlignment,
+    align_gyro,
+    body_poses,
+    camera_poses,
+)
+from barsight.calibration.camera_imu.pose_spline import fit_spline
+from barsight.calibration.camera_imu.problem import (
+    CameraImuProblem,
+    CameraImuState,
+    CornerObservations,
+    ImuTrack,
+    Mount,
+    Sigmas,
+)
 from barsight.calibration.camera_imu.spline_kernels import DEGREE
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.imu_noise import ImuNoise
@@ -32,9 +45,9 @@ GAP_STEPS = 5.0
 START_CORNER_PX = 0.5
 KNOT_RATES_HZ = (20.0, 30.0, 40.0, 60.0, 80.0, 100.0, 150.0, 200.0)
 NOISE_MARGIN = 1.1
-MOST_PNP_PX = 4.0
-MOST_RIG_RAD, MOST_RIG_SHARE = 0.05, 0.15
-LEAST_WALK = 1e-3
+MAX_PNP_PX = 4.0
+MAX_RIG_RAD, MAX_RIG_RATIO = 0.05, 0.15
+MIN_WALK = 1e-3
 REMEDIES = {
     "too-few": "keep the board in sight; check --board",
     "still": "turn the rig about all three axes in front of the board",
@@ -49,8 +62,8 @@ REMEDIES = {
 class Setup:
     """problem and start; views of the board used per camera; notes: what was left out, as sentences."""
 
-    problem: Problem
-    start: State
+    problem: CameraImuProblem
+    start: CameraImuState
     notes: tuple[str, ...]
 
 
@@ -88,7 +101,7 @@ def prepare(
         at = (stamps - start_ns) / NS_PER_S
         inside = (at > -MARGIN_S) & (at < end_s + MARGIN_S)
         corners = [own for own, good in zip(corners, inside, strict=True) if good]
-        ways.append(camera_way(camera, at[inside], corners, board.points_m))
+        ways.append(camera_poses(camera, at[inside], corners, board.points_m))
         kept.append(corners)
     _expect_lenses(ways, source)
     _expect_rig(ways, rig, source)
@@ -103,11 +116,12 @@ def prepare(
         for camera, way, corners, found in zip((rig.cam0, rig.cam1), ways, kept, aligned, strict=True)
     )
     state = _start(ways[0], aligned, time_s, imu, start_ns, end_s, step_s, track)
-    return Setup(Problem(sightings, track, sigmas), state, notes)
+    return Setup(CameraImuProblem(sightings, track, sigmas), state, notes)
 
 
 def knot_rate(track: ImuTrack, sigmas: Sigmas, rate_hz: float) -> float:
-    """Knots per second: the fewest with which splines follow gyro and accelerometer about as well as many.
+    """Choose the knot rate (Hz): the lowest at which splines follow gyro and accelerometer about as well as a
+    high one.
 
     As well means a scatter, freed of the unknowns it takes, of at most 1.1 times the stated noise or the
     least scatter any rate reaches.
@@ -131,7 +145,7 @@ def knot_rate(track: ImuTrack, sigmas: Sigmas, rate_hz: float) -> float:
 
 
 def _checked_imu(imu: ImuSamples, source: Path) -> tuple[ImuSamples, tuple[str, ...]]:
-    """The longest stretch without a gap, in SI units and in time's order."""
+    """Select the longest stretch without a gap, in SI units, in order of time."""
     if imu.stamp_ns.size < 2:
         raise CalibrationError(source, "the IMU's log is empty", "record the IMU too")
     steps = np.diff(imu.stamp_ns)
@@ -162,18 +176,18 @@ def _seen(views: Sequence[BoardView], camera: int) -> tuple[Int64, list[Corners]
     return np.array([stamp for stamp, _ in found], dtype=np.int64), [corners for _, corners in found]
 
 
-def _expect_lenses(ways: Sequence[CameraWay], source: Path) -> None:
+def _expect_lenses(ways: Sequence[CameraPoses], source: Path) -> None:
     for camera, way in enumerate(ways):
         error = float(np.median(way.error_px))
-        if not error <= MOST_PNP_PX:
+        if not error <= MAX_PNP_PX:
             raise CalibrationError(
                 source, f"cam{camera}'s lens doesn't fit the corners (they lie {error:.1f} px off)",
                 "give the --rig and --board these pictures were taken with, cam0 the left camera",
             )  # fmt: skip
 
 
-def _expect_rig(ways: Sequence[CameraWay], rig: StereoRig, source: Path) -> None:
-    """The views' own stereo extrinsics against the rig file's: swapped cameras, another rig."""
+def _expect_rig(ways: Sequence[CameraPoses], rig: StereoRig, source: Path) -> None:
+    """Compare the views' own stereo extrinsics with the rig file's: swapped cameras, another rig."""
     _, left, right = np.intersect1d(ways[0].stamp_s, ways[1].stamp_s, return_indices=True)
     if left.size == 0:
         return
@@ -188,7 +202,7 @@ def _expect_rig(ways: Sequence[CameraWay], rig: StereoRig, source: Path) -> None
     stated = rig.cam0_from_cam1
     angle = np.arccos(np.clip((np.einsum("nij,ij->n", turns, stated.rotation) - 1) / 2, -1, 1))
     off = float(np.linalg.norm(place - stated.translation))
-    if float(np.median(angle)) > MOST_RIG_RAD or off > MOST_RIG_SHARE * rig.baseline_m:
+    if float(np.median(angle)) > MAX_RIG_RAD or off > MAX_RIG_RATIO * rig.baseline_m:
         raise CalibrationError(
             source,
             f"the views place cam1 {off * 1e3:.0f} mm and {np.degrees(np.median(angle)):.1f} degrees from "
@@ -197,45 +211,52 @@ def _expect_rig(ways: Sequence[CameraWay], rig: StereoRig, source: Path) -> None
         )
 
 
-def _aligned(way: CameraWay, time_s: Float64, gyro_radps: Float64, camera: int, source: Path) -> Alignment:
-    found = align(way, time_s, gyro_radps)
+def _aligned(
+    way: CameraPoses, time_s: Float64, gyro_radps: Float64, camera: int, source: Path
+) -> GyroAlignment:
+    found = align_gyro(way, time_s, gyro_radps)
     if isinstance(found, Failed):
         raise CalibrationError(source, f"cam{camera}: {found.reason}", REMEDIES[found.code])
     return found
 
 
 def _sigmas(noise: ImuNoise, rate_hz: float) -> Sigmas:
-    """Per reading, from densities. A walk of zero would tie the biases too hard for the arithmetic."""
+    """Convert noise densities to sigmas per reading.
+
+    A walk of zero would tie the biases too hard for the arithmetic.
+    """
     root = np.sqrt(rate_hz)
     return Sigmas(
         START_CORNER_PX, float(noise.gyro_density * root), float(noise.accel_density * root),
-        max(noise.gyro_walk, LEAST_WALK * noise.gyro_density),
-        max(noise.accel_walk, LEAST_WALK * noise.accel_density),
+        max(noise.gyro_walk, MIN_WALK * noise.gyro_density),
+        max(noise.accel_walk, MIN_WALK * noise.accel_density),
     )  # fmt: skip
 
 
 def _sightings(
-    camera: Camera, way: CameraWay, corners: Sequence[Corners], board: Board, shift_s: float, end_s: float
-) -> Sightings:
-    """The corners of the frames that lie within the spline once shifted, and whose board pose makes sense."""
+    camera: Camera, way: CameraPoses, corners: Sequence[Corners], board: Board, shift_s: float, end_s: float
+) -> CornerObservations:
+    """Select corners of frames inside the shifted spline whose board pose makes sense."""
     at = way.stamp_s + shift_s
     usual = float(np.median(way.error_px))
-    good = (at > EDGE_S) & (at < end_s - EDGE_S) & (way.error_px < max(5 * usual, MOST_PNP_PX))
+    good = (at > EDGE_S) & (at < end_s - EDGE_S) & (way.error_px < max(5 * usual, MAX_PNP_PX))
     chosen = np.flatnonzero(good).tolist()
     frame = np.concatenate([np.full(corners[k].ids.size, n) for n, k in enumerate(chosen)])
     ids = np.concatenate([corners[k].ids for k in chosen])
     pixels = np.concatenate([corners[k].pixels for k in chosen])
-    return Sightings(camera, way.stamp_s[chosen], frame, ids, board.points_m[ids], pixels)
+    return CornerObservations(camera, way.stamp_s[chosen], frame, ids, board.points_m[ids], pixels)
 
 
 def _start(
-    way: CameraWay, aligned: Sequence[Alignment], time_s: Float64, imu: ImuSamples, start_ns: int,
+    way: CameraPoses, aligned: Sequence[GyroAlignment], time_s: Float64, imu: ImuSamples, start_ns: int,
     end_s: float, step_s: float, track: ImuTrack,
-) -> State:  # fmt: skip
-    spline = spline_through(start_ns, end_s, step_s, *body_way(way, aligned[0], time_s, imu.gyro_radps))
+) -> CameraImuState:  # fmt: skip
+    spline = fit_spline(start_ns, end_s, step_s, *body_poses(way, aligned[0], time_s, imu.gyro_radps))
     bias = np.tile(aligned[0].gyro_bias_radps, (len(spline.places_m), 1))
     spline = replace(spline, gyro_bias_radps=bias)
     motion = spline.at(track.time_s)
     gravity = -np.einsum("nij,nj->i", motion.rotation, track.accel_mps2)
     mounts = tuple(Mount(found.rotation, np.zeros(3), found.shift_s) for found in aligned)
-    return State(spline, mounts, gravity * GRAVITY_MPS2 / np.linalg.norm(gravity), np.eye(3), np.eye(3))
+    return CameraImuState(
+        spline, mounts, gravity * GRAVITY_MPS2 / np.linalg.norm(gravity), np.eye(3), np.eye(3)
+    )

@@ -1,4 +1,4 @@
-"""Solving a camera-IMU calibration, and what the solution says of its own uncertainty."""
+"""Solve a camera-IMU calibration and measure the scatter of its residuals."""
 
 from __future__ import annotations
 
@@ -9,17 +9,23 @@ import numpy as np
 
 from barsight.calibration.camera_imu.arrowhead_system import (
     ROWS,
-    ArrowSystem,
-    Eliminated,
+    ArrowheadSystem,
+    EliminatedChain,
     Samples,
+    apply_jacobian,
     assemble,
     eliminate,
-    predicted,
-    pulled,
+    gradient_of,
     step,
 )
 from barsight.calibration.camera_imu.pose_spline import STATE
-from barsight.calibration.camera_imu.problem import Linearised, Problem, State, linearise, moved
+from barsight.calibration.camera_imu.problem import (
+    CameraImuProblem,
+    CameraImuState,
+    Linearised,
+    linearise_camera_imu,
+    retract_state,
+)
 from barsight.core.arrays import Float64, Int64
 from barsight.core.linalg.levenberg_marquardt import Options, minimise
 
@@ -30,16 +36,16 @@ OPTIONS = Options(max_steps=60, min_gain_ratio=1e-8, first_damping=1e-6, min_dam
 class Solution:
     """state; linearised and eliminated there, without damping and without robust weights; steps taken."""
 
-    state: State
+    state: CameraImuState
     linearised: Linearised
-    eliminated: Eliminated
+    eliminated: EliminatedChain
     steps: int
     converged: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
-    """How far each sensor's residuals scatter against what was assumed, and what the fit takes up of them.
+class ResidualSpread:
+    """Scatter of each sensor's residuals against the assumed sigma, and the part absorbed by the fit.
 
     factor: on the assumed sigma. absorbed: the share of the sensor's numbers that the unknowns take up.
     after: (LAGS,) the residuals' autocorrelation, after_expected: the same of white noise after the same fit.
@@ -59,16 +65,16 @@ PROBES = 2
 class _Iterate:
     """A state and, made on use, what is linear there."""
 
-    problem: Problem
+    problem: CameraImuProblem
     huber: float | None
-    state: State
+    state: CameraImuState
 
     @cached_property
     def here(self) -> Linearised:
-        return linearise(self.problem, self.state, self.huber)
+        return linearise_camera_imu(self.problem, self.state, self.huber)
 
     @cached_property
-    def system(self) -> ArrowSystem:
+    def system(self) -> ArrowheadSystem:
         return assemble(self.here.samples, self.here.walks, len(self.state.spline.places_m))
 
     @property
@@ -77,22 +83,26 @@ class _Iterate:
 
     def step(self, damping: float) -> _Iterate:
         chain, common = step(self.system, eliminate(self.system, damping))
-        return replace(self, state=moved(self.state, chain.reshape(-1, STATE), common))
+        return replace(self, state=retract_state(self.state, chain.reshape(-1, STATE), common))
 
 
-def solve(problem: Problem, start: State, huber: float | None) -> Solution:
-    """Levenberg-Marquardt from `start`; huber as in `linearise`. Raises LinAlgError where the way of the body
-    is not determined."""
+def solve_camera_imu(problem: CameraImuProblem, start: CameraImuState, huber: float | None) -> Solution:
+    """Run Levenberg-Marquardt from `start`; huber as in `linearise_camera_imu`.
+
+    Raises LinAlgError where the way of the body is not determined.
+    """
     found = minimise(_Iterate(problem, huber, start), OPTIONS)
     state, here = found.best.state, found.best.here
     if huber is not None:
-        here = linearise(problem, state, None)
+        here = linearise_camera_imu(problem, state, None)
     eliminated = eliminate(assemble(here.samples, here.walks, len(state.spline.places_m)))
     return Solution(state, here, eliminated, found.steps, found.converged)
 
 
-def sensor_spreads(problem: Problem, solution: Solution, seed: int = 0) -> tuple[Spread, Spread, Spread]:
-    """Pictures, gyro, accelerometer: the scatter of their residuals, freed of what the fit takes up.
+def sensor_spreads(
+    problem: CameraImuProblem, solution: Solution, seed: int = 0
+) -> tuple[ResidualSpread, ResidualSpread, ResidualSpread]:
+    """Estimate the scatter of picture, gyro and accelerometer residuals, corrected for what the fit absorbs.
 
     A picture's residuals are its six whitened rows: what all its corners together say of the pose.
 
@@ -114,29 +124,31 @@ def sensor_spreads(problem: Problem, solution: Solution, seed: int = 0) -> tuple
         absorbed = float((drawn * taken).sum() / PROBES)
         factor = float(np.sqrt((residual**2).sum() / max(residual.size - absorbed, 1.0)))
         expected = np.mean([autocorrelation(one) for one in drawn - taken], axis=0)
-        out.append(Spread(factor, absorbed / residual.size, autocorrelation(residual), expected))
+        out.append(ResidualSpread(factor, absorbed / residual.size, autocorrelation(residual), expected))
     return out[0], out[1], out[2]
 
 
 def autocorrelation(series: Float64) -> Float64:
-    """(LAGS,) of a series (S, A), its axes together."""
+    """Compute the autocorrelation (LAGS,) of a series (S, A), its axes together."""
     power = float((series**2).sum())
     return np.array([float((series[k:] * series[:-k]).sum()) / power for k in range(1, LAGS + 1)])
 
 
 def _fitted(samples: Samples, solution: Solution, residual: Float64) -> Float64:
-    """(K, ROWS) what the fit makes of other whitened residuals."""
+    """Project other whitened residuals (K, ROWS) onto the fit's column space."""
     eliminated = solution.eliminated
-    chain, common = pulled(samples, residual, eliminated.through.shape[0])
+    chain, common = gradient_of(samples, residual, eliminated.through.shape[0])
     alone = eliminated.chain_solve(chain)
     moved_common = np.linalg.pinv(eliminated.information, hermitian=True) @ (
         common - np.einsum("np,n->p", eliminated.through, chain)
     )
-    return predicted(samples, alone - np.einsum("np,p->n", eliminated.through, moved_common), moved_common)
+    return apply_jacobian(
+        samples, alone - np.einsum("np,p->n", eliminated.through, moved_common), moved_common
+    )
 
 
 def block_scores(samples: Samples, by_common: Float64, block: Int64, blocks: int) -> tuple[Float64, Float64]:
-    """Each block of time's pull (B, P) on the common parameters and its information (B, P, P).
+    """Sum the gradient (B, P) and information (B, P, P) on the common parameters per block of time.
 
     by_common: (K, ROWS, P) as `projected` gives; block: (K,) the samples' block.
     """

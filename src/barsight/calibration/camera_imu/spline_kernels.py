@@ -1,4 +1,4 @@
-"""One segment of a uniform cumulative B-spline on SO(3) x R3: values, derivatives and Jacobians, compiled.
+"""Evaluate one segment of a uniform cumulative B-spline on SO(3) x R3 with Jacobians, compiled.
 
 Control point m is a rotation R_m and a place p_m. In a segment
 R(u) = R_i Exp(l_1(u) d_1) ... Exp(l_5(u) d_5) with d_j = Log(R_{i+j-1}^T R_{i+j}) [Kim 1995], and the turn
@@ -20,7 +20,7 @@ SMALL = 1e-5
 
 
 def _blending() -> Float64:
-    """(ORDER, ORDER) of control point and power of u: the weights of a uniform B-spline."""
+    """Compute the blending matrix (ORDER, ORDER) of a uniform B-spline, control point by power of u."""
     k = ORDER
     matrix = np.zeros((k, k))
     for s in range(k):
@@ -76,7 +76,7 @@ def exp_so3(v: Float64, scale: float, rotation: Float64, right: Float64) -> None
 
 @kernel()
 def _times(a: Float64, b: Float64, transposed: bool, out: Float64) -> None:
-    """out = a @ b, or a^T @ b."""
+    """Multiply out = a @ b, or a^T @ b."""
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -90,7 +90,7 @@ def rotation_at(
     first: Float64, steps: Float64, inverse_right: Float64, share: Float64, rotation: Float64, rate: Float64,
     turn_by: Float64, rate_by: Float64,
 ) -> None:  # fmt: skip
-    """The rotation and turn rate (body axes) of a segment, with their Jacobians.
+    """Evaluate rotation and turn rate (body axes) of a segment, with their Jacobians.
 
     first: (3, 3) R_i. steps: (DEGREE, 3) d_j; inverse_right: (DEGREE, 3, 3) their inverse right Jacobians.
     share: (3, ORDER) cumulative weights. Filled: rotation (3, 3), rate (3,), turn_by and rate_by

@@ -1,4 +1,4 @@
-"""How well a camera-IMU calibration is known: noise, what hangs together in time, and what was held fixed."""
+"""Estimate the covariance of a camera-IMU calibration: noise, correlated residuals, fixed parameters."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barsight.calibration.camera_imu.arrowhead_system import Eliminated, assemble, eliminate, projected
-from barsight.calibration.camera_imu.problem import MOUNT, Problem, linearise
+from barsight.calibration.camera_imu.arrowhead_system import (
+    EliminatedChain,
+    assemble,
+    eliminate,
+    project_out_chain,
+)
+from barsight.calibration.camera_imu.problem import MOUNT, CameraImuProblem, linearise_camera_imu
 from barsight.calibration.camera_imu.solver import Solution, block_scores
-from barsight.calibration.stereo.covariance_inflation import widened
+from barsight.calibration.stereo.covariance_inflation import inflate_covariance
 from barsight.core.arrays import Float64
 
 BLOCK_S = 1.0
@@ -48,9 +53,11 @@ class Uncertainty:
     fixed: tuple[HeldFixed, ...]
 
 
-def uncertainty(problem: Problem, solution: Solution) -> Uncertainty:
-    """From the Schur complement of the common parameters, widened by how seconds disagree and by how far the
-    mounting would move if lenses and IMU scales, held fixed, were free and the residuals gain by it."""
+def uncertainty(problem: CameraImuProblem, solution: Solution) -> Uncertainty:
+    """Compute the covariance from the Schur complement of the common parameters, widened by how seconds
+    disagree and by how far the mounting would move if lenses and IMU scales, held fixed, were free and the
+    residuals gain by it.
+    """
     names = problem.parameter_names
     unit = needed_units(names)
     scaled = solution.eliminated.information * unit[:, None] * unit
@@ -60,7 +67,7 @@ def uncertainty(problem: Problem, solution: Solution) -> Uncertainty:
     # A direction that nothing was seen of gets a huge sigma, not an error.
     solid = np.maximum(values, FLOOR)
     inverse = (vectors / solid) @ vectors.T * unit[:, None] * unit
-    covariance, correlation = widened(inverse, 1.0, *_blocks(problem, solution))
+    covariance, correlation = inflate_covariance(inverse, 1.0, *_blocks(problem, solution))
     fixed = []
     for group, shift in _freed(problem, solution, inverse, correlation):
         fixed.append(group)
@@ -72,12 +79,12 @@ def uncertainty(problem: Problem, solution: Solution) -> Uncertainty:
 
 
 def needed_units(names: Sequence[str]) -> Float64:
-    """(P,) what each parameter must be known to, by the unit its name ends with."""
+    """Return the needed accuracy (P,) of each parameter, by the unit its name ends with."""
     ends = [name.rsplit("_", 1)[-1] if "_" in name.rsplit(".", 1)[-1] else "" for name in names]
     return np.array([NEEDED.get(end, NEEDED[""]) for end in ends])
 
 
-def _blocks(problem: Problem, solution: Solution) -> tuple[Float64, Float64]:
+def _blocks(problem: CameraImuProblem, solution: Solution) -> tuple[Float64, Float64]:
     times = [
         sightings.stamp_s + mount.shift_s
         for sightings, mount in zip(problem.sightings, solution.state.mounts, strict=True)
@@ -85,18 +92,18 @@ def _blocks(problem: Problem, solution: Solution) -> tuple[Float64, Float64]:
     block = (np.concatenate([*times, problem.imu.time_s]) / BLOCK_S).astype(np.int64)
     block = np.clip(block, 0, None)
     samples = solution.linearised.samples
-    by_common = projected(samples, solution.eliminated.through)
+    by_common = project_out_chain(samples, solution.eliminated.through)
     return block_scores(samples, by_common, block, int(block.max()) + 1)
 
 
 def _freed(
-    problem: Problem, solution: Solution, inverse: Float64, correlation: float
+    problem: CameraImuProblem, solution: Solution, inverse: Float64, correlation: float
 ) -> list[tuple[HeldFixed, Float64]]:
-    """What freeing the lenses, and the IMU's scales, would change: one Newton step from the solution."""
+    """Estimate the effect of freeing lenses and IMU scales: one Newton step from the solution."""
     freed = replace(problem, scales=True, lenses=True)
-    here = linearise(freed, solution.state, None)
+    here = linearise_camera_imu(freed, solution.state, None)
     system = assemble(here.samples, here.walks, len(solution.state.spline.places_m))
-    whole: Eliminated = eliminate(system)
+    whole: EliminatedChain = eliminate(system)
     gradient = system.common_gradient - np.einsum("np,n->p", whole.through, system.chain_gradient)
     names = list(freed.parameter_names)
     own = [names.index(name) for name in problem.parameter_names]
@@ -125,7 +132,7 @@ def _freed(
 
 
 def _direction(names: Sequence[str], vector: Float64) -> str:
-    """A direction's largest parts, in words."""
+    """Describe a direction's largest components in words."""
     order = np.argsort(-np.abs(vector))
     kept = [k for k in order[:4] if abs(vector[k]) > 0.3 * abs(vector[order[0]])]
     return " with ".join(names[k].rsplit("_", 1)[0].replace(".", " ") for k in kept)

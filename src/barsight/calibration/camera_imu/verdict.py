@@ -1,4 +1,4 @@
-"""Is a camera-IMU calibration good enough? A verdict per line, and how to move the rig next time."""
+"""Judge a camera-IMU calibration line by line and advise on the next recording."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from barsight.calibration.boards.board_views import BoardView
 from barsight.calibration.camera_imu.calibration import (
     CameraImuCalibration,
     calibrate_camera_imu,
-    mount_differences,
+    subtract_mounts,
 )
 from barsight.calibration.camera_imu.problem import MOUNT
 from barsight.calibration.geometry.imu_noise import ImuNoise
@@ -23,8 +23,8 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError, Failed
 from barsight.core.types import ImuSamples
 
-LEAST_HALF_S = 6.0
-LEAST_RATE_RADPS, LEAST_FORCE_MPS2 = 0.3, 1.0
+MIN_HALF_S = 6.0
+MIN_RATE_RADPS, MIN_FORCE_MPS2 = 0.3, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class CameraImuAssessment:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the lines."""
+        """Return the worst of the lines."""
         return max((line.verdict for line in self.lines), key=list(Verdict).index)
 
 
@@ -62,8 +62,8 @@ def cross_halves(
     """Solve two halves apart. Failed `short` where a half would be under six seconds, `half` where one can't
     be calibrated."""
     spline = calibration.solution.state.spline
-    if spline.segments * spline.step_s < 2 * LEAST_HALF_S:
-        return Failed("short", f"halves need {2 * LEAST_HALF_S:g} s together")
+    if spline.segments * spline.step_s < 2 * MIN_HALF_S:
+        return Failed("short", f"halves need {2 * MIN_HALF_S:g} s together")
     ordered = sorted(views, key=lambda view: int(view.name))
     middle = len(ordered) // 2
     solved = []
@@ -75,7 +75,7 @@ def cross_halves(
             return Failed("half", f"a half can't be calibrated alone: {error.problem}")
     own = slice(0, 2 * MOUNT)
     predicted = np.hypot(solved[0].sigma[own], solved[1].sigma[own])
-    return Halves(mount_differences(solved[1].solution.state, solved[0].solution.state), predicted)
+    return Halves(subtract_mounts(solved[1].solution.state, solved[0].solution.state), predicted)
 
 
 def assess_camera_imu(calibration: CameraImuCalibration, halves: Halves | Failed) -> CameraImuAssessment:
@@ -126,16 +126,16 @@ def _advice(calibration: CameraImuCalibration) -> tuple[str, ...]:
     track = calibration.problem.imu
     spread = np.linalg.eigh(np.cov(track.gyro_radps.T))
     weak, axis = float(np.sqrt(max(spread[0][0], 0))), spread[1][:, 0]
-    if weak < LEAST_RATE_RADPS:
+    if weak < MIN_RATE_RADPS:
         name = "xyz"[int(np.abs(axis).argmax())]
         advice.append(
-            f"turn faster about the IMU's {name} axis: {weak:.2f} rad/s were seen, {LEAST_RATE_RADPS:g} help"
+            f"turn faster about the IMU's {name} axis: {weak:.2f} rad/s were seen, {MIN_RATE_RADPS:g} help"
         )
     shake = float(np.sqrt(np.linalg.eigvalsh(np.cov(track.accel_mps2.T))[0]))
-    if shake < LEAST_FORCE_MPS2:
+    if shake < MIN_FORCE_MPS2:
         advice.append(
             f"move more briskly along all three axes: the weakest shows {shake:.2f} m/s^2, "
-            f"{LEAST_FORCE_MPS2:g} help"
+            f"{MIN_FORCE_MPS2:g} help"
         )
     for group in calibration.uncertainty.fixed:
         if group.matters and group.name == "lenses":

@@ -1,4 +1,4 @@
-"""EuRoC's `sensor.yaml` files: a rig and an IMU's noise, in and out."""
+"""Read and write EuRoC's `sensor.yaml` files: a rig and an IMU's noise."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ DISTORTION_NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class MountedImu:
-    """Where the IMU sits and how it is noisy. noise is None where the file doesn't say."""
+    """Mounting and noise of an IMU. noise is None where the file doesn't say."""
 
     body_from_imu: Pose
     noise: ImuNoise | None
 
 
 def read_rig(mav0: Path) -> StereoRig:
-    """The rig of `cam0/sensor.yaml` and `cam1/sensor.yaml`. Raises `CalibrationError`."""
+    """Read the rig of `cam0/sensor.yaml` and `cam1/sensor.yaml`. Raises `CalibrationError`."""
     documents = [read_document(mav0 / name / "sensor.yaml") for name in ("cam0", "cam1")]
     mounts = [
         document.pose("T_BS", "body", name)
@@ -45,7 +45,7 @@ def read_rig(mav0: Path) -> StereoRig:
 
 
 def read_camera(document: Document, coefficients_key: str) -> Camera:
-    """The camera of EuRoC's or Kalibr's keys, which differ in the name of the coefficients only."""
+    """Read a camera from EuRoC's or Kalibr's keys, which differ in the name of the coefficients only."""
     model = str(document.get("camera_model"))
     if model != "pinhole":
         raise document.error("camera_model", f"{model!r} is not supported", "calibrate as pinhole")
@@ -72,7 +72,7 @@ def read_camera(document: Document, coefficients_key: str) -> Camera:
 def build_rig(
     path: Path, cam0: Camera, cam1: Camera, body_from_cam0: Pose, body_from_cam1: Pose, shift_ns: int
 ) -> StereoRig:
-    """A `StereoRig`, its refusals turned into `CalibrationError` about `path`."""
+    """Build a `StereoRig`, its refusals turned into `CalibrationError` about `path`."""
     try:
         return StereoRig(cam0, cam1, body_from_cam0, body_from_cam1, shift_ns)
     except ValueError as error:
@@ -81,7 +81,7 @@ def build_rig(
 
 
 def read_imu(path: Path) -> MountedImu:
-    """The IMU's `sensor.yaml`. Raises `CalibrationError`."""
+    """Read the IMU's `sensor.yaml`. Raises `CalibrationError`."""
     document = read_document(path)
     pose = document.pose("T_BS", "body", "imu") if "T_BS" in document.values else None
     keys = (

@@ -1,4 +1,4 @@
-"""Kalibr's `camchain-imucam.yaml` and `imu.yaml`, in and out.
+"""Read and write Kalibr's `camchain-imucam.yaml` and `imu.yaml`.
 
 Kalibr stores `T_cam_imu` = cam_from_body (the body is the IMU), `T_cn_cnm1` = cam1_from_cam0 and
 `timeshift_cam_imu` with t_imu = t_cam + shift. Radial-tangential lenses of 5 and 8 coefficients, which Kalibr
@@ -47,7 +47,7 @@ class ImuFile:
 
 
 def read_camchain(path: Path) -> CamChain:
-    """The rig of the first two cameras of a camchain. Raises `CalibrationError`."""
+    """Read the rig of the first two cameras of a camchain. Raises `CalibrationError`."""
     document = read_document(path)
     cam0, cam1 = document.section("cam0"), document.section("cam1")
     cameras = read_camera(cam0, "distortion_coeffs"), read_camera(cam1, "distortion_coeffs")
@@ -65,7 +65,10 @@ def read_camchain(path: Path) -> CamChain:
 
 
 def read_imu_file(path: Path) -> ImuFile:
-    """The noise model of `imu.yaml`, which Kalibr writes flat or below `imu0`. Raises `CalibrationError`."""
+    """Read the noise model of `imu.yaml`, which Kalibr writes flat or below `imu0`.
+
+    Raises `CalibrationError`.
+    """
     document = read_document(path)
     if "imu0" in document.values:
         document = document.section("imu0")
@@ -134,7 +137,7 @@ def _topic(document: Document) -> str | None:
 
 
 def _expect_agreement(cam1: Document, left: Pose, right: Pose) -> None:
-    """Kalibr states the stereo extrinsics twice; a file whose two statements differ was edited by hand."""
+    """Refuse a camchain whose two statements of the stereo extrinsics differ: it was edited by hand."""
     if "T_cn_cnm1" not in cam1.values:
         return
     stated = cam1.pose("T_cn_cnm1", "cam0", "cam1", inverted=True)

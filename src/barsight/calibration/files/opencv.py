@@ -1,4 +1,4 @@
-"""Stereo rigs in OpenCV's YAML, XML or JSON, in and out: M1 D1 M2 D2 R T, as its stereo sample writes them.
+"""Read and write stereo rigs in OpenCV's YAML, XML or JSON (M1 D1 M2 D2 R T, as its stereo sample).
 
 R and T are cam1_from_cam0, T in metres. OpenCV's own files don't carry the pictures' size: `image_width` and
 `image_height` must be in them. A key `distortion_model: equidistant` marks fisheye lenses.
@@ -29,7 +29,7 @@ ORIGINAL = "take the calibration's original file"
 
 
 def read_opencv_rig(path: Path) -> StereoRig:
-    """The rig of one OpenCV file, or of `intrinsics` with `extrinsics` of the same suffix beside it.
+    """Read the rig of one OpenCV file, or of `intrinsics` with `extrinsics` of the same suffix beside it.
 
     The body is cam0. Raises `CalibrationError` naming the key that is missing or can't be.
     """
@@ -83,7 +83,7 @@ def write_opencv_rig(path: Path, rig: StereoRig, *, xml: bool = False) -> None:
 
 
 def _matrices(path: Path) -> dict[str, Float64]:
-    """The known entries as matrices; `fisheye` is there where the lenses are."""
+    """Read the known entries as matrices; `fisheye` is there where the lenses are."""
     if not path.is_file():
         raise CalibrationError(path, "no such file", "check the path")
     try:

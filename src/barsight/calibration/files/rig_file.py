@@ -1,4 +1,4 @@
-"""Our own rig file: YAML, versioned, with the covariance of what was calibrated.
+"""Read and write our own rig file: versioned YAML with the calibration's covariance.
 
 docs/reference/rig-file.md describes the keys. Readers accept every version up to their own.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.calibration.boards.board import Board
-from barsight.calibration.boards.board_warp import bent
+from barsight.calibration.boards.board_warp import apply_shape
 from barsight.calibration.files.euroc import build_rig, read_camera
 from barsight.calibration.files.yaml_document import Document, read_document, write_document
 from barsight.calibration.geometry.camera import Camera
@@ -40,7 +40,7 @@ def write_rig_file(path: Path, rig: StereoRig, section: Mapping[str, object] | N
 
 
 def read_own_rig(document: Document) -> StereoRig:
-    """The rig of a document with the key `barsight_rig`. Raises `CalibrationError`."""
+    """Read the rig of a document with the key `barsight_rig`. Raises `CalibrationError`."""
     version = document.number(VERSION_KEY)
     if not 1 <= version <= VERSION:
         raise document.error(
@@ -56,7 +56,7 @@ def read_own_rig(document: Document) -> StereoRig:
 
 
 def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
-    """(parameter names (C,), covariance (C, C)) of a rig file, None where it carries none."""
+    """Read parameter names (C,) and covariance (C, C) of a rig file, None where it carries none."""
     document = read_document(path)
     if document.values.get("calibration") is None:
         return None
@@ -72,12 +72,14 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
 
 
 def read_board(path: Path, board: Board) -> Board:
-    """`board` with the shape that `calibrate stereo` found of it, where the rig file comes from the same."""
+    """Apply the board shape that `calibrate stereo` found, where the rig file comes from the same board."""
     section = read_document(path).values.get("calibration")
     if not isinstance(section, dict) or section.get("board") != str(board):
         return board
     try:
-        return bent(board, {name: float(entry["value"]) for name, entry in section["board_shape"].items()})
+        return apply_shape(
+            board, {name: float(entry["value"]) for name, entry in section["board_shape"].items()}
+        )
     except (KeyError, TypeError, ValueError, AttributeError):
         raise CalibrationError(path, "board_shape can't be read", "take the original file") from None
 

@@ -1,4 +1,4 @@
-"""One door for every file that holds a rig: ours, Kalibr's camchain, OpenCV's, an EuRoC folder."""
+"""Read and write a rig in any format: ours, Kalibr's camchain, OpenCV's, an EuRoC folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KNOWN = "a rig.yaml of barsight, Kalibr's camchain, OpenCV's YAML or XML, or an 
 
 
 class RigFormat(StrEnum):
-    """What a rig can be written as. EUROC is a folder, the others are files."""
+    """Formats to write a rig in. EUROC is a folder, the others are files."""
 
     BARSIGHT = "barsight"
     KALIBR = "kalibr"
@@ -32,7 +32,7 @@ class RigFormat(StrEnum):
 
 
 def read_rig_file(path: Path) -> StereoRig:
-    """The rig at `path`, of whichever format. Raises `CalibrationError`."""
+    """Read the rig at `path`, in whichever format. Raises `CalibrationError`."""
     if path.is_dir():
         return read_rig(path / "mav0" if (path / "mav0").is_dir() else path)
     if path.suffix.lower() == ".xml" or _is_opencv(path):
@@ -46,14 +46,14 @@ def read_rig_file(path: Path) -> StereoRig:
 
 
 def holds_own_rig(path: Path) -> bool:
-    """Whether a rig file is of our own format, the one with a covariance."""
+    """Check for a rig file of our own format, the one with a covariance."""
     if path.is_dir() or path.suffix.lower() == ".xml" or _is_opencv(path):
         return False
     return VERSION_KEY in read_document(path).values
 
 
-def chosen_rig(path: Path | None, own: StereoRig) -> StereoRig:
-    """The rig of a file that the user names, or the recording's `own` where none is named.
+def select_rig(path: Path | None, own: StereoRig) -> StereoRig:
+    """Select the rig of a file that the user names, else the recording's `own`.
 
     A calibration of two cameras alone says nothing of the body: `own` says where cam0 sits, and the clocks.
     """
@@ -69,7 +69,7 @@ def chosen_rig(path: Path | None, own: StereoRig) -> StereoRig:
 
 
 def body_is_cam0(rig: StereoRig) -> bool:
-    """Whether the rig's body is its left camera: nobody said where an IMU sits."""
+    """Check whether the rig's body is its left camera: nobody said where an IMU sits."""
     return bool(np.array_equal(rig.body_from_cam0.matrix, np.eye(4)))
 
 

@@ -1,4 +1,4 @@
-"""Calibration files as text: YAML that names the file and the key when something in it can't be."""
+"""Read and write calibration YAML with errors that name file and key."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ class Document:
     prefix: str = ""
 
     def error(self, key: str, problem: str, remedy: str) -> CalibrationError:
-        """The error to raise about one key."""
+        """Make the error to raise about one key."""
         return CalibrationError(self.path, f"{self.prefix}{key}: {problem}", remedy)
 
     def get(self, key: str) -> Any:
-        """The raw value of a key that must be there."""
+        """Return the raw value of a required key."""
         if self.values.get(key) is None:
             raise self.error(key, "is missing", "add the key or take the calibration's original file")
         return self.values[key]
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number; the default where the key is absent and a default is given."""
+        """Return a finite number; the default where the key is absent and a default is given."""
         if default is not None and self.values.get(key) is None:
             return default
         return self.numbers_in(key, [self.get(key)])[0]
 
     def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
-        """A list of finite numbers, of this length where one is given."""
+        """Return a list of finite numbers, of this length where one is given."""
         value = self.get(key)
         if not isinstance(value, list):
             raise self.error(key, "is not a list of numbers", "write it as [a, b, ...]")
@@ -53,7 +53,7 @@ class Document:
         return numbers
 
     def numbers_in(self, key: str, value: Sequence[Any]) -> tuple[float, ...]:
-        """The elements as finite floats. YAML 1.1 reads `1e-5` as text, so text is tried too."""
+        """Convert the elements to finite floats. YAML 1.1 reads `1e-5` as text, so text is tried too."""
         try:
             numbers = tuple(float(v) for v in value if not isinstance(v, bool))
         except (TypeError, ValueError):
@@ -65,7 +65,9 @@ class Document:
         return numbers
 
     def matrix(self, key: str) -> Float64:
-        """(4, 4) from `{rows, cols, data}` (EuRoC), from four rows of four (Kalibr) or from 16 numbers."""
+        """Return a (4, 4) matrix from `{rows, cols, data}` (EuRoC), four rows of four (Kalibr) or
+        16 numbers.
+        """
         value = self.get(key)
         if isinstance(value, dict):
             value = value.get("data")
@@ -76,7 +78,9 @@ class Document:
         return np.array(self.numbers_in(key, value), dtype=np.float64).reshape(4, 4)
 
     def pose(self, key: str, target: str, source: str, *, inverted: bool = False) -> Pose:
-        """`target_from_source` out of a 4x4 matrix; with `inverted` the file stores `source_from_target`."""
+        """Return `target_from_source` of a 4x4 matrix; with `inverted` the file stores
+        `source_from_target`.
+        """
         matrix = self.matrix(key)
         try:
             return canonical_pose(target, source, matrix, inverted=inverted)
@@ -84,7 +88,7 @@ class Document:
             raise self.error(key, str(error), "a calibration must hold a rotation; copy it again") from None
 
     def section(self, key: str) -> Document:
-        """A mapping inside this one."""
+        """Return a mapping inside this one."""
         value = self.get(key)
         if not isinstance(value, dict):
             raise self.error(key, "is not a mapping", "compare with Kalibr's file format")
@@ -118,7 +122,7 @@ def write_document(path: Path, values: dict[str, Any]) -> None:
 
 
 def canonical_pose(target: str, source: str, matrix: Float64, *, inverted: bool = False) -> Pose:
-    """A mounting whose numbers don't depend on which of its two directions a file stores.
+    """Build a mounting whose numbers don't depend on which of its two directions a file stores.
 
     EuRoC stores `body_from_cam`, Kalibr `cam_from_body`; the detour over the inverse costs some 1e-16. The
     rotation is made orthonormal and rounded to 1e-13, which is fine enough for `Pose` to keep it as it is

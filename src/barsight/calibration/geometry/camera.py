@@ -1,4 +1,4 @@
-"""Pinhole cameras with radial-tangential (4, 5 or 8 coefficients) or equidistant lenses."""
+"""Model pinhole cameras with radial-tangential (4, 5 or 8 coefficients) or equidistant lenses."""
 
 from __future__ import annotations
 
@@ -61,16 +61,19 @@ class Camera:
 
     @property
     def matrix(self) -> Float64:
-        """(3, 3) intrinsic matrix K."""
+        """Return the intrinsic matrix K (3, 3)."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]], np.float64)
 
     @property
     def is_ideal(self) -> bool:
-        """No lens distortion at all. An equidistant lens bends rays even where its coefficients are zero."""
+        """Check for no lens distortion at all.
+
+        An equidistant lens bends rays even where its coefficients are zero.
+        """
         return self.distortion is not Distortion.EQUIDISTANT and not any(self.coefficients)
 
     def project(self, points: Float64) -> Float64:
-        """(N, 3) points in the camera's frame (z > 0) to (N, 2) raw pixels."""
+        """Project points (N, 3) in the camera's frame (z > 0) to raw pixels (N, 2)."""
         pts = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
         if len(pts) == 0:
             return np.empty((0, 2))
@@ -83,7 +86,7 @@ class Camera:
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
     def rays(self, pixels: Float64) -> Float64:
-        """(N, 2) raw pixels to (N, 3) directions with z = 1 in the camera's frame."""
+        """Unproject raw pixels (N, 2) to directions (N, 3) with z = 1 in the camera's frame."""
         pts = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         coefficients = np.array(self.coefficients, dtype=np.float64)
         if self.is_ideal:

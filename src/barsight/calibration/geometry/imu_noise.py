@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """The IMU's noise model, Kalibr's units.
+    """IMU noise model in Kalibr's units.
 
     gyro_density: rad/s/sqrt(Hz). gyro_walk: rad/s^2/sqrt(Hz). accel_density: m/s^2/sqrt(Hz).
     accel_walk: m/s^3/sqrt(Hz). rate_hz: as the file states it.

@@ -1,4 +1,4 @@
-"""Projection with analytic derivatives: what the calibration's least squares linearises.
+"""Project points with analytic Jacobians by point and lens parameters.
 
 Pixels come from the same models as `Camera.project` (OpenCV's radial-tangential with 4, 5 or 8 coefficients,
 equidistant [Kannala 2006]); a test holds both together.
@@ -18,7 +18,7 @@ INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 class Lens(StrEnum):
-    """The lens models a calibration can solve for."""
+    """Lens models a calibration can solve for."""
 
     RADTAN4 = "radtan4"
     RADTAN5 = "radtan5"
@@ -27,18 +27,18 @@ class Lens(StrEnum):
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:
-        """k1, k2, ... in the order of `Camera.coefficients`."""
+        """Return k1, k2, ... in the order of `Camera.coefficients`."""
         if self is Lens.EQUIDISTANT:
             return ("k1", "k2", "k3", "k4")
         return ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")[: int(self[-1])]
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """fx, fy, cx, cy and the coefficients."""
+        """Return fx, fy, cx, cy and the coefficients."""
         return INTRINSIC_NAMES + self.coefficient_names
 
     def camera(self, parameters: Float64, width: int, height: int) -> Camera:
-        """The camera of one parameter vector. Raises ValueError where it can't be."""
+        """Build the camera of one parameter vector. Raises ValueError where it can't be."""
         fx, fy, cx, cy, *rest = (float(value) for value in parameters)
         kind = Distortion.EQUIDISTANT if self is Lens.EQUIDISTANT else Distortion.RADTAN
         return Camera(width, height, fx, fy, cx, cy, kind, tuple(rest))
@@ -53,8 +53,8 @@ class Projected:
     by_lens: Float64
 
 
-def project(lens: Lens, parameters: Float64, points: Float64) -> Projected:
-    """points (N, 3) in the camera's frame, z > 0; parameters (4 + coefficients,)."""
+def project_lens(lens: Lens, parameters: Float64, points: Float64) -> Projected:
+    """Project points (N, 3) in the camera's frame, z > 0; parameters (4 + coefficients,)."""
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     bend = _equidistant if lens is Lens.EQUIDISTANT else _radial_tangential
     bent, by_plane, by_coefficients = bend(x, y, parameters[4:])

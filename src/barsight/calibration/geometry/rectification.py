@@ -1,4 +1,4 @@
-"""Rectification: raw pairs to pairs whose matches lie on the same row.
+"""Rectify raw pairs so that matches lie on the same row.
 
 Both cameras are turned about their centres so that their x axes run along the baseline and their rows agree
 [Fusiello 2000]; the lens distortion is taken off in the same interpolation.
@@ -53,7 +53,7 @@ class Rectifier:
         self._left_valid, self._right_valid = left.valid, right.valid
 
     def __call__(self, frame: StereoFrame) -> RectifiedPair | Failed:
-        """The rectified pair; Failed `wrong-size` where the images don't have the calibration's size."""
+        """Rectify a pair; Failed `wrong-size` where the images don't have the calibration's size."""
         for name, image, size in (
             ("left", frame.left, self._size),
             ("right", frame.right, self._right_size),
@@ -69,11 +69,11 @@ class Rectifier:
         return RectifiedPair(frame.stamp_ns, left, right, self._left_valid, self._right_valid, self.camera)
 
     def left(self, image: UInt8) -> UInt8:
-        """The left image alone, of the calibration's size."""
+        """Rectify the left image alone, of the calibration's size."""
         return image if self._warps is None else self._warps[0](image)
 
     def places(self, left: Float64, right: Float64) -> tuple[Float64, Float64]:
-        """Where raw pixels (N, 2) of cam0 and cam1 come to lie in the rectified pair, (N, 2) each."""
+        """Rectify raw pixels (N, 2) of cam0 and cam1, (N, 2) each."""
         camera = self.camera
         placed = []
         for lens, rotation, pixels, cx in zip(
@@ -86,7 +86,9 @@ class Rectifier:
 
 
 def _rectified_axes(rig: StereoRig) -> Float64:
-    """(3, 3) cam0_from_rect0: x along the baseline, z as near as can be to the mean of the optical axes."""
+    """Compute cam0_from_rect0 (3, 3): x along the baseline, z as near as can be to the mean of the optical
+    axes.
+    """
     if _is_rectified(rig):
         return np.eye(3)
     cam0_from_cam1 = rig.cam0_from_cam1
@@ -98,7 +100,7 @@ def _rectified_axes(rig: StereoRig) -> Float64:
 
 
 def right_from_rectified(rig: StereoRig) -> Float64:
-    """(3, 3) cam1_from_rect1: the rectified axes, which both cameras share, in the right camera."""
+    """Compute cam1_from_rect1 (3, 3): the rectified axes, which both cameras share, in the right camera."""
     right: Float64 = rig.cam0_from_cam1.rotation.T @ _rectified_axes(rig)
     return right
 
@@ -119,7 +121,7 @@ def _is_rectified(rig: StereoRig) -> bool:
 
 
 def _principal_point(camera: Camera, rotation: Float64, focal: float) -> tuple[float, float]:
-    """Keeps the middle of the raw image in the middle of the rectified one."""
+    """Keep the middle of the raw image in the middle of the rectified one."""
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
     ray = camera.rays(middle)[0] @ rotation
     x, y = middle[0] - focal * ray[:2] / ray[2]

@@ -1,4 +1,4 @@
-"""Pictures bent to rectified pixels, in two passes of which each runs along a row.
+"""Warp pictures to rectified pixels in two separable passes.
 
 A rectified row crosses the raw picture's columns one by one on a gentle curve. So the raw picture is first
 read where the curve crosses each column, then along the curve: 8 products a pixel in place of the 16 of
@@ -15,12 +15,12 @@ from barsight.core.arrays import Bool, Float32, UInt8, kernel
 
 _SHARP = np.float32(-0.75)
 """The cubic convolution's free number, as in OpenCV [Keys 1981]."""
-_ZERO, _HALF, _ONE, _MOST = (np.float32(v) for v in (0, 0.5, 1, 255))
+_ZERO, _HALF, _ONE, _MAX_VALUE = (np.float32(v) for v in (0, 0.5, 1, 255))
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Where each rectified pixel comes from: map_x, map_y (H, W) float32 raw pixels; valid where inside.
+    """Rectification map: map_x, map_y (H, W) float32 raw pixels; valid where inside.
 
     crossing: (H, w) float32 raw y at which each rectified row crosses each of the raw picture's w columns.
     """
@@ -32,7 +32,7 @@ class Warp:
 
     @classmethod
     def of(cls, map_x: Float32, map_y: Float32, raw_size: tuple[int, int]) -> Warp:
-        """raw_size: (h, w)."""
+        """Build from maps; raw_size: (h, w)."""
         height, width = raw_size
         valid = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1)
         columns = np.arange(width)
@@ -41,7 +41,7 @@ class Warp:
         return cls(map_x, map_y, valid, np.array(rows, np.float32))
 
     def __call__(self, image: UInt8) -> UInt8:
-        """(H, W) of a raw (h, w); the border's pixels go on beyond it."""
+        """Warp a raw (h, w) picture to (H, W); border pixels are replicated."""
         warped = np.empty(self.map_x.shape, np.uint8)
         _warp(np.ascontiguousarray(image), self.crossing, self.map_x, warped)
         return warped
@@ -79,12 +79,12 @@ def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> Non
             k = min(int(x), width)
             a, b, c, d = _weights(x - np.float32(k))
             value = a * row[k] + b * row[k + 1] + c * row[k + 2] + d * row[k + 3] + _HALF
-            line[j] = np.uint8(min(max(value, _ZERO), _MOST))
+            line[j] = np.uint8(min(max(value, _ZERO), _MAX_VALUE))
 
 
 @kernel(fastmath=True)
 def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Of the four pixels around a place a share t after the second."""
+    """Compute the cubic weights of the four pixels around a place at fraction t after the second."""
     rest = _ONE - t
     outer = _SHARP * t * rest
     second = ((_SHARP + _ONE + _ONE) * t - (_SHARP + _ONE + _ONE + _ONE)) * t * t + _ONE

@@ -1,4 +1,4 @@
-"""The stereo rig: two cameras on a body, and the clock offset between cameras and IMU."""
+"""Define the stereo rig: two cameras on a body, and the clock offset between cameras and IMU."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class StereoRig:
 
     @property
     def cam0_from_cam1(self) -> Pose:
-        """The stereo extrinsics."""
+        """Return the stereo extrinsics."""
         return self.body_from_cam0.inverse() @ self.body_from_cam1
 
     @property
     def baseline_m(self) -> float:
-        """The distance between the cameras' centres."""
+        """Return the distance between the cameras' centres."""
         translation = self.cam0_from_cam1.translation
         return float((translation @ translation) ** 0.5)

@@ -1,4 +1,4 @@
-"""The least squares of a calibration: lenses, the rig, the board's shape and every view's board pose at once.
+"""Adjust lenses, rig, board shape and all board poses in one least-squares problem.
 
 A board point P_W is seen as P_L = R_L P_W + T_L by cam0 and as P_R = R P_L + T by cam1 [paper Eq. 1-3]; the
 residuals are its pixels. Board poses only meet the common parameters, so the normal equations are solved by
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.boards.board_views import BoardView
-from barsight.calibration.geometry.projection import Lens, project
+from barsight.calibration.geometry.projection import Lens, project_lens
 from barsight.core.arrays import Float64, Int64
 from barsight.core.linalg.levenberg_marquardt import Options, minimise
 from barsight.core.pose import skew
@@ -29,7 +29,7 @@ SHAPE_PX = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class CornerTable:
     """One camera's corners, sorted by view. view, ids: (N,). points_m: (N, 3). pixels: (N, 2).
 
     by_shape: (N, 3, S) how the points move with the board's shape.
@@ -43,7 +43,7 @@ class Observed:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class AdjustmentState:
     """lenses: a parameter vector per camera. cam1_from_cam0, cam0_from_board: rotations and translations.
 
     rotation (3, 3), translation_m (3,) of the rig; board_rotation (V, 3, 3), board_translation_m (V, 3).
@@ -59,12 +59,12 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class AdjustmentResult:
     """state; residuals_px: (N, 2) per camera, seen minus projected; reduced: (C, C) Schur complement of the
     common parameters at unit weights; scores: (V, C) each view's share of the common gradient; steps taken;
     converged."""
 
-    state: State
+    state: AdjustmentState
     residuals_px: tuple[Float64, ...]
     reduced: Float64
     view_reduced: Float64
@@ -98,9 +98,9 @@ class _Iterate:
     """A state and, made on use, its normal equations."""
 
     lens: Lens
-    seen: tuple[Observed, ...]
+    seen: tuple[CornerTable, ...]
     huber_px: float | None
-    state: State
+    state: AdjustmentState
 
     @cached_property
     def normal(self) -> _Normal:
@@ -116,8 +116,10 @@ class _Iterate:
 
 def observe(
     views: Sequence[BoardView], board_points_m: Float64, basis: Float64, cameras: int
-) -> tuple[Observed, ...]:
-    """The corners of all views as flat arrays, for the first `cameras` cameras; basis: of `shape_basis`."""
+) -> tuple[CornerTable, ...]:
+    """Collect the corners of all views as flat arrays, for the first `cameras` cameras; basis: of
+    `shape_basis`.
+    """
     gathered = []
     for camera in range(cameras):
         seen = [(number, view.cameras[camera]) for number, view in enumerate(views)]
@@ -125,12 +127,15 @@ def observe(
         index = [np.full(corners.ids.size, number) for number, corners in known]
         ids = np.concatenate([corners.ids for _, corners in known]).astype(np.int64)
         pixels = np.concatenate([corners.pixels for _, corners in known])
-        gathered.append(Observed(np.concatenate(index), ids, board_points_m[ids], pixels, basis[ids]))
+        gathered.append(CornerTable(np.concatenate(index), ids, board_points_m[ids], pixels, basis[ids]))
     return tuple(gathered)
 
 
-def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float | None) -> Solved:
-    """Levenberg-Marquardt from `start`; huber_px is where a residual's weight begins to fall, None for never.
+def adjust(
+    lens: Lens, seen: tuple[CornerTable, ...], start: AdjustmentState, huber_px: float | None
+) -> AdjustmentResult:
+    """Run Levenberg-Marquardt from `start`; huber_px: where a residual's weight begins to fall, None for
+    never.
 
     One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one.
     `converged` is False where the steps ran out.
@@ -142,13 +147,15 @@ def solve(lens: Lens, seen: tuple[Observed, ...], start: State, huber_px: float 
     lost = np.einsum("vci,vij,vdj->vcd", plain.mixed, inverse, plain.mixed)
     scores = plain.view_gradient - np.einsum("vci,vij,vj->vc", plain.mixed, inverse, plain.board_gradient)
     view_reduced = plain.view_common - lost
-    return Solved(
+    return AdjustmentResult(
         state, plain.residuals, plain.common - lost.sum(axis=0), view_reduced, scores, found.steps,
         found.converged,
     )  # fmt: skip
 
 
-def _linearise(lens: Lens, seen: tuple[Observed, ...], state: State, huber_px: float | None) -> _Normal:
+def _linearise(
+    lens: Lens, seen: tuple[CornerTable, ...], state: AdjustmentState, huber_px: float | None
+) -> _Normal:
     width = len(lens.parameter_names)
     count = state.board_rotation.shape[0]
     shape = state.shape.size
@@ -196,9 +203,11 @@ def _linearise(lens: Lens, seen: tuple[Observed, ...], state: State, huber_px: f
 
 
 def _derivatives(
-    lens: Lens, observed: Observed, state: State, camera: int
+    lens: Lens, observed: CornerTable, state: AdjustmentState, camera: int
 ) -> tuple[Float64, Float64, Float64]:
-    """Residuals (N, 2) and the projection's derivatives by the common (N, 2, C) and board (N, 2, 6) steps."""
+    """Compute residuals (N, 2) and the projection's derivatives by the common (N, 2, C) and board (N, 2, 6)
+    steps.
+    """
     rotation = state.board_rotation[observed.view]
     turned = np.einsum("nij,nj->ni", rotation, observed.points_m + observed.by_shape @ state.shape)
     by_shape = rotation @ observed.by_shape
@@ -209,7 +218,7 @@ def _derivatives(
         point = rig_turned + state.translation_m
         by_board, by_shape = state.rotation @ by_board, state.rotation @ by_shape
     point = np.column_stack([point[:, :2], np.maximum(point[:, 2], NEAREST_Z_M)])
-    projected = project(lens, state.lenses[camera], point)
+    projected = project_lens(lens, state.lenses[camera], point)
     by_common = projected.by_lens
     if camera == 1:
         by_rig = np.concatenate([-skew(rig_turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
@@ -218,7 +227,7 @@ def _derivatives(
     return observed.pixels - projected.pixels, by_common, projected.by_point @ by_board
 
 
-def _move(state: State, normal: _Normal, damping: float) -> State:
+def _move(state: AdjustmentState, normal: _Normal, damping: float) -> AdjustmentState:
     """Take one damped step. Raises LinAlgError where the equations have no solution."""
     boards = normal.boards + damping * normal.boards * np.eye(6) + 1e-12 * np.eye(6)
     common = normal.common + damping * np.diag(np.diag(normal.common))
@@ -228,11 +237,13 @@ def _move(state: State, normal: _Normal, damping: float) -> State:
     target = normal.gradient - np.einsum("vci,vi->c", through, normal.board_gradient)
     step = np.linalg.solve(reduced, target)
     rest = normal.board_gradient - np.einsum("vci,c->vi", normal.mixed, step)
-    return move(state, step, np.einsum("vij,vj->vi", inverse, rest))
+    return retract_adjustment(state, step, np.einsum("vij,vj->vi", inverse, rest))
 
 
-def move(state: State, common: Float64, boards: Float64 | None = None) -> State:
-    """`state` after a step (C,) of the common parameters and (V, 6) of the boards, turned from the left.
+def retract_adjustment(
+    state: AdjustmentState, common: Float64, boards: Float64 | None = None
+) -> AdjustmentState:
+    """Retract a step (C,) of the common parameters and (V, 6) of the boards, turned from the left.
 
     A step without the board's shape leaves it as it is.
     """

@@ -1,4 +1,4 @@
-"""Calibrating a stereo rig from views of a board: each camera alone, then both in one least squares.
+"""Calibrate a stereo rig from views of a board: each camera alone, then both in one least squares.
 
 Blurred pictures, corners and views that don't fit are taken out one kind after the other, each with its
 reason. The covariance is that of the least squares, widened where the residuals of a view hang together more
@@ -20,8 +20,14 @@ from barsight.calibration.boards.board_warp import BoardShape, board_shape, shap
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.calibration.stereo.bundle_adjustment import Observed, Solved, State, observe, solve
-from barsight.calibration.stereo.covariance_inflation import covariance_of
+from barsight.calibration.stereo.bundle_adjustment import (
+    AdjustmentResult,
+    AdjustmentState,
+    CornerTable,
+    adjust,
+    observe,
+)
+from barsight.calibration.stereo.covariance_inflation import common_covariance
 from barsight.calibration.stereo.initialization import board_pose, start_lens, start_rig
 from barsight.calibration.stereo.outlier_removal import (
     FEWEST_VIEWS,
@@ -36,7 +42,7 @@ from barsight.core.errors import CalibrationError, Failed
 from barsight.core.pose import Pose
 
 HUBER_PX = 1.0
-MOST_ROUNDS = 12
+MAX_ROUNDS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +62,9 @@ class StereoCalibration:
     board: Board
     lens: Lens
     rig: StereoRig
-    state: State
+    state: AdjustmentState
     views: tuple[BoardView, ...]
-    observed: tuple[Observed, ...]
+    observed: tuple[CornerTable, ...]
     removed: tuple[Removed, ...]
     residuals_px: tuple[Float64, ...]
     sigma_px: float
@@ -71,7 +77,7 @@ class StereoCalibration:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square distance between seen and projected corners, both cameras together."""
+        """Return the root mean square reprojection error (px), both cameras together."""
         return rms(np.concatenate(self.residuals_px))
 
     @property
@@ -129,14 +135,14 @@ def calibrate_stereo(
     before = {view.name: view for view in kept}
     start = _start(cameras, (lenses[0], lenses[1]), kept, points, source, removed)
     start = replace(start, shape=np.zeros(basis.shape[2]))
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         observed = observe(kept, points, basis, 2)
-        solved = solve(lens, observed, start, HUBER_PX)
+        solved = adjust(lens, observed, start, HUBER_PX)
         _expect_order(solved.state, source)
         remaining, out = drop_misfits(kept, observed, solved, start, cameras, points)
         limit = None
         if not out:
-            solved = solve(lens, observed, solved.state, None)
+            solved = adjust(lens, observed, solved.state, None)
             remaining, out, limit = drop_corners(kept, observed, solved)
         removed += out
         if not out and limit is None:
@@ -149,19 +155,19 @@ def calibrate_stereo(
 
 
 def rms(residuals: Float64) -> float:
-    """Root mean square length of (N, 2) residuals."""
+    """Compute the root mean square length of (N, 2) residuals."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def parameter_names(lens: Lens) -> tuple[str, ...]:
-    """Names of the common parameters in the covariance's order."""
+    """Return names of the common parameters in the covariance's order."""
     own = [f"cam{camera}.{name}" for camera in (0, 1) for name in lens.parameter_names]
     rig = [f"cam1_from_cam0.{part}" for part in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")]
     return (*own, *rig)
 
 
-def rig_of(lens: Lens, state: State, sizes: Sequence[tuple[int, int]]) -> StereoRig:
-    """The rig of a solved state, its body at cam0. Raises ValueError where it can't be."""
+def rig_of(lens: Lens, state: AdjustmentState, sizes: Sequence[tuple[int, int]]) -> StereoRig:
+    """Build the rig of a solved state, its body at cam0. Raises ValueError where it can't be."""
     cam1_from_cam0 = Pose("cam1", "cam0", state.rotation, state.translation_m)
     body_from_cam0 = Pose.identity("body", "cam0")
     cameras = [lens.camera(state.lenses[n], *sizes[n]) for n in (0, 1)]
@@ -171,7 +177,7 @@ def rig_of(lens: Lens, state: State, sizes: Sequence[tuple[int, int]]) -> Stereo
 def _start(
     cameras: tuple[Camera, Camera], lenses: tuple[Float64, Float64], views: Sequence[BoardView],
     points: Float64, source: Path, removed: Sequence[Removed],
-) -> State:  # fmt: skip
+) -> AdjustmentState:  # fmt: skip
     _expect_views(views, source, removed)
     start = start_rig(cameras, lenses, views, points)
     if isinstance(start, Failed):
@@ -179,8 +185,10 @@ def _start(
     return start
 
 
-def _kept_state(state: State, views: Sequence[BoardView], kept: Sequence[BoardView]) -> State:
-    """`state` with the board poses of the kept views only."""
+def _kept_state(
+    state: AdjustmentState, views: Sequence[BoardView], kept: Sequence[BoardView]
+) -> AdjustmentState:
+    """Select the board poses of the kept views."""
     number = {view.name: n for n, view in enumerate(views)}
     rows = np.array([number[view.name] for view in kept])
     return replace(
@@ -190,19 +198,19 @@ def _kept_state(state: State, views: Sequence[BoardView], kept: Sequence[BoardVi
 
 def _solve_alone(
     lens: Lens, views: Sequence[BoardView], camera: int, points: Float64, size: tuple[int, int], source: Path
-) -> Solved:
+) -> AdjustmentResult:
     corners = [c for c in (view.cameras[camera] for view in views) if isinstance(c, Corners)]
     start = start_lens(lens, corners, points, size)
     if isinstance(start, Failed):
         raise CalibrationError(source, f"cam{camera}: {start.reason}", "check --board and the pictures")
     guess = lens.camera(start, *size)
     poses = [board_pose(guess, c, points) for c in corners]
-    state = State(
+    state = AdjustmentState(
         (start,), np.eye(3), np.zeros(3), np.array([p[0] for p in poses]), np.array([p[1] for p in poses]),
         np.zeros(0),
     )  # fmt: skip
     single = [BoardView(view.name, c, None) for view, c in zip(views, corners, strict=True)]
-    return solve(lens, observe(single, points, np.zeros((*points.shape, 0)), 1), state, HUBER_PX)
+    return adjust(lens, observe(single, points, np.zeros((*points.shape, 0)), 1), state, HUBER_PX)
 
 
 def _camera(lens: Lens, parameters: Float64, size: tuple[int, int], source: Path) -> Camera:
@@ -214,7 +222,7 @@ def _camera(lens: Lens, parameters: Float64, size: tuple[int, int], source: Path
         ) from None
 
 
-def _expect_order(state: State, source: Path) -> None:
+def _expect_order(state: AdjustmentState, source: Path) -> None:
     x, y, z = -state.rotation.T @ state.translation_m
     if x < 0 and abs(x) > max(abs(y), abs(z)):
         raise CalibrationError(
@@ -239,12 +247,12 @@ def _expect_views(views: Sequence[BoardView], source: Path, removed: Sequence[Re
 
 def _finish(
     kept: list[BoardView], board: Board, lens: Lens, sizes: tuple[tuple[int, int], tuple[int, int]],
-    source: Path, observed: tuple[Observed, ...], solved: Solved, removed: list[Removed],
+    source: Path, observed: tuple[CornerTable, ...], solved: AdjustmentResult, removed: list[Removed],
     alone: tuple[float, float],
 ) -> StereoCalibration:  # fmt: skip
     try:
         corners = sum(seen.ids.size for seen in observed)
-        covariance, sigma, correlation = covariance_of(solved, corners, len(kept))
+        covariance, sigma, correlation = common_covariance(solved, corners, len(kept))
         rig = rig_of(lens, solved.state, sizes)
     except np.linalg.LinAlgError:
         raise CalibrationError(

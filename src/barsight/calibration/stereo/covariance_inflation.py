@@ -1,20 +1,20 @@
-"""The covariance of common parameters where residuals hang together more than independent noise would."""
+"""Widen a covariance for correlated residuals (cluster-robust sandwich estimator)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from barsight.calibration.stereo.bundle_adjustment import Solved
+from barsight.calibration.stereo.bundle_adjustment import AdjustmentResult
 from barsight.core.arrays import Float64
 
 WIDENED_FROM = 3.0
 """Standard deviations of its own scatter by which the groups' correlation must stand out to widen sigmas."""
 
 
-def widened(
+def inflate_covariance(
     inverse: Float64, variance: float, scores: Float64, informations: Float64
 ) -> tuple[Float64, float]:
-    """(covariance (C, C), correlation: the factor on the variances, 1 for none).
+    """Compute the cluster-robust covariance (C, C) and the variance inflation (1 for none).
 
     inverse: (C, C) of the whole information at unit weights; variance: the residuals'. scores (G, C) and
     informations (G, C, C): each group's (a view's, a second's) share of gradient and information. A group
@@ -42,8 +42,8 @@ def widened(
     return factor @ wide @ factor.T, correlation
 
 
-def covariance_of(solved: Solved, corners: int, views: int) -> tuple[Float64, float, float]:
-    """(covariance (C, C), sigma_px, correlation) of the common parameters, the board's shape last.
+def common_covariance(solved: AdjustmentResult, corners: int, views: int) -> tuple[Float64, float, float]:
+    """Compute covariance (C, C), sigma_px and inflation of the common parameters, the board's shape last.
 
     Widened where views hang together.
     """
@@ -51,12 +51,12 @@ def covariance_of(solved: Solved, corners: int, views: int) -> tuple[Float64, fl
     freedom = 2 * corners - solved.reduced.shape[0] - 6 * views
     variance = float((residuals**2).sum() / max(freedom, 1))
     inverse = scaled_inverse(solved.reduced)
-    covariance, correlation = widened(inverse, variance, solved.scores, solved.view_reduced)
+    covariance, correlation = inflate_covariance(inverse, variance, solved.scores, solved.view_reduced)
     return covariance, float(np.sqrt(variance)), correlation
 
 
 def scaled_inverse(matrix: Float64) -> Float64:
-    """The inverse of a symmetric positive matrix whose parameters have very different sizes.
+    """Invert a symmetric positive matrix whose parameters have very different scales.
 
     Raises LinAlgError where a direction is not determined.
     """

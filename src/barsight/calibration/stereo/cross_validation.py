@@ -1,4 +1,4 @@
-"""Two halves of the views solved apart: do they differ by what their sigmas say?"""
+"""Cross-validate a calibration: solve two halves of the views apart and compare with their sigmas."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 
 from barsight.calibration.boards.board_views import BoardView
 from barsight.calibration.boards.board_warp import shape_basis
-from barsight.calibration.geometry.projection import project
-from barsight.calibration.stereo.bundle_adjustment import Solved, observe, solve
+from barsight.calibration.geometry.projection import project_lens
+from barsight.calibration.stereo.bundle_adjustment import AdjustmentResult, adjust, observe
 from barsight.calibration.stereo.calibration import StereoCalibration, rig_of
 from barsight.calibration.stereo.projection_uncertainty import (
     depth_derivatives,
     picture_grid,
+    rotation_free_projector,
     sample_pairs,
     sizes_of,
-    triangulate,
-    turn_free,
+    triangulate_depth,
 )
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 
 FEWEST_PER_HALF = 3
-MOST_BLOCKS = 16
+MAX_BLOCKS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class CrossValidation:
 
     @property
     def ratio(self) -> float:
-        """How many times its predicted sigma the worst difference of projections or depths is."""
+        """Return the worst ratio of difference to predicted sigma over projections and depths."""
         pairs = [*zip(self.difference_px, self.predicted_px, strict=True)]
         pairs += [*zip(self.depth_mm, self.depth_predicted_mm, strict=True)]
         return max(measured / predicted for measured, predicted in pairs if predicted > 0)
@@ -56,7 +56,7 @@ def cross_validate(calibration: StereoCalibration, ranges_m: Sequence[float]) ->
     """Solve two halves apart, blocks of neighbouring views taken in turn so that a film's neighbours, which
     repeat each other, stay together. Failed `few-views` where a half has fewer than three."""
     both = [view for view in calibration.views if view.cam0 is not None and view.cam1 is not None]
-    block = max(len(both) // MOST_BLOCKS, 1)
+    block = max(len(both) // MAX_BLOCKS, 1)
     halves = [[v for n, v in enumerate(both) if n // block % 2 == half] for half in (0, 1)]
     if min(len(half) for half in halves) < FEWEST_PER_HALF:
         return Failed("few-views", f"{len(both)} views are too few to solve two halves apart")
@@ -68,7 +68,7 @@ def cross_validate(calibration: StereoCalibration, ranges_m: Sequence[float]) ->
         return Failed("undetermined", "half of the views alone don't determine the calibration")
 
 
-def _solve_half(calibration: StereoCalibration, half: list[BoardView]) -> Solved:
+def _solve_half(calibration: StereoCalibration, half: list[BoardView]) -> AdjustmentResult:
     index = {view.name: number for number, view in enumerate(calibration.views)}
     rows = np.array([index[view.name] for view in half])
     state = replace(
@@ -77,11 +77,11 @@ def _solve_half(calibration: StereoCalibration, half: list[BoardView]) -> Solved
         board_translation_m=calibration.state.board_translation_m[rows],
     )
     seen = observe(half, calibration.board.points_m, shape_basis(calibration.board), 2)
-    return solve(calibration.lens, seen, state, None)
+    return adjust(calibration.lens, seen, state, None)
 
 
-def _half_covariance(calibration: StereoCalibration, half: Solved) -> Float64:
-    """The half's covariance, widened by its views' correlation as the whole's is.
+def _half_covariance(calibration: StereoCalibration, half: AdjustmentResult) -> Float64:
+    """Widen the half's covariance by its views' correlation as the whole's is.
 
     With S and S_h the whole's and the half's information: S_h^-1/2 (S^1/2 C S^1/2) S_h^-1/2, which is sigma^2
     S_h^-1 where C is sigma^2 S^-1.
@@ -96,7 +96,10 @@ def _half_covariance(calibration: StereoCalibration, half: Solved) -> Float64:
 
 
 def _power(matrix: Float64, exponent: float) -> Float64:
-    """A symmetric positive matrix to a power. Raises LinAlgError where a direction is not determined."""
+    """Raise a symmetric positive matrix to a power.
+
+    Raises LinAlgError where a direction is not determined.
+    """
     values, vectors = np.linalg.eigh(matrix)
     if values[0] < 1e-13 * values[-1]:
         raise np.linalg.LinAlgError("undetermined")
@@ -105,16 +108,21 @@ def _power(matrix: Float64, exponent: float) -> Float64:
 
 
 def _compare(
-    calibration: StereoCalibration, solved: list[Solved], spread: Float64, ranges_m: tuple[float, ...]
+    calibration: StereoCalibration,
+    solved: list[AdjustmentResult],
+    spread: Float64,
+    ranges_m: tuple[float, ...],
 ) -> CrossValidation:
     width = len(calibration.lens.parameter_names)
     difference, predicted = [], []
     for camera in (0, 1):
         grid = picture_grid(calibration, camera)
-        free = turn_free(calibration.lens, calibration.state.lenses[camera], grid)
-        ends = [project(calibration.lens, s.state.lenses[camera], grid.rays).pixels for s in solved]
+        free = rotation_free_projector(calibration.lens, calibration.state.lenses[camera], grid)
+        ends = [project_lens(calibration.lens, s.state.lenses[camera], grid.rays).pixels for s in solved]
         own = slice(camera * width, (camera + 1) * width)
-        by = project(calibration.lens, calibration.state.lenses[camera], grid.rays).by_lens.reshape(-1, width)
+        by = project_lens(calibration.lens, calibration.state.lenses[camera], grid.rays).by_lens.reshape(
+            -1, width
+        )
         covered = np.repeat(grid.covered, 2)
         effect = (free @ by)[covered]
         change = (free @ (ends[0] - ends[1]).ravel())[covered]
@@ -125,7 +133,7 @@ def _compare(
     rigs = [rig_of(calibration.lens, s.state, sizes) for s in solved]
     number, left, right = sample_pairs(calibration.rig, ranges_m)
     by = depth_derivatives(calibration, left, right)
-    depth = triangulate(rigs[0], left, right) - triangulate(rigs[1], left, right)
+    depth = triangulate_depth(rigs[0], left, right) - triangulate_depth(rigs[1], left, right)
     variance = np.einsum("nc,cd,nd->n", by, spread, by)
     seen = tuple(k for k in range(len(ranges_m)) if (number == k).any())
     direction = calibration.state.translation_m / np.linalg.norm(calibration.state.translation_m)

@@ -1,4 +1,4 @@
-"""What a rig file's covariance costs in disparity: the part of a sigma that no view averages out."""
+"""Propagate a rig file's covariance to disparity: the systematic part of a sigma."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from barsight.calibration.files.rig_file import read_covariance
 from barsight.calibration.files.rig_formats import holds_own_rig, read_rig_file
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.calibration.stereo.projection_uncertainty import sample_pairs, triangulate
+from barsight.calibration.stereo.projection_uncertainty import sample_pairs, triangulate_depth
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 
@@ -21,8 +21,8 @@ INTRINSICS = 4
 
 
 def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
-    """One standard deviation (px, median over the picture) that the calibration causes at `range_m`; None
-    where no file is given or it carries no covariance. Raises `CalibrationError` for one that can't be.
+    """Compute the standard deviation (px, median over the picture) that the calibration causes at `range_m`;
+    None where no file is given or it carries no covariance. Raises `CalibrationError` for one that can't be.
     """
     if path is None or not holds_own_rig(path) or (known := read_covariance(path)) is None:
         return None
@@ -34,7 +34,7 @@ def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
     steps = STEP_SIGMAS * np.sqrt(np.diag(covariance))
     columns = []
     for number, step in enumerate(steps):
-        ends = [triangulate(_moved(rig, names, number, sign * step), left, right) for sign in (1, -1)]
+        ends = [triangulate_depth(_moved(rig, names, number, sign * step), left, right) for sign in (1, -1)]
         columns.append((ends[0] - ends[1]) / (2 * step))
     by = np.column_stack(columns)
     sigma_m = float(np.median(np.sqrt(np.einsum("nc,cd,nd->n", by, covariance, by))))
@@ -42,7 +42,7 @@ def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
 
 
 def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> StereoRig:
-    """The rig with one named parameter changed."""
+    """Perturb one named parameter of the rig."""
     owner, _, name = names[number].partition(".")
     if owner in ("cam0", "cam1"):
         first = names.index(next(other for other in names if other.startswith(f"{owner}.")))

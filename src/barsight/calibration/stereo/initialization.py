@@ -1,4 +1,4 @@
-"""Start values of a stereo calibration: focal lengths, board poses and the rig, found without a guess."""
+"""Estimate start values of a stereo calibration: focal lengths, board poses and the rig."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.boards.board_views import BoardView, Corners
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.projection import Lens
-from barsight.calibration.stereo.bundle_adjustment import State
+from barsight.calibration.stereo.bundle_adjustment import AdjustmentState
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 
@@ -22,7 +22,7 @@ TRIED_VIEWS = 12
 def start_lens(
     lens: Lens, corners: Sequence[Corners], points_m: Float64, size: tuple[int, int]
 ) -> Float64 | Failed:
-    """fx, fy, cx, cy and coefficients of zero: the focal length that fits the boards best.
+    """Estimate fx, fy, cx, cy with coefficients of zero: the focal length that fits the boards best.
 
     size: width, height. Candidates are the closed form [Zhang 2000] and shares of the picture's width.
     """
@@ -54,7 +54,9 @@ def start_lens(
 
 
 def board_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[Float64, Float64, float]:
-    """cam_from_board's rotation (3, 3) and translation (3,), and the RMS in px (inf where there is none)."""
+    """Solve PnP: cam_from_board's rotation (3, 3), translation (3,) and RMS in px (inf where there
+    is none).
+    """
     rays = camera.rays(corners.pixels)
     inside = np.isfinite(rays).all(axis=1) & (np.abs(rays[:, :2]).max(axis=1) < 10)
     if inside.sum() < 4:
@@ -79,9 +81,10 @@ def board_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[Flo
 def start_rig(
     cameras: tuple[Camera, Camera], lenses: tuple[Float64, Float64], views: Sequence[BoardView],
     points_m: Float64,
-) -> State | Failed:  # fmt: skip
-    """Board poses by each camera alone, the rig as the median over the views of R = R_R R_L^-1,
-    T = T_R - R T_L [paper Eq. 3]. Failed `no-common-view` where no view is seen by both."""
+) -> AdjustmentState | Failed:  # fmt: skip
+    """Solve board poses by each camera alone and the rig as the median over the views of R = R_R R_L^-1, T =
+    T_R - R T_L [paper Eq. 3]. Failed `no-common-view` where no view is seen by both.
+    """
     poses = [
         [
             None if c is None else board_pose(camera, c, points_m)
@@ -107,11 +110,11 @@ def start_rig(
         elif right is not None:
             board_rotation[number] = rotation.T @ right[0]
             board_translation[number] = rotation.T @ (right[1] - translation)
-    return State(lenses, rotation, translation, board_rotation, board_translation, np.zeros(0))
+    return AdjustmentState(lenses, rotation, translation, board_rotation, board_translation, np.zeros(0))
 
 
 def _middle_rotation(rotations: Float64) -> Float64:
-    """The rotation with the least sum of distances to the others: an outlier can't be it."""
+    """Compute the L1 median rotation: an outlier can't be it."""
     apart = np.linalg.norm(rotations[:, None] - rotations[None], axis=(2, 3))
     chosen: Float64 = rotations[int(apart.sum(axis=1).argmin())]
     return chosen

@@ -1,4 +1,4 @@
-"""What a stereo calibration leaves out, and why: blurred pictures, views of another board, odd corners."""
+"""Remove outliers of a stereo calibration: blurred pictures, views of another board, odd corners."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.calibration.boards.board_views import BoardView, Corners, Removed
 from barsight.calibration.geometry.camera import Camera
-from barsight.calibration.stereo.bundle_adjustment import Observed, Solved, State
+from barsight.calibration.stereo.bundle_adjustment import AdjustmentResult, AdjustmentState, CornerTable
 from barsight.calibration.stereo.initialization import board_pose
 from barsight.core.arrays import Float64
 
@@ -18,13 +18,13 @@ FEWEST_CORNERS = 8
 BLUR_FACTOR, BLUR_MARGIN_PX = 1.6, 1.0
 MISFIT_FACTOR, MISFIT_MARGIN_PX = 3.0, 0.3
 CORNER_SIGMAS = 4.5
-MOST_CORNERS_OUT = 0.3
-MOST_ALONE_PX = 2.0
+MAX_CORNERS_OUT = 0.3
+MAX_ALONE_PX = 2.0
 SAME_TURN_RAD, SAME_SHIFT = 0.05, 0.15
 
 
 def drop_small(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
-    """Without the pictures that show fewer than eight corners."""
+    """Drop the pictures that show fewer than eight corners."""
     kept, removed = [], []
     for view in views:
         for camera, corners in enumerate(view.cameras):
@@ -38,7 +38,7 @@ def drop_small(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Remove
 
 
 def drop_blurred(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
-    """Without the pictures whose edges are much wider than the same camera's median."""
+    """Drop the pictures whose edges are much wider than the same camera's median."""
     kept, removed = list(views), []
     for camera in (0, 1):
         widths = np.array([np.nan if c is None else c.edge_px for c in (v.cameras[camera] for v in kept)])
@@ -54,10 +54,14 @@ def drop_blurred(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Remo
 
 
 def drop_misfits(
-    views: Sequence[BoardView], observed: tuple[Observed, ...], solved: Solved, start: State,
-    cameras: tuple[Camera, Camera], points_m: Float64,
-) -> tuple[list[BoardView], list[Removed]]:  # fmt: skip
-    """Without the worst views, where their residuals are far above the others'.
+    views: Sequence[BoardView],
+    observed: tuple[CornerTable, ...],
+    solved: AdjustmentResult,
+    start: AdjustmentState,
+    cameras: tuple[Camera, Camera],
+    points_m: Float64,
+) -> tuple[list[BoardView], list[Removed]]:
+    """Drop the worst views, where their residuals are far above the others'.
 
     start: the rig before this solve, which the bad views haven't pulled, for naming the cause.
     """
@@ -77,9 +81,9 @@ def drop_misfits(
 
 
 def drop_corners(
-    views: Sequence[BoardView], observed: tuple[Observed, ...], solved: Solved
+    views: Sequence[BoardView], observed: tuple[CornerTable, ...], solved: AdjustmentResult
 ) -> tuple[list[BoardView], list[Removed], float | None]:
-    """Without the corners beyond 4.5 robust sigma, and the pictures that lose a third of theirs.
+    """Drop the corners beyond 4.5 robust sigma, and the pictures that lose a third of theirs.
 
     The third is the limit (px), None where every corner lies within. See `corner_notes` for the reasons.
     """
@@ -94,7 +98,7 @@ def drop_corners(
                 continue
             clean = False
             bad = length[seen.view == number] > limit
-            if bad.mean() > MOST_CORNERS_OUT or (~bad).sum() < FEWEST_CORNERS:
+            if bad.mean() > MAX_CORNERS_OUT or (~bad).sum() < FEWEST_CORNERS:
                 reason = f"{bad.sum()} of {bad.size} corners lie more than {limit:.2f} px off"
                 removed.append(Removed(views[number].name, f"cam{camera}", reason))
                 kept[number] = _without(kept[number], camera)
@@ -105,7 +109,7 @@ def drop_corners(
 
 
 def corner_notes(before: dict[str, BoardView], after: Sequence[BoardView]) -> list[Removed]:
-    """What was taken out of pictures that are still used."""
+    """List what was removed from pictures that are still used."""
     notes = []
     for view in after:
         for camera, corners in enumerate(view.cameras):
@@ -118,8 +122,8 @@ def corner_notes(before: dict[str, BoardView], after: Sequence[BoardView]) -> li
     return notes
 
 
-def view_rms(observed: tuple[Observed, ...], residuals: tuple[Float64, ...], views: int) -> Float64:
-    """(V,) root mean square residual (px) of each view, over both cameras."""
+def view_rms(observed: tuple[CornerTable, ...], residuals: tuple[Float64, ...], views: int) -> Float64:
+    """Compute the root mean square residual (V,) px of each view, over both cameras."""
     squares, counts = np.zeros(views), np.zeros(views)
     for seen, residual in zip(observed, residuals, strict=True):
         squares += np.bincount(seen.view, (residual**2).sum(axis=1), views)
@@ -128,12 +132,12 @@ def view_rms(observed: tuple[Observed, ...], residuals: tuple[Float64, ...], vie
     return rms
 
 
-def _cause(view: BoardView, state: State, cameras: tuple[Camera, Camera], points_m: Float64) -> str:
-    """What is wrong with a view, as far as the rig it implies by itself tells."""
+def _cause(view: BoardView, state: AdjustmentState, cameras: tuple[Camera, Camera], points_m: Float64) -> str:
+    """Name what is wrong with a view, as far as the rig it implies by itself tells."""
     if view.cam0 is None or view.cam1 is None:
         return "the board is another one, or bent or badly found"
     turn, shift, fit = _implied(view.cam0, view.cam1, cameras, points_m)
-    if fit > MOST_ALONE_PX:
+    if fit > MAX_ALONE_PX:
         return "shows another board, or was taken by another camera"
     exchanged = _implied(view.cam1, view.cam0, cameras, points_m)
     length = float(np.linalg.norm(state.translation_m))
@@ -153,7 +157,7 @@ def _cause(view: BoardView, state: State, cameras: tuple[Camera, Camera], points
 def _implied(
     left: Corners, right: Corners, cameras: tuple[Camera, Camera], points_m: Float64
 ) -> tuple[Float64, Float64, float]:
-    """cam1_from_cam0 by one view alone (rotation, translation) and the worse camera's RMS (px)."""
+    """Estimate cam1_from_cam0 by one view alone (rotation, translation) and the worse camera's RMS (px)."""
     first, second = board_pose(cameras[0], left, points_m), board_pose(cameras[1], right, points_m)
     turn = second[0] @ first[0].T
     return turn, second[1] - turn @ first[1], max(first[2], second[2])

@@ -1,4 +1,4 @@
-"""What a calibration's covariance costs: in pixels over the picture, in depth over the range.
+"""Propagate a calibration's covariance to pixels over the picture and to depth over the range.
 
 A turn of the whole camera is not an error of its lens (its mounting takes it up), so projections are compared
 after the best common rotation, as mrcal does for points far away.
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.calibration.geometry.camera import Camera
-from barsight.calibration.geometry.projection import Lens, project
+from barsight.calibration.geometry.projection import Lens, project_lens
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.calibration.stereo.bundle_adjustment import move
+from barsight.calibration.stereo.bundle_adjustment import retract_adjustment
 from barsight.calibration.stereo.calibration import StereoCalibration, rig_of
 from barsight.core.arrays import Bool, Float64
 
@@ -37,7 +37,7 @@ class PictureGrid:
 
 
 def picture_grid(calibration: StereoCalibration, camera: int) -> PictureGrid:
-    """The cells of one camera's picture."""
+    """Sample one camera's picture on a grid."""
     model = (calibration.rig.cam0, calibration.rig.cam1)[camera]
     x = (np.arange(COLUMNS) + 0.5) * model.width / COLUMNS - 0.5
     y = (np.arange(ROWS) + 0.5) * model.height / ROWS - 0.5
@@ -50,9 +50,11 @@ def picture_grid(calibration: StereoCalibration, camera: int) -> PictureGrid:
     return PictureGrid(x, y, pixels, model.rays(pixels), covered.ravel())
 
 
-def turn_free(lens: Lens, parameters: Float64, grid: PictureGrid) -> Float64:
-    """(2N, 2N) matrix that takes the best rotation, fitted over the covered cells, off changes of pixels."""
-    by_point = project(lens, parameters, grid.rays).by_point
+def rotation_free_projector(lens: Lens, parameters: Float64, grid: PictureGrid) -> Float64:
+    """Build the projector (2N, 2N) that removes the best-fit rotation, over the covered cells, from pixel
+    changes.
+    """
+    by_point = project_lens(lens, parameters, grid.rays).by_point
     x, y, z = grid.rays.T
     zero = np.zeros_like(x)
     cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
@@ -64,12 +66,14 @@ def turn_free(lens: Lens, parameters: Float64, grid: PictureGrid) -> Float64:
 
 
 def projection_sigma(calibration: StereoCalibration, camera: int, covariance: Float64) -> Float64:
-    """(N,) px: the larger axis' standard deviation of where the grid's rays are projected to."""
+    """Propagate covariance to projections: standard deviation (N,) px along the larger axis at the grid's
+    rays.
+    """
     grid = picture_grid(calibration, camera)
     width = len(calibration.lens.parameter_names)
     parameters = calibration.state.lenses[camera]
-    by_lens = project(calibration.lens, parameters, grid.rays).by_lens.reshape(-1, width)
-    effect = turn_free(calibration.lens, parameters, grid) @ by_lens
+    by_lens = project_lens(calibration.lens, parameters, grid.rays).by_lens.reshape(-1, width)
+    effect = rotation_free_projector(calibration.lens, parameters, grid) @ by_lens
     own = slice(camera * width, (camera + 1) * width)
     pairs = effect.reshape(-1, 2, width)
     spread = pairs @ covariance[own, own] @ pairs.transpose(0, 2, 1)
@@ -77,8 +81,10 @@ def projection_sigma(calibration: StereoCalibration, camera: int, covariance: Fl
     return sigma
 
 
-def triangulate(rig: StereoRig, left: Float64, right: Float64) -> Float64:
-    """(N,) depth along cam0's axis (m) of the point nearest to both rays of raw pixel pairs (N, 2)."""
+def triangulate_depth(rig: StereoRig, left: Float64, right: Float64) -> Float64:
+    """Triangulate raw pixel pairs (N, 2): depth (N,) m along cam0's axis of the point nearest to
+    both rays.
+    """
     pose = rig.cam0_from_cam1
     a = rig.cam0.rays(left)
     b = rig.cam1.rays(right) @ pose.rotation.T
@@ -93,7 +99,7 @@ def triangulate(rig: StereoRig, left: Float64, right: Float64) -> Float64:
 
 
 def sample_pairs(rig: StereoRig, ranges_m: Sequence[float]) -> tuple[Float64, Float64, Float64]:
-    """Pixel pairs of points that both cameras see: (range index (N,), left (N, 2), right (N, 2)).
+    """Sample pixel pairs of points that both cameras see: (range index (N,), left (N, 2), right (N, 2)).
 
     A 7x5 grid over cam0's picture at each range; points outside cam1's picture are left out.
     """
@@ -115,7 +121,7 @@ def sample_pairs(rig: StereoRig, ranges_m: Sequence[float]) -> tuple[Float64, Fl
 
 
 def depth_derivatives(calibration: StereoCalibration, left: Float64, right: Float64) -> Float64:
-    """(N, C) m: the triangulated depths' derivatives by the common parameters, pixels held fixed."""
+    """Differentiate triangulated depths by the common parameters (N, C) m, pixels held fixed."""
     sizes = sizes_of(calibration.rig)
     steps = STEP_SIGMAS * np.sqrt(np.diag(calibration.covariance))
     columns = []
@@ -124,15 +130,16 @@ def depth_derivatives(calibration: StereoCalibration, left: Float64, right: Floa
         for sign in (1.0, -1.0):
             change = np.zeros(steps.size)
             change[number] = sign * step
-            rig = rig_of(calibration.lens, move(calibration.state, change), sizes)
-            ends.append(triangulate(rig, left, right))
+            rig = rig_of(calibration.lens, retract_adjustment(calibration.state, change), sizes)
+            ends.append(triangulate_depth(rig, left, right))
         columns.append((ends[0] - ends[1]) / (2 * step))
     return np.column_stack(columns)
 
 
 def depth_sigma(calibration: StereoCalibration, ranges_m: Sequence[float]) -> Float64:
-    """(R, 2) m at each range: the median and the largest standard deviation over the picture that the
-    calibration alone causes; NaN where no point is seen by both."""
+    """Propagate covariance to depth: (R, 2) m at each range, median and largest standard deviation over the
+    picture that the calibration alone causes; NaN where no point is seen by both.
+    """
     number, left, right = sample_pairs(calibration.rig, ranges_m)
     by = depth_derivatives(calibration, left, right)
     sigma = np.sqrt(np.einsum("nc,cd,nd->n", by, calibration.covariance, by))

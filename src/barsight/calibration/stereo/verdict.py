@@ -1,4 +1,4 @@
-"""Is a stereo calibration good enough? A verdict per line with its reason, and which views to add."""
+"""Judge a stereo calibration line by line and advise on views to add."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """What the report shows of a calibration beside the calibration itself.
+    """Judgement of a calibration as the report shows it.
 
     lines: the judged properties. advice: which views to add. projection_sigma_px: per camera (ROWS, COLUMNS).
     epipolar_px: (N,) row differences of matching corners after rectification. ranges_m, depth_sigma_m: (R,),
@@ -65,7 +65,7 @@ class Assessment:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the lines."""
+        """Return the worst of the lines."""
         order = list(Verdict)
         return max((line.verdict for line in self.lines), key=order.index)
 
@@ -100,7 +100,7 @@ def assess(calibration: StereoCalibration, working_range_m: float) -> Assessment
 
 
 def epipolar_errors(calibration: StereoCalibration) -> Float64:
-    """(N,) px: right row minus left row of the corners both cameras see, after rectification."""
+    """Compute rectified row errors (N,) px, right minus left, of the corners both cameras see."""
     rig = calibration.rig
     rectifier = Rectifier(rig)
     left_turn = rectifier.body_from_rect0.rotation
@@ -115,7 +115,7 @@ def epipolar_errors(calibration: StereoCalibration) -> Float64:
 
 
 def tilts(calibration: StereoCalibration) -> Float64:
-    """(V, 2) degrees: each board's tilt about the picture's vertical and horizontal axis."""
+    """Compute each board's tilt (V, 2) degrees about the picture's vertical and horizontal axis."""
     normal = calibration.state.board_rotation[:, :, 2]
     normal = normal * np.where(normal[:, 2:] < 0, -1.0, 1.0)
     return np.degrees(np.arctan2(normal[:, :2], normal[:, 2:]))
@@ -124,7 +124,7 @@ def tilts(calibration: StereoCalibration) -> Float64:
 def judge(
     name: str, value: float, unit: str, good: float, usable: float, why: str, *, above: bool = False
 ) -> Line:
-    """A line whose verdict follows from two limits; `above` where more is better."""
+    """Judge a value against two limits; `above` where more is better."""
     sign = -1.0 if above else 1.0
     is_good, is_usable = sign * value <= sign * good, sign * value <= sign * usable
     verdict = Verdict.GOOD if is_good else Verdict.USABLE if is_usable else Verdict.REDO
@@ -172,7 +172,7 @@ def _advice(calibration: StereoCalibration) -> tuple[str, ...]:
 
 
 def summary_sentence(lines: Sequence[Line]) -> str:
-    """One sentence for the terminal: what keeps the calibration from being good."""
+    """Summarise in one sentence what keeps the calibration from being good."""
     weak = [
         f"{line.name} {line.value} ({line.verdict})" for line in lines if line.verdict is not Verdict.GOOD
     ]

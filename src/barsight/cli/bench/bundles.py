@@ -1,4 +1,4 @@
-"""`barsight bench bundles`: found bundles against true ones."""
+"""Run `barsight bench bundles`: found bundles against true ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from barsight.benchmarks.yard.bundle_scores import (
     BundleErrors,
     bundle_report,
     bundle_table,
-    joined,
+    join_scores,
     read_true_bundles,
     reliability,
     score_bundles,
@@ -47,7 +47,7 @@ def bench_found_bundles(
     keep: Path | None = None,
     save: Json = None,
 ) -> None:
-    """Found bundles against the true ones: of drawn yards, of rendered ones, or of one measured recording.
+    """Score found bundles against true ones: of drawn yards, of rendered ones, or of one measured recording.
 
     Args:
         recording: A simulated recording; with it goes `out`.
@@ -86,7 +86,9 @@ def bench_found_bundles(
 def _bench_rendered(
     yards: int, seed: int, keep: Path, console: Console
 ) -> tuple[BundleErrors, tuple[float, ...]]:
-    """Bundles are found anew in the kept maps, so that a kept folder judges the code as it is."""
+    """Score rendered yards: bundles are found anew in the kept maps, so that a kept folder judges the code as
+    it is.
+    """
     parts, seconds = [], []
     for number, settings in enumerate(rendered_yards(yards, seed)):
         recording, out = _measured(keep / f"seed_{seed}_yard_{number:02d}", settings)
@@ -101,11 +103,11 @@ def _bench_rendered(
             f"{part.found} of {part.free} found, {part.wrong} of {part.claimed} false",
             highlight=False,
         )
-    return joined(parts), tuple(seconds)
+    return join_scores(parts), tuple(seconds)
 
 
 def _measured(folder: Path, settings: SimulationSettings) -> tuple[Path, Path]:
-    """The yard's recording and measured folder, made where they are not there yet."""
+    """Render and measure the yard where its folders are not there yet."""
     recording, out = folder / "recording", folder / "measured"
     folder.mkdir(parents=True, exist_ok=True)
     if not recording.is_dir():

@@ -1,4 +1,4 @@
-"""`barsight bench NAME`: tables of methods, side by side in one run."""
+"""Run `barsight bench NAME`: tables of methods, side by side."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _stereo(
     repeats: int = 5,
     save: Json = None,
 ) -> None:
-    """Accuracy and time of stereo methods on Middlebury-style folders with true disparity.
+    """Measure accuracy and time of stereo methods on Middlebury-style folders with true disparity.
 
     Args:
         data: A folder of scenes, each with left.png, right.png, disp.pfm and perhaps nonocc.png.
@@ -81,7 +81,7 @@ def _stereo(
 
 
 def _stereo_speed(methods: tuple[MethodName, ...] = METHODS, repeats: int = 5, save: Json = None) -> None:
-    """Time of stereo methods on a pair of 1280x1024 with 96 candidates, against OpenCV's 5-path SGBM.
+    """Time stereo methods on a pair of 1280x1024 with 96 candidates, against OpenCV's 5-path SGBM.
 
     Our own is timed in both presets, with guesses as `disparity` wants them and without as a map does.
 
@@ -105,7 +105,7 @@ def _stereo_speed(methods: tuple[MethodName, ...] = METHODS, repeats: int = 5, s
 
 
 def _stereo_steps(out: Annotated[Path, tyro.conf.arg(aliases=("-o",))]) -> None:
-    """A picture of what each step of our own stereo does to a rendered bar.
+    """Draw what each step of our own stereo does to a rendered bar.
 
     Args:
         out: PNG to write.
@@ -114,7 +114,7 @@ def _stereo_steps(out: Annotated[Path, tyro.conf.arg(aliases=("-o",))]) -> None:
 
 
 def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = None) -> None:
-    """Our own stereo with one part left out at a time: accuracy, bias and sigma.
+    """Measure our own stereo with one part left out at a time: accuracy, bias and sigma.
 
     Args:
         data: A folder of scenes, each with left.png, right.png, disp.pfm and perhaps nonocc.png.
@@ -133,7 +133,7 @@ def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = No
 def _subpixel(
     data: Path | None = None, methods: tuple[MethodName, ...] = METHODS, scenes: int = 6, save: Json = None
 ) -> None:
-    """Bias against the fraction of the true disparity (pixel locking), and whether sigma is right.
+    """Measure bias against the fraction of the true disparity (pixel locking), and check sigma.
 
     Args:
         data: Middlebury folder; its motorcycle joins the rendered plane and bar where it is given.
@@ -148,7 +148,7 @@ def _subpixel(
 
 
 def _target_size(methods: tuple[MethodName, ...] = METHODS, poses: int = 10, save: Json = None) -> None:
-    """The paper's Table 1: a bar of 90 mm measured from 1.8 to 8.5 m.
+    """Reproduce the paper's Table 1: a bar of 90 mm measured from 1.8 to 8.5 m.
 
     Args:
         methods: The methods to compare.

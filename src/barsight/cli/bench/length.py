@@ -1,4 +1,4 @@
-"""`barsight bench length`: how time and memory grow with the yard."""
+"""Run `barsight bench length`: time and memory against the length of the yard."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def bench_length(
     times: int = 10,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """Time and memory of measuring a recording, and the same recording driven several times end to end.
+    """Measure time and memory of a recording and of the same recording driven several times end to end.
 
     Args:
         recording: A recording with crane encoders, as barsight simulate writes it.

@@ -1,4 +1,4 @@
-"""`barsight bench lifts`."""
+"""Run `barsight bench lifts`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def bench_lift_targets(
     magnet: Path | None = None,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """Count under the magnet's footprint and vetoes, on simulated yards against exact knowledge.
+    """Score count under the magnet's footprint and vetoes on simulated yards against exact knowledge.
 
     Args:
         yards: Simulated yards, of one to five layers and seven mixes of bars.

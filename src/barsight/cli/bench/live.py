@@ -1,4 +1,4 @@
-"""`barsight bench live`."""
+"""Run `barsight bench live`."""
 
 from __future__ import annotations
 

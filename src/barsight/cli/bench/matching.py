@@ -1,4 +1,4 @@
-"""`barsight bench features|matching|front-end`: detectors and filters against truth, and their speed."""
+"""Run `barsight bench features|matching|front-end`: detectors and filters against truth, and their speed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def features(
     repeats: int = 5,
     save: Json = None,
 ) -> None:
-    """The paper's Table 2: number and time of features.
+    """Reproduce the paper's Table 2: number and time of features.
 
     Args:
         recordings: Recordings with stored true depth, as `barsight simulate` makes them.
@@ -44,7 +44,7 @@ def matching(
     count: int = 2000,
     save: Json = None,
 ) -> None:
-    """The paper's Table 3 with the precision and recall of every filter.
+    """Reproduce the paper's Table 3 with the precision and recall of every filter.
 
     Args:
         recordings: Recordings with stored true depth, encoders and IMU.
@@ -61,7 +61,7 @@ def matching(
 def front_end(
     recordings: tyro.conf.Positional[tuple[Path, ...]], repeats: int = 3, save: Json = None
 ) -> None:
-    """Pairs a second from stored pictures to followed points, with and without the other sensors.
+    """Time the front end in pairs a second, with and without the other sensors.
 
     Args:
         recordings: Any recordings.

@@ -1,4 +1,4 @@
-"""`barsight bench yard`: render the field test, measure it with each method, compare."""
+"""Run `barsight bench yard`: render the field test, measure it with each method, compare."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def bench_yard(
     methods: tuple[Method, ...] = get_args(Method),
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """The paper's field test at its scale: laser, the paper's method, SGBM and ours on one recording.
+    """Run the paper's field test at its scale: laser, the paper's method, SGBM and ours on one recording.
 
     35 m and 100 pairs take about an hour on two cores; --length 7 --frames 20 gives a first answer.
 
@@ -72,7 +72,7 @@ def bench_yard(
 
 
 def measure_apart(recording: Path, out: Path, flags: tuple[str, ...]) -> None:
-    """In a process of its own, so that memory and time are this method's alone."""
+    """Measure in a process of its own, so that memory and time are this method's alone."""
     command = [sys.executable, "-m", "barsight", "measure", str(recording), "-o", str(out), *flags]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:

@@ -1,4 +1,4 @@
-"""`barsight calibrate board --board BOARD -o board.png`."""
+"""Run `barsight calibrate board --board BOARD -o board.png`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from barsight.core.files import atomic_path, expect_output
 from barsight.simulation.board import draw_board, draw_views
 
 INCH_M = 0.0254
-MOST_PX = 30_000
+MAX_PX = 30_000
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -42,7 +42,7 @@ def run(arguments: Sequence[str]) -> None:
         if not 30 <= dpi <= 2400:
             raise ConfigError(f"--dpi {dpi} can't be; give 30 to 2400")
         longest = (max(target.columns, target.rows) + 3) * target.size_m * (1 + target.spacing) * dpi / INCH_M
-        if longest > MOST_PX:
+        if longest > MAX_PX:
             raise ConfigError(f"--dpi {dpi} makes {longest:.0f} px of this board; give less")
         drawn = draw_views(target) if views else draw_board(target, dpi / INCH_M, target.size_m)
         with atomic_path(out) as path:

@@ -1,4 +1,6 @@
-"""`barsight calibrate camera-imu RECORDING --rig rig.yaml --imu imu.yaml --board BOARD -o rig_imu.yaml`."""
+"""Run `barsight calibrate camera-imu RECORDING --rig rig.yaml --imu imu.yaml --board BOARD -o
+rig_imu.yaml`.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,7 @@ def run(arguments: Sequence[str]) -> None:
         imu_topic: str | None = None,
         gyro_unit: tyro.conf.EnumChoicesFromValues[GyroUnit] = GyroUnit.AUTO,
         accel_unit: tyro.conf.EnumChoicesFromValues[AccelUnit] = AccelUnit.AUTO,
-        most_views: int = 2000,
+        max_views: int = 2000,
     ) -> None:
         """Calibrate where the cameras sit on the IMU, and the offset between their clocks.
 
@@ -68,21 +70,19 @@ def run(arguments: Sequence[str]) -> None:
             imu_topic: A bag's topic of the IMU, where its calibration doesn't say.
             gyro_unit: The gyroscope's unit in imu0.csv; auto takes degrees where the header says so.
             accel_unit: The accelerometer's unit in imu0.csv; auto goes by gravity.
-            most_views: Recordings are thinned to so many pictures, evenly.
+            max_views: Recordings are thinned to so many pictures, evenly.
         """
-        _expect(out, most_views)
+        _expect(out, max_views)
         console = Console(stderr=True)
         lenses = read_rig_file(rig)
         own_file = rig.is_file() and rig.suffix in (".yaml", ".yml")
         target = read_board(rig, parse_board(board)) if own_file else parse_board(board)
         with stages(console) as advance:
             if any((recording / name).is_file() for name in NAMES):
-                views, samples, stated = _from_detections(
-                    recording, target, most_views, gyro_unit, accel_unit
-                )
+                views, samples, stated = _from_detections(recording, target, max_views, gyro_unit, accel_unit)
             else:
                 settings = RecordingSettings(rig=rig, imu_topic=imu_topic)
-                views, samples, stated = _from_pictures(recording, settings, target, most_views, advance)
+                views, samples, stated = _from_pictures(recording, settings, target, max_views, advance)
             noise = read_imu_file(imu).noise if imu else stated
             if noise is None:
                 raise ConfigError(
@@ -112,14 +112,14 @@ def run(arguments: Sequence[str]) -> None:
     call(command, "calibrate camera-imu", arguments)
 
 
-def _expect(out: Path, most_views: int) -> None:
+def _expect(out: Path, max_views: int) -> None:
     expect_output(out, ".yaml", ".yml")
-    if most_views < 60:
-        raise ConfigError(f"--most-views {most_views} is too few; give 60 or more")
+    if max_views < 60:
+        raise ConfigError(f"--max-views {max_views} is too few; give 60 or more")
 
 
 def _expect_noise(path: Path, noise: ImuNoise) -> None:
-    """Densities that no IMU has are another unit's."""
+    """Refuse noise densities that no IMU has: another unit's."""
     if not (1e-6 < noise.gyro_density < 0.05 and 1e-5 < noise.accel_density < 1.0):
         raise InputError(
             path, f"noise densities of {noise.gyro_density:g} rad/s/sqrt(Hz) and {noise.accel_density:g} "

@@ -1,4 +1,4 @@
-"""`barsight calibrate check RECORDING [-o check.json]`."""
+"""Run `barsight calibrate check RECORDING [-o check.json]`."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.core.files import expect_output
 from barsight.motion.batch.fusion import FusionSettings
-from barsight.motion.rig_check.drift_check import CheckSettings, RigCheck, State, check_rig
+from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, RigCheck, check_rig
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.report.calibration.rig_check_page import write_rig_check_report
 
 COLOURS = {
-    State.GOOD: "green",
-    State.RECALIBRATE: "red",
-    State.CONTRADICTION: "red",
-    State.NOT_SEEN: "yellow",
+    DriftState.GOOD: "green",
+    DriftState.RECALIBRATE: "red",
+    DriftState.CONTRADICTION: "red",
+    DriftState.NOT_SEEN: "yellow",
 }
 
 

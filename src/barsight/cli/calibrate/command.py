@@ -1,4 +1,4 @@
-"""`barsight calibrate KIND ...`: finds the calibration asked for."""
+"""Dispatch `barsight calibrate KIND ...` to the calibration asked for."""
 
 from __future__ import annotations
 

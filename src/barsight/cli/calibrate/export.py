@@ -1,4 +1,4 @@
-"""`barsight calibrate export RIG -o FILE --to FORMAT`."""
+"""Run `barsight calibrate export RIG -o FILE --to FORMAT`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`barsight calibrate imu-noise LOG -o imu.yaml`."""
+"""Run `barsight calibrate imu-noise LOG -o imu.yaml`."""
 
 from __future__ import annotations
 

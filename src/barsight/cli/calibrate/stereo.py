@@ -1,4 +1,4 @@
-"""`barsight calibrate stereo PICTURES --board BOARD -o rig.yaml`."""
+"""Run `barsight calibrate stereo PICTURES --board BOARD -o rig.yaml`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         lens: tyro.conf.EnumChoicesFromValues[Lens] = Lens.RADTAN4,
         range_m: float = 7.0,
-        most_views: int = 150,
+        max_views: int = 150,
         resolution: str | None = None,
     ) -> None:
         """Calibrate two cameras from pictures of a board that both see.
@@ -48,17 +48,17 @@ def run(arguments: Sequence[str]) -> None:
             out: The rig file to write (.yaml); its report goes beside it (.html and .json).
             lens: The lens model. More coefficients need corners near the pictures' corners.
             range_m: The range at which the rig will measure; the verdict judges the depth there.
-            most_views: Films are thinned to so many views, evenly.
+            max_views: Films are thinned to so many views, evenly.
             resolution: WIDTHxHEIGHT of the cameras, for detections, which don't carry it.
         """
-        _expect(out, range_m, most_views)
+        _expect(out, range_m, max_views)
         console = Console(stderr=True)
         target = parse_board(board)
         if pictures.is_dir() and has_detections(pictures):
-            views, sizes, left_out = views_from_detections(pictures, target, most_views, resolution)
+            views, sizes, left_out = views_from_detections(pictures, target, max_views, resolution)
         else:
             with stages(console) as advance:
-                views, sizes, left_out = views_from_pictures(pictures, target, most_views, advance)
+                views, sizes, left_out = views_from_pictures(pictures, target, max_views, advance)
         calibration = calibrate_stereo(views, target, lens, sizes, pictures, left_out)
         assessment = assess(calibration, range_m)
         html, data = out.with_suffix(".html"), out.with_suffix(".json")
@@ -74,12 +74,12 @@ def run(arguments: Sequence[str]) -> None:
     call(command, "calibrate stereo", arguments)
 
 
-def _expect(out: Path, range_m: float, most_views: int) -> None:
+def _expect(out: Path, range_m: float, max_views: int) -> None:
     expect_output(out, ".yaml", ".yml")
     if not 0.05 <= range_m <= 1000:
         raise ConfigError(f"--range-m {range_m:g} can't be; give the working distance in metres")
-    if most_views < 6:
-        raise ConfigError(f"--most-views {most_views} is too few; give 6 or more")
+    if max_views < 6:
+        raise ConfigError(f"--max-views {max_views} is too few; give 6 or more")
 
 
 def _print(console: Console, calibration: StereoCalibration, out: Path, html: Path) -> None:

@@ -1,4 +1,4 @@
-"""`barsight calibrate yard TARGETS.csv|RECORDING -o yard.yaml`."""
+"""Run `barsight calibrate yard TARGETS.csv|RECORDING -o yard.yaml`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from barsight.cli.progress import stages
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.files import atomic_path, expect_output
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.crane_moves import MovedYard, yard_from_moves
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.recording.base import RecordingSettings
@@ -27,8 +27,8 @@ from barsight.recording.open import open_recording
 from barsight.registration.yard import YardCalibration, calibrate_yard
 from barsight.report.calibration.yard_page import write_yard_report
 
-MOST_TURN_DEG = 0.05
-MOST_PLACE_M = 0.01
+MAX_TURN_DEG = 0.05
+MAX_PLACE_M = 0.01
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -41,7 +41,7 @@ def run(arguments: Sequence[str]) -> None:
         sigma_m: float = 0.005,
         reading: Annotated[RecordingSettings, tyro.conf.arg(name="recording")] = RecordingSettings(),  # noqa: B008
     ) -> None:
-        """Where the measurement's world lies in the yard, from surveyed targets or from crane moves.
+        """Register the measurement's world in the yard, from surveyed targets or from crane moves.
 
         Args:
             source: A .csv of targets (name,yard_x,yard_y,yard_z,x,y,z in m; optionally sigma_m, and check = 1
@@ -96,7 +96,7 @@ def _from_moves(path: Path, reading: RecordingSettings, console: Console) -> Mov
             done += 1
             advance("travel", done, total)
 
-        estimator = FusedTrajectory(FusionSettings(use="stereo,imu"), CraneSettings())
+        estimator = BatchFusion(FusionSettings(use="stereo,imu"), CraneSettings())
         trajectory = estimator(recording, Rectifier(recording.rig), count)
     moved = yard_from_moves(trajectory, crane, recording.rig.timeshift_cam_imu_ns)
     if isinstance(moved, Failed):
@@ -122,7 +122,7 @@ def _content(found: YardCalibration, hangs: Float64 | None) -> dict[str, Any]:
 
 
 def _is_good(found: YardCalibration) -> bool:
-    return found.turn_sigma_deg <= MOST_TURN_DEG and found.place_sigma_m <= MOST_PLACE_M and not found.doubts
+    return found.turn_sigma_deg <= MAX_TURN_DEG and found.place_sigma_m <= MAX_PLACE_M and not found.doubts
 
 
 def _print(found: YardCalibration, verdict: str, out: Path, console: Console) -> None:
@@ -143,5 +143,5 @@ def _print(found: YardCalibration, verdict: str, out: Path, console: Console) ->
     if verdict == "good":
         console.print("[green]good[/green]")
     else:
-        limits = f"{MOST_TURN_DEG:g} deg and {1e3 * MOST_PLACE_M:g} mm without doubts are good"
+        limits = f"{MAX_TURN_DEG:g} deg and {1e3 * MAX_PLACE_M:g} mm without doubts are good"
         console.print(f"[yellow]{verdict}[/yellow]: {limits}; more points, further apart, help")

@@ -19,7 +19,7 @@ class Iterate(Protocol):
 
     @property
     def cost(self) -> float:
-        """The sum that is minimised. May raise LinAlgError."""
+        """Return the sum that is minimised. May raise LinAlgError."""
 
     def step(self: I, damping: float) -> I:
         """Solve the normal equations, their diagonal raised by the share `damping`, and move.
@@ -64,7 +64,7 @@ class Minimum(Generic[I]):
 
     @property
     def converged(self) -> bool:
-        """Whether further steps would gain next to nothing."""
+        """Return whether further steps would gain next to nothing."""
         return self.termination is Termination.CONVERGED
 
 

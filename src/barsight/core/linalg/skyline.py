@@ -15,7 +15,7 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64, kernel
 
 
-class Band(NamedTuple):
+class Skyline(NamedTuple):
     """The lower half of a symmetric matrix (n, n). first: (n,) each row's first column that may be filled;
     element (i, j), first[i] <= j <= i, is `values[offset[i] + j]`.
     """
@@ -25,24 +25,24 @@ class Band(NamedTuple):
     offset: Int64
 
 
-def empty(first: Int64) -> Band:
-    """Zeros."""
+def empty_skyline(first: Int64) -> Skyline:
+    """Allocate zeros."""
     index = np.arange(len(first))
     end = np.cumsum(index - first + 1)
-    return Band(np.zeros(end[-1] if len(end) else 0), first, end - index - 1)
+    return Skyline(np.zeros(end[-1] if len(end) else 0), first, end - index - 1)
 
 
-def even(rows: Float64) -> Band:
-    """A matrix of one half-width w as a band, the same memory: rows (n, w), `rows[i, w - 1 - (i - j)]` is
-    its element (i, j).
+def uniform_band(rows: Float64) -> Skyline:
+    """View a matrix of one half-width w as a skyline, the same memory: rows (n, w), `rows[i, w - 1 - (i -
+    j)]` is its element (i, j).
     """
-    return Band(rows.reshape(-1), *_even(*rows.shape))
+    return Skyline(rows.reshape(-1), *_even(*rows.shape))
 
 
-def full(matrix: Float64) -> Band:
+def full(matrix: Float64) -> Skyline:
     """Wrap the lower half of a whole symmetric matrix (n, n), the same memory."""
     at = np.arange(len(matrix))
-    return Band(matrix.reshape(-1), np.zeros_like(at), at * len(matrix))
+    return Skyline(matrix.reshape(-1), np.zeros_like(at), at * len(matrix))
 
 
 @lru_cache(maxsize=256)
@@ -52,8 +52,8 @@ def _even(n: int, width: int) -> tuple[Int64, Int64]:
 
 
 @kernel(fastmath=True)
-def factorise(band: Band) -> bool:
-    """Replaces the matrix by its lower factor; false where it isn't positive definite."""
+def factorise_skyline(band: Skyline) -> bool:
+    """Replace the matrix by its lower Cholesky factor; false where it isn't positive definite."""
     values, first, offset = band
     for i in range(len(first)):
         for j in range(first[i], i + 1):
@@ -74,9 +74,9 @@ def factorise(band: Band) -> bool:
 
 
 @kernel(fastmath=True)
-def solve_forward(factor: Band, x: Float64) -> None:
-    """Replaces x (n, m), right sides beside each other so that the factor is read once for all of them, by
-    the factor's inverse times these. Four rows at a time, so that the sums stay in the registers.
+def solve_forward(factor: Skyline, x: Float64) -> None:
+    """Replace x (n, m), right sides beside each other so that the factor is read once for all of them, by the
+    factor's inverse times these. Four rows at a time, so that the sums stay in the registers.
     """
     values, first, offset = factor
     sides = x.shape[1]
@@ -97,8 +97,8 @@ def solve_forward(factor: Band, x: Float64) -> None:
 
 
 @kernel(fastmath=True)
-def solve_back(factor: Band, x: Float64) -> None:
-    """Replaces x (n, m) by the inverse of the factor's transpose times it."""
+def solve_back_dense(factor: Skyline, x: Float64) -> None:
+    """Replace x (n, m) by the inverse of the factor's transpose times it."""
     values, first, offset = factor
     sides = x.shape[1]
     for i in range(len(first) - 1, -1, -1):
@@ -112,8 +112,8 @@ def solve_back(factor: Band, x: Float64) -> None:
 
 
 @kernel(fastmath=True)
-def products(x: Float64, result: Float64) -> None:
-    """result (m, m): x^T x of x (n, m). BLAS's threads wait for each other where the machine is busy."""
+def gram_matrix(x: Float64, result: Float64) -> None:
+    """Multiply x^T x (m, m) of x (n, m). BLAS's threads wait for each other where the machine is busy."""
     result[:] = 0
     for i in range(x.shape[0]):
         for a in range(x.shape[1]):

@@ -1,4 +1,6 @@
-"""The cloud: every height that enough views support, sides and lower surfaces included, a file per tile."""
+"""Write the cloud: every height that enough views support, sides and lower surfaces included, a file per
+tile.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ class CloudPart:
 
     @classmethod
     def of(cls, tile: Float32, winner: Int8, key: TileKey, cell_m: float, min_views: int) -> CloudPart:
-        """A tile's heights that min_views support; winner: (rows, columns), which of them is the surface."""
+        """Select a tile's heights that min_views support; winner: (rows, columns), which of them is the
+        surface.
+        """
         row, column, slot = np.nonzero(tile[..., VIEWS] >= min_views)
         kept = tile[row, column, slot]
         x, y = column + key[0] * TILE_CELLS, row + key[1] * TILE_CELLS
@@ -42,7 +46,7 @@ class CloudPart:
         )
 
     def finished(self, z_m: Float32, sigma_m: Float32, blur_m: Float32) -> CloudPart:
-        """The elected points as the finished surface has them; the others' sigma with the part for bars.
+        """Update elected points to the finished surface; the others' sigma with the part for bars.
 
         z_m, sigma_m, blur_m: (rows, columns) of the tile.
         """
@@ -59,7 +63,7 @@ class CloudPart:
 
 
 def read_part(folder: Path, key: TileKey) -> CloudPart:
-    """The tile's points as they were written last."""
+    """Read the tile's points as they were written last."""
     with np.load(cloud_file(folder, key)) as part:
         return CloudPart(**part)
 

@@ -1,4 +1,4 @@
-"""Contours: the surface cut along X at a given y."""
+"""Cut contours from the surface along X at a given y."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import median_filter
 
 from barsight.core.arrays import Float64, UInt8
-from barsight.core.types import Contour, LaserProfile, Source
+from barsight.core.types import Contour, HeightSource, LaserProfile
 from barsight.mapping.surface.surface import Surface
 
 SPACING_M = 0.01
@@ -24,10 +24,11 @@ def cut_contours(
     profile_y_m: tuple[float, ...],
     kind: Literal["fused", "paper"] = "fused",
 ) -> tuple[Contour, ...]:
-    """A contour at each y asked for; without any at each laser profile; without a laser in the middle.
+    """Cut a contour at each y asked for; without any at each laser profile; without a laser in the middle.
 
     At a laser profile the samples fall on the laser's own x grid, continued over the whole surface, and the
-    contour has the laser's number; others are numbered on after the laser's. kind: `cut`, or `smoothed` too.
+    contour has the laser's number; others are numbered on after the laser's. kind: `cut_contour`, or
+    `smooth_contour` too.
     """
     places = [(p.profile, float(np.median(p.y_m)), float(p.x_m[0])) for p in laser]
     if profile_y_m:
@@ -39,12 +40,12 @@ def cut_contours(
         places = list(dict.fromkeys(asked))
     elif not laser:
         places = [(0, (surface.rows[0] + surface.rows[1] - 1) / 2 * surface.cell_m, 0.0)]
-    contours = tuple(cut(surface, number, y, phase) for number, y, phase in places)
-    return contours if kind == "fused" else tuple(smoothed(contour) for contour in contours)
+    contours = tuple(cut_contour(surface, number, y, phase) for number, y, phase in places)
+    return contours if kind == "fused" else tuple(smooth_contour(contour) for contour in contours)
 
 
-def cut(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0) -> Contour:
-    """Samples every 10 mm along the whole surface, on the grid through x = phase_m.
+def cut_contour(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0) -> Contour:
+    """Sample every 10 mm along the whole surface, on the grid through x = phase_m.
 
     Each is the bilinear mean of the four cells around it, without those that lie more than 30 mm above or
     below the nearest one, so that an edge stays an edge. Unknown where the nearest cell is unknown.
@@ -69,8 +70,9 @@ def cut(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0) -> Con
     return Contour(profile, x, np.full(x.shape, y_m), *_blend(z, sigma, source, weights))
 
 
-def smoothed(contour: Contour) -> Contour:
-    """The paper's post-processing [paper 4.4]: median, cubic interpolation where there is no data, filter.
+def smooth_contour(contour: Contour) -> Contour:
+    """Apply the paper's post-processing [paper 4.4]: median, cubic interpolation where there is no data,
+    filter.
 
     The paper takes the median over the points that several frames have at one place; those the map has fused
     already, so it is taken over a sample and its neighbours. Interpolated samples are FILLED with half the
@@ -92,12 +94,12 @@ def smoothed(contour: Contour) -> Contour:
     after = np.searchsorted(known, filled)
     step = np.abs(median[after] - median[after - 1])
     sigma[filled] = np.hypot(step / 2, np.maximum(sigma[known[after]], sigma[known[after - 1]]))
-    source[filled] = Source.FILLED
+    source[filled] = HeightSource.FILLED
     return Contour(contour.profile, contour.x_m, contour.y_m, z, sigma, source)
 
 
 def _blend(z: Float64, sigma: Float64, source: UInt8, weights: Float64) -> tuple[Float64, Float64, UInt8]:
-    """(4, N) corners to height, sigma and source (N,)."""
+    """Interpolate (4, N) corners to height, sigma and source (N,)."""
     nearest = np.argmax(weights, axis=0)[None, :]
     z_nearest = np.take_along_axis(z, nearest, axis=0)
     source_nearest = np.take_along_axis(source, nearest, axis=0)
@@ -105,7 +107,7 @@ def _blend(z: Float64, sigma: Float64, source: UInt8, weights: Float64) -> tuple
     w = np.where(joined, weights, 0.0)
     with np.errstate(invalid="ignore"):
         w /= w.sum(axis=0)
-    known = source_nearest[0] != Source.UNKNOWN
+    known = source_nearest[0] != HeightSource.UNKNOWN
     height = np.where(known, np.where(joined, w * z, 0).sum(axis=0), np.nan)
     spread = np.where(known, np.where(joined, w * sigma, 0).sum(axis=0), np.nan)
     return height, spread, source_nearest[0]

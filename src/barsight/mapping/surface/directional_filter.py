@@ -1,5 +1,6 @@
-"""Heights along bars: a bar is straight, so along it the same height is measured again and again, and what
-matching's window has blurred across it can be undone without raising the noise.
+"""Average heights along bars and deblur across them: a bar is straight, so along it the same height is
+measured again and again, and what matching's window has blurred across it can be undone without raising the
+noise.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ _SAMPLE_CELLS = 2
 _DIRECTIONS = 16
 _STEP_M = 0.03
 _WIDEST_CELLS = np.float32(1.5)
-_BLUR_CELLS, _BLUR_SHARE, _VALLEY_SHARE = 11, 2.0, 4.5
+_BLUR_CELLS, _BLUR_RATIO, _VALLEY_RATIO = 11, 2.0, 4.5
 _VALLEY_CELLS = 6
 
 
-def lengthways(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[Float32, Int8]:
-    """(H, W) heights, each the weighted mean along that of 16 directions in which it is most alike, and the
-    number of that direction, -1 where there is no height.
+def smooth_along_bars(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[Float32, Int8]:
+    """Average heights (H, W) along that of 16 directions in which each is most alike, and the number of that
+    direction, -1 where there is no height.
 
     weight: (H, W), 0 where there is no height (NaN). Heights further than gate_m from a cell's own are
     another surface: they don't count in its mean, and against the direction. Every other cell up to `reach`
@@ -37,8 +38,11 @@ def lengthways(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[
 def _lengthways(
     z: Float32, weight: Float32, gate_m: float, rows: Int64, columns: Int64, reach: int
 ) -> tuple[Float32, Int8]:
-    """z, weight: with `reach` cells more on each side. What the neighbour chose is tried first: it is mostly
-    right, and so the others are given up early."""
+    """Average along the best direction.
+
+    z, weight: with `reach` cells more on each side. What the neighbour chose is tried first: it is mostly
+    right, and so the others are given up early.
+    """
     height, width = z.shape[0] - 2 * reach, z.shape[1] - 2 * reach
     out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)
     likely = 0
@@ -70,23 +74,23 @@ def _lengthways(
     return out, chosen
 
 
-def sharpened(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:
-    """(H, W) heights, each moved away from the mean of its two neighbours across the bar: what a blur with a
-    sigma of blur_cells (H, W) takes from crests and gives to valleys [van Cittert 1931, one step].
+def deblur_across(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:
+    """Deblur heights (H, W) across the bar, away from the mean of both neighbours: what a blur with a sigma
+    of blur_cells (H, W) takes from crests and gives to valleys [van Cittert 1931, one step].
 
-    direction: (H, W) the bar's own, of `lengthways`, whose heights z are. A cell stays as it is where a
-    neighbour is missing or over 30 mm higher or lower, which is a step and no bend. A wider blur than
+    direction: (H, W) the bar's own, of `smooth_along_bars`, whose heights z are. A cell stays as it is where
+    a neighbour is missing or over 30 mm higher or lower, which is a step and no bend. A wider blur than
     `_WIDEST_CELLS` is undone in part only, since noise would grow more than bars gain.
     """
     rows, columns = np.rint(_across()).astype(np.int64)
     return _sharpened(z, direction, np.minimum(blur_cells, _WIDEST_CELLS) ** 2, rows, columns)
 
 
-def valleys(z: Float32, direction: Int8) -> Bool:
-    """(H, W) whether a height lies below something on either side of it, across the bar and no further than
+def valley_mask(z: Float32, direction: Int8) -> Bool:
+    """Mark valleys (H, W): heights below something on either side, across the bar and no further than
     `_VALLEY_CELLS`: what a step of over 30 mm parts from it doesn't count.
 
-    z: (H, W) heights, NaN where there is none; direction: (H, W) the bar's own, of `lengthways`.
+    z: (H, W) heights, NaN where there is none; direction: (H, W) the bar's own, of `smooth_along_bars`.
     """
     onward = np.arange(1, _VALLEY_CELLS + 1)[:, None]
     rows, columns = (np.rint(onward * turn).astype(np.int64) for turn in _across())
@@ -94,25 +98,25 @@ def valleys(z: Float32, direction: Int8) -> Bool:
 
 
 def blur_sigma(moved: Float32, valley: Bool) -> Float32:
-    """(H, W) standard deviation of what blur and gloss leave on bars. moved: (H, W) by how much `sharpened`
-    has moved heights, NaN or 0 where it couldn't; valley: (H, W), see `valleys`.
+    """Estimate the standard deviation (H, W) that blur and gloss leave on bars. moved: (H, W) by how much
+    `deblur_across` has moved heights, NaN or 0 where it couldn't; valley: (H, W), see `valley_mask`.
 
     The correction that is best differs from stack to stack by more than itself, and flanks are as unsure as
-    crests: `_BLUR_SHARE` times the RMS over about a bar's width. Two bars of diameter D meet in a cusp: a
+    crests: `_BLUR_RATIO` times the RMS over about a bar's width. Two bars of diameter D meet in a cusp: a
     pixel's width p beside its bottom they lie sqrt(D p) higher, while a crest falls by p^2 / D. So valleys
-    have `_VALLEY_SHARE` times the RMS. Both shares were found on seven yards.
+    have `_VALLEY_RATIO` times the RMS. Both shares were found on seven yards.
     """
     known = np.isfinite(moved) & (moved != 0)
     squares, count = (
         cv2.blur(a.astype(np.float32), (_BLUR_CELLS, _BLUR_CELLS))
         for a in (np.where(known, moved, 0) ** 2, known)
     )
-    share = np.where(valley, np.float32(_VALLEY_SHARE), np.float32(_BLUR_SHARE))
+    share = np.where(valley, np.float32(_VALLEY_RATIO), np.float32(_BLUR_RATIO))
     return np.asarray(share * np.sqrt(np.maximum(squares, 0) / np.maximum(count, 1e-6)), np.float32)
 
 
 def _across() -> Float64:
-    """(2, 16) one cell across the bar of each direction, as a step in rows and in columns."""
+    """Compute one cell across the bar of each direction (2, 16), as a step in rows and in columns."""
     turn = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
     return np.array([np.cos(turn), -np.sin(turn)])
 

@@ -1,4 +1,4 @@
-"""The election of the surface: of a cell's heights the highest that those who must see it do see.
+"""Elect the surface among a cell's heights: the highest that the views with free line of sight support.
 
 A wrong height hangs in the air, most often beside an edge, where matching stretches the nearer surface by a
 few pixels. Every view that looks through it to what lies behind speaks against it. So a height's votes are
@@ -22,7 +22,13 @@ from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.visibility import STRIDE, density, free, inside, may_be_covered
+from barsight.mapping.surface.visibility import (
+    STRIDE,
+    frustum_margin,
+    is_unoccluded,
+    may_be_occluded,
+    point_density,
+)
 from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
 
 _ALONG = 30
@@ -32,9 +38,10 @@ _NOTHING = np.float32(-1e6)
 
 
 @dataclass(frozen=True, eq=False)
-class Sights:
-    """Where K views were taken from: rect0_from_reference as rotation (K, 3, 3) and translation (K, 3), and
-    the places of both cameras (K, 2, 3) in the reference frame. spacing_rad: angle between points."""
+class ViewFrusta:
+    """Frusta of K views: rect0_from_reference as rotation (K, 3, 3) and translation (K, 3), and the places of
+    both cameras (K, 2, 3) in the reference frame. spacing_rad: angle between points.
+    """
 
     camera: RectifiedCamera
     spacing_rad: float
@@ -43,8 +50,8 @@ class Sights:
     eyes: Float64
 
     @classmethod
-    def of(cls, poses: Sequence[Pose], camera: RectifiedCamera, points_per_pixel: int = 1) -> Sights:
-        """From the views' reference_from_rect0."""
+    def of(cls, poses: Sequence[Pose], camera: RectifiedCamera, points_per_pixel: int = 1) -> ViewFrusta:
+        """Build from the views' reference_from_rect0."""
         inverses = [pose.inverse() for pose in poses]
         both = np.array([[0.0, 0.0, 0.0], [camera.baseline_m, 0.0, 0.0]])
         return cls(
@@ -57,17 +64,18 @@ class Sights:
 
     @property
     def height_m(self) -> float:
-        """The cameras' median height."""
+        """Return the cameras' median height."""
         return float(np.median(self.eyes[..., 2]))
 
     def pixel_m(self, z_m: Float32, height_m: float) -> Float32:
-        """The width of a pixel on the ground at heights z_m, m, seen from height_m."""
+        """Return the width of a pixel on the ground at heights z_m, m, seen from height_m."""
         above = np.abs(np.float32(height_m) - z_m)
         return np.asarray(above / np.float32(self.camera.focal_px), np.float32)
 
     def planes(self) -> Float64:
-        """(6, 4, K) a x + b y + c z + d of the planes that bound what both pictures of a view hold, less
-        `_BORDER_PX` all around: 0 or more on their inner side."""
+        """Compute the frustum planes (6, 4, K), a x + b y + c z + d, of what both pictures of a view hold,
+        less `_BORDER_PX` all around: 0 or more on their inner side.
+        """
         camera = self.camera
         rays = np.concatenate([self.rotation, self.translation[:, :, None]], axis=2)
         x, y, depth = np.moveaxis(rays, 1, 0)
@@ -80,7 +88,9 @@ class Sights:
         return np.ascontiguousarray(np.moveaxis(np.array(low + high), 1, 2))
 
     def touching(self, low_m: Float64, high_m: Float64) -> Bool:
-        """(K,) whether a view's left picture may hold something of the box from low_m to high_m (3,)."""
+        """Return (K,): whether a view's left picture may hold something of the box from low_m to
+        high_m (3,).
+        """
         corners = np.array(list(product(*zip(low_m, high_m, strict=True))))
         x, y, depth = np.moveaxis(corners @ self.rotation.mT + self.translation[:, None], -1, 0)
         camera = self.camera
@@ -90,7 +100,7 @@ class Sights:
         chosen: Bool = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
         return chosen
 
-    def near(self, low_m: Float64, high_m: Float64) -> Sights:
+    def near(self, low_m: Float64, high_m: Float64) -> ViewFrusta:
         """Those views alone that are `touching` the box."""
         chosen = self.touching(low_m, high_m)
         return replace(
@@ -102,9 +112,10 @@ class Sights:
 
 
 @kernel()
-def first_heights(tile: Float32, min_views: int, top_share: float) -> Float32:
-    """(rows, columns) what votes alone elect: the highest with top_share of the best-seen one's views; NaN
-    where none has enough views."""
+def elect_by_votes(tile: Float32, min_views: int, top_ratio: float) -> Float32:
+    """Elect heights (rows, columns) by votes alone: the highest with top_ratio of the best-seen one's views;
+    NaN where none has enough views.
+    """
     rows, columns = tile.shape[:2]
     highest = np.full((rows, columns), np.nan, np.float32)
     for i in range(rows):
@@ -112,25 +123,25 @@ def first_heights(tile: Float32, min_views: int, top_share: float) -> Float32:
             most = np.float32(0)
             for s in range(SLOTS):
                 most = max(most, tile[i, j, s, VIEWS])
-            needed = max(np.float32(min_views), np.float32(top_share) * most)
+            needed = max(np.float32(min_views), np.float32(top_ratio) * most)
             for s in range(SLOTS):
                 if tile[i, j, s, VIEWS] >= needed and not highest[i, j] >= tile[i, j, s, Z]:
                     highest[i, j] = tile[i, j, s, Z]
     return highest
 
 
-def elect(
+def elect_surface(
     tile: Float32,
     key: TileKey,
     around: Float32,
-    sights: Sights,
+    sights: ViewFrusta,
     cell_m: float,
     min_views: int,
     settings: MapSettings,
 ) -> Int8:
-    """Which of each cell's heights is the surface, (rows, columns), -1 where none is.
+    """Elect which of each cell's heights is the surface, (rows, columns), -1 where none is.
 
-    around: (3 * TILE_CELLS, 3 * TILE_CELLS) `first_heights` of the tile and its eight neighbours.
+    around: (3 * TILE_CELLS, 3 * TILE_CELLS) `elect_by_votes` of the tile and its eight neighbours.
     """
     known = np.isfinite(around)
     ceiling = float(around[known].max()) if known.any() else 0.0
@@ -145,11 +156,13 @@ def elect(
         tile, corner, around, roof, ceiling, sights.planes(), sights.eyes, cell_m, float(min_views),
         cell_m / sights.spacing_rad,
     )  # fmt: skip
-    return _elected(tile, share, expected, cell_m, float(min_views), settings.own_share, settings.along_share)
+    return _elected(tile, share, expected, cell_m, float(min_views), settings.own_ratio, settings.along_ratio)
 
 
 def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) -> Float64 | None:
-    """(2, 3) m, the lowest and the highest corner of the heights that min_views support; None without any."""
+    """Return (2, 3) m, the lowest and the highest corner of the heights that min_views support; None without
+    any.
+    """
     held = tile[..., Z][tile[..., VIEWS] >= min_views]
     if held.size == 0:
         return None
@@ -172,7 +185,7 @@ def _supported(
     min_views: float,
     one_point_m: float,
 ) -> tuple[Float32, Float32]:
-    """Two arrays (rows, columns, SLOTS): the share of the votes that a height can expect which it has, -1
+    """Compute support, two arrays (rows, columns, SLOTS): the ratio of votes to those a height can expect, -1
     where fewer than min_views see or can see it or something may lie above; and how many it can expect.
 
     A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
@@ -190,14 +203,14 @@ def _supported(
                 z = float(tile[i, j, s, Z])
                 point[0], point[1], point[2] = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z
                 able, votes = 0, 0.0
-                inside(point[0], point[1], z, planes, margin)
+                frustum_margin(point[0], point[1], z, planes, margin)
                 for k in range(margin.size):
                     if margin[k] >= 0:
-                        seen = free(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
-                        if seen and free(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
+                        seen = is_unoccluded(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
+                        if seen and is_unoccluded(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
                             able += 1
-                            votes += density(point, eyes[k, 0], one_point_m)
-                covered = able >= min_views and may_be_covered(
+                            votes += point_density(point, eyes[k, 0], one_point_m)
+                covered = able >= min_views and may_be_occluded(
                     point, i, j, around, ceiling, planes, margin, cell_m, min_views
                 )
                 if able >= min_views and not covered:
@@ -213,8 +226,8 @@ def _elected(
     expected: Float32,
     cell_m: float,
     min_views: float,
-    own_share: float,
-    along_share: float,
+    own_ratio: float,
+    along_ratio: float,
 ) -> Int8:
     rows, columns = tile.shape[:2]
     winner = np.full((rows, columns), -1, np.int8)
@@ -226,8 +239,8 @@ def _elected(
                 if share[i, j, s] < 0 or (best >= 0 and z <= tile[i, j, best, Z]):
                     continue
                 # Where views expect less than min_views points a cell, an empty neighbour says nothing.
-                needed = along_share if expected[i, j, s] < min_views else own_share
-                if share[i, j, s] >= needed or _share_along(tile, share, i, j, z, cell_m) >= along_share:
+                needed = along_ratio if expected[i, j, s] < min_views else own_ratio
+                if share[i, j, s] >= needed or _share_along(tile, share, i, j, z, cell_m) >= along_ratio:
                     best = s
             winner[i, j] = best
     return winner
@@ -235,8 +248,9 @@ def _elected(
 
 @kernel()
 def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
-    """The mean share of a height and its like within `_ALONG` cells (every third is read), along that of four
-    directions in which most of the tile's cells have one: the bar's own, or the edge's."""
+    """Average the support of a height and its like within `_ALONG` cells (every third is read), along that of
+    four directions in which most of the tile's cells have one: the bar's own, or the edge's.
+    """
     most, result = -1, 0.0
     for direction in range(4):
         di, dj = (0, 1, 1, 1)[direction], (1, 0, 1, -1)[direction]

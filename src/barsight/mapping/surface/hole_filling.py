@@ -1,4 +1,4 @@
-"""Heights between seen cells: what a gap may be filled with."""
+"""Fill gaps between seen cells."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from barsight.core.arrays import Bool, Float32, kernel
 
 
 @kernel()
-def bridged(z: Float32, sigma: Float32, seen: Bool, reach: int) -> Bool:
+def bridge_gaps(z: Float32, sigma: Float32, seen: Bool, reach: int) -> Bool:
     """Write height and sigma into the cells that aren't seen but have seen ones within `reach` on opposite
     sides, along x or along y (the nearer pair wins); (H, W) which those are.
     """
@@ -33,7 +33,7 @@ def bridged(z: Float32, sigma: Float32, seen: Bool, reach: int) -> Bool:
 
 @kernel()
 def _steps(seen: Bool, i: int, j: int, di: int, dj: int, reach: int) -> int:
-    """Steps to the first seen cell that way, 0 where there is none within `reach`."""
+    """Count steps to the first seen cell that way, 0 where there is none within `reach`."""
     for n in range(1, reach + 1):
         a, b = i + n * di, j + n * dj
         if a < 0 or b < 0 or a >= seen.shape[0] or b >= seen.shape[1]:

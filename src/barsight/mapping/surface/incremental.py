@@ -15,11 +15,16 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.parallel import ordered_map
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.cloud import CloudPart, cloud_file, read_part
-from barsight.mapping.surface.directional_filter import blur_sigma, lengthways, sharpened, valleys
-from barsight.mapping.surface.height_selection import Sights, elect, first_heights, supported_box
+from barsight.mapping.surface.directional_filter import (
+    blur_sigma,
+    deblur_across,
+    smooth_along_bars,
+    valley_mask,
+)
+from barsight.mapping.surface.height_selection import ViewFrusta, elect_by_votes, elect_surface, supported_box
 from barsight.mapping.surface.surface import (
     Layers,
     Surface,
@@ -52,8 +57,8 @@ class _Figures:
 class SurfaceElection:
     """Elects the surface of the tiles in `store`; `folder` takes its files and those of the surfaces.
 
-    Poses that were given once stay: the next `Sights` begin with the same views. Nothing in `store` changes
-    but by `finish`.
+    Poses that were given once stay: the next `ViewFrusta` begin with the same views. Nothing in `store`
+    changes but by `finish`.
     """
 
     def __init__(self, store: TileStore, folder: Path, cell_m: float, settings: MapSettings) -> None:
@@ -70,8 +75,8 @@ class SurfaceElection:
         self._figures: dict[TileKey, tuple[tuple[object, ...], _Figures]] = {}
         self._height_m = np.inf
 
-    def snapshot(self, min_views: int, sights: Sights) -> Surface:
-        """The surface as it stands, of its own from now on; only tiles that changed are elected anew.
+    def snapshot(self, min_views: int, sights: ViewFrusta) -> Surface:
+        """Return the surface as it stands, of its own from now on; only tiles that changed are elected anew.
 
         A tile that lies beside one that changed waits for its own next change, or for `finish`.
         """
@@ -79,15 +84,15 @@ class SurfaceElection:
             self._height_m = sights.height_m
         return self._surface(min_views, sights, beside=False)
 
-    def finish(self, min_views: int, sights: Sights) -> Surface:
-        """The surface at the end; the tiles in `store` are given up."""
+    def finish(self, min_views: int, sights: ViewFrusta) -> Surface:
+        """Return the surface at the end; the tiles in `store` are given up."""
         self._height_m = sights.height_m
         surface = self._surface(min_views, sights, beside=True)
         self._store.clear()
         shutil.rmtree(self._work)
         return surface
 
-    def _surface(self, min_views: int, sights: Sights, *, beside: bool) -> Surface:
+    def _surface(self, min_views: int, sights: ViewFrusta, *, beside: bool) -> Surface:
         """beside: whether tiles count as changed for what lies beside them too."""
         keys = self._store.keys()
         read_tile.cache_clear()
@@ -118,7 +123,7 @@ class SurfaceElection:
 
         def look(item: tuple[TileKey, Float32]) -> tuple[TileKey, Float64 | None]:
             key, tile = item
-            np.save(_first_file(self._first, key), first_heights(tile, min_views, self._settings.top_share))
+            np.save(_first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
             return key, supported_box(tile, key, self._cell_m, min_views)
 
         states = {key: (self._store.version(key), min_views) for key in keys}
@@ -126,7 +131,7 @@ class SurfaceElection:
         for key, box in ordered_map(look, ((key, self._store.read(key)) for key in changed)):
             self._boxes[key] = states[key], box
 
-    def _elect(self, keys: list[TileKey], min_views: int, sights: Sights, beside: bool) -> None:
+    def _elect(self, keys: list[TileKey], min_views: int, sights: ViewFrusta, beside: bool) -> None:
         """Elect tiles that changed; if `beside`, also those round which one did or that new views look at."""
         known = frozenset(keys)
 
@@ -139,7 +144,7 @@ class SurfaceElection:
         def elect_tile(item: tuple[TileKey, Float32]) -> TileKey:
             key, tile = item
             around = _first_around(self._first, key, known)
-            winner = elect(tile, key, around, sights, self._cell_m, min_views, self._settings)
+            winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings)
             write_tile(self._elected, key, elected_layers(tile, winner))
             CloudPart.of(tile, winner, key, self._cell_m, min_views).write(self._elected, key)
             return key
@@ -149,7 +154,7 @@ class SurfaceElection:
         for key in ordered_map(elect_tile, ((key, self._store.read(key)) for key in changed)):
             self._winners[key] = states[key], (self._winners[key][1] if key in self._winners else 0) + 1
 
-    def _finish(self, keys: list[TileKey], sights: Sights, beside: bool) -> None:
+    def _finish(self, keys: list[TileKey], sights: ViewFrusta, beside: bool) -> None:
         """Average, sharpen and fill tiles that were elected anew; if `beside`, also those round them."""
         known = frozenset(keys)
 
@@ -169,9 +174,10 @@ class SurfaceElection:
         for key, figures in ordered_map(finish_tile, changed):
             self._figures[key] = states[key], figures
 
-    def _filled(self, key: TileKey, keys: frozenset[TileKey], sights: Sights) -> tuple[Layers, Float32]:
-        """The tile averaged lengthways, sharpened, its narrow gaps filled, looking at most the halo around
-        it; and what blur and gloss leave on bars, 1 sigma."""
+    def _filled(self, key: TileKey, keys: frozenset[TileKey], sights: ViewFrusta) -> tuple[Layers, Float32]:
+        """Average the tile lengthways, sharpen it, fill its narrow gaps, looking at most the halo around it;
+        and what blur and gloss leave on bars, 1 sigma.
+        """
         settings, cell_m = self._settings, self._cell_m
         along, reach = (min(round(way_m / cell_m), _HALO) for way_m in (settings.along_m, settings.fill_m))
         side = TILE_CELLS + 2 * _HALO
@@ -183,10 +189,10 @@ class SurfaceElection:
         blur = np.zeros((side, side), np.float32)
         if along > 0:
             weight = np.nan_to_num(around.sigma_m**-2)
-            z, direction = lengthways(around.z_m, weight, settings.least_gate_m, along)
+            z, direction = smooth_along_bars(around.z_m, weight, settings.min_gate_m, along)
             pixel_m = sights.pixel_m(z, self._height_m)
-            sharp = sharpened(z, direction, settings.sharpen_px * pixel_m / cell_m)
-            blur = blur_sigma(sharp - z, valleys(sharp, direction))
+            sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
+            blur = blur_sigma(sharp - z, valley_mask(sharp, direction))
             around = replace(around, z_m=sharp, sigma_m=np.hypot(around.sigma_m, blur))
         if reach > 0:
             fill_gaps(around, reach)
@@ -195,7 +201,7 @@ class SurfaceElection:
         return layers, blur[inner, inner]
 
     def _linked(self, keys: list[TileKey]) -> Path:
-        """A folder of its own with links to the finished tiles, which are never written to again."""
+        """Return a folder of its own with links to the finished tiles, which are never written to again."""
         folder = Path(tempfile.mkdtemp(prefix="surface_", dir=self._folder))
         for key in keys:
             for name in (tile_file, cloud_file):
@@ -215,12 +221,12 @@ def _changed(
 
 
 def _around(key: TileKey) -> list[TileKey]:
-    """A tile and its eight neighbours."""
+    """Return a tile and its eight neighbours."""
     return [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 
 
 def _first_around(folder: Path, key: TileKey, keys: frozenset[TileKey]) -> Float32:
-    """The first heights of a tile and its eight neighbours, (3 * TILE_CELLS, 3 * TILE_CELLS)."""
+    """Assemble the first heights of a tile and its eight neighbours, (3 * TILE_CELLS, 3 * TILE_CELLS)."""
     around = np.full((3 * TILE_CELLS, 3 * TILE_CELLS), np.nan, np.float32)
     for neighbour in _around(key):
         if neighbour in keys:
@@ -240,9 +246,11 @@ def _first_file(folder: Path, key: TileKey) -> Path:
 
 
 def _figures(key: TileKey, layers: Layers) -> _Figures:
-    there = layers.source != Source.UNKNOWN
-    seen, filled = ((layers.source == code).sum() for code in (Source.VISION, Source.FILLED))
-    sigmas = layers.sigma_m[layers.source == Source.VISION][::17] if there.any() else np.empty(0, np.float32)
+    there = layers.source != HeightSource.UNKNOWN
+    seen, filled = ((layers.source == code).sum() for code in (HeightSource.VISION, HeightSource.FILLED))
+    sigmas = (
+        layers.sigma_m[layers.source == HeightSource.VISION][::17] if there.any() else np.empty(0, np.float32)
+    )
     spans = [_span(there.any(axis=axis), key[axis] * TILE_CELLS) for axis in (0, 1)]
     return _Figures(int(seen), int(filled), sigmas, *spans)
 

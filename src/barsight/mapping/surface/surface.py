@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Float32, Int8, UInt8
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.mapping.fusion import height_sigma
 from barsight.mapping.surface.cloud import CloudPart, read_part
-from barsight.mapping.surface.hole_filling import bridged
+from barsight.mapping.surface.hole_filling import bridge_gaps
 from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, Z
 
 
@@ -32,14 +32,14 @@ class Layers:
 
     @classmethod
     def unknown(cls, rows: int, columns: int) -> Layers:
-        """A rectangle of which nothing is known."""
+        """Make a rectangle of which nothing is known."""
         nan = np.full((rows, columns), np.nan, np.float32)
         none = np.zeros((rows, columns), np.float32)
         return cls(nan, nan.copy(), none, none.astype(np.uint8), nan.copy())
 
 
 def grey_levels(intensity: Float32) -> UInt8:
-    """Whole grey levels from 1, 0 where no view saw the cell."""
+    """Round to grey levels from 1, 0 where no view saw the cell."""
     return np.where(np.isfinite(intensity), np.rint(intensity).clip(1, 255), 0).astype(np.uint8)
 
 
@@ -62,11 +62,11 @@ class Surface:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the rectangle that holds everything known."""
+        """Return (rows, columns) of the rectangle that holds everything known."""
         return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
 
     def window(self, column: int, row: int, columns: int, rows: int) -> Layers:
-        """The rectangle from cell (column, row) on; unknown where there is no tile."""
+        """Read the rectangle from cell (column, row) on; unknown where there is no tile."""
         layers = Layers.unknown(rows, columns)
         for tile_row in range(row // TILE_CELLS, (row + rows - 1) // TILE_CELLS + 1):
             for tile_column in range(column // TILE_CELLS, (column + columns - 1) // TILE_CELLS + 1):
@@ -76,8 +76,9 @@ class Surface:
         return layers
 
     def cloud(self) -> Iterator[CloudPart]:
-        """Every height that enough views support, sides and lower surfaces included, tile by tile; those
-        that are the surface are as it has them."""
+        """Yield every height that enough views support, sides and lower surfaces included, tile by tile;
+        those that are the surface are as it has them.
+        """
         for key in sorted(self.tiles):
             yield read_part(self.folder, key)
 
@@ -90,7 +91,7 @@ def elected_layers(tile: Float32, winner: Int8) -> Layers:
     layers.z_m[row, column] = won[:, Z]
     layers.sigma_m[row, column] = height_sigma(won)
     layers.views[row, column] = won[:, VIEWS]
-    layers.source[row, column] = Source.VISION
+    layers.source[row, column] = HeightSource.VISION
     layers.intensity[row, column] = won[:, GREY]
     return layers
 
@@ -101,8 +102,8 @@ def fill_gaps(layers: Layers, reach: int) -> None:
     The height is interpolated between the two (the nearer pair wins), its sigma is half their difference at
     the least, and its source says FILLED.
     """
-    filled = bridged(layers.z_m, layers.sigma_m, layers.source == Source.VISION, reach)
-    layers.source[filled] = Source.FILLED
+    filled = bridge_gaps(layers.z_m, layers.sigma_m, layers.source == HeightSource.VISION, reach)
+    layers.source[filled] = HeightSource.FILLED
 
 
 def tile_file(folder: Path, key: TileKey) -> Path:

@@ -1,4 +1,4 @@
-"""Lines of sight: whether a view has a point in its pictures, free before it, and nothing above it unseen."""
+"""Trace lines of sight: in the frustum, not occluded, and nothing above it unseen."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ STRIDE = 8
 
 
 @kernel()
-def density(point: Float64, eye: Float64, one_point_m: float) -> float:
-    """Points that a view has in a level cell, at most 1."""
+def point_density(point: Float64, eye: Float64, one_point_m: float) -> float:
+    """Compute points that a view has in a level cell, at most 1."""
     x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
     squared = x * x + y * y + z * z
     return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
 
 
 @kernel()
-def inside(x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64) -> None:
-    """How far the point lies inside of both pictures of each view: margin (K,), not below 0 where it does.
+def frustum_margin(x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64) -> None:
+    """Compute the margin (K,) of a point inside both pictures of each view, not below 0 where it does.
 
     planes: (6, 4, K), see `Sights.planes`.
     """
@@ -36,7 +36,7 @@ def inside(x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64)
 
 
 @kernel()
-def may_be_covered(
+def may_be_occluded(
     point: Float64,
     row: int,
     column: int,
@@ -47,11 +47,12 @@ def may_be_covered(
     cell_m: float,
     min_views: float,
 ) -> bool:
-    """Whether, within `_CUT_CELLS` along x or y, a much higher surface ends where fewer than min_views views
-    could see it go on towards the point: their pictures end there. margin: (K,) is written to.
+    """Check for possible occlusion: within `_CUT_CELLS` along x or y, a much higher surface ends where fewer
+    than min_views views could see it go on towards the point: their pictures end there. margin: (K,) is
+    written to.
     """
     x_m, y_m = point[0], point[1]
-    if enough_views(x_m, y_m, ceiling, planes, margin, min_views):
+    if has_enough_views(x_m, y_m, ceiling, planes, margin, min_views):
         return False
     for direction in range(4):
         di, dj = (0, 0, 1, -1)[direction], (1, -1, 0, 0)[direction]
@@ -60,21 +61,23 @@ def may_be_covered(
             if height > point[2] + _OVERHANG_CELLS * cell_m:
                 outward = max(n - _CUT_MARGIN_CELLS, 0) * cell_m
                 x_there, y_there = x_m + dj * outward, y_m + di * outward
-                if not enough_views(x_there, y_there, height, planes, margin, min_views):
+                if not has_enough_views(x_there, y_there, height, planes, margin, min_views):
                     return True
                 break
     return False
 
 
 @kernel()
-def enough_views(x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64, least: float) -> bool:
-    """Whether at least so many views have the point in both pictures."""
-    inside(x_m, y_m, z_m, planes, margin)
+def has_enough_views(
+    x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64, least: float
+) -> bool:
+    """Check that at least so many views have the point in both pictures."""
+    frustum_margin(x_m, y_m, z_m, planes, margin)
     return bool((margin >= 0).sum() >= least)
 
 
 @kernel()
-def free(
+def is_unoccluded(
     point: Float64,
     row: int,
     column: int,
@@ -84,7 +87,7 @@ def free(
     ceiling: float,
     cell_m: float,
 ) -> bool:
-    """Whether no cell between rises over the line from the point (in the middle tile) to the eye above it.
+    """Check that no cell between rises over the line from the point (in the middle tile) to the eye above it.
 
     roof: the highest of `around` within `STRIDE` cells. A line over the roof skips as many: it only rises.
     """

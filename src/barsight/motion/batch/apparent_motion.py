@@ -1,4 +1,4 @@
-"""What seems to slide as it is passed, and what seems to lie deeper or higher than it does: ribs and gloss.
+"""Model apparent slides and disparity biases of strips of the yard (ribs and gloss).
 
 A ribbed bar is a screw: seen from further on, the side that faces the camera shows other ribs, which seem to
 have slid along the bar; what highlights do to mill scale is alike. In the picture such a point turns about
@@ -18,21 +18,27 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Bool
-from barsight.motion.linear.schur_complement import substitute
-from barsight.motion.problem.gauss_newton import State, guess_of, optimise, rig_of, sights_of
-from barsight.motion.problem.gtsam_factors import factors
-from barsight.motion.problem.marginals import piece_variances
+from barsight.motion.linear.schur_complement import back_substitute
+from barsight.motion.problem.gauss_newton import (
+    GraphState,
+    linearisation_point,
+    observations_of,
+    optimise_graph,
+    rig_of,
+)
+from barsight.motion.problem.gtsam_factors import build_graph
+from barsight.motion.problem.marginals import slide_variances
 from barsight.motion.problem.normal_equations import System
 from barsight.motion.problem.problem import Pieces, Problem
 
-LENGTH_SHARE = 0.2
-HEIGHT_SHARE = 0.07
+LENGTH_RATIO = 0.2
+HEIGHT_RATIO = 0.07
 """A piece is this long along the way, and this high, in terms of the points' distance."""
 FIRST_SIGMA_RAD = 2e-4
-LEAST_SIGMA_RAD = 5e-6
+MIN_SIGMA_RAD = 5e-6
 FIRST_SIGMA_PX = 0.005
-LEAST_PIECES = 4
-LEAST_SEEN = 4
+MIN_PIECES = 4
+MIN_SEEN = 4
 """A point seen less often says nothing of how it slides."""
 PRIOR_POINTS = 5
 """How many points' worth all pieces' scatter counts in that of one."""
@@ -43,9 +49,10 @@ STEPS = 2
 """Gauss-Newton's, in a round: each begins where the one before ended."""
 
 
-def pieces_of(problem: Problem, state: State, used: Bool) -> Pieces | None:
-    """Strips across the way, apart in height; None where there are too few of them, or fewer points than
-    pieces that say how they slide."""
+def partition_points(problem: Problem, state: GraphState, used: Bool) -> Pieces | None:
+    """Partition the points into strips across the way, apart in height; None where there are too few of them,
+    or fewer points than pieces that say how they slide.
+    """
     seen = problem.sightings
     if seen is None or not problem.has_latency:
         return None
@@ -54,52 +61,53 @@ def pieces_of(problem: Problem, state: State, used: Bool) -> Pieces | None:
     range_m = camera.focal_px * camera.baseline_m / disparity
     place = np.array([pose.translation for pose in problem.start])
     _, _, axes = np.linalg.svd(place - place.mean(axis=0), full_matrices=False)
-    along = np.floor(state.points[:, :3] @ axes[0] / (LENGTH_SHARE * range_m))
-    up = np.floor(state.points[:, 2] / (HEIGHT_SHARE * range_m) + 0.5)
+    along = np.floor(state.points[:, :3] @ axes[0] / (LENGTH_RATIO * range_m))
+    up = np.floor(state.points[:, 2] / (HEIGHT_RATIO * range_m) + 0.5)
     names, piece = np.unique(np.column_stack([along, up]), axis=0, return_inverse=True)
-    telling = int((np.bincount(seen.track[used]) >= LEAST_SEEN).sum())
-    if len(names) < LEAST_PIECES or telling < len(names):
+    telling = int((np.bincount(seen.track[used]) >= MIN_SEEN).sum())
+    if len(names) < MIN_PIECES or telling < len(names):
         return None
     return Pieces(piece.ravel().astype(np.int64), np.full(len(names), FIRST_SIGMA_RAD), 0.5, FIRST_SIGMA_PX)
 
 
-def with_slides(
-    problem: Problem, state: State, used: Bool, rounds: int = ROUNDS
-) -> tuple[Problem, State, System]:
-    """Solved with what pieces share as unknowns, and how far they go as they show it [EM: Dempster 1977; of
-    disparities MacKay 1992, faster where there is little to find].
+def solve_with_slides(
+    problem: Problem, state: GraphState, used: Bool, rounds: int = ROUNDS
+) -> tuple[Problem, GraphState, System]:
+    """Solve with slides as unknowns and their sigma by EM, with what pieces share as unknowns, and how far
+    they go as they show it [EM: Dempster 1977; of disparities MacKay 1992, faster where there is little to
+    find].
     """
-    pieces = problem.pieces or pieces_of(problem, state, used)
-    graph = factors(problem)
+    pieces = problem.pieces or partition_points(problem, state, used)
+    graph = build_graph(problem)
     if pieces is None:
-        return problem, *optimise(problem, graph, state, used)
+        return problem, *optimise_graph(problem, graph, state, used)
     if not len(state.pieces):
         state = replace(state, pieces=np.zeros(2 * pieces.count))
     for left in reversed(range(rounds)):
         problem = replace(problem, pieces=pieces)
-        state, system = optimise(problem, graph, state, used, most=STEPS)
+        state, system = optimise_graph(problem, graph, state, used, most=STEPS)
         pieces = _learnt(problem, state, system, pieces, used)
         if left:
             del system
     return problem, state, system
 
 
-def _learnt(problem: Problem, state: State, system: System, pieces: Pieces, used: Bool) -> Pieces:
+def _learnt(problem: Problem, state: GraphState, system: System, pieces: Pieces, used: Bool) -> Pieces:
     seen = problem.sightings
     assert seen is not None
     variance = np.zeros(len(state.points))
-    still, guess = np.zeros((len(problem.kept), 6)), guess_of(problem, state)
+    still, guess = np.zeros((len(problem.kept), 6)), linearisation_point(problem, state)
     none, points = np.zeros(2 * pieces.count + 2), state.points.copy()
-    substitute(rig_of(seen), sights_of(problem, used), guess, still, none, points, variance)
+    back_substitute(rig_of(seen), observations_of(problem, used), guess, still, none, points, variance)
     counts = np.bincount(seen.track[used], minlength=len(variance))
-    good = counts >= LEAST_SEEN
+    good = counts >= MIN_SEEN
     slides, disparities = np.split(state.pieces, 2)
     square = (points[:, 3] - slides[pieces.piece]) ** 2 + variance
     everywhere = square[good].mean()
     total = np.bincount(pieces.piece[good], square[good], pieces.count) + PRIOR_POINTS * everywhere
     own = np.sqrt(total / (np.bincount(pieces.piece[good], minlength=pieces.count) + PRIOR_POINTS))
-    own = np.maximum(own, LEAST_SIGMA_RAD)
-    spread, in_all = piece_variances(system, np.concatenate([1 / own, np.zeros(pieces.count)]))
+    own = np.maximum(own, MIN_SIGMA_RAD)
+    spread, in_all = slide_variances(system, np.concatenate([1 / own, np.zeros(pieces.count)]))
     unit = replace(pieces, own_sigma_rad=own, share=1.0)
     scatter = (spread[: pieces.count] / own**2).sum() - in_all / (pieces.count + 1)
     slid = unit.cost(np.concatenate([slides, np.zeros(pieces.count)])) + scatter

@@ -1,4 +1,4 @@
-"""The batch estimate: one factor graph over a whole recording's poses, velocities, biases and points."""
+"""Estimate a whole recording in one factor graph: poses, velocities, biases and points."""
 
 from __future__ import annotations
 
@@ -9,33 +9,39 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
-from barsight.core.motion_detail import Inertial, InSigmas
+from barsight.core.motion_detail import InertialStates, NormalisedResiduals
 from barsight.core.pose import Pose, skew
 from barsight.core.types import RigDrift
 from barsight.inertial.model import ImuBias
-from barsight.motion.batch.apparent_motion import with_slides
-from barsight.motion.batch.rig_drift_search import sought
+from barsight.motion.batch.apparent_motion import solve_with_slides
+from barsight.motion.batch.rig_drift_search import optimise_with_drift
 from barsight.motion.problem.encoder_factors import (
     EncoderState,
-    agreeing,
-    disagreement,
+    encoder_inliers,
+    encoder_residuals,
     encoder_state,
-    with_known_bends,
+    with_known_curvature,
 )
-from barsight.motion.problem.gauss_newton import State, optimise, sighting_residuals
-from barsight.motion.problem.gtsam_factors import factors, start_values
+from barsight.motion.problem.gauss_newton import GraphState, optimise_graph, sighting_residuals
+from barsight.motion.problem.gtsam_factors import build_graph, initial_values
 from barsight.motion.problem.marginals import Marginals, marginals
 from barsight.motion.problem.normal_equations import System
-from barsight.motion.problem.problem import Placed, Problem, StereoSightings
-from barsight.motion.problem.residuals import imu_in_sigmas, inertial, pictures_in_sigmas
-from barsight.motion.problem.rig_drift import with_own_bias
-from barsight.motion.problem.stereo_factors import nearness, often, persistence, start_points, taken_up
+from barsight.motion.problem.problem import EncoderPosition, Problem, StereoObservations
+from barsight.motion.problem.residuals import inertial_states, normalised_imu, normalised_reprojection
+from barsight.motion.problem.rig_drift import with_matching_bias
+from barsight.motion.problem.stereo_factors import (
+    dof_correction,
+    initial_points,
+    spatial_inflation,
+    temporal_inflation,
+    well_observed,
+)
 
 FARTHEST_OUTLIER_SIGMAS = 3.5
-MOST_ROUNDS = 3
-LEAST_AGREEING = 0.5
+MAX_ROUNDS = 3
+MIN_AGREEING = 0.5
 """Where fewer of the encoders' places agree, none is left out: who is wrong can't be told."""
-LEAST_FACTOR = 0.1
+MIN_FACTOR = 0.1
 START_GAIN = 1e-3
 """The first solution only has to tell outliers: steps that gain less than this share of the cost end it."""
 
@@ -60,17 +66,18 @@ class Estimate:
     drift: RigDrift | None
     used: Bool
     encoders: EncoderState | None
-    placed: tuple[Placed, ...]
+    placed: tuple[EncoderPosition, ...]
     encoder_off_m: Float64
     encoder_used: Bool
-    inertial: Inertial | None
-    pictures: InSigmas | None
-    imu: InSigmas | None
+    inertial: InertialStates | None
+    pictures: NormalisedResiduals | None
+    imu: NormalisedResiduals | None
     points: Int64
 
 
-def solve(problem: Problem, frames: Int64) -> Estimate:
-    """frames: (F,) the nodes whose covariance is wanted, also relative, each with the next.
+def solve_batch(problem: Problem, frames: Int64) -> Estimate:
+    """Solve the batch problem. frames: (F,) the nodes whose covariance is wanted, also relative, each with
+    the next.
 
     After a first solution, drift of the rig included, encoders' places are taken anew with the accelerations
     it shows, sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was seen; then the drift
@@ -81,28 +88,28 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     problem = replace(problem, asked=frames)
     used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
     if problem.sightings is not None:
-        used = often(problem.sightings, used)
-    state = State(start_values(problem), start_points(problem), np.zeros(2))
-    state, system = optimise(problem, factors(problem), state, used, least_gain=START_GAIN)
+        used = well_observed(problem.sightings, used)
+    state = GraphState(initial_values(problem), initial_points(problem), np.zeros(2))
+    state, system = optimise_graph(problem, build_graph(problem), state, used, min_gain=START_GAIN)
     seeks_drift = problem.sightings is not None and problem.offset_prior_px > 0 and bool(used.any())
     if problem.sightings is not None and used.any():
         if problem.has_latency and seeks_drift:
-            state, system, _ = sought(problem, state, system, used, START_GAIN)
+            state, system, _ = optimise_with_drift(problem, state, system, used, START_GAIN)
         del system
-        seen, problem = problem.sightings, with_known_bends(problem, state.values)
+        seen, problem = problem.sightings, with_known_curvature(problem, state.values)
         problem, state, system, used = _with_seen_noise(problem, seen, state, used)
     drift: RigDrift | None = None
     everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         if seeks_drift:
-            state, system, drift = sought(problem, state, system, used)
-        now = agreeing(state.values, everywhere)
-        if (now == agreed).all() or now.mean() < LEAST_AGREEING:
+            state, system, drift = optimise_with_drift(problem, state, system, used)
+        now = encoder_inliers(state.values, everywhere)
+        if (now == agreed).all() or now.mean() < MIN_AGREEING:
             break
         agreed = now
         chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
         problem = replace(problem, placed=chosen)
-        state, system = optimise(problem, factors(problem), state, used)
+        state, system = optimise_graph(problem, build_graph(problem), state, used)
     pairs = np.column_stack([np.arange(len(frames) - 1), np.arange(1, len(frames))])
     poses, found = _poses(state, problem), marginals(system, pairs)
     shown = tuple(poses[k] for k in frames)
@@ -110,31 +117,46 @@ def solve(problem: Problem, frames: Int64) -> Estimate:
     everything[frames] = found.nodes
     velocity, biases = _inertial(state, problem)
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
-    pictures, points = pictures_in_sigmas(problem, state, used)
+    pictures, points = normalised_reprojection(problem, state, used)
     return Estimate(
-        poses, covariances(found, shown, drift), relative(found, shown, drift, pairs), velocity, biases,
-        sigma, drift and with_own_bias(drift, problem), used,
+        poses,
+        covariances(found, shown, drift),
+        relative_covariances(found, shown, drift, pairs),
+        velocity,
+        biases,
+        sigma,
+        drift and with_matching_bias(drift, problem),
+        used,
         encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
-        everywhere.placed, disagreement(state.values, everywhere), agreeing(state.values, everywhere),
-        inertial(problem, state, everything), pictures, imu_in_sigmas(problem, state), points,
-    )  # fmt: skip
+        everywhere.placed,
+        encoder_residuals(state.values, everywhere),
+        encoder_inliers(state.values, everywhere),
+        inertial_states(problem, state, everything),
+        pictures,
+        normalised_imu(problem, state),
+        points,
+    )
 
 
 def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None) -> Float64:
-    """(F, 6, 6) of the poses in the reference's axes, what the rig's drift leaves open included."""
+    """Compute pose covariances (F, 6, 6) in the reference's axes, what the rig's drift leaves open
+    included.
+    """
     shared = np.zeros((2, 2)) if drift is None else drift.covariance
     result = np.zeros((len(poses), 6, 6))
     for k, pose in enumerate(poses):
         turned = np.zeros((6, 6))
         turned[:3, :3] = turned[3:, 3:] = pose.rotation
-        own = found.poses[k] + found.swing[k] @ shared @ found.swing[k].T
+        own = found.poses[k] + found.drift_jacobian_of_pose[k] @ shared @ found.drift_jacobian_of_pose[k].T
         result[k] = turned @ own @ turned.T
     return result
 
 
-def relative(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None, pairs: Int64) -> Float64:
-    """(P, 6, 6) of the later pose in the earlier one, rotation then translation of a small motion that
-    follows it, in its own axes: what both are off by alike doesn't count.
+def relative_covariances(
+    found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None, pairs: Int64
+) -> Float64:
+    """Compute covariances (P, 6, 6) of the later pose in the earlier one, rotation then translation of a
+    small motion that follows it, in its own axes: what both are off by alike doesn't count.
     """
     shared = np.zeros((2, 2)) if drift is None else drift.covariance
     result = np.empty((len(pairs), 6, 6))
@@ -142,34 +164,36 @@ def relative(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None, 
         moved = poses[new].inverse() @ poses[old]
         carried = np.kron(np.eye(2), moved.rotation)
         carried[3:, :3] = skew(moved.translation) @ moved.rotation
-        swing = found.swing[new] - carried @ found.swing[old]
+        drift_jacobian_of_pose = (
+            found.drift_jacobian_of_pose[new] - carried @ found.drift_jacobian_of_pose[old]
+        )
         both = carried @ found.cross[p]
         own = found.poses[new] + carried @ found.poses[old] @ carried.T - both - both.T
-        result[p] = own + swing @ shared @ swing.T
+        result[p] = own + drift_jacobian_of_pose @ shared @ drift_jacobian_of_pose.T
     return result
 
 
 def _with_seen_noise(
-    problem: Problem, seen: StereoSightings, state: State, used: Bool
-) -> tuple[Problem, State, System, Bool]:
-    """The problem with the sightings' sigma as their residuals show it, and without the far ones, solved."""
+    problem: Problem, seen: StereoObservations, state: GraphState, used: Bool
+) -> tuple[Problem, GraphState, System, Bool]:
+    """Re-solve with the sightings' sigma estimated from their residuals, and without outliers."""
     residual = sighting_residuals(problem, state, used)
     share = np.abs(residual) / seen.sigma_px[:, None]
-    factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])) * taken_up(seen, used))
-    used = often(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+    factor = max(MIN_FACTOR, 1.4826 * float(np.median(share[used])) * dof_correction(seen, used))
+    used = well_observed(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
     seen = replace(seen, sigma_px=factor * seen.sigma_px)
-    problem, state, system = with_slides(replace(problem, sightings=seen), state, used)
+    problem, state, system = solve_with_slides(replace(problem, sightings=seen), state, used)
     residual = sighting_residuals(problem, state, used)
-    wider = persistence(residual, seen, used) * nearness(residual, seen, used)
+    wider = temporal_inflation(residual, seen, used) * spatial_inflation(residual, seen, used)
     if wider > 1:
         del system
         problem = replace(problem, sightings=replace(seen, sigma_px=wider * seen.sigma_px))
-        problem, state, system = with_slides(problem, state, used, rounds=1)
+        problem, state, system = solve_with_slides(problem, state, used, rounds=1)
     return problem, state, system, used
 
 
-def _inertial(state: State, problem: Problem) -> tuple[Float64 | None, tuple[ImuBias, ...]]:
-    """(M, 3) velocities and the biases, where there is an IMU."""
+def _inertial(state: GraphState, problem: Problem) -> tuple[Float64 | None, tuple[ImuBias, ...]]:
+    """Extract velocities (M, 3) and the biases, where there is an IMU."""
     if not problem.has_imu:
         return None, ()
     nodes = range(len(problem.start))
@@ -178,7 +202,7 @@ def _inertial(state: State, problem: Problem) -> tuple[Float64 | None, tuple[Imu
     return np.array([state.values.atVector(V(k)) for k in nodes]), biases
 
 
-def _poses(state: State, problem: Problem) -> tuple[Pose, ...]:
+def _poses(state: GraphState, problem: Problem) -> tuple[Pose, ...]:
     target = problem.start[0].target
     return tuple(_pose(state.values.atPose3(X(k)), target) for k in range(len(problem.start)))
 

@@ -1,4 +1,4 @@
-"""Sensors that contradict themselves or each other before anything is estimated from them."""
+"""Check sensors for contradictions, in themselves or among each other, before estimation."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.crane.sway import turned_angle
 from barsight.motion.frontend.tracking import Sighting
 
-LEAST_FROZEN = 5
+MIN_FROZEN = 5
 SIDE, SPEED_WINDOW_S = 8, 0.3
 """The speed before a freeze is taken over so many readings, or so long where that is more."""
 MIN_HELD_M, HELD_SIGMAS = 0.01, 8.0
 """A crane that froze would have gone further than this, and than so many sigma of a reading."""
 MAX_BRAKING_MPS2 = 1.0
-MOST_FRAMES_OFF = 2
+MAX_FRAMES_OFF = 2
 MANY_STEPS = 8
 """Recordings that leave fewer steps are looked at for one frame off only."""
-LEAST_STEPS = 2
+MIN_STEPS = 2
 """Five frames. They tell seven times in ten, seven frames always (docs/explanation/motion.md)."""
 WINDOW_S = 0.35
 TURN_SIGMA_RAD = 5e-4
@@ -37,14 +37,14 @@ DEGREES = 180 / np.pi
 
 @dataclass(frozen=True, eq=False)
 class CheckedCrane:
-    """The readings that can be used, and sentences on what was left out."""
+    """Usable readings, and sentences on what was left out."""
 
     samples: CraneSamples
     warnings: tuple[str, ...]
 
 
 def check_crane(crane: CraneSamples) -> CheckedCrane:
-    """Leaves out readings that stand still while the crane must be moving, and those beyond a jump.
+    """Remove readings that stand still while the crane must be moving, and those beyond a jump.
 
     Which side of a jump is right can't be told from the encoders: the longer one stays.
     """
@@ -72,8 +72,8 @@ def check_crane(crane: CraneSamples) -> CheckedCrane:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
-    """What pictures and other sensors say of the same K steps between frames.
+class StepComparison:
+    """Pictures' and other sensors' measurements of the same K steps between frames.
 
     turn: (K, 3) rotation vector old body from new body and way: (K,) m by the pictures. gyro: (K, 3) and
     travel: (K,) by IMU and encoders, NaN where they don't cover it. seconds: (K,).
@@ -89,9 +89,9 @@ class Steps:
 def compare_steps(
     sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
     rectifier: Rectifier, shift_ns: int, offs: tuple[int, ...] = (0,),
-) -> tuple[Steps, ...]:  # fmt: skip
-    """For each of `offs` the steps with the other sensors taken that many frames further on; the same steps
-    for all, those of the outer frames left out.
+) -> tuple[StepComparison, ...]:  # fmt: skip
+    """Measure for each of `offs` the steps with the other sensors taken that many frames further on; the same
+    steps for all, those of the outer frames left out.
     """
     count, ends = len(sightings), max(abs(off) for off in offs)
     steps = [k for k in range(1 + ends, count - ends) if sightings[k].motion is not None]
@@ -110,7 +110,7 @@ def compare_steps(
         old, new = [k + off - 1 for k in steps], [k + off for k in steps]
         travel = np.linalg.norm(place[new] - place[old], axis=1)
         found.append(
-            Steps(turn, way, angle[new] - angle[old], travel, (stamps[new] - stamps[old]) / NS_PER_S)
+            StepComparison(turn, way, angle[new] - angle[old], travel, (stamps[new] - stamps[old]) / NS_PER_S)
         )
     return tuple(found)
 
@@ -119,21 +119,22 @@ def frames_off(
     sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
     rectifier: Rectifier, shift_ns: int,
 ) -> int:  # fmt: skip
-    """By how many frames the cameras' stamps are late against gyro and encoders; 0 where that isn't clear.
+    """Estimate by how many frames the cameras' stamps are late against gyro and encoders; 0 where that isn't
+    clear.
 
     The turns and ways that pictures show between neighbouring frames are held against those of the other
     sensors between the stamps of neighbours further on or back. The gyro's bias is fitted each time.
     """
-    most = MOST_FRAMES_OFF if len(sightings) > 2 * MOST_FRAMES_OFF + MANY_STEPS else 1
+    most = MAX_FRAMES_OFF if len(sightings) > 2 * MAX_FRAMES_OFF + MANY_STEPS else 1
     offs = tuple(range(-most, most + 1))
     cost = {}
     for off, steps in zip(offs, compare_steps(sightings, imu, crane, rectifier, shift_ns, offs), strict=True):
         turned = _gyro_residual(steps)
         travelled = np.isfinite(steps.travel)
         terms = []
-        if len(turned) >= LEAST_STEPS:
+        if len(turned) >= MIN_STEPS:
             terms.append(float((turned**2).mean()) / TURN_SIGMA_RAD**2)
-        if travelled.sum() >= LEAST_STEPS:
+        if travelled.sum() >= MIN_STEPS:
             wrong = (steps.travel - steps.way)[travelled]
             terms.append(float((wrong**2).mean()) / WAY_SIGMA_M**2)
         cost[off] = float(np.mean(terms)) if terms else 0.0
@@ -145,10 +146,10 @@ def frames_off(
 def gyro_in_degrees(
     sightings: tuple[Sighting, ...], imu: ImuSamples, rectifier: Rectifier, shift_ns: int
 ) -> bool:
-    """Whether the gyro turns some 57 times as far as the pictures, step by step."""
+    """Check whether the gyro turns some 57 times as far as the pictures, step by step."""
     (steps,) = compare_steps(sightings, imu, None, rectifier, shift_ns)
     radians, degrees = _gyro_residual(steps), _gyro_residual(steps, DEGREES)
-    if len(radians) < LEAST_STEPS:
+    if len(radians) < MIN_STEPS:
         return False
     spread = float((radians**2).mean())
     return (
@@ -156,8 +157,10 @@ def gyro_in_degrees(
     )
 
 
-def _gyro_residual(steps: Steps, per_turn: float = 1.0) -> Float64:
-    """(K, 3) gyro minus `per_turn` times the pictures' turn, without the constant rate that fits best."""
+def _gyro_residual(steps: StepComparison, per_turn: float = 1.0) -> Float64:
+    """Subtract `per_turn` times the pictures' turn from the gyro (K, 3), and the constant rate that fits
+    best.
+    """
     known = np.isfinite(steps.gyro).all(axis=1)
     time = steps.seconds[known, None]
     off = steps.gyro[known] - per_turn * steps.turn[known]
@@ -166,7 +169,7 @@ def _gyro_residual(steps: Steps, per_turn: float = 1.0) -> Float64:
 
 
 def _seen(sightings: tuple[Sighting, ...], steps: list[int], rectifier: Rectifier) -> tuple[Float64, Float64]:
-    """(K, 3) turn old body from new body, and (K,) length of the way, by the pictures."""
+    """Measure by the pictures: turn old body from new body (K, 3) and length of the way (K,)."""
     mount = rectifier.body_from_rect0
     turns, ways = [], []
     for k in steps:
@@ -196,7 +199,7 @@ def _frozen(crane: CraneSamples) -> list[tuple[int, int]]:
     least = max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
     found = []
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if last - first + 1 < LEAST_FROZEN or first < SIDE // 2:
+        if last - first + 1 < MIN_FROZEN or first < SIDE // 2:
             continue
         after = place[last + 1 : last + 4]
         away = float(np.linalg.norm(np.median(after, axis=0) - place[last])) if len(after) == 3 else 0.0

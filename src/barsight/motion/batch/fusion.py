@@ -1,4 +1,4 @@
-"""One estimate from cameras, IMU and encoders, whichever there are: the trajectory of a whole recording."""
+"""Estimate a recording's trajectory from cameras, IMU and encoders, whichever there are, in one batch."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
-from barsight.core.motion_detail import Inertial, InSigmas, MotionDetail, Relative
+from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
 from barsight.motion.batch.fault_detection import check_crane, frames_off, gyro_in_degrees
 from barsight.motion.crane.encoder_trajectory import (
     CraneSettings,
-    CraneTrajectory,
+    EncoderOdometry,
     fit_position,
-    with_seen_noise,
+    reestimate_noise,
 )
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
-from barsight.motion.frontend.board_corners import follow_corners
+from barsight.motion.frontend.board_corners import track_named_points
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.tracking import FrontEndSettings, Sighting, follow, innovations
-from barsight.motion.gravity import Level, level_attitude
-from barsight.motion.problem.nodes import Nodes, make_nodes, start_poses, tied_by_imu
+from barsight.motion.frontend.tracking import FrontEndSettings, Sighting, innovations, track_recording
+from barsight.motion.gravity import GravityAlignment, align_with_gravity
+from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
 from barsight.recording.base import Recording
 from barsight.recording.formats.board_corners import CornerRecording
 
@@ -62,7 +62,7 @@ class FusionSettings:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """The sensors named."""
+        """Return the sensors named."""
         return tuple(name.strip() for name in self.use.split(",") if name.strip())
 
 
@@ -72,20 +72,20 @@ class _Inputs:
     imu: ImuSamples | None
     sightings: tuple[Sighting, ...]
     refused: tuple[RefusedFrame, ...]
-    level: Level | None
+    level: GravityAlignment | None
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class FusedTrajectory:
+class BatchFusion:
     """`TrajectoryEstimator` for any recording; the reference is `yard` with encoders, else `world`."""
 
     settings: FusionSettings
     crane: CraneSettings
 
     def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Frames that neither pictures nor encoders place are refused. Raises MeasurementError where no
-        sensor that places the body is left to use.
+        """Estimate; frames that neither pictures nor encoders place are refused. Raises MeasurementError
+        where no sensor that places the body is left to use.
         """
         inputs = self._gather(recording, rectifier, advance)
         shift = recording.rig.timeshift_cam_imu_ns
@@ -118,9 +118,9 @@ class FusedTrajectory:
         )  # fmt: skip
 
     def _simple(self, recording: Recording, rectifier: Rectifier, inputs: _Inputs) -> Trajectory:
-        """Without a graph: the encoders' trajectory, or frame to frame."""
+        """Estimate without a graph: the encoders' trajectory, or frame to frame."""
         if inputs.crane is not None:
-            return CraneTrajectory(self.crane)(recording, rectifier, _silent)
+            return EncoderOdometry(self.crane)(recording, rectifier, _silent)
         return StereoOdometry(self.settings.front_end.rough)(recording, rectifier, _silent)
 
     def _reference(self, inputs: _Inputs) -> str:
@@ -129,7 +129,7 @@ class FusedTrajectory:
     def _gather(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> _Inputs:
         use = self.settings.sensors
         stated = recording.crane() if "crane" in use else None
-        checked = None if stated is None else check_crane(with_seen_noise(stated))
+        checked = None if stated is None else check_crane(reestimate_noise(stated))
         crane = None if checked is None else checked.samples
         imu, spoiled = recording.imu() if "imu" in use else None, 0
         if imu is not None:
@@ -144,14 +144,16 @@ class FusedTrajectory:
             predictor = CranePredictor(crane, imu, bias, rectifier, shift) if crane else lambda a, b: None
             if isinstance(recording, CornerRecording):
                 rough = self.settings.front_end.rough
-                sightings, refused = follow_corners(recording, rectifier, rough, advance)
+                sightings, refused = track_named_points(recording, rectifier, rough, advance)
             else:
-                sightings, refused = follow(recording, rectifier, predictor, self.settings.front_end, advance)
+                sightings, refused = track_recording(
+                    recording, rectifier, predictor, self.settings.front_end, advance
+                )
         else:
             for _ in recording.index.stamps_ns:
                 advance()
         self._refuse_wrong_sensors(recording, rectifier, sightings, imu, crane)
-        level = None if crane else level_attitude(recording)
+        level = None if crane else align_with_gravity(recording)
         warnings = (level.warnings if level else ()) + (checked.warnings if checked else ())
         if spoiled:
             warnings += (f"{spoiled} IMU samples are at the end of their scale and were left out",)
@@ -163,7 +165,7 @@ class FusedTrajectory:
         self, recording: Recording, rectifier: Rectifier, sightings: tuple[Sighting, ...],
         imu: ImuSamples | None, crane: CraneSamples | None,
     ) -> None:  # fmt: skip
-        """Raises InputError where the pictures show that a sensor's unit or the cameras' stamps are wrong."""
+        """Raise InputError where the pictures show that a sensor's unit or the cameras' stamps are wrong."""
         shift = recording.rig.timeshift_cam_imu_ns
         if imu is not None and gyro_in_degrees(sightings, imu, rectifier, shift):
             raise InputError(
@@ -181,25 +183,30 @@ class FusedTrajectory:
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
-    ) -> tuple[Estimate, tuple[str, ...], InSigmas | None]:
+    ) -> tuple[Estimate, tuple[str, ...], NormalisedResiduals | None]:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
-        from barsight.motion.batch.bundle_adjustment import solve
-        from barsight.motion.problem.encoder_factors import encoder_warnings, places
-        from barsight.motion.problem.problem import Attitude, Placed, Problem, StereoSightings
-        from barsight.motion.problem.residuals import encoders_in_sigmas
+        from barsight.motion.batch.bundle_adjustment import solve_batch
+        from barsight.motion.problem.encoder_factors import encoder_positions, encoder_warnings
+        from barsight.motion.problem.problem import (
+            AttitudePrior,
+            EncoderPosition,
+            Problem,
+            StereoObservations,
+        )
+        from barsight.motion.problem.residuals import normalised_encoders
 
-        start = start_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
+        start = initial_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
         noise = recording.imu_noise() or ORDINARY_NOISE
         if inputs.crane is not None:
             known = int(inputs.crane.stamp_ns[0]), int(inputs.crane.stamp_ns[-1])
         else:
             known = inputs.sightings[0].stamp_ns + shift, inputs.sightings[-1].stamp_ns + shift
-        ties = tied_by_imu(nodes, start, known, inputs.imu, noise)
-        placed: tuple[Placed, ...] = ()
-        attitudes: list[Attitude] = []
+        ties = constrain_by_imu(nodes, start, known, inputs.imu, noise)
+        placed: tuple[EncoderPosition, ...] = ()
+        attitudes: list[AttitudePrior] = []
         if inputs.crane is not None:
             chosen = _apart(nodes.stamp_ns, seconds_to_ns(PLACE_SPACING_S))
-            placed = places(inputs.crane, nodes.stamp_ns, chosen)
+            placed = encoder_positions(inputs.crane, nodes.stamp_ns, chosen)
             nominal = inputs.crane.yard_from_body_nominal
             still = [k for k in chosen if k in ties.still]
             for k in chosen:
@@ -207,11 +214,11 @@ class FusedTrajectory:
                 sigma = self.crane.attitude_std_deg * 1.6
                 if k in still:
                     sigma = self.crane.sway_std_deg * len(still) ** 0.5
-                attitudes.append(Attitude(k, nominal, np.full(3, np.deg2rad(sigma))))
+                attitudes.append(AttitudePrior(k, nominal, np.full(3, np.deg2rad(sigma))))
         seen = None
         if inputs.sightings:
             at = {int(nodes.stamp_ns[k]) - shift: int(k) for k in nodes.frame}
-            seen = StereoSightings.of(
+            seen = StereoObservations.of(
                 inputs.sightings, [at[s.stamp_ns] for s in inputs.sightings], rectifier.camera,
                 rectifier.body_from_rect0,
             )  # fmt: skip
@@ -222,22 +229,26 @@ class FusedTrajectory:
             crane=inputs.crane, has_latency=bool(placed),
             has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
-        estimate = solve(problem, nodes.frame)
+        estimate = solve_batch(problem, nodes.frame)
         warnings = encoder_warnings(
             estimate.encoders, nodes.stamp_ns, estimate.placed, estimate.encoder_off_m, estimate.encoder_used
         )
-        encoders = encoders_in_sigmas(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
+        encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
         return estimate, warnings, encoders
 
 
 def _detail(
-    estimate: Estimate, sightings: tuple[Sighting, ...], nodes: Nodes, encoders: InSigmas | None, shift: int
+    estimate: Estimate,
+    sightings: tuple[Sighting, ...],
+    nodes: Nodes,
+    encoders: NormalisedResiduals | None,
+    shift: int,
 ) -> MotionDetail:
-    """By cam0's clock; of the frames alone where it is of the nodes."""
+    """Select details by cam0's clock; of the frames alone where it is of the nodes."""
     inertial = estimate.inertial
     if inertial is not None:
         values = {f.name: getattr(inertial, f.name)[nodes.frame] for f in fields(inertial)}
-        inertial = Inertial(**{**values, "stamp_ns": values["stamp_ns"] - shift})
+        inertial = InertialStates(**{**values, "stamp_ns": values["stamp_ns"] - shift})
     seen = {sighting.stamp_ns: sighting.ambiguous for sighting in sightings}
     shown = np.flatnonzero(estimate.points)
     ambiguous = [seen.get(int(stamp) - shift, 0) for stamp in nodes.stamp_ns[shown]]
@@ -247,17 +258,17 @@ def _detail(
         for part in (estimate.pictures, estimate.imu, encoders)
     ]
     return MotionDetail(
-        inertial, by_frames[0], by_frames[1], by_frames[2], points, Relative(estimate.relative),
+        inertial, by_frames[0], by_frames[1], by_frames[2], points, RelativePoses(estimate.relative),
         innovations(sightings),
     )  # fmt: skip
 
 
 def _silent() -> None:
-    """The frames were told already."""
+    """Swallow progress: the frames were told already."""
 
 
 def _untied(sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]) -> tuple[str, ...]:
-    """The warning that pictures don't follow from each other, though encoders place their frames."""
+    """Warn that pictures don't follow from each other, though encoders place their frames."""
     count = len(refused) + sum(sighting.motion is None for sighting in sightings[1:])
     if count == 0:
         return ()
@@ -269,7 +280,7 @@ def _untied(sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]) 
 def _placed_frames(
     recording: Recording, crane: CraneSamples, sighted: Int64, shift: int
 ) -> tuple[Int64, list[RefusedFrame]]:
-    """Stamps of all frames that the encoders or the pictures place, and the refused ones."""
+    """List stamps of all frames that the encoders or the pictures place, and the refused ones."""
     known = set(sighted.tolist())
     frames: list[int] = []
     refused: list[RefusedFrame] = []
@@ -282,10 +293,10 @@ def _placed_frames(
     return np.array(frames, np.int64), refused
 
 
-def _apart(stamp_ns: Int64, least_ns: int) -> list[int]:
-    """Indices of stamps at least so far apart, from the first on."""
+def _apart(stamp_ns: Int64, min_ns: int) -> list[int]:
+    """Select indices of stamps at least so far apart, from the first on."""
     chosen = [0]
     for k in range(1, len(stamp_ns)):
-        if stamp_ns[k] - stamp_ns[chosen[-1]] >= 0.97 * least_ns:
+        if stamp_ns[k] - stamp_ns[chosen[-1]] >= 0.97 * min_ns:
             chosen.append(k)
     return chosen

@@ -1,4 +1,4 @@
-"""The rig's drift sought from where the estimate stands, and weighed against its prior at every step.
+"""Search the rig's drift from the present estimate, weighed against its prior at every step.
 
 Over a short way yaw and scale look alike: sightings alone would follow a valley far from the truth, where
 what is linear here no longer holds. So each step goes to where sightings and prior together want it.
@@ -10,37 +10,42 @@ import numpy as np
 
 from barsight.core.arrays import Bool
 from barsight.core.types import RigDrift
-from barsight.motion.problem.gauss_newton import RELATIVE_GAIN, State, moved, optimise
-from barsight.motion.problem.gtsam_factors import factors
+from barsight.motion.problem.gauss_newton import RELATIVE_GAIN, GraphState, optimise_graph, retract
+from barsight.motion.problem.gtsam_factors import build_graph
 from barsight.motion.problem.normal_equations import System
 from barsight.motion.problem.problem import Problem
-from barsight.motion.problem.rig_drift import columns, weigh
+from barsight.motion.problem.rig_drift import combine_with_prior, drift_jacobian
 
-MOST_STEPS = 6
-LEAST_STEP_PX = 0.02
+MAX_STEPS = 6
+MIN_STEP_PX = 0.02
 
 
-def drifted(problem: Problem, state: State, system: System, used: Bool) -> tuple[State, RigDrift]:
-    """The state moved to the drift that sightings and prior together show, and that drift."""
+def apply_estimated_drift(
+    problem: Problem, state: GraphState, system: System, used: Bool
+) -> tuple[GraphState, RigDrift]:
+    """Move the state to the drift that sightings and prior together show; also that drift."""
     own, slope = system.schur(system.forward)
     best = state.drift - np.linalg.solve(own, slope)[-2:]
-    drift = weigh(best, np.linalg.inv(own)[-2:, -2:].astype(np.float64), problem)
+    drift = combine_with_prior(best, np.linalg.inv(own)[-2:, -2:].astype(np.float64), problem)
     fixed = np.zeros(len(own))
     fixed[-2:] = np.array([drift.yaw_rad, drift.scale]) - state.drift
-    return moved(problem, state, used, *system.step(problem.free, fixed=fixed)), drift
+    return retract(problem, state, used, *system.step(problem.free, fixed=fixed)), drift
 
 
-def sought(
-    problem: Problem, state: State, system: System, used: Bool, least_gain: float = RELATIVE_GAIN
-) -> tuple[State, System, RigDrift]:
-    """The best state with its drift, from one that is good without. least_gain: see `optimise`."""
-    seen, graph = problem.sightings, factors(problem)
+def optimise_with_drift(
+    problem: Problem, state: GraphState, system: System, used: Bool, min_gain: float = RELATIVE_GAIN
+) -> tuple[GraphState, System, RigDrift]:
+    """Optimise the state together with its drift, from one that is good without.
+
+    min_gain: see `optimise_graph`.
+    """
+    seen, graph = problem.sightings, build_graph(problem)
     assert seen is not None
-    by_drift = columns(seen)
-    for _ in range(MOST_STEPS):
+    by_drift = drift_jacobian(seen)
+    for _ in range(MAX_STEPS):
         before = state.drift
-        state, drift = drifted(problem, state, system, used)
-        state, system = optimise(problem, graph, state, used, least_gain=least_gain)
-        if np.abs(by_drift @ (state.drift - before)).max() < LEAST_STEP_PX:
+        state, drift = apply_estimated_drift(problem, state, system, used)
+        state, system = optimise_graph(problem, graph, state, used, min_gain=min_gain)
+        if np.abs(by_drift @ (state.drift - before)).max() < MIN_STEP_PX:
             break
     return state, system, drift

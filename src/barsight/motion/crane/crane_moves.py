@@ -1,4 +1,4 @@
-"""The yard from crane moves: the way as the cameras saw it against the way as the encoders counted it."""
+"""Register the world to the yard by crane moves: visual trajectory against encoders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from barsight.registration.rigid import design_rows
 from barsight.registration.yard import YardCalibration, calibrate_yard
 
 WINDOW_S = 0.35
-LEAST_FRAMES, MOST_FRAMES = 8, 300
+MIN_FRAMES, MAX_FRAMES = 8, 300
 FADES = 8
 RATIOS = tuple(2.0**k for k in range(-4, 9, 2))
 """Power of the errors that go together over that of each place's own."""
@@ -34,17 +34,17 @@ class MovedYard:
 def yard_from_moves(trajectory: Trajectory, crane: CraneSamples, shift_ns: int) -> MovedYard | Failed:
     """Align a trajectory in `world` with the encoders' places of the body.
 
-    Odometry drifts, so neighbours err alike: see `errors_together`. At most `MOST_FRAMES` places, evenly, are
-    used. Failed `few-points`, and `roll` where the crane moved along one axis only.
+    Odometry drifts, so neighbours err alike: see `error_correlation`. At most `MAX_FRAMES` places, evenly,
+    are used. Failed `few-points`, and `roll` where the crane moved along one axis only.
     """
     seen, counted, stamps_ns = [], [], []
-    for frame in trajectory.frames[:: -(-len(trajectory.frames) // MOST_FRAMES)]:
+    for frame in trajectory.frames[:: -(-len(trajectory.frames) // MAX_FRAMES)]:
         fit = fit_position(crane, frame.stamp_ns + shift_ns, seconds_to_ns(WINDOW_S))
         if not isinstance(fit, Failed):
             stamps_ns.append(frame.stamp_ns)
             seen.append(frame.reference_from_body.translation)
             counted.append(fit.position_m + crane.crane_to_body_m)
-    if len(seen) < LEAST_FRAMES:
+    if len(seen) < MIN_FRAMES:
         return Failed("few-points", f"only {len(seen)} frames have a place by pictures and by encoders")
     measured, yard = np.array(seen), np.array(counted)
     names = tuple(str(k) for k in range(len(seen)))
@@ -58,15 +58,15 @@ def yard_from_moves(trajectory: Trajectory, crane: CraneSamples, shift_ns: int) 
             "move bridge and trolley in one recording",
         )  # fmt: skip
     stamps = np.array(stamps_ns, np.int64)
-    together = errors_together(measured, found, (stamps - stamps[0]) / NS_PER_S)
+    together = error_correlation(measured, found, (stamps - stamps[0]) / NS_PER_S)
     found = calibrate_yard(names, measured, yard, together, free, "world")
     assert not isinstance(found, Failed)
     attitude = np.mean([frame.reference_from_body.rotation for frame in trajectory.frames], axis=0)
     return MovedYard(found, nearest_rotation(found.alignment.target_from_source.rotation @ attitude))
 
 
-def errors_together(measured: Float64, found: YardCalibration, time_s: Float64) -> Float64:
-    """(N, N) m2: how the errors of places (N, 3) go together, on each axis alike.
+def error_correlation(measured: Float64, found: YardCalibration, time_s: Float64) -> Float64:
+    """Model the correlation (N, N) m2 of the errors of places (N, 3), on each axis alike.
 
     Each place has an error of its own and one that fades over a time: odometry drifts. Both sizes and the
     time are those under which the residuals are likely once the fit has taken up its six unknowns [restricted

@@ -91,14 +91,16 @@ class Windows:
     limit_m: Float64
 
     def steps(self, place_m: Float64) -> Float64:
-        """(K, 3) steps by least squares."""
+        """Return (K, 3): steps by least squares."""
         steps: Float64 = np.einsum("kn,knj->kj", self.weights, place_m[self._readings])
         return steps
 
     def robust_fits(
         self, place_m: Float64, sigma_m: float, parameters: int | None = None
     ) -> tuple[Float64, Int64]:
-        """(K,) sizes of the last parameter by Cauchy's weights; (K,) how many readings agree with the fit."""
+        """Return (K,): sizes of the last parameter by Cauchy's weights; (K,) how many readings agree with the
+        fit.
+        """
         places, design = place_m[self._readings], self.design[..., :parameters]
         root = np.ones_like(self.weights)
         for _ in range(ROBUST_STEPS):
@@ -142,7 +144,9 @@ def _windows(time: Float64, test: JumpTest) -> Windows:
 
 
 def _off_neighbours(crane: CraneSamples) -> tuple[Float64, Float64]:
-    """(N - 4, 3) readings minus the cubic through two on either side; (N - 4,) sigmas over a reading's."""
+    """Return (N - 4, 3): readings minus the cubic through two on either side; (N - 4,) sigmas over a
+    reading's.
+    """
     time = _seconds(crane)
     if len(time) < 9:
         return np.empty((0, 3)), np.empty(0)

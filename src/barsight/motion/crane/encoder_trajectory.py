@@ -1,4 +1,4 @@
-"""The trajectory from the crane's encoders and the body's nominal attitude, with the gyro's sway about it."""
+"""Estimate the trajectory by dead reckoning: encoders, nominal attitude, and the gyro's sway about it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from barsight.motion.crane.sway import sway_at, turned_angle
 from barsight.recording.base import Recording
 
 CAUCHY_SIGMAS = 3.0
-LEAST_FOR_NOISE = 100
+MIN_FOR_NOISE = 100
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,16 @@ class CraneSettings:
 
 
 @dataclass(frozen=True)
-class CraneTrajectory:
+class EncoderOdometry:
     """`TrajectoryEstimator` for recordings with encoders; the reference is `yard`."""
 
     settings: CraneSettings
 
     def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Raises MeasurementError where the recording has no encoders. No image is read."""
+        """Estimate the poses.
+
+        Raises MeasurementError where the recording has no encoders. No image is read.
+        """
         crane = recording.crane()
         if crane is None:
             raise MeasurementError(
@@ -87,7 +90,7 @@ class CraneTrajectory:
 
 
 @dataclass(frozen=True, eq=False)
-class FittedPlace:
+class FittedPosition:
     """The crane point near a stamp: position_m, velocity_mps, acceleration_mps2 (3,) in `yard`; covariance
     (3, 3) of the position.
     """
@@ -100,8 +103,8 @@ class FittedPlace:
 
 def fit_position(
     crane: CraneSamples, stamp_ns: int, window_ns: int, acceleration_mps2: Float64 | None = None
-) -> FittedPlace | Failed:
-    """The crane point at `stamp_ns` by the readings around it.
+) -> FittedPosition | Failed:
+    """Fit the crane point at `stamp_ns` to the readings around it.
 
     A parabola through the readings within the window (a line where they are fewer than six), by least
     squares with Cauchy's weights, so that single wild readings don't pull however far off they are. Where
@@ -126,16 +129,16 @@ def fit_position(
     coefficients, variance = fitted[:, :3], fitted[0, 3] * crane.position_std_m**2
     if degree == 2:
         bend = 2 * coefficients[2] / window_s**2
-    return FittedPlace(coefficients[0], coefficients[1] / window_s, bend, np.eye(3) * variance)
+    return FittedPosition(coefficients[0], coefficients[1] / window_s, bend, np.eye(3) * variance)
 
 
-def with_seen_noise(crane: CraneSamples) -> CraneSamples:
-    """The readings with the sigma that they show themselves, within a factor of two of the stated one.
+def reestimate_noise(crane: CraneSamples) -> CraneSamples:
+    """Re-estimate the readings' sigma from themselves, within a factor of two of the stated one.
 
     From fourth differences, which no smooth motion passes; their median, so that wild ones don't count. (Each
     wild reading is in five of them, so the far ones leave before the median.)
     """
-    if len(crane.stamp_ns) < LEAST_FOR_NOISE:
+    if len(crane.stamp_ns) < MIN_FOR_NOISE:
         return crane
     fourth = np.abs(np.diff(crane.position_m, n=4, axis=0))
     kept = fourth

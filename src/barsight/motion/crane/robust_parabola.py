@@ -1,4 +1,4 @@
-"""A parabola through readings that holds against wild ones: the live estimate fits several a frame."""
+"""Fit a robust parabola through readings: the live estimate fits several a frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROUNDS = 10
 
 @kernel()
 def fit_parabola(time: Float64, values: Float64, length: float, result: Float64) -> None:
-    """By least squares with Cauchy's weights, which fall from residuals of `length` on.
+    """Fit least squares with Cauchy's robust weights, which fall from residuals of `length` on.
 
     time: (N,), about -1...1; values (N, 3). result: (P, 4) the P coefficients, lowest power first, and the
     first column of their covariance where a reading's variance is 1.

@@ -1,4 +1,4 @@
-"""How the body sways about its nominal attitude, from the gyro.
+"""Estimate the body's sway about its nominal attitude from the gyro.
 
 A gantry keeps its attitude on average, so the integrated gyro without its mean and trend over some seconds
 is the sway: the mean stands for the unknown start, the trend for the gyro's bias.
@@ -13,19 +13,19 @@ from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
 from barsight.core.types import ImuSamples
 
-LEAST_SPAN_S = 4.0
-MOST_GAP_S = 0.2
+MIN_SPAN_S = 4.0
+MAX_GAP_S = 0.2
 
 
 def turned_angle(imu: ImuSamples) -> Float64:
-    """(N, 3) the gyro's integral by the trapezium rule, rad, body axes: good for turns of a few degrees."""
+    """Integrate the gyro (N, 3) by the trapezium rule, rad, body axes: good for turns of a few degrees."""
     step_s = np.diff(imu.stamp_ns)[:, None] / NS_PER_S
     between = (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) / 2 * step_s
     return np.vstack([np.zeros((1, 3)), np.cumsum(between, axis=0)])
 
 
 def sway_at(imu: ImuSamples, angle: Float64, stamp_ns: int, half_window_s: float) -> Float64 | Failed:
-    """(3,) rotation vector `nominal body from body` at a stamp, rad.
+    """Compute the rotation vector (3,) `nominal body from body` at a stamp, rad.
 
     angle: from `turned_angle`. The trend is fitted over half_window_s before and after. Failed `no-imu` where
     the samples don't enclose the stamp, leave a gap there or span less than 4 s.
@@ -35,9 +35,7 @@ def sway_at(imu: ImuSamples, angle: Float64, stamp_ns: int, half_window_s: float
     stamps: Int64 = imu.stamp_ns[first:last]
     if stamps.size < 8 or stamps[0] > stamp_ns or stamps[-1] < stamp_ns:
         return Failed("no-imu", "the IMU doesn't cover the frame")
-    if stamps[-1] - stamps[0] < seconds_to_ns(LEAST_SPAN_S) or np.diff(stamps).max() > seconds_to_ns(
-        MOST_GAP_S
-    ):
+    if stamps[-1] - stamps[0] < seconds_to_ns(MIN_SPAN_S) or np.diff(stamps).max() > seconds_to_ns(MAX_GAP_S):
         return Failed("no-imu", "the IMU has a gap around the frame or is too short")
     time = (stamps - stamp_ns) / NS_PER_S
     design = np.column_stack([np.ones(time.size), time])

@@ -1,4 +1,4 @@
-"""The estimate while the crane travels: each frame's pose from what is known when it comes.
+"""Estimate while the crane travels (fixed lag): each frame's pose from what is known when it comes.
 
 The same factors as the batch estimate's, over the last few frames; what leaves stays as a prior, so time and
 memory don't grow with the way.
@@ -16,17 +16,17 @@ from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.fixed_lag.sensor_buffer import Readings
-from barsight.motion.frontend.tracking import Sighting, follow_live
-from barsight.motion.gravity import level_attitude
+from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.frontend.tracking import Sighting, track_incrementally
+from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
 
 if TYPE_CHECKING:
-    from barsight.motion.fixed_lag.smoother import LiveEstimator
+    from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 
 
 @dataclass(frozen=True)
-class LiveSettings:
+class FixedLagSettings:
     """The estimate while travelling."""
 
     frames: int = 8
@@ -38,30 +38,30 @@ class LiveSettings:
 
 
 @dataclass(frozen=True)
-class LiveTrajectory:
+class FixedLagFusion:
     """`TrajectoryEstimator` that never looks ahead: `yard` with encoders, else `world`, whose upright is the
     first second's.
     """
 
     settings: FusionSettings
-    live: LiveSettings
+    live: FixedLagSettings
     crane: CraneSettings
 
     def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Frames that neither pictures nor encoders place are refused."""
-        from barsight.motion.fixed_lag.smoother import LiveEstimator
+        """Estimate; frames that neither pictures nor encoders place are refused."""
+        from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 
         use = self.settings.sensors
         crane, imu = recording.crane(), recording.imu()
-        readings = Readings(
+        readings = ReadingsSoFar(
             crane if "crane" in use else None, imu if "imu" in use else None,
             recording.imu_noise() or ORDINARY_NOISE,
         )  # fmt: skip
         if readings.crane is None and "stereo" not in use:
             raise MeasurementError(f"{recording.path}: no crane encoders; estimate with --use stereo")
         shift = recording.rig.timeshift_cam_imu_ns
-        level = None if readings.crane is not None else level_attitude(recording)
-        estimator = LiveEstimator(
+        level = None if readings.crane is not None else align_with_gravity(recording)
+        estimator = FixedLagEstimator(
             self.settings, self.crane, self.live.frames, rectifier, shift, readings, level
         )
         placed: list[PosedFrame] = []
@@ -80,11 +80,13 @@ class LiveTrajectory:
         )
 
     def _frames(
-        self, recording: Recording, rectifier: Rectifier, estimator: LiveEstimator,
+        self, recording: Recording, rectifier: Rectifier, estimator: FixedLagEstimator,
         advance: Callable[[], None],
     ) -> Iterator[Sighting | RefusedFrame]:  # fmt: skip
         if "stereo" in self.settings.sensors:
-            yield from follow_live(recording, rectifier, estimator.predict, self.settings.front_end, advance)
+            yield from track_incrementally(
+                recording, rectifier, estimator.predict, self.settings.front_end, advance
+            )
             return
         for stamp in recording.index.stamps_ns:
             advance()

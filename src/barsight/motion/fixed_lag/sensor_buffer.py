@@ -1,4 +1,4 @@
-"""Encoders and IMU as far as they have come."""
+"""Hold encoder and IMU readings up to now."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from barsight.core.types import CraneSamples, ImuSamples
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """Encoders and IMU as they have come by now, and how the IMU's noise is."""
+class ReadingsSoFar:
+    """Encoder and IMU readings up to now, and the IMU's noise."""
 
     crane: CraneSamples | None
     imu: ImuSamples | None
     noise: ImuNoise
 
-    def between(self, first_ns: int, last_ns: int) -> Readings:
-        """Those within the stamps."""
+    def between(self, first_ns: int, last_ns: int) -> ReadingsSoFar:
+        """Select those within the stamps."""
         crane, imu = self.crane, self.imu
         if crane is not None:
             part = slice(*np.searchsorted(crane.stamp_ns, (first_ns, last_ns)))
@@ -27,4 +27,4 @@ class Readings:
         if imu is not None:
             part = slice(*np.searchsorted(imu.stamp_ns, (first_ns, last_ns)))
             imu = ImuSamples(imu.stamp_ns[part], imu.gyro_radps[part], imu.accel_mps2[part])
-        return Readings(crane, imu, self.noise)
+        return ReadingsSoFar(crane, imu, self.noise)

@@ -1,4 +1,4 @@
-"""The last few frames' unknowns and what binds them, as a problem of their own; what leaves stays as a prior.
+"""Hold the fixed-lag window: the last few frames' unknowns and factors; what leaves stays as a prior.
 
 A point begins anew after as many frames as the window holds, each at another frame than its neighbours. So
 every point that was seen at a frame which leaves has ended and is taken out whole, each sighting used once.
@@ -17,11 +17,11 @@ from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.inertial.model import BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated
-from barsight.motion.fixed_lag.window_equations import Newest
+from barsight.motion.fixed_lag.window_equations import NewestNode
 from barsight.motion.frontend.tracking import Sighting
-from barsight.motion.problem.gauss_newton import State
-from barsight.motion.problem.problem import LEAST_SIGMA_PX, Problem, StereoSightings
-from barsight.motion.problem.stereo_factors import start_points
+from barsight.motion.problem.gauss_newton import GraphState
+from barsight.motion.problem.problem import MIN_SIGMA_PX, Problem, StereoObservations
+from barsight.motion.problem.stereo_factors import initial_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,34 +35,34 @@ class Window:
     """
 
     problem: Problem
-    state: State
+    state: GraphState
     names: Int64
     slide: float = 0.0
     frames: int = 0
     noise: float | None = None
     drift_covariance: Float64 | None = None
     frame_nodes: tuple[int, ...] = ()
-    newest: Newest | None = None
+    newest: NewestNode | None = None
     seen_ns: int | None = None
     placed_ns: int | None = None
     stood: bool = False
 
     def pose(self, node: int) -> Pose:
-        """reference_from_body."""
+        """Return reference_from_body of a node."""
         pose = self.state.values.atPose3(X(node))
         target = self.problem.start[0].target
         return Pose(target, "body", pose.rotation().matrix(), np.asarray(pose.translation()))
 
     @property
     def body(self) -> BodyState:
-        """The last node's, with an IMU."""
+        """Return the last node's state, with an IMU."""
         last = len(self.problem.start) - 1
         pose = self.pose(last)
         return BodyState(pose.rotation, pose.translation, np.asarray(self.state.values.atVector(V(last))))
 
     @property
     def bias(self) -> ImuBias:
-        """The last node's."""
+        """Return the last node's biases."""
         if not self.problem.has_imu:
             return ImuBias.none()
         found = self.state.values.atConstantBias(B(len(self.problem.start) - 1))
@@ -70,20 +70,26 @@ class Window:
 
     @property
     def covariance(self) -> Float64:
-        """(6, 6) of the last node's pose, rotation then translation in the reference's axes."""
+        """Compute the covariance (6, 6) of the last node's pose, rotation then translation in the reference's
+        axes.
+        """
         assert self.newest is not None
         turned = np.kron(np.eye(2), self.pose(len(self.problem.start) - 1).rotation)
         shared = np.zeros((2, 2)) if self.drift_covariance is None else self.drift_covariance
-        swing = self.newest.swing[:6]
-        result: Float64 = turned @ (self.newest.covariance[:6, :6] + swing @ shared @ swing.T) @ turned.T
+        drift_jacobian_of_pose = self.newest.drift_jacobian_of_pose[:6]
+        result: Float64 = (
+            turned
+            @ (self.newest.covariance[:6, :6] + drift_jacobian_of_pose @ shared @ drift_jacobian_of_pose.T)
+            @ turned.T
+        )
         return result
 
 
-def grown(
+def add_nodes(
     window: Window, stamp_ns: list[int], poses: list[Pose], velocity_mps: list[Float64],
     parts: tuple[Preintegrated | None, ...],
 ) -> Window:  # fmt: skip
-    """With nodes at later stamps (IMU's clock), started at the given poses and velocities; parts: the motion
+    """Add nodes at later stamps (IMU's clock), started at the given poses and velocities; parts: the motion
     to each from the node before.
     """
     values, problem = gtsam.Values(window.state.values), window.problem
@@ -100,17 +106,17 @@ def grown(
     return replace(window, problem=problem, state=replace(window.state, values=values))
 
 
-def with_frame(
+def add_frame(
     window: Window, sighting: Sighting | None, camera: RectifiedCamera, body_from_rect0: Pose, held: int
 ) -> Window:
-    """The last node is a frame that shows `sighting`; points begin anew every `held` frames."""
+    """Make the last node a frame that shows `sighting`; points begin anew every `held` frames."""
     node, count = len(window.problem.start) - 1, window.frames
     grew = replace(window, frames=count + 1, frame_nodes=(*window.frame_nodes, node))
     if sighting is None:
         return grew
     grew = replace(grew, seen_ns=int(window.problem.stamp_ns[-1]))
     name = sighting.track * 1_000_000 + (count + sighting.track) // held
-    nodes, sigma = np.full(len(name), node), np.hypot(sighting.sigma_px, LEAST_SIGMA_PX)
+    nodes, sigma = np.full(len(name), node), np.hypot(sighting.sigma_px, MIN_SIGMA_PX)
     stereo, mount = sighting.stereo, body_from_rect0
     old = window.problem.sightings
     if old is not None:
@@ -120,7 +126,7 @@ def with_frame(
     order = np.argsort(name, kind="stable")
     first = np.diff(name[order], prepend=-1) > 0
     names = name[order][first]
-    seen = StereoSightings(nodes[order], np.cumsum(first) - 1, stereo[order], sigma[order], camera, mount)
+    seen = StereoObservations(nodes[order], np.cumsum(first) - 1, stereo[order], sigma[order], camera, mount)
     points = np.full((len(names), 4), np.nan)
     points[np.searchsorted(names, window.names)] = _placed(window)
     return replace(
@@ -130,9 +136,9 @@ def with_frame(
 
 
 def _placed(window: Window) -> Float64:
-    """(T, 4) the points, those seen once where that sighting has them."""
+    """Collect the points (T, 4), those seen once where that sighting has them."""
     points = window.state.points.copy()
     new = np.flatnonzero(np.isnan(points[:, 0]))
     if len(new):
-        points[new] = start_points(window.problem, window.state.poses, new)
+        points[new] = initial_points(window.problem, window.state.poses, new)
     return points

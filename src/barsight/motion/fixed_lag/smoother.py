@@ -1,4 +1,4 @@
-"""Takes frames as they come: new nodes, what binds them, the window's solution, and what leaves it.
+"""Update the fixed-lag estimate frame by frame: new nodes, their factors, solution, marginalisation.
 
 Sensors are read no further than they would have come; the encoders' place of a node joins as soon as the
 readings after it do.
@@ -19,25 +19,25 @@ from barsight.core.types import PosedFrame, RefusedFrame
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
-from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, with_seen_noise
-from barsight.motion.fixed_lag.sensor_buffer import Readings
-from barsight.motion.fixed_lag.sliding_window import Window, grown, with_frame
-from barsight.motion.fixed_lag.window_update import solved, without
-from barsight.motion.frontend.motion_prediction import CranePredictor, moved_by_imu
+from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
+from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
+from barsight.motion.fixed_lag.window_update import marginalise, solve_window
+from barsight.motion.frontend.motion_prediction import CranePredictor, predict_by_imu
 from barsight.motion.frontend.tracking import Sighting
-from barsight.motion.gravity import Level
-from barsight.motion.problem.gauss_newton import State
-from barsight.motion.problem.gtsam_factors import start_values
+from barsight.motion.gravity import GravityAlignment
+from barsight.motion.problem.gauss_newton import GraphState
+from barsight.motion.problem.gtsam_factors import initial_values
 from barsight.motion.problem.nodes import (
-    MOST_STILL_M,
-    divided,
+    MAX_STILL_M,
+    constrain_by_imu,
+    initial_poses,
+    is_imu_quiet,
     make_nodes,
-    preintegrated,
-    quiet_at,
-    start_poses,
-    tied_by_imu,
+    preintegrate_between,
+    subdivide,
 )
-from barsight.motion.problem.problem import Attitude, Placed, Problem
+from barsight.motion.problem.problem import AttitudePrior, EncoderPosition, Problem
 
 SENSOR_DELAY_S = 0.06
 """A frame is computed once readings this much later are there."""
@@ -46,12 +46,12 @@ LOOK_BACK_S = 6.0
 FIT_S = PLACE_SPACING_S / 2 + 0.01
 
 
-class LiveEstimator:
-    """Takes frame after frame and holds `held` of them; `window` is all that it knows."""
+class FixedLagEstimator:
+    """Fixed-lag estimator that holds `held` frames; `window` is all that it knows."""
 
     def __init__(
         self, settings: FusionSettings, crane: CraneSettings, held: int, rectifier: Rectifier, shift_ns: int,
-        readings: Readings, level: Level | None,
+        readings: ReadingsSoFar, level: GravityAlignment | None,
     ) -> None:  # fmt: skip
         self._settings, self._crane, self._held = settings, crane, held
         self._rectifier, self._shift_ns = rectifier, shift_ns
@@ -60,16 +60,18 @@ class LiveEstimator:
         self._failed = False
 
     def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
-        """A `Predictor`: by the IMU from the last estimate, else by encoders; None without either."""
+        """Predict the motion as a `Predictor`: by the IMU from the last estimate, else by encoders; None
+        without either.
+        """
         window, now = self.window, self._now(new_ns)
         if window is None or window.newest is None:
             return None
         at = np.flatnonzero(window.problem.stamp_ns == old_ns + self._shift_ns)
         if now.imu is not None and at.size:
             stamps = np.array([window.problem.stamp_ns[-1], new_ns + self._shift_ns])
-            part = preintegrated(stamps, now.imu, now.noise, window.bias)[0]
+            part = preintegrate_between(stamps, now.imu, now.noise, window.bias)[0]
             if part is not None:
-                return moved_by_imu(
+                return predict_by_imu(
                     window.pose(int(at[0])), window.body, part, window.bias, window.newest.covariance,
                     self._rectifier.body_from_rect0,
                 )  # fmt: skip
@@ -79,7 +81,7 @@ class LiveEstimator:
         return CranePredictor(now.crane, now.imu, bias, self._rectifier, self._shift_ns)(old_ns, new_ns)
 
     def take(self, seen: Sighting | RefusedFrame) -> PosedFrame | RefusedFrame:
-        """The frame's pose, or why it has none."""
+        """Estimate the frame's pose, or say why it has none."""
         stamp = seen.stamp_ns + self._shift_ns
         sighting = seen if isinstance(seen, Sighting) else None
         now = self._now(seen.stamp_ns)
@@ -95,10 +97,10 @@ class LiveEstimator:
         if isinstance(window, Failed):
             return RefusedFrame(seen.stamp_ns, window.reason)
         rectifier = self._rectifier
-        window = with_frame(window, sighting, rectifier.camera, rectifier.body_from_rect0, self._held)
+        window = add_frame(window, sighting, rectifier.camera, rectifier.body_from_rect0, self._held)
         window = self._bound(window, sighting, now, stamp)
         try:
-            window, leaving = solved(window, self._held)
+            window, leaving = solve_window(window, self._held)
         except np.linalg.LinAlgError:
             if self._failed and now.crane is not None:
                 self.window = None  # what is held may be the cause, and encoders know where to begin anew
@@ -107,16 +109,18 @@ class LiveEstimator:
         self._failed = False
         pose = window.pose(len(window.problem.start) - 1)
         covariance = window.covariance
-        self.window = without(window, leaving) if leaving else window
+        self.window = marginalise(window, leaving) if leaving else window
         return PosedFrame(seen.stamp_ns, pose, covariance)
 
-    def _now(self, stamp_ns: int) -> Readings:
-        """What has come when the frame of a stamp is computed, back to before the nodes held."""
+    def _now(self, stamp_ns: int) -> ReadingsSoFar:
+        """Select the readings that have come when the frame of a stamp is computed, back to before the nodes
+        held.
+        """
         last = stamp_ns + self._shift_ns + seconds_to_ns(SENSOR_DELAY_S)
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
         return self._readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
 
-    def _begun(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
+    def _begun(self, stamp: int, sighting: Sighting | None, now: ReadingsSoFar) -> Window | Failed:
         # Without encoders the first frame is the origin: a node before it would be, and move against it.
         nodes = make_nodes(np.array([stamp]), None if now.crane is None else now.imu)
         if now.crane is None:
@@ -124,41 +128,41 @@ class LiveEstimator:
         elif isinstance(fit_position(now.crane, stamp, seconds_to_ns(0.35)), Failed):
             return Failed("no-encoder", "the encoders don't cover the first frame")
         sightings = () if sighting is None else (sighting,)
-        start = start_poses(nodes, now.crane, sightings, self._shift_ns, self._rectifier, self._level)
+        start = initial_poses(nodes, now.crane, sightings, self._shift_ns, self._rectifier, self._level)
         known = (stamp, stamp) if now.crane is None else (int(now.crane.stamp_ns[0]), stamp)
-        ties = tied_by_imu(nodes, start, known, now.imu, now.noise)
+        ties = constrain_by_imu(nodes, start, known, now.imu, now.noise)
         settings = self._settings
         problem = Problem(
             start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
             offset_prior_px=settings.calibration_sigma_px, scale_prior=settings.scale_sigma,
             has_latency=now.crane is not None, has_imu=now.imu is not None,
         )  # fmt: skip
-        state = State(start_values(problem), np.empty((0, 4)), np.zeros(2))
+        state = GraphState(initial_values(problem), np.empty((0, 4)), np.zeros(2))
         window = Window(problem, state, np.empty(0, np.int64))
         return self._with_attitudes(window, 0, now)
 
-    def _grown(self, stamp: int, sighting: Sighting | None, now: Readings) -> Window | Failed:
+    def _grown(self, stamp: int, sighting: Sighting | None, now: ReadingsSoFar) -> Window | Failed:
         window = self.window
         assert window is not None
         first = len(window.problem.start)
         last_ns = int(window.problem.stamp_ns[-1])
-        stamps = divided(last_ns, stamp) if now.imu is not None else [stamp]
+        stamps = subdivide(last_ns, stamp) if now.imu is not None else [stamp]
         parts: tuple[Preintegrated | None, ...] = (None,) * len(stamps)
         if now.imu is not None:
-            parts = preintegrated(np.array([last_ns, *stamps]), now.imu, now.noise, window.bias)
+            parts = preintegrate_between(np.array([last_ns, *stamps]), now.imu, now.noise, window.bias)
         poses, speeds = self._started(window, stamps, parts, sighting, now)
-        grew = grown(window, stamps, poses, speeds, parts)
+        grew = add_nodes(window, stamps, poses, speeds, parts)
         if now.imu is not None and self._stays(window, stamp, sighting, now):
-            quiet = quiet_at(grew.problem.stamp_ns[first:], now.imu, now.noise)
+            quiet = is_imu_quiet(grew.problem.stamp_ns[first:], now.imu, now.noise)
             still = (*grew.problem.still, *(first + int(k) for k in np.flatnonzero(quiet)))
             grew = replace(grew, problem=replace(grew.problem, still=still))
         return self._with_attitudes(grew, first, now)
 
     def _started(
         self, window: Window, stamps: list[int], parts: tuple[Preintegrated | None, ...],
-        sighting: Sighting | None, now: Readings,
+        sighting: Sighting | None, now: ReadingsSoFar,
     ) -> tuple[list[Pose], list[Float64]]:  # fmt: skip
-        """Where new nodes begin: by the IMU, else on the line to where pictures or encoders see the last."""
+        """Initialise new nodes: by the IMU, else on the line to where pictures or encoders see the last."""
         old = window.pose(len(window.problem.start) - 1)
         if all(part is not None for part in parts):
             poses, speeds, state = [], [], window.body
@@ -185,23 +189,23 @@ class LiveEstimator:
         poses = [Pose(old.target, "body", end.rotation, old.translation + s * way) for s in share]
         return poses, [way / seconds] * len(stamps)
 
-    def _stays(self, window: Window, stamp: int, sighting: Sighting | None, now: Readings) -> bool:
-        """Whether encoders, else pictures, see no way since the last node. (An IMU sees none at any constant
-        speed.)
+    def _stays(self, window: Window, stamp: int, sighting: Sighting | None, now: ReadingsSoFar) -> bool:
+        """Check whether encoders, else pictures, see no way since the last node. (An IMU sees none at any
+        constant speed.)
         """
         last_ns = int(window.problem.stamp_ns[-1])
         if now.crane is not None:
             window_ns = seconds_to_ns(FIT_S)
             fits = [fit_position(now.crane, ns, window_ns) for ns in (last_ns, stamp)]
             places = [fit.position_m for fit in fits if not isinstance(fit, Failed)]
-            return len(places) == 2 and float(np.linalg.norm(places[1] - places[0])) < MOST_STILL_M
+            return len(places) == 2 and float(np.linalg.norm(places[1] - places[0])) < MAX_STILL_M
         if sighting is None or sighting.motion is None or window.seen_ns != last_ns:
             return False
-        return float(np.linalg.norm(sighting.motion.translation)) < MOST_STILL_M
+        return float(np.linalg.norm(sighting.motion.translation)) < MAX_STILL_M
 
-    def _with_attitudes(self, window: Window, first: int, now: Readings) -> Window:
-        """The nominal attitude at the nodes from `first` on: loose under way; standing still it is told once,
-        since its error is the same each time.
+    def _with_attitudes(self, window: Window, first: int, now: ReadingsSoFar) -> Window:
+        """Add the nominal attitude at the nodes from `first` on: loose under way; standing still it is told
+        once, since its error is the same each time.
         """
         if now.crane is None:
             return window
@@ -212,17 +216,17 @@ class LiveEstimator:
                 if stood:
                     continue
                 sigma, stood = crane.sway_std_deg, True
-            added.append(Attitude(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
+            added.append(AttitudePrior(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
         told = replace(problem, attitudes=problem.attitudes + tuple(added))
         return replace(window, problem=told, stood=stood)
 
-    def _bound(self, window: Window, sighting: Sighting | None, now: Readings, stamp: int) -> Window:
-        """With the encoders' places of nodes whose fit has come to be complete, 0.4 s apart; at once where
+    def _bound(self, window: Window, sighting: Sighting | None, now: ReadingsSoFar, stamp: int) -> Window:
+        """Add the encoders' places of nodes whose fit has come to be complete, 0.4 s apart; at once where
         nothing else ties the last node to the one before.
         """
         if now.crane is None:
             return window
-        crane, placed, problem = with_seen_noise(now.crane), list(window.problem.placed), window.problem
+        crane, placed, problem = reestimate_noise(now.crane), list(window.problem.placed), window.problem
         placed_ns = window.placed_ns
         complete, last = stamp + seconds_to_ns(SENSOR_DELAY_S - FIT_S), len(problem.start) - 1
         by_imu = last > 0 and problem.preintegrated[-1] is not None
@@ -237,6 +241,6 @@ class LiveEstimator:
                 continue
             place = fit.position_m + crane.crane_to_body_m
             sigma = float(np.sqrt(fit.covariance[0, 0]))
-            placed.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
+            placed.append(EncoderPosition(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
             placed_ns = node_ns
         return replace(window, problem=replace(problem, placed=tuple(placed)), placed_ns=placed_ns)

@@ -1,4 +1,4 @@
-"""The window's normal equations, dense, and the one step that solves them.
+"""Form and solve the window's normal equations, dense.
 
 Unknowns: node by node of the frames held (pose, with an IMU velocity and biases; nodes between are taken out
 first, `gaps`), then the border: with encoders their latency and the slide that all points in view share
@@ -15,72 +15,91 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg import skyline
 from barsight.core.pose import Pose, skew
 from barsight.motion.linear import dense_cholesky
-from barsight.motion.linear.chain_elimination import Chain, Gap, with_gaps, without_gaps
-from barsight.motion.linear.schur_complement import Reduced, eliminate
+from barsight.motion.linear.chain_elimination import (
+    Chain,
+    EliminatedNodes,
+    back_substitute_nodes,
+    eliminate_nodes,
+)
+from barsight.motion.linear.schur_complement import ReducedSystem, eliminate_points
 from barsight.motion.problem.encoder_factors import add_encoders
-from barsight.motion.problem.gauss_newton import State, guess_of, moved, rig_of, sights_of
-from barsight.motion.problem.gtsam_factors import chain_of, factors
+from barsight.motion.problem.gauss_newton import (
+    GraphState,
+    linearisation_point,
+    observations_of,
+    retract,
+    rig_of,
+)
+from barsight.motion.problem.gtsam_factors import build_graph, linearise_chain
 from barsight.motion.problem.problem import Problem, latency_of
-from barsight.motion.problem.rig_drift import LOOSE, weigh
+from barsight.motion.problem.rig_drift import LOOSE, combine_with_prior
 
 SLIDE_SIGMA_RAD = 2.5e-4
 """How far all points in view slide alike (1 sigma): 1 to 4e-4 over stacks, nothing on floors (`slides`)."""
 SLIDE_WAY_M = 5.0
 """The way on which what is in view changes, and its slide with it."""
-LEAST_WAY_M = 1e-4
+MIN_WAY_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Equations:
+class DenseEquations:
     """matrix (n, n) and gradient (n,) of the unknowns; gaps: nodes taken out beforehand."""
 
     matrix: Float64
     gradient: Float64
-    gaps: tuple[Gap, ...]
+    gaps: tuple[EliminatedNodes, ...]
 
-    def __add__(self, other: Equations) -> Equations:
-        return Equations(self.matrix + other.matrix, self.gradient + other.gradient, self.gaps + other.gaps)
+    def __add__(self, other: DenseEquations) -> DenseEquations:
+        return DenseEquations(
+            self.matrix + other.matrix, self.gradient + other.gradient, self.gaps + other.gaps
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Newest:
+class NewestNode:
     """The last node's covariance (n, n), of pose (body axes), velocity (reference) and biases (accelerometer,
     gyro), the rig's drift taken as known; swing (n, 2) by which it goes with the drift.
     """
 
     covariance: Float64
-    swing: Float64
+    drift_jacobian_of_pose: Float64
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class WindowSolution:
     """state, slide: moved by `step` (n,). drift_covariance: (2, 2), None where the rig is taken as exact."""
 
-    state: State
+    state: GraphState
     slide: float
     step: Float64
-    newest: Newest
+    newest: NewestNode
     drift_covariance: Float64 | None
 
 
-def border_of(problem: Problem, state: State, slide: float) -> Float64:
-    """(b,) latency and slide if there are encoders, then the drift."""
+def border_of(problem: Problem, state: GraphState, slide: float) -> Float64:
+    """Collect the border (b,): latency and slide if there are encoders, then the drift."""
     slides = [slide] if problem.has_latency else []
     return np.concatenate([latency_of(state.values), slides, state.drift])
 
 
 def slide_twist(body_from_rect0: Pose) -> Float64:
-    """(6,) the body's small motion (turn, shift, own axes) by which pictures turn about the camera's axis."""
+    """Compute the body's twist (6,) (turn, shift, own axes) by which pictures turn about the
+    camera's axis.
+    """
     axis = body_from_rect0.rotation[:, 2]
     return np.concatenate([axis, skew(body_from_rect0.translation) @ axis])
 
 
-def gathered(problem: Problem, state: State, used: Bool, first: int, end: int) -> Equations:
-    """Of the used sightings, and of what else binds nodes first...end - 1 to each other and to node `end`."""
+def assemble_equations(
+    problem: Problem, state: GraphState, used: Bool, first: int, end: int
+) -> DenseEquations:
+    """Assemble equations of the used sightings and of what else binds nodes first...end - 1 to each other and
+    to node `end`.
+    """
     kept, size = problem.kept, problem.width
     last = min(end, len(problem.start) - 1)
     within = kept[(kept >= first) & (kept <= last)]
-    chain, gaps = without_gaps(_chain(problem, state, first, end, last), within - first)
+    chain, gaps = eliminate_nodes(_chain(problem, state, first, end, last), within - first)
     border = 4 if problem.has_latency else 2
     count = len(kept) * size
     matrix, gradient = np.zeros((count + border, count + border)), np.zeros(count + border)
@@ -96,24 +115,28 @@ def gathered(problem: Problem, state: State, used: Bool, first: int, end: int) -
         matrix[count, count] += chain.corner
         gradient[count] += chain.corner_gradient
     gaps = tuple(replace(gap, first=gap.first + first, end=gap.end + first) for gap in gaps)
-    return Equations(matrix, gradient, gaps)
+    return DenseEquations(matrix, gradient, gaps)
 
 
-def _chain(problem: Problem, state: State, first: int, end: int, last: int) -> Chain:
-    """Of nodes first...last."""
+def _chain(problem: Problem, state: GraphState, first: int, end: int, last: int) -> Chain:
+    """Linearise the chain of nodes first...last."""
     size = problem.width
-    chain = chain_of(factors(problem, first, end), state.values, size, len(problem.start))
+    chain = linearise_chain(build_graph(problem, first, end), state.values, size, len(problem.start))
     placed = tuple(place for place in problem.placed if first <= place.node < end)
     add_encoders(chain, replace(problem, placed=placed), state.poses, latency_of(state.values))
     here = slice(first * size, (last + 1) * size)
     return replace(chain, rows=chain.rows[here], gradient=chain.gradient[here], side=chain.side[here])
 
 
-def _add_pictures(problem: Problem, state: State, used: Bool, matrix: Float64, gradient: Float64) -> None:
+def _add_pictures(
+    problem: Problem, state: GraphState, used: Bool, matrix: Float64, gradient: Float64
+) -> None:
     seen, nodes, size = problem.sightings, len(problem.kept), problem.width
     assert seen is not None
-    reduced = Reduced.empty(nodes, nodes)
-    eliminate(rig_of(seen), sights_of(problem, used), guess_of(problem, state), reduced)
+    reduced = ReducedSystem.empty(nodes, nodes)
+    eliminate_points(
+        rig_of(seen), observations_of(problem, used), linearisation_point(problem, state), reduced
+    )
     dense_cholesky.add_blocks(reduced.band, size, matrix)
     at = (np.arange(nodes)[:, None] * size + np.arange(6)).ravel()
     gradient[at] += reduced.gradient
@@ -124,15 +147,17 @@ def _add_pictures(problem: Problem, state: State, used: Bool, matrix: Float64, g
     if problem.has_latency:
         by_slide = np.zeros(len(gradient))
         by_slide[at] = np.tile(slide_twist(seen.body_from_rect0), nodes)
-        side = dense_cholesky.product(matrix, by_slide)
+        side = dense_cholesky.multiply(matrix, by_slide)
         matrix[-3] += side
         matrix[:, -3] += side
         matrix[-3, -3] = by_slide @ side
         gradient[-3] += by_slide @ gradient
 
 
-def of_prior(problem: Problem, state: State, slide: float) -> Equations:
-    """What has left, at the present state; as long as nothing has, how far all may slide."""
+def prior_equations(problem: Problem, state: GraphState, slide: float) -> DenseEquations:
+    """Evaluate the marginal prior at the present state; as long as nothing has left, how far all
+    may slide.
+    """
     border = border_of(problem, state, slide)
     whole = len(problem.kept) * problem.width + len(border)
     matrix, gradient, prior = np.zeros((whole, whole)), np.zeros(whole), problem.prior
@@ -141,20 +166,20 @@ def of_prior(problem: Problem, state: State, slide: float) -> Equations:
         at = np.concatenate([np.arange(count), np.arange(whole - len(border), whole)])
         since = np.concatenate([prior.since(state.values), border - prior.border])
         matrix[np.ix_(at, at)] = prior.matrix
-        gradient[at] = prior.gradient + dense_cholesky.product(prior.matrix, since)
+        gradient[at] = prior.gradient + dense_cholesky.multiply(prior.matrix, since)
     elif problem.has_latency:
         matrix[-3, -3], gradient[-3] = SLIDE_SIGMA_RAD**-2, slide * SLIDE_SIGMA_RAD**-2
-    return Equations(matrix, gradient, ())
+    return DenseEquations(matrix, gradient, ())
 
 
-def step_of(problem: Problem, state: State, slide: float, used: Bool, equations: Equations) -> Solved:
-    """To where everything fits best. Raises LinAlgError where the measurements leave an unknown
-    undetermined.
-    """
+def solve_step(
+    problem: Problem, state: GraphState, slide: float, used: Bool, equations: DenseEquations
+) -> WindowSolution:
+    """Solve for the full step. Raises LinAlgError where the measurements leave an unknown undetermined."""
     size, matrix = problem.width, equations.matrix.copy()
     matrix[[-2, -1], [-2, -1]] += 1 / np.array(LOOSE) ** 2
     band, right = skyline.full(matrix), equations.gradient[:, None].copy()
-    if not skyline.factorise(band):
+    if not skyline.factorise_skyline(band):
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
     skyline.solve_forward(band, right)
     factor, forward = matrix, right[:, 0]
@@ -162,47 +187,51 @@ def step_of(problem: Problem, state: State, slide: float, used: Bool, equations:
     if problem.offset_prior_px > 0 and used.any():
         own = np.tril(factor[-2:, -2:])
         best = state.drift - np.linalg.solve(own.T, forward[-2:])
-        drift = weigh(best, np.linalg.inv(own @ own.T).astype(np.float64), problem)
+        drift = combine_with_prior(best, np.linalg.inv(own @ own.T).astype(np.float64), problem)
         by_drift, covariance = np.array([drift.yaw_rad, drift.scale]) - state.drift, drift.covariance
     left = -right[:-2] - (by_drift @ factor[-2:, :-2])[:, None]
-    skyline.solve_back(skyline.Band(band.values, band.first[:-2], band.offset[:-2]), left)
+    skyline.solve_back_dense(skyline.Skyline(band.values, band.first[:-2], band.offset[:-2]), left)
     step = np.concatenate([left[:, 0], by_drift])
     tail = len(matrix) - len(problem.kept) * size + size
     own = np.tril(factor[-tail:, -tail:])
     information = own @ own.T
     inverse = np.linalg.inv(information[:-2, :-2])[:size].astype(np.float64)
-    newest = Newest(inverse[:, :size], -inverse @ information[:-2, -2:])
+    newest = NewestNode(inverse[:, :size], -inverse @ information[:-2, -2:])
     slid = float(step[-3]) if problem.has_latency else 0.0
-    return Solved(
+    return WindowSolution(
         _stepped(problem, state, used, step, equations.gaps), slide + slid, step, newest, covariance
     )
 
 
-def _stepped(problem: Problem, state: State, used: Bool, step: Float64, gaps: tuple[Gap, ...]) -> State:
+def _stepped(
+    problem: Problem, state: GraphState, used: Bool, step: Float64, gaps: tuple[EliminatedNodes, ...]
+) -> GraphState:
     size, count = problem.width, len(problem.kept)
     latency = step[count * size : -3]
     by_node = step[: count * size].reshape(count, size)
-    by_node = with_gaps(by_node, float(latency.sum()), problem.kept, gaps, len(problem.start))
+    by_node = back_substitute_nodes(by_node, float(latency.sum()), problem.kept, gaps, len(problem.start))
     pictures = by_node[problem.kept, :6]
     if problem.has_latency and problem.sightings is not None:
         pictures = pictures + step[-3] * slide_twist(problem.sightings.body_from_rect0)
     border = np.concatenate([latency, step[-2:]])
-    return moved(problem, state, used, by_node, np.empty(0), border, pictures)
+    return retract(problem, state, used, by_node, np.empty(0), border, pictures)
 
 
-def prior_of(left: Equations, step: Float64, count: int) -> tuple[Float64, Float64]:
-    """Matrix and gradient of all unknowns but the first `count`, after the step."""
-    matrix, slope = left.matrix, left.gradient + dense_cholesky.product(left.matrix, step)
+def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Float64, Float64]:
+    """Marginalise: matrix and gradient of all unknowns but the first `count`, after the step."""
+    matrix, slope = left.matrix, left.gradient + dense_cholesky.multiply(left.matrix, step)
     share = np.linalg.solve(matrix[:count, :count], matrix[:count, count:]).T
     own = matrix[count:, count:] - share @ matrix[:count, count:]
     return (own + own.T) / 2, slope[count:] - share @ slope[:count]
 
 
-def slid_on(matrix: Float64, gradient: Float64, slide: float, way_m: float) -> tuple[Float64, Float64]:
-    """A prior's matrix and gradient after a way: what is in view keeps a share of its slide, the rest is
-    drawn anew [Uhlenbeck and Ornstein 1930].
+def propagate_slide(
+    matrix: Float64, gradient: Float64, slide: float, way_m: float
+) -> tuple[Float64, Float64]:
+    """Propagate the slide of a prior's matrix and gradient over a way: what is in view keeps a share of its
+    slide, the rest is drawn anew [Uhlenbeck and Ornstein 1930].
     """
-    keeps = float(np.exp(-max(way_m, LEAST_WAY_M) / SLIDE_WAY_M))
+    keeps = float(np.exp(-max(way_m, MIN_WAY_M) / SLIDE_WAY_M))
     fresh = 1 / ((1 - keeps**2) * SLIDE_SIGMA_RAD**2)
     old = matrix[-3, -3] + keeps**2 * fresh
     side, pull = matrix[-3].copy(), gradient[-3] - keeps * (1 - keeps) * slide * fresh

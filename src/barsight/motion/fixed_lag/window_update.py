@@ -1,4 +1,4 @@
-"""A window solved by one step, and what then leaves it.
+"""Solve a window by one step and marginalise what leaves it.
 
 The frames before were solved, so the newest is placed by the points that are known, and outliers leave,
 beforehand. What leaves is linearised once, with the rest, and stays as a prior.
@@ -15,79 +15,92 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.pose import Pose
-from barsight.motion.batch.bundle_adjustment import FARTHEST_OUTLIER_SIGMAS, LEAST_AGREEING, LEAST_FACTOR
+from barsight.motion.batch.bundle_adjustment import FARTHEST_OUTLIER_SIGMAS, MIN_AGREEING, MIN_FACTOR
 from barsight.motion.fixed_lag.sliding_window import Window
 from barsight.motion.fixed_lag.window_equations import (
-    Equations,
+    DenseEquations,
+    assemble_equations,
     border_of,
-    gathered,
-    of_prior,
-    prior_of,
-    slid_on,
-    step_of,
+    marginal_prior,
+    prior_equations,
+    propagate_slide,
+    solve_step,
 )
 from barsight.motion.linear.motion_only_kernel import frame_equations
-from barsight.motion.linear.schur_complement import substitute
-from barsight.motion.problem.encoder_factors import agreeing
-from barsight.motion.problem.gauss_newton import State, guess_of, rig_of, sighting_residuals, sights_of
-from barsight.motion.problem.problem import Prior, Problem
-from barsight.motion.problem.stereo_factors import nearness, often, persistence, taken_up
+from barsight.motion.linear.schur_complement import back_substitute
+from barsight.motion.problem.encoder_factors import encoder_inliers
+from barsight.motion.problem.gauss_newton import (
+    GraphState,
+    linearisation_point,
+    observations_of,
+    rig_of,
+    sighting_residuals,
+)
+from barsight.motion.problem.problem import MarginalPrior, Problem
+from barsight.motion.problem.stereo_factors import (
+    dof_correction,
+    spatial_inflation,
+    temporal_inflation,
+    well_observed,
+)
 
-NOISE_SHARE = 0.2
+NOISE_RATIO = 0.2
 """By how much one window's noise moves the running one."""
-LEAST_POINTS = 30
+MIN_POINTS = 30
 """So many of the known points seen anew place a frame before all is solved."""
 STEPS = 2
 """Gauss-Newton's, of the newest frame alone."""
 
 
 @dataclass(frozen=True, eq=False)
-class Leaving:
-    """The first `nodes` nodes and the points `ended` (T,), what they say and the step that was made since."""
+class MarginalisedPart:
+    """Marginalised part: the first `nodes` nodes and the points `ended` (T,), their equations and the step
+    made since.
+    """
 
     nodes: int
     ended: Bool
-    equations: Equations
+    equations: DenseEquations
     step: Float64
 
 
-def solved(window: Window, held: int) -> tuple[Window, Leaving | None]:
-    """With the unknowns as they fit best, and what is to leave so that `held` frames are left. Raises
-    LinAlgError where the measurements leave an unknown undetermined.
+def solve_window(window: Window, held: int) -> tuple[Window, MarginalisedPart | None]:
+    """Solve the window, and select what is to leave so that `held` frames are left. Raises LinAlgError where
+    the measurements leave an unknown undetermined.
     """
     problem = replace(window.problem, asked=np.array(window.frame_nodes))
     state, noise, stated = window.state, window.noise, problem.sightings
     used = np.zeros(0, np.bool_)
     if stated is not None:
         problem = replace(problem, sightings=replace(stated, sigma_px=(noise or 1.0) * stated.sigma_px))
-        used = often(stated, np.ones(len(stated.node), np.bool_))
+        used = well_observed(stated, np.ones(len(stated.node), np.bool_))
     if stated is not None and used.any():
         state = _placed_by_points(problem, state, used)
         residual = sighting_residuals(problem, state, used)
         share = np.abs(residual) / stated.sigma_px[:, None]
-        factor = max(LEAST_FACTOR, 1.4826 * float(np.median(share[used])) * taken_up(stated, used))
-        used = often(stated, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+        factor = max(MIN_FACTOR, 1.4826 * float(np.median(share[used])) * dof_correction(stated, used))
+        used = well_observed(stated, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
         shown = replace(stated, sigma_px=factor * stated.sigma_px)
-        now = factor * persistence(residual, shown, used) * nearness(residual, shown, used)
-        noise = now if noise is None else (1 - NOISE_SHARE) * noise + NOISE_SHARE * now
+        now = factor * temporal_inflation(residual, shown, used) * spatial_inflation(residual, shown, used)
+        noise = now if noise is None else (1 - NOISE_RATIO) * noise + NOISE_RATIO * now
         problem = replace(problem, sightings=replace(stated, sigma_px=noise * stated.sigma_px))
     count = window.frame_nodes[-held] if len(window.frame_nodes) > held else 0
     ended = np.zeros(len(window.names), np.bool_)
-    equations = of_prior(problem, state, window.slide)
-    leaving: Leaving | None = None
+    equations = prior_equations(problem, state, window.slide)
+    leaving: MarginalisedPart | None = None
     goes = np.zeros_like(used)
     if count:
         if stated is not None:
             ended[stated.track[stated.node < count]] = True
             goes = ended[stated.track]
-        equations = left = equations + gathered(problem, state, used & goes, 0, count)
-    equations = equations + gathered(problem, state, used & ~goes, count, len(problem.start))
-    found = step_of(problem, state, window.slide, used, equations)
+        equations = left = equations + assemble_equations(problem, state, used & goes, 0, count)
+    equations = equations + assemble_equations(problem, state, used & ~goes, count, len(problem.start))
+    found = solve_step(problem, state, window.slide, used, equations)
     if count:
-        leaving = Leaving(count, ended, left, found.step)
-    fits = agreeing(found.state.values, problem)
+        leaving = MarginalisedPart(count, ended, left, found.step)
+    fits = encoder_inliers(found.state.values, problem)
     kept = tuple(place for place, fit in zip(problem.placed, fits, strict=True) if fit)
-    if len(kept) <= LEAST_AGREEING * len(problem.placed):
+    if len(kept) <= MIN_AGREEING * len(problem.placed):
         kept = problem.placed
     if stated is not None:
         turned = _about_axis(stated.body_from_rect0, found.slide - window.slide)
@@ -100,43 +113,47 @@ def solved(window: Window, held: int) -> tuple[Window, Leaving | None]:
 
 
 def _about_axis(body_from_rect0: Pose, angle: float) -> Pose:
-    """The camera turned about its own axis."""
+    """Turn the camera about its own axis."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return replace(body_from_rect0, rotation=body_from_rect0.rotation @ turn)
 
 
-def _placed_by_points(problem: Problem, state: State, used: Bool) -> State:
-    """The newest frame where the known points have it, then its points where all frames have them."""
+def _placed_by_points(problem: Problem, state: GraphState, used: Bool) -> GraphState:
+    """Place the newest frame by the known points, then its points by all frames."""
     seen, node = problem.sightings, len(problem.start) - 1
     assert seen is not None
-    rig, sights = rig_of(seen), sights_of(problem, used)
-    if (seen.node[used] == node).sum() >= LEAST_POINTS:
+    rig, sights = rig_of(seen), observations_of(problem, used)
+    if (seen.node[used] == node).sum() >= MIN_POINTS:
         values = gtsam.Values(state.values)
         for _ in range(STEPS):
             normal, gradient = np.zeros((6, 6)), np.zeros(6)
-            frame_equations(rig, sights, guess_of(problem, state), len(problem.kept) - 1, normal, gradient)
+            frame_equations(
+                rig, sights, linearisation_point(problem, state), len(problem.kept) - 1, normal, gradient
+            )
             values.update(X(node), values.atPose3(X(node)).retract(-np.linalg.solve(normal, gradient)))
             state = replace(state, values=values)
     points, still = state.points.copy(), np.zeros((len(problem.kept), 6))
     shown = np.zeros(len(points), np.bool_)
     shown[seen.track[seen.node == node]] = True
     sights = sights._replace(used=used & shown[seen.track])
-    substitute(rig, sights, guess_of(problem, state), still, np.zeros(2), points, np.empty(len(points)))
+    back_substitute(
+        rig, sights, linearisation_point(problem, state), still, np.zeros(2), points, np.empty(len(points))
+    )
     return replace(state, points=points)
 
 
-def without(window: Window, leaving: Leaving) -> Window:
-    """Without what leaves."""
+def marginalise(window: Window, leaving: MarginalisedPart) -> Window:
+    """Marginalise what leaves."""
     problem, count = window.problem, leaving.nodes
     stayed = np.array([k - count for k in window.frame_nodes if k >= count])
     gone = len(window.frame_nodes) - len(stayed)
-    matrix, gradient = prior_of(leaving.equations, leaving.step, gone * problem.width)
+    matrix, gradient = marginal_prior(leaving.equations, leaving.step, gone * problem.width)
     if problem.has_latency:
         way = window.state.poses[count, :3, 3] - window.state.poses[0, :3, 3]
-        matrix, gradient = slid_on(matrix, gradient, window.slide, float(np.linalg.norm(way)))
+        matrix, gradient = propagate_slide(matrix, gradient, window.slide, float(np.linalg.norm(way)))
     values, border = _renumbered(window.state, problem, count), border_of(problem, window.state, window.slide)
-    prior = Prior(stayed, values, border, matrix, gradient)
+    prior = MarginalPrior(stayed, values, border, matrix, gradient)
     seen, names, points = problem.sightings, window.names, window.state.points
     if seen is not None:
         stays, place = ~leaving.ended[seen.track], np.cumsum(~leaving.ended) - 1
@@ -158,7 +175,7 @@ def without(window: Window, leaving: Leaving) -> Window:
     )  # fmt: skip
 
 
-def _renumbered(state: State, problem: Problem, count: int) -> gtsam.Values:
+def _renumbered(state: GraphState, problem: Problem, count: int) -> gtsam.Values:
     nodes = range(count, len(problem.start))
     values = gtsam.Values()
     if problem.has_imu:
@@ -177,7 +194,7 @@ def _renumbered(state: State, problem: Problem, count: int) -> gtsam.Values:
 
 @cache
 def _no_biases(count: int) -> gtsam.Values:
-    """To add vectors to: to insert a bias itself takes thirty times as long."""
+    """Make zero biases to add vectors to: to insert a bias itself takes thirty times as long."""
     values = gtsam.Values()
     for k in range(count):
         values.insert(B(k), gtsam.imuBias.ConstantBias())

@@ -1,4 +1,5 @@
-"""The paper's stitching: each frame is tied to the one before by the SVD of matched points. For comparison.
+"""Stitch as the paper does, for comparison: each frame is tied to the one before by the SVD of matched
+points.
 
 Its errors add up along the way, and its homography throws away what lies off the dominant plane; our own
 estimate does neither.
@@ -19,12 +20,12 @@ from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import match_mutual
-from barsight.motion.crane.encoder_trajectory import CraneSettings, CraneTrajectory
-from barsight.motion.frontend.relative_pose import carried, in_world
-from barsight.motion.frontend.stereo_features import OdometrySettings, View, views
-from barsight.motion.gravity import level_attitude
+from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry
+from barsight.motion.frontend.relative_pose import rotate_covariance, transport_covariance
+from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_views
+from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
-from barsight.registration.rigid import Alignment, align
+from barsight.registration.rigid import Alignment, align_rigid
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,12 @@ class StitchingSettings:
     """Matches further off the common homography than this are left out."""
     trend_px: float = 25.0
     """Matches further off the motion that crane and IMU predict than this are left out."""
-    least_matches: int = 12
+    min_matches: int = 12
     """A frame with fewer matches is refused."""
 
     def __post_init__(self) -> None:
-        if min(self.homography_px, self.trend_px) <= 0 or self.least_matches < 4:
-            raise ConfigError("the stitching's tolerances must be positive and least_matches at least 4")
+        if min(self.homography_px, self.trend_px) <= 0 or self.min_matches < 4:
+            raise ConfigError("the stitching's tolerances must be positive and min_matches at least 4")
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,13 @@ class PaperStitching:
     crane: CraneSettings
 
     def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Frames without enough matches are refused; the next one is tied to the last good one."""
+        """Estimate; frames without enough matches are refused, the next one is tied to the last good one."""
         predicted = self._predicted(recording, rectifier)
         placed: list[PosedFrame] = []
         refused: list[RefusedFrame] = []
-        last: View | None = None
+        last: FeatureView | None = None
         noise = np.diag([1e-12] * 6)
-        for view in views(recording, rectifier, self.features, advance):
+        for view in feature_views(recording, rectifier, self.features, advance):
             if isinstance(view, RefusedFrame):
                 refused.append(view)
                 continue
@@ -71,7 +72,7 @@ class PaperStitching:
                 if predicted and first is None:
                     refused.append(RefusedFrame(view.stamp_ns, "the encoders don't cover the first frame"))
                     continue
-                pose = level_attitude(recording).world_from_body if first is None else first
+                pose = align_with_gravity(recording).world_from_body if first is None else first
             else:
                 trend = _between(predicted.get(last.stamp_ns), predicted.get(view.stamp_ns), rectifier)
                 step = self._step(last, view, rectifier.camera, trend)
@@ -82,9 +83,11 @@ class PaperStitching:
                 old_rect0 = old @ rectifier.body_from_rect0
                 new_rect0 = old_rect0 @ step.target_from_source
                 pose = new_rect0 @ rectifier.body_from_rect0.inverse()
-                added = in_world(step.covariance, old_rect0.rotation)
+                added = rotate_covariance(step.covariance, old_rect0.rotation)
                 lever = pose.translation - new_rect0.translation
-                noise = carried(noise, pose.translation - old.translation) + carried(added, lever)
+                noise = transport_covariance(
+                    noise, pose.translation - old.translation
+                ) + transport_covariance(added, lever)
             placed.append(PosedFrame(view.stamp_ns, pose, noise))
             last = view
         reference = "yard" if predicted else "world"
@@ -94,21 +97,23 @@ class PaperStitching:
     def _predicted(self, recording: Recording, rectifier: Rectifier) -> dict[int, Pose]:
         if recording.crane() is None:
             return {}
-        trajectory = CraneTrajectory(self.crane)(recording, rectifier, lambda: None)
+        trajectory = EncoderOdometry(self.crane)(recording, rectifier, lambda: None)
         return {frame.stamp_ns: frame.reference_from_body for frame in trajectory.frames}
 
-    def _step(self, old: View, new: View, camera: RectifiedCamera, trend: Pose | None) -> Alignment | Failed:
+    def _step(
+        self, old: FeatureView, new: FeatureView, camera: RectifiedCamera, trend: Pose | None
+    ) -> Alignment | Failed:
         pairs = match_mutual(old.features, new.features)
         first, second = old.points(pairs[:, 0], self.features), new.points(pairs[:, 1], self.features)
         kept = np.isfinite(first[:, 2]) & np.isfinite(second[:, 2])
-        if kept.sum() >= self.settings.least_matches:
+        if kept.sum() >= self.settings.min_matches:
             kept[kept] = self._on_plane(old, new, pairs[kept])
             kept &= self._on_trend(first, new.features.pixels[pairs[:, 1]], camera, trend)
-        if kept.sum() < self.settings.least_matches:
+        if kept.sum() < self.settings.min_matches:
             return Failed("no-matches", f"only {int(kept.sum())} matches with the frame before agree")
-        return align(second[kept], first[kept], ("rect0", "rect0"))
+        return align_rigid(second[kept], first[kept], ("rect0", "rect0"))
 
-    def _on_plane(self, old: View, new: View, pairs: Int64) -> Bool:
+    def _on_plane(self, old: FeatureView, new: FeatureView, pairs: Int64) -> Bool:
         cv2.setRNGSeed(1)
         _, inliers = cv2.findHomography(
             old.features.pixels[pairs[:, 0]], new.features.pixels[pairs[:, 1]], cv2.RANSAC,
@@ -129,7 +134,7 @@ class PaperStitching:
 
 
 def _between(old: Pose | None, new: Pose | None, rectifier: Rectifier) -> Pose | None:
-    """new_from_old of `rect0`, from two body poses."""
+    """Compute new_from_old of `rect0` from two body poses."""
     if old is None or new is None:
         return None
     return (new @ rectifier.body_from_rect0).inverse() @ (old @ rectifier.body_from_rect0)

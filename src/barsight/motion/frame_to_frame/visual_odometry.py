@@ -1,4 +1,6 @@
-"""Stereo visual odometry: ORB features, metric PnP with RANSAC, refined on both images of the new pair."""
+"""Estimate stereo visual odometry: ORB features, metric PnP with RANSAC, refined on both images of the new
+pair.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
-from barsight.motion.frontend.relative_pose import carried, in_world, move
-from barsight.motion.frontend.stereo_features import OdometrySettings, View, views
-from barsight.motion.gravity import level_attitude
+from barsight.motion.frontend.relative_pose import estimate_step, rotate_covariance, transport_covariance
+from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_views
+from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
 
 
@@ -27,14 +29,16 @@ class StereoOdometry:
     settings: OdometrySettings
 
     def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Frames without enough agreeing features are refused; the next one is tied to the last good one."""
-        level = level_attitude(recording)
+        """Estimate; frames without enough agreeing features are refused, the next one is tied to the last
+        good one.
+        """
+        level = align_with_gravity(recording)
         body_from_rect0 = rectifier.body_from_rect0
         placed: list[PosedFrame] = []
         refused: list[RefusedFrame] = []
-        last: View | None = None
+        last: FeatureView | None = None
         noise, stretch = np.diag([1e-12] * 6), np.zeros(3)
-        for view in views(recording, rectifier, self.settings, advance):
+        for view in feature_views(recording, rectifier, self.settings, advance):
             if isinstance(view, RefusedFrame):
                 refused.append(view)
                 continue
@@ -42,7 +46,7 @@ class StereoOdometry:
                 placed.append(PosedFrame(view.stamp_ns, level.world_from_body, noise))
                 last = view
                 continue
-            step = move(last, view, self.settings)
+            step = estimate_step(last, view, self.settings)
             if isinstance(step, Failed):
                 refused.append(RefusedFrame(view.stamp_ns, step.reason))
                 continue
@@ -52,7 +56,9 @@ class StereoOdometry:
             pose = world_from_new @ body_from_rect0.inverse()
             way = pose.translation - old.translation
             lever = pose.translation - world_from_new.translation
-            noise = carried(noise, way) + carried(in_world(step.covariance, world_from_new.rotation), lever)
+            noise = transport_covariance(noise, way) + transport_covariance(
+                rotate_covariance(step.covariance, world_from_new.rotation), lever
+            )
             stretch = stretch + step.scale_sigma * way
             covariance = noise.copy()
             covariance[3:, 3:] += np.outer(stretch, stretch)

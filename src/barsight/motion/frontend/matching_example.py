@@ -1,4 +1,4 @@
-"""One pair of neighbouring frames with its matches laid open, for the report's pictures."""
+"""Extract one pair of neighbouring frames with its matches for the report's pictures."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.errors import Failed
 from barsight.core.types import RefusedFrame
 from barsight.features.detectors import make_detector
-from barsight.features.guided_matching import GuidedMatches, PredictedMotion, predict_places, triangulate
-from barsight.features.matching import is_mutual, nearest, on_one_plane
+from barsight.features.guided_matching import (
+    GuidedMatches,
+    PredictedMotion,
+    predict_projections,
+    triangulate_stereo,
+)
+from barsight.features.matching import homography_inliers, is_mutual, nearest_neighbours
 from barsight.features.patch_alignment import PatchPair, patch_pair
-from barsight.features.tracks import Tracks, carry_on
+from barsight.features.tracks import Tracks, update_tracks
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.relative_pose import move
-from barsight.motion.frontend.tracking import FrontEndSettings, consensus, look_at_corners
+from barsight.motion.frontend.relative_pose import estimate_step
+from barsight.motion.frontend.tracking import FrontEndSettings, describe_corners, motion_consensus
 from barsight.recording.base import Recording
 from barsight.stereo.search_range import coarse_disparity
 
@@ -52,7 +57,7 @@ class MatchingExample:
 def matching_example(
     recording: Recording, rectifier: Rectifier, placed_ns: Int64, settings: FrontEndSettings, with_crane: bool
 ) -> MatchingExample | Failed:
-    """Of the two neighbouring frames in the middle of those placed (N,)."""
+    """Match the two neighbouring frames in the middle of those placed (N,)."""
     pairs = _middle(recording, rectifier, placed_ns)
     if isinstance(pairs, Failed):
         return pairs
@@ -62,20 +67,20 @@ def matching_example(
         return prediction
     none = GuidedMatches(np.empty((0, 3)), np.empty(0), np.zeros(0, np.bool_), np.zeros(0, np.bool_))
     coarse = coarse_disparity(old.pair.left, old.pair.right, rectifier.camera.doffs_px)
-    tracks = carry_on(Tracks(), old, none, none.found, coarse, settings.tracks)
-    points = triangulate(tracks.stereo, rectifier.camera)
-    places = predict_places(points, settings.tracks.sigma_px, prediction, rectifier.camera)
-    result = consensus(tracks, new, prediction, settings)
+    tracks = update_tracks(Tracks(), old, none, none.found, coarse, settings.tracks)
+    points = triangulate_stereo(tracks.stereo, rectifier.camera)
+    places = predict_projections(points, settings.tracks.sigma_px, prediction, rectifier.camera)
+    result = motion_consensus(tracks, new, prediction, settings)
     if isinstance(result, Failed):
         return result
     agreed, matches, _ = result
     first, second = (make_detector("orb")(pair.pair.left, FEATURES) for pair in (old, new))
-    forward = nearest(first.descriptors, second.descriptors)
-    mutual = is_mutual(forward, nearest(second.descriptors, first.descriptors))
+    forward = nearest_neighbours(first.descriptors, second.descriptors)
+    mutual = is_mutual(forward, nearest_neighbours(second.descriptors, first.descriptors))
     shown = forward.index >= 0
     raw = np.column_stack([first.pixels[shown], second.pixels[forward.index[shown]]]).astype(np.float64)
     filtered = mutual[shown]
-    filtered[filtered] = on_one_plane(raw[filtered, :2], raw[filtered, 2:])
+    filtered[filtered] = homography_inliers(raw[filtered, :2], raw[filtered, 2:])
     return MatchingExample(
         (old.pair.stamp_ns, new.pair.stamp_ns), old.pair.left, new.pair.left, first.pixels, raw, filtered,
         tracks.stereo[:, :2], places.stereo[:, :2], places.covariance[:, :2, :2], matches.stereo[:, :2],
@@ -112,11 +117,11 @@ def _predicted(
         prediction = predictor(old.pair.stamp_ns, new.pair.stamp_ns)
         if prediction is not None:
             return prediction, True
-    views = [look_at_corners(pair, settings) for pair in (old, new)]
+    views = [describe_corners(pair, settings) for pair in (old, new)]
     for view in views:
         if isinstance(view, Failed):
             return view, False
-    step = move(views[0], views[1], settings.rough)  # type: ignore[arg-type]
+    step = estimate_step(views[0], views[1], settings.rough)  # type: ignore[arg-type]
     if isinstance(step, Failed):
         return step, False
     return PredictedMotion(step.rotation, step.translation, 4 * step.covariance), False

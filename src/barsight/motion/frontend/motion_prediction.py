@@ -1,4 +1,4 @@
-"""How the left camera moves between two frames as encoders and gyro know it, for the front end."""
+"""Predict the left camera's motion between two frames from encoders and gyro, for the front end."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class CranePredictor:
         self._body_from_rect0 = rectifier.body_from_rect0
 
     def __call__(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
-        """None where the encoders don't cover both frames."""
+        """Predict; None where the encoders don't cover both frames."""
         window = seconds_to_ns(WINDOW_S)
         old = fit_position(self._crane, old_ns + self._shift_ns, window)
         new = fit_position(self._crane, new_ns + self._shift_ns, window)
@@ -60,14 +60,15 @@ class CranePredictor:
         travel = float(np.linalg.norm(new.position_m - old.position_m))
         slew = float(np.linalg.norm(new.velocity_mps - old.velocity_mps)) * SLEW_SIGMA_S
         covariance = np.eye(6) * turn_sigma**2
-        swing = (SWAY_RAD * travel) ** 2 + (2e-3) ** 2 + slew**2
+        drift_jacobian_of_pose = (SWAY_RAD * travel) ** 2 + (2e-3) ** 2 + slew**2
         covariance[3:, 3:] = (
-            motion.rotation @ (old.covariance + new.covariance) @ motion.rotation.T + np.eye(3) * swing
+            motion.rotation @ (old.covariance + new.covariance) @ motion.rotation.T
+            + np.eye(3) * drift_jacobian_of_pose
         )
         return PredictedMotion(motion.rotation, motion.translation, covariance)
 
     def _turn(self, old_ns: int, new_ns: int) -> tuple[Float64, float]:
-        """(3,) rotation vector old body from new body, and its sigma (rad)."""
+        """Integrate the rotation vector (3,) old body from new body, and its sigma (rad)."""
         seconds = (new_ns - old_ns) / 1e9
         if self._imu is not None:
             stamps = np.array([old_ns, new_ns]) + self._shift_ns
@@ -78,11 +79,11 @@ class CranePredictor:
         return np.zeros(3), SWAY_RAD * 2**0.5
 
 
-def moved_by_imu(
+def predict_by_imu(
     old: Pose, state: BodyState, part: Preintegrated, bias: ImuBias, covariance: Float64,
     body_from_rect0: Pose,
 ) -> PredictedMotion:  # fmt: skip
-    """The motion of `rect0` from an old body to the one that the IMU takes `state` to.
+    """Predict the motion of `rect0` from an old body to the one that the IMU takes `state` to.
 
     covariance: (15, 15) of the state in GTSAM's order: pose in body axes, velocity, biases. It counts
     `SPARE_SIGMAS` times.

@@ -1,4 +1,6 @@
-"""One step of stereo odometry: metric PnP with RANSAC, refined on both pictures, and how steps add up."""
+"""Estimate one step of stereo odometry: metric PnP with RANSAC, refined on both pictures; chain
+covariances.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +14,15 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import skew
 from barsight.core.types import RectifiedCamera
-from barsight.features.guided_matching import match_across, triangulated_by
+from barsight.features.guided_matching import match_across, triangulation_jacobian
 from barsight.features.matching import match_mutual
-from barsight.features.patch_alignment import locate
-from barsight.motion.frontend.relative_pose_kernel import MOST_SIGMAS, step_equations
-from barsight.motion.frontend.stereo_features import OdometrySettings, View
+from barsight.features.patch_alignment import align_patches
+from barsight.motion.frontend.relative_pose_kernel import MAX_SIGMAS, step_equations
+from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class RelativePose:
     """new_from_old: pose of the old `rect0` in the new one, and its covariance (6, 6).
 
     scale_sigma: relative error of the step's length that the calibration may cause; it doesn't average out.
@@ -34,11 +36,11 @@ class Step:
     kept: Bool
 
 
-def move(old: View, new: View, settings: OdometrySettings) -> Step | Failed:
-    """The motion between two views by the features that match mutually."""
+def estimate_step(old: FeatureView, new: FeatureView, settings: OdometrySettings) -> RelativePose | Failed:
+    """Estimate the motion between two views by the features that match mutually."""
     camera = new.pair.pair.camera
     pairs = match_mutual(old.features, new.features)
-    if len(pairs) < settings.least_inliers:
+    if len(pairs) < settings.min_inliers:
         return Failed("no-matches", f"only {len(pairs)} features match the frame before")
     points = old.points(pairs[:, 0], settings)
     known = np.isfinite(points[:, 2])
@@ -47,17 +49,17 @@ def move(old: View, new: View, settings: OdometrySettings) -> Step | Failed:
     guesses = new.features.pixels[pairs[:, 1]].astype(np.float64)
     about = new.about_px[pairs[:, 1]].astype(np.float64)
     grown = points[:, 2] * (about + camera.doffs_px) / (camera.focal_px * camera.baseline_m)
-    again = locate(old.pair.left, new.pair.left, places, guesses, grown=grown)
+    again = align_patches(old.pair.left, new.pair.left, places, guesses, grown=grown)
     right = match_across(new.pair, again.pixels, about)
     kept = again.found & right.found
     points, target = points[kept], np.column_stack([again.pixels, right.pixels[:, 0]])[kept]
-    if len(points) < settings.least_inliers:
+    if len(points) < settings.min_inliers:
         return Failed("no-matches", f"only {len(points)} features can be followed from the frame before")
     start = ransac(points, target[:, :2], camera, settings)
     if isinstance(start, Failed):
         return start
     rotation, translation = start
-    return refine(points, target, rotation, translation, camera, settings)
+    return refine_pose(points, target, rotation, translation, camera, settings)
 
 
 def ransac(
@@ -79,20 +81,21 @@ def ransac(
         flags=cv2.SOLVEPNP_AP3P,
     )
     count = 0 if inliers is None else len(inliers)
-    if not good or count < settings.least_inliers:
+    if not good or count < settings.min_inliers:
         return Failed("no-consensus", f"only {count} of {len(points)} matches agree on one motion")
     return Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel()
 
 
-def refine(
+def refine_pose(
     points: Float64,
     target: Float64,
     rotation: Float64,
     translation: Float64,
     camera: RectifiedCamera,
     settings: OdometrySettings,
-) -> Step | Failed:
-    """Gauss-Newton on u, v and u_right of the new pair, each residual whitened by its own covariance.
+) -> RelativePose | Failed:
+    """Refine by Gauss-Newton on u, v and u_right of the new pair, each residual whitened by its own
+    covariance.
 
     The noise of the three places that the old point was triangulated from, most of it along its ray, is
     projected into the new pair and widens the residual's covariance. Huber's weights; outliers beyond 5
@@ -100,7 +103,7 @@ def refine(
     """
     base = camera.focal_px * camera.baseline_m
     lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, base, camera.doffs_px])
-    by_old_places, target = triangulated_by(points, camera), np.ascontiguousarray(target)
+    by_old_places, target = triangulation_jacobian(points, camera), np.ascontiguousarray(target)
     kept: Bool = np.ones(len(points), dtype=np.bool_)
     distance, normal, gradient = np.empty(len(points)), np.empty((6, 6)), np.empty(6)
     for _ in range(10):
@@ -108,8 +111,8 @@ def refine(
             points, by_old_places, target, rotation, translation, lens, settings.pixel_sigma_px**2, distance,
             normal, gradient,
         )  # fmt: skip
-        kept = distance < MOST_SIGMAS
-        if kept.sum() < settings.least_inliers:
+        kept = distance < MAX_SIGMAS
+        if kept.sum() < settings.min_inliers:
             return Failed("no-consensus", f"only {int(kept.sum())} of {len(points)} points agree in 3D")
         update = np.linalg.solve(normal, gradient)
         rotation = Rotation.from_rotvec(update[:3]).as_matrix() @ rotation
@@ -118,12 +121,12 @@ def refine(
             break
     depth = float(np.median(points[kept, 2]))
     scale_sigma = settings.calibration_sigma_px * depth / base
-    return Step(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
+    return RelativePose(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
 
 
-def carried(covariance: Float64, way: Float64) -> Float64:
-    """(6, 6) of a pose, rotation then translation in the reference's axes, for a point `way` (m) further on
-    that is fixed to it: what the attitude is off by swings the point.
+def transport_covariance(covariance: Float64, way: Float64) -> Float64:
+    """Transport a pose covariance (6, 6), rotation then translation in the reference's axes, to a point `way`
+    (m) further on that is fixed to it: what the attitude is off by swings the point.
     """
     further = np.eye(6)
     further[3:, :3] = -skew(way)
@@ -131,8 +134,8 @@ def carried(covariance: Float64, way: Float64) -> Float64:
     return result
 
 
-def in_world(covariance: Float64, rotation: Float64) -> Float64:
-    """(6, 6) of a pose, turned by (3, 3) to other axes."""
+def rotate_covariance(covariance: Float64, rotation: Float64) -> Float64:
+    """Rotate a pose covariance (6, 6) by (3, 3) to other axes."""
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = rotation
     result: Float64 = turned @ covariance @ turned.T

@@ -1,4 +1,6 @@
-"""One step's normal equations, point by point: what the consensus of a frame spends its iterations on."""
+"""Form one step's normal equations, point by point: what the consensus of a frame spends its
+iterations on.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ from barsight.core.arrays import Float64, kernel
 
 NEAREST_M = 0.1
 HUBER_SIGMAS = 1.5
-MOST_SIGMAS = 5.0
+MAX_SIGMAS = 5.0
 
 
 @kernel()
@@ -16,7 +18,7 @@ def step_equations(
     points: Float64, by_old_places: Float64, target: Float64, turn: Float64, place: Float64, lens: Float64,
     variance: float, distance: Float64, normal: Float64, gradient: Float64,
 ) -> None:  # fmt: skip
-    """Fills distance (N,), each point's residual in its own sigmas (infinite behind the camera), and the
+    """Compute distance (N,), each point's residual in its own sigmas (infinite behind the camera), and the
     normal matrix (6, 6) and gradient (6,) of a small turn, then shift, in the new frame's axes.
 
     points (N, 3) in the old frame; by_old_places (N, 3, 3) m per px of the places they were triangulated
@@ -58,7 +60,7 @@ def step_equations(
                 pull[i] += information[i, j] * residual[j]
             square += pull[i] * residual[i]
         distance[n] = np.sqrt(square)
-        if distance[n] >= MOST_SIGMAS:
+        if distance[n] >= MAX_SIGMAS:
             continue
         weight = min(1.0, HUBER_SIGMAS / max(distance[n], 1e-9))
         for i in range(3):
@@ -75,7 +77,7 @@ def step_equations(
 
 @kernel()
 def _product(a: Float64, b: Float64, result: Float64) -> None:
-    """a (3, 3) times b (3, M)."""
+    """Multiply a (3, 3) by b (3, M)."""
     for i in range(3):
         for j in range(b.shape[1]):
             result[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
@@ -83,7 +85,7 @@ def _product(a: Float64, b: Float64, result: Float64) -> None:
 
 @kernel()
 def _inverse(m: Float64, result: Float64) -> None:
-    """Of a (3, 3) matrix, by its cofactors."""
+    """Invert a (3, 3) matrix by its cofactors."""
     for i in range(3):
         for j in range(3):
             a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3

@@ -1,4 +1,4 @@
-"""Pictures one by one as stereo odometry looks at them: features with a depth, or why there are none."""
+"""Detect features with depth in each picture for stereo odometry, or say why there are none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.types import RefusedFrame
-from barsight.features.guided_matching import match_across, triangulate
+from barsight.features.guided_matching import match_across, triangulate_stereo
 from barsight.features.orb import Features, detect_orb
 from barsight.features.patch_alignment import PatchPair, patch_pair
 from barsight.recording.base import Recording
@@ -24,11 +24,11 @@ class OdometrySettings:
 
     features: int = 3000
     """Features a picture."""
-    nearest_m: float = 0.5
+    min_range_m: float = 0.5
     """Points nearer than this aren't used."""
-    farthest_baselines: float = 60.0
+    max_range_baselines: float = 60.0
     """Points further than this many baselines aren't used for motion."""
-    least_inliers: int = 25
+    min_inliers: int = 25
     """A frame with fewer agreeing points is refused."""
     pixel_sigma_px: float = 0.3
     """The noise of a feature's place (1 sigma)."""
@@ -38,14 +38,14 @@ class OdometrySettings:
     """Points further off than this are outliers."""
 
     def __post_init__(self) -> None:
-        if not 100 <= self.features <= 100_000 or self.least_inliers < 6:
-            raise ConfigError("features must lie in 100...100000, least_inliers be at least 6")
-        if min(self.nearest_m, self.farthest_baselines, self.pixel_sigma_px, self.ransac_px) <= 0:
+        if not 100 <= self.features <= 100_000 or self.min_inliers < 6:
+            raise ConfigError("features must lie in 100...100000, min_inliers be at least 6")
+        if min(self.min_range_m, self.max_range_baselines, self.pixel_sigma_px, self.ransac_px) <= 0:
             raise ConfigError("the odometry's distances and tolerances must be positive")
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class FeatureView:
     """One frame's features. about_px: (N,) their coarse disparities; coarse: (h, w) the pair's, NaN unknown;
     both in px of the full picture.
     """
@@ -57,27 +57,27 @@ class View:
 
     @property
     def stamp_ns(self) -> int:
-        """The frame's."""
+        """Return the frame's stamp."""
         return self.pair.pair.stamp_ns
 
     def points(self, index: Int64, settings: OdometrySettings) -> Float64:
-        """(M, 3) in `rect0` of the features of an index (M,), NaN where the right picture shows none at a
-        useful depth.
+        """Triangulate the features of an index: (M, 3) in `rect0` of the features of an index (M,), NaN where
+        the right picture shows none at a useful depth.
         """
         camera = self.pair.pair.camera
         places = self.features.pixels[index].astype(np.float64)
         right = match_across(self.pair, places, self.about_px[index].astype(np.float64))
-        points = triangulate(np.column_stack([places, right.pixels[:, 0]]), camera)
+        points = triangulate_stereo(np.column_stack([places, right.pixels[:, 0]]), camera)
         with np.errstate(invalid="ignore"):
-            kept = right.found & (points[:, 2] > settings.nearest_m)
-            kept &= points[:, 2] < settings.farthest_baselines * camera.baseline_m
+            kept = right.found & (points[:, 2] > settings.min_range_m)
+            kept &= points[:, 2] < settings.max_range_baselines * camera.baseline_m
         return np.where(kept[:, None], points, np.nan)
 
 
-def views(
+def feature_views(
     recording: Recording, rectifier: Rectifier, settings: OdometrySettings, advance: Callable[[], None]
-) -> Iterator[View | RefusedFrame]:
-    """Of each frame its ORB features, or why it shows none. `advance` is called once a frame."""
+) -> Iterator[FeatureView | RefusedFrame]:
+    """Yield each frame's ORB features, or why it shows none. `advance` is called once a frame."""
     for frame in recording.frames():
         advance()
         if isinstance(frame, RefusedFrame):
@@ -87,15 +87,15 @@ def views(
         if isinstance(pair, Failed):
             yield RefusedFrame(frame.stamp_ns, pair.reason)
             continue
-        view = look(patch_pair(pair), detect_orb(pair.left, settings.features), settings)
+        view = match_coarsely(patch_pair(pair), detect_orb(pair.left, settings.features), settings)
         yield RefusedFrame(frame.stamp_ns, view.reason) if isinstance(view, Failed) else view
 
 
-def look(
+def match_coarsely(
     pair: PatchPair, features: Features, settings: OdometrySettings,
     span: tuple[float, float] | None = None,
-) -> View | Failed:  # fmt: skip
-    """A pair's left features that have a coarse disparity; Failed `no-features` where too few do.
+) -> FeatureView | Failed:  # fmt: skip
+    """Select a pair's left features that have a coarse disparity; Failed `no-features` where too few do.
 
     span: the lowest and highest disparity to expect, px, where that is known.
     """
@@ -105,6 +105,6 @@ def look(
     column = (features.pixels[:, 0] * coarse.shape[1] / camera.width).astype(int)
     about = coarse[row, column]
     known = np.isfinite(about)
-    if known.sum() < settings.least_inliers:
+    if known.sum() < settings.min_inliers:
         return Failed("no-features", f"only {int(known.sum())} features have a depth")
-    return View(pair, features.chosen(known), about[known], coarse)
+    return FeatureView(pair, features.chosen(known), about[known], coarse)

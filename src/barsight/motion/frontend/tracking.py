@@ -1,4 +1,4 @@
-"""The front end: points followed through a recording's pairs, each frame's motion checked by consensus."""
+"""Track points through a recording's pairs, each frame's motion checked by consensus."""
 
 from __future__ import annotations
 
@@ -11,25 +11,30 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
-from barsight.core.motion_detail import InSigmas
-from barsight.core.parallel import ordered_map, read_ahead
+from barsight.core.motion_detail import NormalisedResiduals
+from barsight.core.parallel import ordered_map, prefetch
 from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame
-from barsight.features.guided_matching import GuidedMatches, PredictedMotion, predict_places, triangulate
+from barsight.features.guided_matching import (
+    GuidedMatches,
+    PredictedMotion,
+    predict_projections,
+    triangulate_stereo,
+)
 from barsight.features.orb import describe_upright
 from barsight.features.patch_alignment import PatchPair, patch_pair
-from barsight.features.self_similarity import repeat_px
-from barsight.features.tracks import Tracks, TrackSettings, carry_on, detect_corners, find_again
-from barsight.motion.frontend.relative_pose import Step, move, ransac, refine
-from barsight.motion.frontend.stereo_features import OdometrySettings, View, look
+from barsight.features.self_similarity import texture_period_px
+from barsight.features.tracks import Tracks, TrackSettings, detect_corners, match_tracks, update_tracks
+from barsight.motion.frontend.relative_pose import RelativePose, estimate_step, ransac, refine_pose
+from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, match_coarsely
 from barsight.recording.base import Recording
 from barsight.stereo.search_range import coarse_disparity
 
 PREPARED = 1
 """Pairs that are rectified ahead while the one before is followed."""
-LEAST_SHARE = 0.45
+MIN_RATIO = 0.45
 """One bar off, a twentieth of the points find one alike and agree, on dull bars a third; at the true place
 most do (six in ten from a car, eight over a yard)."""
-LEAST_KNOWN = 200
+MIN_KNOWN = 200
 SPAN = 1.6
 """New points are sought up to this much nearer and further than the known ones."""
 
@@ -39,8 +44,8 @@ Predictor = Callable[[int, int], PredictedMotion | None]
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """What one frame shows. track: (N,) names of points; stereo: (N, 3) u, v and right u, px; sigma_px: (N,)
-    of each as the patches show it.
+    """Tracked points of one frame. track: (N,) names of points; stereo: (N, 3) u, v and right u, px;
+    sigma_px: (N,) of each as the patches show it.
 
     motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
     one before. ambiguous: how many points were refused since the prediction was too coarse for the bars.
@@ -58,7 +63,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class FrontEndSettings:
-    """How points are followed."""
+    """Settings of the front end."""
 
     tracks: TrackSettings = field(default_factory=TrackSettings)
     rough: OdometrySettings = field(default_factory=lambda: OdometrySettings(features=900))
@@ -72,27 +77,27 @@ class _State:
     tracks: Tracks | None
     next_track: int
     stamp_ns: int
-    view: View | None
+    view: FeatureView | None
 
 
-def follow(
+def track_recording(
     recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
     advance: Callable[[], None],
 ) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:  # fmt: skip
-    """Sightings of all frames that show enough; the others are refused with a reason."""
-    seen = list(follow_live(recording, rectifier, predictor, settings, advance))
+    """Track all frames that show enough; the others are refused with a reason."""
+    seen = list(track_incrementally(recording, rectifier, predictor, settings, advance))
     return (
         tuple(s for s in seen if isinstance(s, Sighting)),
         tuple(s for s in seen if isinstance(s, RefusedFrame)),
     )
 
 
-def follow_live(
+def track_incrementally(
     recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
     advance: Callable[[], None],
 ) -> Iterator[Sighting | RefusedFrame]:  # fmt: skip
-    """One frame after the other; only the last few views are held. `predictor` is asked when a frame's turn
-    comes, so it may know what was made of the frames before.
+    """Track frame by frame; only the last few views are held. `predictor` is asked when a frame's turn comes,
+    so it may know what was made of the frames before.
     """
     state: _State | None = None
 
@@ -104,7 +109,7 @@ def follow_live(
             return RefusedFrame(frame.stamp_ns, rectified.reason)
         return patch_pair(rectified)
 
-    for pair in ordered_map(prepare, read_ahead(recording.frames()), PREPARED):
+    for pair in ordered_map(prepare, prefetch(recording.frames()), PREPARED):
         advance()
         if isinstance(pair, RefusedFrame):
             yield pair
@@ -125,7 +130,7 @@ def follow_live(
 def _see(
     state: _State | None, pair: PatchPair, prediction: PredictedMotion | None, settings: FrontEndSettings
 ) -> tuple[_State, Sighting] | Failed:
-    view: View | None = None
+    view: FeatureView | None = None
     if state is None or state.tracks is None:
         kept = np.zeros(0, np.bool_)
         matches = GuidedMatches(np.empty((0, 3)), np.empty(0), kept, kept)
@@ -133,14 +138,14 @@ def _see(
         motion, innovation = None, None
     else:
         tracks, predicted = state.tracks, prediction
-        found = None if prediction is None else consensus(tracks, pair, prediction, settings)
+        found = None if prediction is None else motion_consensus(tracks, pair, prediction, settings)
         if found is None or isinstance(found, Failed):
             rough_motion = _rough(state, tracks, pair, settings)
             if isinstance(rough_motion, Failed):
                 return rough_motion
             step, view = rough_motion
             prediction = PredictedMotion(step.rotation, step.translation, 4 * step.covariance)
-            found = consensus(tracks, pair, prediction, settings)
+            found = motion_consensus(tracks, pair, prediction, settings)
             if isinstance(found, Failed):
                 return found
         kept, matches, motion = found
@@ -152,8 +157,8 @@ def _see(
         coarse = coarse_disparity(left, right, camera.doffs_px, known=span, both_ways=False)
     else:
         coarse = view.coarse
-    tracks = carry_on(tracks, pair, matches, kept, coarse, settings.tracks)
-    if len(tracks.track) < settings.rough.least_inliers:
+    tracks = update_tracks(tracks, pair, matches, kept, coarse, settings.tracks)
+    if len(tracks.track) < settings.rough.min_inliers:
         return Failed("no-features", f"only {len(tracks.track)} points have a depth")
     ambiguous = int(matches.ambiguous.sum())
     sighting = Sighting(
@@ -163,26 +168,26 @@ def _see(
 
 
 def _innovation(predicted: PredictedMotion, found: PredictedMotion) -> Float64:
-    """(6,) turn and way of the found motion minus the predicted one, each over its sigma."""
+    """Compute the innovation (6,): turn and way found minus predicted, each over its sigma."""
     turn = Rotation.from_matrix(found.rotation @ predicted.rotation.T)
     way = found.translation - turn.as_matrix() @ predicted.translation
     sigma = np.sqrt(np.diag(predicted.covariance + found.covariance))
     return np.asarray(np.concatenate([turn.as_rotvec(), way]) / sigma, np.float64)
 
 
-def innovations(sightings: tuple[Sighting, ...]) -> InSigmas | None:
-    """Of all frames whose motion was predicted, None if there are none."""
+def innovations(sightings: tuple[Sighting, ...]) -> NormalisedResiduals | None:
+    """Collect the innovations of all frames whose motion was predicted, None if there are none."""
     told = [(s.stamp_ns, s.innovation) for s in sightings if s.innovation is not None]
     if not told:
         return None
     names = tuple(f"{part} {axis}" for part in ("turn", "way") for axis in "xyz")
     stamps = np.array([stamp for stamp, _ in told], np.int64)
-    return InSigmas(names, stamps, np.array([values for _, values in told]))
+    return NormalisedResiduals(names, stamps, np.array([values for _, values in told]))
 
 
 def _span(known: Float64, camera: RectifiedCamera) -> tuple[float, float] | None:
-    """The disparities to expect, px, by those of the points that are known, (N, 3); None for too few."""
-    if len(known) < LEAST_KNOWN:
+    """Predict the disparity range (px) from the known points (N, 3); None for too few."""
+    if len(known) < MIN_KNOWN:
         return None
     low, high = np.percentile(known[:, 0] - known[:, 2] + camera.doffs_px, (1, 99))
     return float(low / SPAN - camera.doffs_px), float(high * SPAN - camera.doffs_px)
@@ -190,57 +195,57 @@ def _span(known: Float64, camera: RectifiedCamera) -> tuple[float, float] | None
 
 def _rough(
     state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
-) -> tuple[Step, View] | Failed:
-    """The motion by both pairs' corners, without any prediction."""
+) -> tuple[RelativePose, FeatureView] | Failed:
+    """Estimate the motion by both pairs' corners, without any prediction."""
     assert tracks.last is not None
     span = _span(tracks.stereo, pair.pair.camera)
-    old = state.view or look_at_corners(patch_pair(tracks.last), settings, span)
-    new = look_at_corners(pair, settings, span)
+    old = state.view or describe_corners(patch_pair(tracks.last), settings, span)
+    new = describe_corners(pair, settings, span)
     if isinstance(old, Failed):
         return old
     if isinstance(new, Failed):
         return new
-    step = move(old, new, settings.rough)
+    step = estimate_step(old, new, settings.rough)
     return step if isinstance(step, Failed) else (step, new)
 
 
-def look_at_corners(
+def describe_corners(
     pair: PatchPair, settings: FrontEndSettings, span: tuple[float, float] | None = None
-) -> View | Failed:
-    """The corners of a pair, described; `look` says the rest."""
+) -> FeatureView | Failed:
+    """Detect and describe the corners of a pair; `match_coarsely` says the rest."""
     chosen, image = replace(settings.tracks, points=settings.rough.features), pair.pair.left
     corners = detect_corners(image, chosen, np.empty((0, 2)))
-    return look(pair, describe_upright(image, corners), settings.rough, span)
+    return match_coarsely(pair, describe_upright(image, corners), settings.rough, span)
 
 
-def consensus(
+def motion_consensus(
     tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings
 ) -> tuple[Bool, GuidedMatches, PredictedMotion] | Failed:
-    """Points found again in their ellipses that agree on one motion in 3D, and that motion."""
+    """Select points found again in their ellipses that agree on one motion in 3D, and that motion."""
     assert tracks.last is not None
-    repeats = repeat_px(tracks.last.left, tracks.stereo[:, :2])
+    repeats = texture_period_px(tracks.last.left, tracks.stereo[:, :2])
     camera = pair.pair.camera
-    predicted = predict_places(
-        triangulate(tracks.stereo, camera), settings.tracks.sigma_px, prediction, camera
+    predicted = predict_projections(
+        triangulate_stereo(tracks.stereo, camera), settings.tracks.sigma_px, prediction, camera
     )
-    matches = find_again(tracks, pair, predicted, settings.tracks, repeats)
+    matches = match_tracks(tracks, pair, predicted, settings.tracks, repeats)
     index = np.flatnonzero(matches.found)
-    least = settings.rough.least_inliers
+    least = settings.rough.min_inliers
     if index.size < least:
         alike = int(matches.ambiguous.sum())
         why = f", {alike} can't be told from the next bar's" if alike else ""
         return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again{why}")
-    points, target = triangulate(tracks.stereo[index], camera), matches.stereo[index]
+    points, target = triangulate_stereo(tracks.stereo[index], camera), matches.stereo[index]
     start = ransac(points, target[:, :2], camera, settings.rough)
     if isinstance(start, Failed):
         return start
-    step = refine(points, target, *start, camera, settings.rough)
+    step = refine_pose(points, target, *start, camera, settings.rough)
     if isinstance(step, Failed):
         return step
     kept = np.zeros(len(tracks.track), np.bool_)
     kept[index[step.kept]] = True
     share = kept.sum() / max(1, int((predicted.inside & ~matches.ambiguous).sum()))
-    if share < LEAST_SHARE:
+    if share < MIN_RATIO:
         return Failed(
             "ambiguous",
             f"only {100 * share:.0f} % of the points are found where they are expected: another bar may be",
@@ -253,13 +258,15 @@ def _with_ambiguous(
     tracks: Tracks, pair: PatchPair, motion: PredictedMotion, matches: GuidedMatches, kept: Bool,
     repeats: Float64, settings: FrontEndSettings,
 ) -> tuple[Bool, GuidedMatches]:  # fmt: skip
-    """Points too ambiguous for the prediction, looked for anew by the motion on which the others agree."""
+    """Match points too ambiguous for the prediction anew by the motion on which the others agree."""
     left = np.flatnonzero(matches.ambiguous)
     if left.size == 0:
         return kept, matches
     some, camera = tracks.chosen(matches.ambiguous), pair.pair.camera
-    places = predict_places(triangulate(some.stereo, camera), settings.tracks.sigma_px, motion, camera)
-    again = find_again(some, pair, places, settings.tracks, repeats[left])
+    places = predict_projections(
+        triangulate_stereo(some.stereo, camera), settings.tracks.sigma_px, motion, camera
+    )
+    again = match_tracks(some, pair, places, settings.tracks, repeats[left])
     stereo, sigma = matches.stereo.copy(), matches.sigma_px.copy()
     kept, ambiguous = kept.copy(), matches.ambiguous.copy()
     stereo[left], sigma[left], kept[left] = again.stereo, again.sigma_px, again.found

@@ -1,4 +1,4 @@
-"""Nodes between frames, which no picture sees, taken out before all others.
+"""Eliminate nodes between frames, which no picture sees, before all others.
 
 Only the IMU and the encoders bind them, each to its neighbours: between two frames they are a small system of
 their own. The band of what is left is as wide as the longest track in frames, not in nodes.
@@ -29,17 +29,17 @@ class Chain:
 
     @property
     def size(self) -> int:
-        """Unknowns a node."""
+        """Return the number of unknowns a node."""
         return int(self.rows.shape[1]) // 2
 
     def at(self, nodes: Int64) -> Int64:
-        """Where the nodes' unknowns are."""
+        """Return the indices of the nodes' unknowns."""
         return (nodes[:, None] * self.size + np.arange(self.size)).ravel()
 
 
 @dataclass(frozen=True, eq=False)
-class Gap:
-    """Nodes first...end - 1 taken out. answer: (m n, 2 n + 2) by which they follow the kept nodes before and
+class EliminatedNodes:
+    """Eliminated nodes first...end - 1. answer: (m n, 2 n + 2) by which they follow the kept nodes before and
     after, the latency, and nothing at all.
     """
 
@@ -48,9 +48,9 @@ class Gap:
     answer: Float64
 
 
-def without_gaps(chain: Chain, kept: Int64) -> tuple[Chain, tuple[Gap, ...]]:
-    """The chain of the nodes `kept` (K,) alone, and what was taken out. Raises LinAlgError where the sensors
-    leave a node between undetermined.
+def eliminate_nodes(chain: Chain, kept: Int64) -> tuple[Chain, tuple[EliminatedNodes, ...]]:
+    """Form the Schur complement on the nodes `kept` (K,), and what was taken out. Raises LinAlgError where
+    the sensors leave a node between undetermined.
     """
     nodes, at = len(chain.rows) // chain.size, chain.at(kept)
     left = replace(chain, rows=chain.rows[at], gradient=chain.gradient[at], side=chain.side[at])
@@ -61,8 +61,8 @@ def without_gaps(chain: Chain, kept: Int64) -> tuple[Chain, tuple[Gap, ...]]:
     return left, tuple(gaps)
 
 
-def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Gap:
-    """The nodes first...end - 1, between the kept nodes k - 1 and k where there are such."""
+def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> EliminatedNodes:
+    """Eliminate the nodes first...end - 1, between the kept nodes k - 1 and k where there are such."""
     size = chain.size
     here = slice(first * size, end * size)
     right = np.zeros(((end - first) * size, 2 * size + 2))
@@ -71,13 +71,13 @@ def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Gap:
     if end * size < len(chain.rows):
         right[-size:, size:-2] = _link(chain.rows, end).T
     right[:, -2], right[:, -1] = chain.side[here], chain.gradient[here]
-    factor = skyline.even(chain.rows[here].copy())
-    if not skyline.factorise(factor):
+    factor = skyline.uniform_band(chain.rows[here].copy())
+    if not skyline.factorise_skyline(factor):
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
     skyline.solve_forward(factor, right)
     taken = np.empty((right.shape[1], right.shape[1]))
-    skyline.products(right, taken)
-    skyline.solve_back(factor, right)
+    skyline.gram_matrix(right, taken)
+    skyline.solve_back_dense(factor, right)
     row, column = np.tril_indices(size)
     for node, part in ((k - 1, slice(size)), (k, slice(size, 2 * size))):
         if 0 <= node * size < len(left.rows):
@@ -90,19 +90,21 @@ def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Gap:
         left.rows[k * size : (k + 1) * size][row, size - 1 - row + column] = -taken[size:-2, :size]
     left.corner -= taken[-2, -2]
     left.corner_gradient -= taken[-2, -1]
-    return Gap(first, end, right)
+    return EliminatedNodes(first, end, right)
 
 
 def _link(rows: Float64, node: int) -> Float64:
-    """(n, n) how a node (rows) is bound to the one before."""
+    """Extract how a node (rows) is bound to the one before (n, n)."""
     size = rows.shape[1] // 2
     row, column = np.indices((size, size))
     link: Float64 = rows[node * size : (node + 1) * size][row, size - 1 - row + column]
     return link
 
 
-def with_gaps(step: Float64, latency: float, kept: Int64, gaps: tuple[Gap, ...], nodes: int) -> Float64:
-    """(M, n) the step of all nodes from that of the kept ones (K, n) and of the latency."""
+def back_substitute_nodes(
+    step: Float64, latency: float, kept: Int64, gaps: tuple[EliminatedNodes, ...], nodes: int
+) -> Float64:
+    """Back-substitute the step (M, n) of all nodes from that of the kept ones (K, n) and of the latency."""
     result = np.zeros((nodes, step.shape[1]))
     result[kept] = step
     for gap in gaps:

@@ -8,7 +8,7 @@ from barsight.core.arrays import Float64, kernel
 
 
 @kernel(fastmath=True)
-def product(matrix: Float64, vector: Float64) -> Float64:
+def multiply(matrix: Float64, vector: Float64) -> Float64:
     """Multiply a matrix (m, n) by a vector (n,).
 
     BLAS's threads wait for each other where the machine is busy.
@@ -24,7 +24,7 @@ def product(matrix: Float64, vector: Float64) -> Float64:
 
 @kernel()
 def add_band(rows: Float64, begin: int, matrix: Float64) -> None:
-    """Adds a symmetric band (`band`) to the unknowns from `begin` on."""
+    """Add a symmetric band (`band`) to the unknowns from `begin` on."""
     n, width = rows.shape
     for i in range(n):
         for j in range(max(0, i - width + 1), i + 1):
@@ -36,7 +36,7 @@ def add_band(rows: Float64, begin: int, matrix: Float64) -> None:
 
 @kernel()
 def add_blocks(blocks: Float64, size: int, matrix: Float64) -> None:
-    """Adds blocks (M, 6, 6 M) as `eliminate` gives them: of node k with nodes 0...k at the right end."""
+    """Add blocks (M, 6, 6 M) as `eliminate` gives them: of node k with nodes 0...k at the right end."""
     nodes = blocks.shape[0]
     for k in range(nodes):
         for s in range(k + 1):

@@ -1,4 +1,4 @@
-"""Where each unknown stands in the normal equations.
+"""Order the unknowns of the normal equations.
 
 Unknowns go node by node (pose, with an IMU velocity and biases). What a piece of the yard has of its own
 (`slides`) is bound to the nodes that see it and follows the last of these. So the equations are a band,
@@ -15,13 +15,13 @@ import numpy as np
 
 from barsight.core.arrays import Int64
 from barsight.core.linalg import skyline
-from barsight.core.linalg.skyline import Band
+from barsight.core.linalg.skyline import Skyline
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class Ordering:
     """size: unknowns a node. node: (K,) each node's first unknown; piece: (S,) each piece's slide, its
-    disparity is the next. seen: (S, 2) the first and last node that see a piece. first: (n,) as `Band` has
+    disparity is the next. seen: (S, 2) the first and last node that see a piece. first: (n,) as `Skyline` has
     it. reach: how many nodes the longest track spans.
     """
 
@@ -34,26 +34,29 @@ class Layout:
 
     @cached_property
     def poses(self) -> Int64:
-        """(6 K,) where the poses' unknowns are."""
+        """Return the indices (6 K,) of the poses' unknowns."""
         return (self.node[:, None] + np.arange(6)).ravel()
 
     @cached_property
     def nodes(self) -> Int64:
-        """(size K,) where the nodes' unknowns are."""
+        """Return the indices (size K,) of the nodes' unknowns."""
         return (self.node[:, None] + np.arange(self.size)).ravel()
 
     @cached_property
     def pieces(self) -> Int64:
-        """(2 S,) where the pieces' slides are, then their disparities."""
+        """Return the indices (2 S,) of the pieces' slides, then their disparities."""
         return np.concatenate([self.piece, self.piece + 1])
 
-    def zeros(self) -> Band:
-        """A band for all of them."""
-        return skyline.empty(self.first)
+    def zeros(self) -> Skyline:
+        """Allocate a skyline matrix for all of them."""
+        return skyline.empty_skyline(self.first)
 
 
-def layout(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None) -> Layout:
-    """begin, end: (T,) the nodes of each point's first and last sighting; piece: (T,) as `Pieces`."""
+def order_unknowns(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None) -> Ordering:
+    """Order the unknowns.
+
+    begin, end: (T,) the nodes of each point's first and last sighting; piece: (T,) as `Pieces`.
+    """
     index = np.arange(nodes)
     seen = np.empty((0, 2), np.int64)
     if piece is not None:
@@ -73,4 +76,4 @@ def layout(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None)
     for k in range(size):
         first[node + k] = node[earliest if k < 6 else nearest]
     first[own], first[own + 1] = node[seen[:, 0]], node[seen[:, 0]]
-    return Layout(size, node, own, seen, first, int((index - earliest).max(initial=0)) + 1)
+    return Ordering(size, node, own, seen, first, int((index - earliest).max(initial=0)) + 1)

@@ -1,4 +1,4 @@
-"""Where points must be seen in both cameras, and how that goes with poses, points and the rig.
+"""Project points to both cameras with Jacobians by pose, point and rig, compiled.
 
 Errors are predicted minus seen; poses move as GTSAM's do, by a small turn and shift in body axes. A point has
 four unknowns: its place, and how it slides (`slides`), a turn of its image about the camera's axis. The inner
@@ -28,7 +28,7 @@ class Rig(NamedTuple):
     huber: float
 
 
-class Sights(NamedTuple):
+class Observations(NamedTuple):
     """N sightings of T points, in the points' order. first: (T + 1,) each point's begin; node, used (N,);
     stereo (N, 3) u, v, right u; weight (N,) 1 / sigma. piece: (T,) which piece of the yard a point is of;
     tight: (T,) 1 / rad, how it is held to the piece's slide. scale: 1 where the rig's scale is seen, else 0.
@@ -44,10 +44,10 @@ class Sights(NamedTuple):
     scale: float
 
 
-class Guess(NamedTuple):
-    """Where the unknowns are. camera: (M, 3, 4) left camera from reference, turn and shift; points (T, 4);
-    shared (2 S + 2,): the slides of S pieces of the yard, what their disparity is too large by (px), then the
-    rig's drift.
+class LinearisationPoint(NamedTuple):
+    """Linearisation point of the unknowns. camera: (M, 3, 4) left camera from reference, turn and shift;
+    points (T, 4); shared (2 S + 2,): the slides of S pieces of the yard, what their disparity is too large by
+    (px), then the rig's drift.
     """
 
     camera: Float64
@@ -60,9 +60,9 @@ def _error(
     lens: Float64, camera: Float64, points: Float64, shared: Float64, off_px: float, scale: float,
     stereo: Float64, node: int, k: int, t: int, error: Float64, q: Float64, by_shared: Float64,
 ) -> bool:  # fmt: skip
-    """error (3,) px predicted minus seen; q (3,) the point in the left camera; by_shared (3,) how the right
-    column goes with the piece's disparity, which is off_px too large, and the rig's drift. False behind the
-    camera.
+    """Compute error (3,) px predicted minus seen; q (3,) the point in the left camera; by_shared (3,) how the
+    right column goes with the piece's disparity, which is off_px too large, and the rig's drift. False behind
+    the camera.
     """
     x, y, z = points[t, 0], points[t, 1], points[t, 2]
     for i in range(3):
@@ -86,8 +86,8 @@ def _error(
 
 
 @kernel(fastmath=True, inline=True)
-def slide_off(points: Float64, shared: Float64, piece: Int64, t: int) -> float:
-    """How much further a point slides than its piece, rad."""
+def slide_offset(points: Float64, shared: Float64, piece: Int64, t: int) -> float:
+    """Subtract the piece's slide from a point's, rad."""
     off: float = points[t, 3]
     if len(shared) > 2:
         off -= shared[piece[t]]
@@ -95,22 +95,22 @@ def slide_off(points: Float64, shared: Float64, piece: Int64, t: int) -> float:
 
 
 @kernel(fastmath=True, inline=True)
-def disparity_off(shared: Float64, piece: Int64, t: int) -> float:
-    """What a point's disparity is too large by with all of its piece, px."""
+def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
+    """Return what a point's disparity is too large by with all of its piece, px."""
     pieces = (len(shared) - 2) // 2
     off: float = shared[pieces + piece[t]] if pieces > 0 else 0.0
     return off
 
 
 @kernel(fastmath=True)
-def residuals(rig: Rig, sights: Sights, guess: Guess, result: Float64) -> float:
-    """Seen minus predicted (N, 3) px of the used sightings; returns their robust cost."""
+def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result: Float64) -> float:
+    """Compute residuals (N, 3) px, seen minus predicted, of the used sightings; returns their robust cost."""
     lens, huber, scale = rig.lens, rig.huber, sights.scale
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
     camera, points, shared = guess.camera, guess.points, guess.shared
     error, q, by_shared, cost = np.empty(3), np.empty(3), np.empty(3), 0.0
     for t in range(len(first) - 1):
-        seen, off_px = False, disparity_off(shared, sights.piece, t)
+        seen, off_px = False, disparity_offset(shared, sights.piece, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
@@ -126,18 +126,19 @@ def residuals(rig: Rig, sights: Sights, guess: Guess, result: Float64) -> float:
             size = np.sqrt(total) * weight[k]
             cost += size**2 / 2 if size < huber else huber * (size - huber / 2)
         if seen:
-            cost += (sights.tight[t] * slide_off(points, shared, sights.piece, t)) ** 2 / 2
+            cost += (sights.tight[t] * slide_offset(points, shared, sights.piece, t)) ** 2 / 2
     return cost
 
 
 @kernel(fastmath=True, inline=True)
-def rows(
+def whitened_rows(
     lens: Float64, mount: Float64, huber: float, camera: Float64, points: Float64, shared: Float64,
     off_px: float, scale: float, stereo: Float64, weights: Float64, node: int, k: int, t: int, error: Float64,
     q: Float64, by_pose: Float64, by_point: Float64, by_shared: Float64,
 ) -> None:  # fmt: skip
-    """The whitened error (3,) of a sighting and its derivatives: by_pose (3, 6), by_point (3, 4), by_shared
-    (3,) of its third row. q: (3,) scratch.
+    """Compute the whitened error (3,) of a sighting and its Jacobians: by_pose (3, 6), by_point (3, 4),
+    by_shared (3,) of a sighting and its derivatives: by_pose (3, 6), by_point (3, 4), by_shared (3,) of its
+    third row. q: (3,) scratch.
     """
     if not _error(lens, camera, points, shared, off_px, scale, stereo, node, k, t, error, q, by_shared):
         error[:] = 0

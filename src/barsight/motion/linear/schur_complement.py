@@ -1,4 +1,4 @@
-"""Points taken out of the normal equations: what is left binds poses and what is shared only.
+"""Form the Schur complement of the points: what is left binds poses and shared unknowns only.
 
 A point is seen from a few nodes and binds only these, so its unknowns (three where nothing may slide, else
 four) are eliminated where it stands (Schur's complement). With L L^T its own matrix, what it binds loses
@@ -13,17 +13,24 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
-from barsight.core.linalg.skyline import Band
-from barsight.motion.linear.reprojection_kernels import Guess, Rig, Sights, disparity_off, rows, slide_off
+from barsight.core.linalg.skyline import Skyline
+from barsight.motion.linear.reprojection_kernels import (
+    LinearisationPoint,
+    Observations,
+    Rig,
+    disparity_offset,
+    slide_offset,
+    whitened_rows,
+)
 
 NO_PIECES = np.empty((0, 2), np.int64)
 
 
-class Reduced(NamedTuple):
-    """Normal equations of poses and what is shared. band: (M, 6, 6 R) of each pose with those of the nodes
-    k - R + 1...k, of its own block the lower half; gradient (6 M,). What points of S pieces (one where there
-    are none) say of their piece's slide and disparity and of the rig's drift: side (S, 4, 6 Q) with the Q
-    poses from node `first` (S,) on; corner (S, 4, 4), corner_gradient (S, 4) of itself.
+class ReducedSystem(NamedTuple):
+    """Reduced normal equations of poses and what is shared. band: (M, 6, 6 R) of each pose with those of the
+    nodes k - R + 1...k, of its own block the lower half; gradient (6 M,). What points of S pieces (one where
+    there are none) say of their piece's slide and disparity and of the rig's drift: side (S, 4, 6 Q) with the
+    Q poses from node `first` (S,) on; corner (S, 4, 4), corner_gradient (S, 4) of itself.
     """
 
     band: Float64
@@ -34,8 +41,8 @@ class Reduced(NamedTuple):
     corner_gradient: Float64
 
     @classmethod
-    def empty(cls, nodes: int, reach: int, seen: Int64 = NO_PIECES) -> Reduced:
-        """Zeros. seen: (S, 2) the first and last node that see a piece."""
+    def empty(cls, nodes: int, reach: int, seen: Int64 = NO_PIECES) -> ReducedSystem:
+        """Allocate zeros. seen: (S, 2) the first and last node that see a piece."""
         first, longest = np.zeros(1, np.int64), nodes
         if len(seen):
             first, longest = seen[:, 0].copy(), int((seen[:, 1] - seen[:, 0]).max()) + 1
@@ -47,7 +54,7 @@ class Reduced(NamedTuple):
 
 @kernel(fastmath=True, inline=True)
 def _factorise(m: Float64, size: int) -> None:
-    """Replaces a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse."""
+    """Replace a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse."""
     for i in range(size):
         for j in range(i):
             total = m[i, j]
@@ -62,7 +69,7 @@ def _factorise(m: Float64, size: int) -> None:
 
 @kernel(fastmath=True, inline=True)
 def _add_point(error: Float64, by_point: Float64, size: int, normal: Float64, gradient: Float64) -> None:
-    """A sighting's share of its point's own equations; of the matrix the lower half."""
+    """Add a sighting's part of its point's own equations; of the matrix the lower half."""
     for a in range(size):
         gradient[a] += by_point[0, a] * error[0] + by_point[1, a] * error[1] + by_point[2, a] * error[2]
         for b in range(a + 1):
@@ -78,7 +85,7 @@ def _add_pose(
     piece: int, since: int, begin: int, band: Float64, gradient: Float64, side: Float64, size: int,
     bound: Float64,
 ) -> None:  # fmt: skip
-    """A sighting's share of its pose's own equations and of those with what is shared (since, begin: as
+    """Add a sighting's part of its pose's own equations and of those with what is shared (since, begin: as
     `_take_out` has them); bound (4, 6 R) from column `first` on with its point.
     """
     own = band.shape[2] - 6
@@ -98,7 +105,7 @@ def _take_out(
     bound: Float64, width: int, first: int, factor: Float64, size: int, rest: Float64, since: int, begin: int,
     band: Float64, gradient: Float64, side: Float64, corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
-    """Takes U^T U off, U being the factor's inverse times what the point shares: bound (4, width) with the
+    """Subtract U^T U, U being the factor's inverse times what the point shares: bound (4, width) with the
     poses of nodes from `first` on, rest (4, 5) with the piece's slide and disparity, drift and gradient; of
     the shared ones those from `begin` on count. side (its first node is `since`), corner, corner_gradient:
     the piece's.
@@ -141,8 +148,10 @@ def _take_out(
 
 
 @kernel(fastmath=True)
-def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
-    """Adds all used sightings to `result`."""
+def eliminate_points(
+    rig: Rig, sights: Observations, guess: LinearisationPoint, result: ReducedSystem
+) -> None:
+    """Form the Schur complement of the points over all used sightings and add it to `result`."""
     lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
     camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
@@ -155,7 +164,7 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
     begin, size = (0, 4) if last > 1 else (2, 3)
     for t in range(len(first) - 1):
         normal[:], gradient[:], rest[:] = 0.0, 0.0, 0.0
-        begun, end, off_px = -1, -1, disparity_off(shared, piece, t)
+        begun, end, off_px = -1, -1, disparity_offset(shared, piece, t)
         own = piece[t]
         since, corner, corner_slope = begun_at[own], corners[own], corner_slopes[own]
         for k in range(first[t], first[t + 1]):
@@ -166,7 +175,7 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
                 begun = n
                 bound[:] = 0.0
             end = n + 1
-            rows(
+            whitened_rows(
                 lens, mount, huber, camera, points, shared, off_px, scale, stereo, weight, n, k, t, error, q,
                 by_pose, by_point, by_shared,
             )  # fmt: skip
@@ -185,7 +194,7 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
             continue
         if begin == 0:
             held = tight[t] ** 2
-            pull = held * slide_off(points, shared, piece, t)
+            pull = held * slide_offset(points, shared, piece, t)
             normal[3, 3] += held
             gradient[3] += pull
             rest[3, 0] = -held
@@ -202,12 +211,12 @@ def eliminate(rig: Rig, sights: Sights, guess: Guess, result: Reduced) -> None:
 
 
 @kernel(fastmath=True)
-def spread(
-    reduced: Reduced, node: Int64, piece: Int64, rows: Band, gradient: Float64, side: Float64,
+def scatter_reduced(
+    reduced: ReducedSystem, node: Int64, piece: Int64, rows: Skyline, gradient: Float64, side: Float64,
     corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
-    """Adds `reduced` to the equations of all unknowns, which stand as `Layout` has them; the rig's drift is
-    the border's last.
+    """Scatter `reduced` into the equations of all unknowns, which stand as `Layout` has them; the rig's drift
+    is the border's last.
     """
     band, slope, first, sides, corners, corner_slopes = reduced
     values, offset = rows.values, rows.offset
@@ -245,12 +254,17 @@ def spread(
 
 
 @kernel(fastmath=True)
-def substitute(
-    rig: Rig, sights: Sights, guess: Guess, pose_step: Float64, shared_step: Float64, moved: Float64,
+def back_substitute(
+    rig: Rig,
+    sights: Observations,
+    guess: LinearisationPoint,
+    pose_step: Float64,
+    shared_step: Float64,
+    moved: Float64,
     variance: Float64,
-) -> None:  # fmt: skip
-    """The points `moved` (T, 4) after steps (M, 6) of the poses and (2 S + 2,) of what is shared; variance
-    (T,) of each point's slide, all else taken as known.
+) -> None:
+    """Back-substitute the points `moved` (T, 4) after steps (M, 6) of the poses and (2 S + 2,) of what is
+    shared; variance (T,) of each point's slide, all else taken as known.
     """
     lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
@@ -261,13 +275,13 @@ def substitute(
     normal, gradient, last = np.empty((4, 4)), np.empty(4), len(shared_step) - 1
     size = 4 if last > 1 else 3
     for t in range(len(first) - 1):
-        normal[:], gradient[:], off_px = 0.0, 0.0, disparity_off(shared, piece, t)
-        step = disparity_off(shared_step, piece, t)
+        normal[:], gradient[:], off_px = 0.0, 0.0, disparity_offset(shared, piece, t)
+        step = disparity_offset(shared_step, piece, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
             n = node[k]
-            rows(
+            whitened_rows(
                 lens, mount, huber, camera, points, shared, off_px, scale, stereo, weight, n, k, t, error, q,
                 by_pose, by_point, by_shared,
             )  # fmt: skip
@@ -280,7 +294,7 @@ def substitute(
         if normal[0, 0] == 0:
             continue
         if size == 4:
-            held, off = tight[t] ** 2, slide_off(points, shared, piece, t) - shared_step[piece[t]]
+            held, off = tight[t] ** 2, slide_offset(points, shared, piece, t) - shared_step[piece[t]]
             normal[3, 3] += held
             gradient[3] += held * off
         _factorise(normal, size)

@@ -1,4 +1,4 @@
-"""The encoders in the estimate: their latency is estimated, and what contradicts the rest leaves.
+"""Form the encoders' residuals with an estimated latency, and remove outliers.
 
 A reading stamped t says where the crane was at t minus the latency. That shows wherever the speed changes,
 since pictures and IMU know the way by themselves. Their scale against the baseline is the rig's drift; a
@@ -20,14 +20,14 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.linear.chain_elimination import Chain
-from barsight.motion.problem.problem import Placed, Problem, latency_of, poses_of
+from barsight.motion.problem.problem import EncoderPosition, Problem, latency_of, poses_of
 from barsight.motion.problem.rig_drift import HUBER_SIGMAS
 
 FARTHEST_SIGMAS = 5.0
 WINDOW_S = 0.21
 """Readings this near to a node count for it: all of them, nodes being 0.4 s apart."""
-LEAST_SIGMA_M = 0.0003
-LEAST_AGREEING_SIGMA_M = 0.001
+MIN_SIGMA_M = 0.0003
+MIN_AGREEING_SIGMA_M = 0.001
 """What a parabola through the readings may be off by while the crane jerks, which isn't a disagreement."""
 NOTED_LATENCY_SIGMAS = 5.0
 NOTED_LATENCY_S = 0.005
@@ -41,11 +41,11 @@ class EncoderState:
     latency_sigma_s: float
 
 
-def places(
+def encoder_positions(
     crane: CraneSamples, stamp_ns: Int64, nodes: Sequence[int], acceleration_mps2: Float64 | None = None
-) -> tuple[Placed, ...]:
-    """The body at the nodes (of stamps (M,)) by the readings around each; acceleration (M, 3) where it is
-    known, NaN elsewhere.
+) -> tuple[EncoderPosition, ...]:
+    """Interpolate the body's place at the nodes (of stamps (M,)) by the readings around each; acceleration
+    (M, 3) where it is known, NaN elsewhere.
     """
     found = []
     for k in nodes:
@@ -55,12 +55,12 @@ def places(
         fit = fit_position(crane, int(stamp_ns[k]), seconds_to_ns(WINDOW_S), known)
         if not isinstance(fit, Failed):
             place, sigma = fit.position_m + crane.crane_to_body_m, float(np.sqrt(fit.covariance[0, 0]))
-            found.append(Placed(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
+            found.append(EncoderPosition(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
     return tuple(found)
 
 
-def with_known_bends(problem: Problem, values: Any) -> Problem:
-    """With places for which the estimate says how the way bends: they are 1.5 times as good."""
+def with_known_curvature(problem: Problem, values: Any) -> Problem:
+    """Refine places by the estimate's acceleration: they are 1.5 times as good."""
     if problem.crane is None or not problem.has_imu:
         return problem
     velocity = np.array([values.atVector(V(k)) for k in range(len(problem.start))])
@@ -70,11 +70,11 @@ def with_known_bends(problem: Problem, values: Any) -> Problem:
     both = np.flatnonzero(tied[:-1] & tied[1:]) + 1
     bend[both] = (velocity[both + 1] - velocity[both - 1]) / (time[both + 1] - time[both - 1])[:, None]
     nodes = [place.node for place in problem.placed]
-    return replace(problem, placed=places(problem.crane, problem.stamp_ns, nodes, bend))
+    return replace(problem, placed=encoder_positions(problem.crane, problem.stamp_ns, nodes, bend))
 
 
 def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Float64) -> None:
-    """Adds what the problem's places, Huber, say of the chain's nodes and of the latency. poses: (M, 4, 4);
+    """Add the Huber-weighted place residuals to the chain's nodes and the latency. poses: (M, 4, 4);
     latency_s: (1,).
     """
     if not problem.placed:
@@ -82,7 +82,7 @@ def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Floa
     node = _nodes(problem.placed)
     reading, velocity = _readings(problem.placed, float(latency_s[0]))
     turn, error = poses[node, :3, :3], poses[node, :3, 3] - reading
-    sigma = _sigmas(problem.placed, LEAST_SIGMA_M)
+    sigma = _sigmas(problem.placed, MIN_SIGMA_M)
     distance = np.linalg.norm(error, axis=1) / sigma
     weight = HUBER_SIGMAS / np.maximum(distance, HUBER_SIGMAS) / sigma**2
     at = node[:, None] * chain.size + np.arange(3, 6)  # GTSAM's shift, in body axes
@@ -94,15 +94,15 @@ def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Floa
 
 
 def encoders_cost(values: Any, problem: Problem) -> float:
-    """Of the places, Huber's."""
-    sigma = _sigmas(problem.placed, LEAST_SIGMA_M)
-    distance = np.linalg.norm(disagreement(values, problem), axis=1) / sigma
+    """Compute the Huber cost of the places."""
+    sigma = _sigmas(problem.placed, MIN_SIGMA_M)
+    distance = np.linalg.norm(encoder_residuals(values, problem), axis=1) / sigma
     near = np.minimum(distance, HUBER_SIGMAS)
     return float((near * (distance - near / 2)).sum())
 
 
-def disagreement(values: Any, problem: Problem) -> Float64:
-    """(P, 3) m by which the encoders' places are off the poses."""
+def encoder_residuals(values: Any, problem: Problem) -> Float64:
+    """Compute the encoders' residuals (P, 3) m against the poses."""
     if not problem.placed:
         return np.empty((0, 3))
     reading, _ = _readings(problem.placed, float(latency_of(values)[0]))
@@ -110,24 +110,28 @@ def disagreement(values: Any, problem: Problem) -> Float64:
     return off
 
 
-def agreeing(values: Any, problem: Problem) -> Bool:
-    """(P,) places within 5 sigma of the poses."""
-    sigma = _sigmas(problem.placed, LEAST_AGREEING_SIGMA_M)
-    kept: Bool = np.linalg.norm(disagreement(values, problem), axis=1) < FARTHEST_SIGMAS * sigma
+def encoder_inliers(values: Any, problem: Problem) -> Bool:
+    """Select places (P,) within 5 sigma of the poses."""
+    sigma = _sigmas(problem.placed, MIN_AGREEING_SIGMA_M)
+    kept: Bool = np.linalg.norm(encoder_residuals(values, problem), axis=1) < FARTHEST_SIGMAS * sigma
     return kept
 
 
 def encoder_state(values: Any, latency_sigma_s: float) -> EncoderState:
-    """What was found of the encoders."""
+    """Extract the estimated latency of the encoders."""
     return EncoderState(float(values.atVector(E(0))[0]), latency_sigma_s)
 
 
 def encoder_warnings(
-    state: EncoderState | None, node_stamp_ns: Int64, placed: tuple[Placed, ...], off_m: Float64, kept: Bool
+    state: EncoderState | None,
+    node_stamp_ns: Int64,
+    placed: tuple[EncoderPosition, ...],
+    off_m: Float64,
+    kept: Bool,
 ) -> tuple[str, ...]:
-    """Sentences on a latency that matters, and on stretches where encoders and the rest disagree.
+    """Warn of a latency that matters, and of stretches where encoders and the rest disagree.
 
-    off_m: (P, 3) from `disagreement`. Times are seconds since the first node.
+    off_m: (P, 3) from `encoder_residuals`. Times are seconds since the first node.
     """
     sentences = []
     if state is not None and abs(state.latency_s) > max(
@@ -152,17 +156,17 @@ def encoder_warnings(
     return tuple(sentences)
 
 
-def _readings(placed: tuple[Placed, ...], latency_s: float) -> tuple[Float64, Float64]:
-    """(P, 3) the encoders' places `latency_s` later and (P, 3) their speeds, by their parabolas."""
+def _readings(placed: tuple[EncoderPosition, ...], latency_s: float) -> tuple[Float64, Float64]:
+    """Evaluate the encoders' places `latency_s` later (P, 3) and their speeds (P, 3), by their parabolas."""
     place = np.array([p.position_m for p in placed])
     velocity = np.array([p.velocity_mps for p in placed])
     later = velocity + np.array([p.acceleration_mps2 for p in placed]) * latency_s
     return place + (velocity + later) / 2 * latency_s, later
 
 
-def _nodes(placed: tuple[Placed, ...]) -> Int64:
+def _nodes(placed: tuple[EncoderPosition, ...]) -> Int64:
     return np.array([p.node for p in placed], np.int64)
 
 
-def _sigmas(placed: tuple[Placed, ...], least_m: float) -> Float64:
-    return np.array([max(p.sigma_m, least_m) for p in placed], np.float64)
+def _sigmas(placed: tuple[EncoderPosition, ...], min_m: float) -> Float64:
+    return np.array([max(p.sigma_m, min_m) for p in placed], np.float64)

@@ -1,5 +1,5 @@
-"""GTSAM's factors of all but sightings and encoders: preintegrated IMU between neighbouring nodes, priors on
-attitude, biases, latency and, where the body stands still, velocity; and these linearised.
+"""Build GTSAM's factors of all but sightings and encoders: preintegrated IMU between neighbouring nodes,
+priors on attitude, biases, latency and, where the body stands still, velocity; and these linearised.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
-from barsight.motion.linear import skyline
+from barsight.motion.linear import skyline_inverse
 from barsight.motion.linear.chain_elimination import Chain
 from barsight.motion.problem.problem import Problem
 
@@ -21,8 +21,8 @@ OFFSETS = {"x": 0, "v": 6, "b": 9}
 """Where a node's unknowns stand: pose, with an IMU velocity and biases."""
 
 
-def factors(problem: Problem, first: int = 0, end: int | None = None) -> Any:
-    """The graph of a problem without sightings and encoders: of what binds the nodes first...end - 1 (None:
+def build_graph(problem: Problem, first: int = 0, end: int | None = None) -> Any:
+    """Build the graph without sightings and encoders of what binds the nodes first...end - 1 (None:
     all) and, by the IMU, each to the next.
     """
     graph = gtsam.NonlinearFactorGraph()
@@ -33,8 +33,8 @@ def factors(problem: Problem, first: int = 0, end: int | None = None) -> Any:
     return graph
 
 
-def start_values(problem: Problem) -> Any:
-    """GTSAM's values to begin from."""
+def initial_values(problem: Problem) -> Any:
+    """Build GTSAM's start values."""
     values = gtsam.Values()
     bias = gtsam.imuBias.ConstantBias(problem.bias.accel_mps2, problem.bias.gyro_radps)
     place = np.array([pose.translation for pose in problem.start])
@@ -50,18 +50,18 @@ def start_values(problem: Problem) -> Any:
     return values
 
 
-def chain_of(graph: Any, values: Any, width: int, nodes: int) -> Chain:
-    """A graph's normal equations: each node with the next and the latency. width: unknowns a node."""
+def linearise_chain(graph: Any, values: Any, width: int, nodes: int) -> Chain:
+    """Linearise a graph: each node with the next and the latency. width: unknowns a node."""
     size = nodes * width
     rows, gradient, side = np.zeros((size, 2 * width)), np.zeros(size), np.zeros((1, size))
     corner, corner_gradient = np.zeros((1, 1)), np.zeros(1)
     first, at, found, right = _sparse_rows(graph, values, width, size)
-    skyline.add_products(first, at, found, right, rows, gradient, side, corner, corner_gradient)
+    skyline_inverse.add_products(first, at, found, right, rows, gradient, side, corner, corner_gradient)
     return Chain(rows, gradient, side[0], float(corner[0, 0]), float(corner_gradient[0]))
 
 
 def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64, Int64, Float64, Float64]:
-    """GTSAM's whitened rows as `band.add_products` takes them; the latency is unknown `size`."""
+    """Convert GTSAM's whitened rows to the form of `band.add_products`; the latency is unknown `size`."""
     linear = graph.linearize(values)
     if linear.size() == 0:
         return np.zeros(1, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)

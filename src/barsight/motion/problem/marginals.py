@@ -1,4 +1,4 @@
-"""Covariances out of a solved system: each node's own block, and what hangs on the border."""
+"""Compute marginal covariances of a solved system: each node's block, and its dependence on the border."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.linalg.skyline import solve_back, solve_forward
-from barsight.motion.linear.skyline import inverse_blocks
+from barsight.core.linalg.skyline import solve_back_dense, solve_forward
+from barsight.motion.linear.skyline_inverse import inverse_blocks
 from barsight.motion.problem.normal_equations import System
 
 NO_PAIRS = np.empty((0, 2), np.int64)
@@ -24,13 +24,13 @@ class Marginals:
 
     poses: Float64
     latency_sigma_s: float
-    swing: Float64
+    drift_jacobian_of_pose: Float64
     nodes: Float64
     cross: Float64
 
 
 def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
-    """Of a system at its best state. pairs: (P, 2) of these nodes, the earlier first."""
+    """Compute marginals of a system at its best state. pairs: (P, 2) of these nodes, the earlier first."""
     layout = system.layout
     own, _ = system.schur(system.forward)
     count, size = len(layout.node), layout.size
@@ -40,20 +40,20 @@ def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
     cross = cross[:, :6, :6]
     poses = nodes[:, :6, :6]
     by_border = -_to_border(system)[layout.poses].reshape(count, 6, -1)
-    swing, latency = by_border[:, :, -2:], float("nan")
+    drift_jacobian_of_pose, latency = by_border[:, :, -2:], float("nan")
     if len(own) > 2:
         variance = np.linalg.inv(own[:-2, :-2])
         latency = float(variance[0, 0] ** 0.5)
         to_border = by_border[:, :, :-2]
         poses = poses + to_border @ variance @ to_border.transpose(0, 2, 1)
-        swing = swing - to_border @ variance @ own[:-2, -2:]
+        drift_jacobian_of_pose = drift_jacobian_of_pose - to_border @ variance @ own[:-2, -2:]
         cross = cross + to_border[pairs[:, 0]] @ variance @ to_border[pairs[:, 1]].transpose(0, 2, 1)
-    return Marginals(poses, latency, swing, nodes, cross)
+    return Marginals(poses, latency, drift_jacobian_of_pose, nodes, cross)
 
 
-def piece_variances(system: System, weights: Float64) -> tuple[Float64, float]:
-    """(2 S,) of the pieces' slides and disparities, and that of their sum with `weights` (2 S,), the rig's
-    drift taken as known.
+def slide_variances(system: System, weights: Float64) -> tuple[Float64, float]:
+    """Compute variances (2 S,) of the pieces' slides and disparities, and that of their sum with `weights` (2
+    S,), the rig's drift taken as known.
     """
     at, count = system.layout.pieces, len(system.layout.first)
     diagonal, none = np.empty(count), np.empty((0, 1, 1))
@@ -70,7 +70,7 @@ def piece_variances(system: System, weights: Float64) -> tuple[Float64, float]:
 
 
 def _to_border(system: System) -> Float64:
-    """(n, b) the matrix's inverse times what binds its unknowns to the border."""
+    """Solve the matrix's inverse times what binds its unknowns to the border (n, b)."""
     result = system.forward[:, 1:].copy()
-    solve_back(system.factor, result)
+    solve_back_dense(system.factor, result)
     return result

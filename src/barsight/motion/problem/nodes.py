@@ -1,4 +1,4 @@
-"""The instants at which the body is estimated: the frames, and where an IMU ties them some between."""
+"""Place the nodes of the estimate in time: the frames, and with an IMU some between."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.inertial.model import ImuBias
-from barsight.inertial.standstill import standing_start, stands_still
+from barsight.inertial.standstill import estimate_at_rest, stands_still
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.frontend.tracking import Sighting
-from barsight.motion.gravity import Level
+from barsight.motion.gravity import GravityAlignment
 
 if TYPE_CHECKING:
     from barsight.inertial.preintegration import Preintegrated
 
-MOST_SPACING_S = 0.4
+MAX_SPACING_S = 0.4
 LEAD_S = 3.0
 """The IMU's samples this long before the first frame are used too: a crane starts from standing."""
-MOST_STILL_M = 0.005
+MAX_STILL_M = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Nodes:
 
 
 @dataclass(frozen=True, eq=False)
-class ImuTies:
+class ImuConstraints:
     """preintegrated: between nodes k and k + 1 or None. still: nodes at rest. bias: as the rest shows it."""
 
     preintegrated: tuple[Preintegrated | None, ...]
@@ -49,7 +49,7 @@ class ImuTies:
 
 
 def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
-    """The frames' stamps (IMU clock), with an IMU also between them and before the first."""
+    """Place nodes at the frames' stamps (IMU clock), with an IMU also between them and before the first."""
     if imu is None or imu.stamp_ns.size < 2:
         return Nodes(frames_ns, np.arange(len(frames_ns)))
     edges = frames_ns.tolist()
@@ -58,22 +58,22 @@ def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
         edges.insert(0, lead)
     stamps = [edges[0]]
     for first, last in pairwise(edges):
-        stamps += divided(first, last)
+        stamps += subdivide(first, last)
     stamp_ns = np.array(stamps, np.int64)
     return Nodes(stamp_ns, np.searchsorted(stamp_ns, frames_ns))
 
 
-def divided(first_ns: int, last_ns: int) -> list[int]:
-    """Stamps after the first up to the last, at most `MOST_SPACING_S` apart."""
-    parts = max(1, int(np.ceil((last_ns - first_ns) / seconds_to_ns(MOST_SPACING_S) - 0.05)))
+def subdivide(first_ns: int, last_ns: int) -> list[int]:
+    """Divide an interval: stamps after the first up to the last, at most `MAX_SPACING_S` apart."""
+    parts = max(1, int(np.ceil((last_ns - first_ns) / seconds_to_ns(MAX_SPACING_S) - 0.05)))
     return [first_ns + (last_ns - first_ns) * part // parts for part in range(1, parts + 1)]
 
 
-def start_poses(
+def initial_poses(
     nodes: Nodes, crane: CraneSamples | None, sightings: tuple[Sighting, ...], shift_ns: int,
-    rectifier: Rectifier, level: Level | None,
+    rectifier: Rectifier, level: GravityAlignment | None,
 ) -> tuple[Pose, ...]:  # fmt: skip
-    """Where the solver begins: the encoders' places with the nominal attitude, else the frames' chain."""
+    """Initialise the poses: the encoders' places with the nominal attitude, else the frames' chain."""
     if crane is not None:
         stamps, places = [], []
         for stamp in nodes.stamp_ns.tolist():
@@ -98,7 +98,7 @@ def start_poses(
 def _between(
     target: str, stamp_ns: Int64, known_ns: Int64, places: Float64, turns: Rotation
 ) -> tuple[Pose, ...]:
-    """Poses at the nodes by interpolation; the nearest known one beyond the ends."""
+    """Interpolate poses at the nodes; the nearest known one beyond the ends."""
     time = (np.clip(stamp_ns, known_ns[0], known_ns[-1]) - known_ns[0]) / NS_PER_S
     known = (known_ns - known_ns[0]) / NS_PER_S
     place = np.column_stack([np.interp(time, known, places[:, axis]) for axis in range(3)])
@@ -108,25 +108,25 @@ def _between(
     return tuple(Pose(target, "body", r, p) for r, p in zip(rotation, place, strict=True))
 
 
-def tied_by_imu(
+def constrain_by_imu(
     nodes: Nodes, start: tuple[Pose, ...], placed_ns: tuple[int, int], imu: ImuSamples | None, noise: ImuNoise
-) -> ImuTies:
-    """Preintegrated motions between neighbours, and the nodes at which the body rests. placed_ns: from when
-    to when the starting poses are known (IMU's clock).
+) -> ImuConstraints:
+    """Preintegrate between neighbouring nodes and detect those at rest. placed_ns: from when to when the
+    starting poses are known (IMU's clock).
     """
     count = len(nodes.stamp_ns)
     if imu is None:
-        return ImuTies((None,) * (count - 1), (), ImuBias.none())
+        return ImuConstraints((None,) * (count - 1), (), ImuBias.none())
     known = (nodes.stamp_ns >= placed_ns[0]) & (nodes.stamp_ns <= placed_ns[1])
     still = _resting(nodes.stamp_ns, start, known, imu, noise)
     bias = _bias_at_rest(nodes, still, imu, noise)
-    return ImuTies(preintegrated(nodes.stamp_ns, imu, noise, bias), tuple(still), bias)
+    return ImuConstraints(preintegrate_between(nodes.stamp_ns, imu, noise, bias), tuple(still), bias)
 
 
-def preintegrated(
+def preintegrate_between(
     stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise, bias: ImuBias
 ) -> tuple[Preintegrated | None, ...]:
-    """Between neighbouring stamps (M,); None where the IMU has a gap."""
+    """Preintegrate between neighbouring stamps (M,); None where the IMU has a gap."""
     from barsight.inertial.preintegration import Preintegrator
 
     integrator = Preintegrator(imu, noise)
@@ -137,17 +137,17 @@ def preintegrated(
 def _resting(
     stamp_ns: Int64, start: tuple[Pose, ...], known: Bool, imu: ImuSamples, noise: ImuNoise
 ) -> list[int]:
-    """Which of the nodes (M,) the body rests at. That needs both: an IMU that shows nothing but noise, as it
-    does at constant speed, and a place that doesn't change over the neighbours. Where no place is `known`
-    (M,), the rest next to it goes on as long as the IMU shows nothing.
+    """Detect rest at the nodes (M,). That needs both: an IMU that shows nothing but noise, as it does at
+    constant speed, and a place that doesn't change over the neighbours. Where no place is `known` (M,), the
+    rest next to it goes on as long as the IMU shows nothing.
     """
-    quiet = quiet_at(stamp_ns, imu, noise)
+    quiet = is_imu_quiet(stamp_ns, imu, noise)
     place = np.array([pose.translation for pose in start])
     index = np.flatnonzero(known)
     rests = np.zeros(len(stamp_ns), np.bool_)
     for k, node in enumerate(index):
         first, last = index[max(0, k - 1)], index[min(len(index) - 1, k + 1)]
-        near = np.linalg.norm(place[last] - place[first]) < MOST_STILL_M
+        near = np.linalg.norm(place[last] - place[first]) < MAX_STILL_M
         rests[node] = quiet[node] and near and last > first
     if len(index):
         for k in range(index[0] - 1, -1, -1):
@@ -157,19 +157,19 @@ def _resting(
     return [int(k) for k in np.flatnonzero(rests)]
 
 
-def quiet_at(stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise) -> Bool:
-    """(M,) whether the IMU shows nothing but noise around the stamps."""
+def is_imu_quiet(stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise) -> Bool:
+    """Check (M,) whether the IMU shows nothing but noise around the stamps."""
     nearest = np.clip(np.searchsorted(imu.stamp_ns, stamp_ns), 0, imu.stamp_ns.size - 1)
     quiet: Bool = stands_still(imu, noise)[nearest]
     return quiet
 
 
 def _bias_at_rest(nodes: Nodes, still: list[int], imu: ImuSamples, noise: ImuNoise) -> ImuBias:
-    """The biases as the first rest shows them, zero where there is none."""
+    """Estimate the biases from the first rest, zero where there is none."""
     if not still:
         return ImuBias.none()
     last = still[0]
     while last + 1 in still:
         last += 1
-    start = standing_start(imu, int(nodes.stamp_ns[still[0]]), int(nodes.stamp_ns[last]), noise)
+    start = estimate_at_rest(imu, int(nodes.stamp_ns[still[0]]), int(nodes.stamp_ns[last]), noise)
     return ImuBias.none() if isinstance(start, Failed) else start.bias

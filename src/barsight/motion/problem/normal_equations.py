@@ -1,4 +1,4 @@
-"""The normal equations: a band of what nodes have of their own, and a border of what all of them share."""
+"""Solve bordered normal equations: a skyline of the nodes, and a border of shared unknowns."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg import skyline
-from barsight.core.linalg.skyline import Band
-from barsight.motion.linear.chain_elimination import Gap, with_gaps
-from barsight.motion.linear.ordering import Layout
+from barsight.core.linalg.skyline import Skyline
+from barsight.motion.linear.chain_elimination import EliminatedNodes, back_substitute_nodes
+from barsight.motion.linear.ordering import Ordering
 from barsight.motion.problem.rig_drift import LOOSE
 
 
@@ -23,43 +23,43 @@ class System:
     band is of; gaps: those between. nodes: how many in all.
     """
 
-    rows: Band
+    rows: Skyline
     gradient: Float64
     side: Float64
     corner: Float64
     corner_gradient: Float64
-    layout: Layout
+    layout: Ordering
     kept: Int64
-    gaps: tuple[Gap, ...]
+    gaps: tuple[EliminatedNodes, ...]
     nodes: int
     has_latency: bool
 
     @cached_property
-    def factor(self) -> Band:
-        """The band's factor. Raises LinAlgError where the measurements leave it undetermined."""
+    def factor(self) -> Skyline:
+        """Factorise the band. Raises LinAlgError where the measurements leave it undetermined."""
         return self._factor(0.0)
 
-    def _factor(self, damping: float) -> Band:
+    def _factor(self, damping: float) -> Skyline:
         factor = self.rows._replace(values=self.rows.values.copy())
         factor.values[factor.offset + np.arange(len(factor.offset))] *= 1 + damping
-        if not skyline.factorise(factor):
+        if not skyline.factorise_skyline(factor):
             raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
         return factor
 
     @cached_property
     def forward(self) -> Float64:
-        """(n, 1 + b) the factor's inverse times gradient and side."""
+        """Solve forward (n, 1 + b): the factor's inverse times gradient and side."""
         return self._forward(self.factor)
 
-    def _forward(self, factor: Band) -> Float64:
+    def _forward(self, factor: Skyline) -> Float64:
         result = np.column_stack([self.gradient, self.side.T])
         skyline.solve_forward(factor, result)
         return result
 
     def schur(self, forward: Float64) -> tuple[Float64, Float64]:
-        """The border's own matrix (b, b) and gradient (b,)."""
+        """Form the Schur complement (b, b) of the border and its gradient (b,)."""
         taken = np.empty((forward.shape[1], forward.shape[1]))
-        skyline.products(forward, taken)
+        skyline.gram_matrix(forward, taken)
         loose = np.zeros(len(self.corner))
         loose[-2:] = 1 / np.array(LOOSE) ** 2
         return self.corner - taken[1:, 1:] + np.diag(loose), self.corner_gradient - taken[1:, 0]
@@ -67,8 +67,8 @@ class System:
     def step(
         self, free: Bool, damping: float = 0.0, fixed: Float64 | None = None
     ) -> tuple[Float64, Float64, Float64]:
-        """(M n,) of all nodes, (2 S,) of the pieces' slides and disparities, and (b,): the border's `free`
-        (b,) unknowns step too, the others as `fixed` (b,) says.
+        """Solve for the step (M n,) of all nodes, (2 S,) of the pieces' slides and disparities, and (b,): the
+        border's `free` (b,) unknowns step too, the others as `fixed` (b,) says.
         """
         factor = self._factor(damping) if damping else self.factor
         forward = self._forward(factor) if damping else self.forward
@@ -79,8 +79,8 @@ class System:
             right = right + left @ border
             border[free] = -np.linalg.solve(left[np.ix_(free, free)], right[free])
         step = -(forward[:, :1] + forward[:, 1:] @ border[:, None])
-        skyline.solve_back(factor, step)
+        skyline.solve_back_dense(factor, step)
         latency = float(border[0]) if self.has_latency else 0.0
         by_node = step[self.layout.nodes].reshape(-1, self.layout.size)
-        by_node = with_gaps(by_node, latency, self.kept, self.gaps, self.nodes)
+        by_node = back_substitute_nodes(by_node, latency, self.kept, self.gaps, self.nodes)
         return by_node.ravel(), step[self.layout.pieces, 0], border

@@ -1,4 +1,4 @@
-"""What the batch estimate is told: sightings, encoders' places, priors and preintegrated motions."""
+"""Define the batch problem: sightings, encoders' places, priors and preintegrated motions."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from barsight.core.types import CraneSamples, RectifiedCamera
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.frontend.tracking import Sighting
-from barsight.motion.linear.ordering import Layout, layout
+from barsight.motion.linear.ordering import Ordering, order_unknowns
 
-MOST_SIGHTINGS = 40
-LEAST_SIGMA_PX = 0.03
+MAX_SIGHTINGS = 40
+MIN_SIGMA_PX = 0.03
 """What no patch is better than, however well it fits: rectification, splines and aliasing."""
 
 
 @dataclass(frozen=True, eq=False)
-class StereoSightings:
+class StereoObservations:
     """Points seen, N sightings of T points: track (N,) 0...T-1 ascending and within each node (N,)
     ascending; stereo (N, 3) u, v, right u, px, sigma_px (N,) of each, and how the camera is mounted.
     """
@@ -41,8 +41,8 @@ class StereoSightings:
     def of(
         cls, sightings: Sequence[Sighting], node: Sequence[int], camera: RectifiedCamera,
         body_from_rect0: Pose,
-    ) -> StereoSightings:  # fmt: skip
-        """From the front end's, each with its node. A point that is seen at more than `MOST_SIGHTINGS`
+    ) -> StereoObservations:  # fmt: skip
+        """Build from the front end's, each with its node. A point that is seen at more than `MAX_SIGHTINGS`
         frames begins anew, which bounds what is tied together.
         """
         nodes = np.concatenate([np.full(len(s.track), k) for s, k in zip(sightings, node, strict=True)])
@@ -50,25 +50,25 @@ class StereoSightings:
         order = np.lexsort((nodes, track))
         begin = np.flatnonzero(np.diff(track[order], prepend=-1))
         place = np.arange(len(order)) - np.repeat(begin, np.diff(begin, append=len(order)))
-        named = np.cumsum(place % MOST_SIGHTINGS == 0) - 1
+        named = np.cumsum(place % MAX_SIGHTINGS == 0) - 1
         stereo = np.vstack([s.stereo for s in sightings])[order]
-        sigma = np.hypot(np.concatenate([s.sigma_px for s in sightings])[order], LEAST_SIGMA_PX)
+        sigma = np.hypot(np.concatenate([s.sigma_px for s in sightings])[order], MIN_SIGMA_PX)
         return cls(nodes[order], named, stereo, sigma, camera, body_from_rect0)
 
     @cached_property
     def first(self) -> Int64:
-        """(T + 1,) where each point's sightings begin, and the end."""
+        """Return the start of each point's sightings (T + 1,), and the end."""
         return np.searchsorted(self.track, np.arange(self.track[-1] + 2)).astype(np.int64)
 
     @cached_property
     def reach(self) -> Int64:
-        """(T,) nodes between a point's first and last sighting."""
+        """Return the number of nodes (T,) between a point's first and last sighting."""
         reach: Int64 = self.node[self.first[1:] - 1] - self.node[self.first[:-1]]
         return reach
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class EncoderPosition:
     """A node's place by the encoders: (3,) of the body in `yard`, how it moves, and the place's sigma, m."""
 
     node: int
@@ -79,7 +79,7 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class Attitude:
+class AttitudePrior:
     """A prior on a node's attitude, reference_from_body (3, 3); sigma_rad (3,) in body axes."""
 
     node: int
@@ -105,20 +105,20 @@ class Pieces:
 
     @property
     def count(self) -> int:
-        """How many."""
+        """Return the number of pieces."""
         return len(self.own_sigma_rad)
 
     @property
     def slide_sigma_rad(self) -> Float64:
-        """(S,) of a piece as a whole."""
+        """Return the slide sigma (S,) of a piece as a whole."""
         return self.share * self.own_sigma_rad
 
     def common(self, unknowns: Float64) -> float:
-        """What slides have in common, as `unknowns` (2 S,) show it: slides, then disparities."""
+        """Estimate the common slide from `unknowns` (2 S,): slides, then disparities."""
         return float((unknowns[: self.count] / self.slide_sigma_rad).sum()) / (self.count + 1)
 
     def cost(self, unknowns: Float64) -> float:
-        """Half the square of these in sigma."""
+        """Compute half the squared sum of these in sigma."""
         slides, disparities = np.split(unknowns, 2)
         common = self.common(unknowns)
         own = slides / self.slide_sigma_rad - common
@@ -126,8 +126,8 @@ class Pieces:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
-    """What nodes that have left say of those that stay, to second order about `at`.
+class MarginalPrior:
+    """Marginal prior: what marginalised nodes say of those that stay, to second order about `at`.
 
     nodes: (P,) those it binds; at: GTSAM's values of these; border (b,) of what all nodes share. matrix
     (n, n) and gradient (n,) of their unknowns, node by node, then the border.
@@ -148,7 +148,7 @@ class Prior:
         return inertial_of(self.at, self.nodes)
 
     def since(self, values: Any) -> Float64:
-        """How far the nodes' unknowns have moved from `at`, node by node in one row."""
+        """Compute how far the nodes' unknowns have moved from `at`, node by node in one row."""
         moved = [
             at.localCoordinates(values.atPose3(X(k)))
             for k, at in zip(self.nodes.tolist(), self._poses, strict=True)
@@ -157,7 +157,7 @@ class Prior:
 
 
 def poses_of(values: Any) -> Float64:
-    """(M, 4, 4) reference_from_body of GTSAM's values, which hold nodes 0...M - 1."""
+    """Extract reference_from_body (M, 4, 4) of GTSAM's values, which hold nodes 0...M - 1."""
     flat = gtsam.utilities.extractPose3(values)
     poses = np.zeros((len(flat), 4, 4))
     poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:], 1.0
@@ -165,7 +165,7 @@ def poses_of(values: Any) -> Float64:
 
 
 def inertial_of(values: Any, nodes: Int64) -> Float64:
-    """(P, 9) velocities and biases of the nodes in GTSAM's values; (P, 0) without an IMU."""
+    """Extract velocities and biases (P, 9) of the nodes in GTSAM's values; (P, 0) without an IMU."""
     if not values.exists(V(0)):
         return np.empty((len(nodes), 0))
     velocity = [values.atVector(V(k)) for k in nodes.tolist()]
@@ -173,13 +173,13 @@ def inertial_of(values: Any, nodes: Int64) -> Float64:
 
 
 def latency_of(values: Any) -> Float64:
-    """(1,) the encoders' latency in GTSAM's values; (0,) without encoders."""
+    """Extract the encoders' latency (1,) of GTSAM's values; (0,) without encoders."""
     return np.asarray(values.atVector(E(0))) if values.exists(E(0)) else np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Everything the estimate knows. start: (M,) poses to begin from, one per node.
+    """Inputs of the estimate. start: (M,) poses to begin from, one per node.
 
     first_fixed: whether the first node defines the reference (no crane). preintegrated: between nodes k and
     k + 1, None where there is no IMU or it has a gap. still: nodes at which the body doesn't move.
@@ -188,10 +188,10 @@ class Problem:
     start: tuple[Pose, ...]
     stamp_ns: Int64
     first_fixed: bool
-    sightings: StereoSightings | None
+    sightings: StereoObservations | None
     preintegrated: tuple[Preintegrated | None, ...]
-    placed: tuple[Placed, ...]
-    attitudes: tuple[Attitude, ...]
+    placed: tuple[EncoderPosition, ...]
+    attitudes: tuple[AttitudePrior, ...]
     still: tuple[int, ...]
     bias: ImuBias
     gyro_bias_sigma_radps: float = 0.02
@@ -201,7 +201,7 @@ class Problem:
     """How far a yaw between the cameras may move the disparity (1 sigma); 0 takes it as exact."""
     scale_prior: float = 5e-4
     """By which share baseline and encoders may disagree (1 sigma)."""
-    prior: Prior | None = None
+    prior: MarginalPrior | None = None
     """Takes the place of what fixes the first node, the biases and the latency."""
     crane: CraneSamples | None = None
     """The readings that `placed` are of."""
@@ -217,45 +217,46 @@ class Problem:
 
     @cached_property
     def kept(self) -> Int64:
-        """(K,) the nodes of the system."""
+        """Return the nodes (K,) of the system."""
         return np.arange(len(self.start)) if self.asked is None else self.asked
 
     @property
     def width(self) -> int:
-        """Unknowns a node: a pose, with an IMU velocity and biases."""
+        """Return the number of unknowns a node: a pose, with an IMU velocity and biases."""
         return 15 if self.has_imu else 6
 
     @cached_property
     def places(self) -> Int64:
-        """(M,) where the system has each node; those taken out beforehand: nowhere."""
+        """Return the index (M,) of each node in the system; those taken out beforehand: nowhere."""
         places = np.full(len(self.start), -1)
         places[self.kept] = np.arange(len(self.kept))
         return places
 
     @cached_property
-    def layout(self) -> Layout:
-        """Where the system has each unknown."""
+    def layout(self) -> Ordering:
+        """Order the unknowns of the system."""
         begin = end = np.empty(0, np.int64)
         if self.sightings is not None and len(self.sightings.node):
             node, first = self.places[self.sightings.node], self.sightings.first
             begin, end = node[first[:-1]], node[first[1:] - 1]
         piece = None if self.pieces is None else self.pieces.piece
-        return layout(self.width, len(self.kept), begin, end, piece)
+        return order_unknowns(self.width, len(self.kept), begin, end, piece)
 
     @property
     def border(self) -> int:
-        """Unknowns that all nodes share: the encoders' latency, what pieces' slides have in common, the rig's
-        drift."""
+        """Count the unknowns that all nodes share: the encoders' latency, what pieces' slides have in common,
+        the rig's drift.
+        """
         return int(self.has_latency) + int(self.pieces is not None) + 2
 
     @property
     def free(self) -> Bool:
-        """(border,) all of these but the drift, which is sought apart."""
+        """Select (border,) all of these but the drift, which is estimated apart."""
         free = np.ones(self.border, np.bool_)
         free[-2:] = False
         return free
 
     @property
     def sees_scale(self) -> bool:
-        """Whether encoders say how long the way is."""
+        """Check whether encoders say how long the way is."""
         return self.has_latency

@@ -1,4 +1,4 @@
-"""Velocity, biases and every sensor's residuals in sigma out of a solved problem."""
+"""Compute velocity, biases and every sensor's normalised residuals of a solved problem."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V
 
 from barsight.core.arrays import Bool, Float64, Int64
-from barsight.core.motion_detail import Inertial, InSigmas
-from barsight.motion.problem.gauss_newton import State, sighting_residuals
-from barsight.motion.problem.gtsam_factors import factors
-from barsight.motion.problem.problem import Placed, Problem
+from barsight.core.motion_detail import InertialStates, NormalisedResiduals
+from barsight.motion.problem.gauss_newton import GraphState, sighting_residuals
+from barsight.motion.problem.gtsam_factors import build_graph
+from barsight.motion.problem.problem import EncoderPosition, Problem
 
 IMU_PARTS = 9
 """Of GTSAM's residual: three of turn, of way and of speed; the biases' walk follows."""
 
 
-def inertial(problem: Problem, state: State, covariance: Float64) -> Inertial | None:
-    """Of all nodes (their own clock). covariance: (M, n, n) as `Marginals.nodes` has it.
+def inertial_states(problem: Problem, state: GraphState, covariance: Float64) -> InertialStates | None:
+    """Extract velocity and biases of all nodes (their own clock). covariance: (M, n, n) as `Marginals.nodes`
+    has it.
 
     The velocity is NaN where the IMU ties the node to neither neighbour.
     """
@@ -30,15 +31,17 @@ def inertial(problem: Problem, state: State, covariance: Float64) -> Inertial | 
     tied = np.array([part is not None for part in problem.preintegrated])
     alone = ~(np.append(tied, False) | np.append(False, tied))
     velocity[alone] = sigma[alone, :3] = np.nan
-    return Inertial(
+    return InertialStates(
         problem.stamp_ns, velocity, sigma[:, :3],
         np.array([bias.gyroscope() for bias in biases]), sigma[:, 6:],
         np.array([bias.accelerometer() for bias in biases]), sigma[:, 3:6],
     )  # fmt: skip
 
 
-def pictures_in_sigmas(problem: Problem, state: State, used: Bool) -> tuple[InSigmas | None, Int64]:
-    """RMS of each node's used sightings, and how many there are (M,)."""
+def normalised_reprojection(
+    problem: Problem, state: GraphState, used: Bool
+) -> tuple[NormalisedResiduals | None, Int64]:
+    """Compute the RMS of each node's used sightings over their sigmas, and how many there are (M,)."""
     seen = problem.sightings
     nodes = len(problem.start)
     if seen is None or not used.any():
@@ -48,26 +51,32 @@ def pictures_in_sigmas(problem: Problem, state: State, used: Bool) -> tuple[InSi
     mean = np.column_stack([np.bincount(seen.node[used], part, nodes) for part in square.T])
     shown = count > 0
     values = np.sqrt(mean[shown] / count[shown, None])
-    return InSigmas(("u", "v", "right u"), problem.stamp_ns[shown], values), count
+    return NormalisedResiduals(("u", "v", "right u"), problem.stamp_ns[shown], values), count
 
 
-def imu_in_sigmas(problem: Problem, state: State) -> InSigmas | None:
-    """RMS over the axes between each node and the one before, at the latter's stamp."""
+def normalised_imu(problem: Problem, state: GraphState) -> NormalisedResiduals | None:
+    """Compute the RMS over the axes between each node and the one before, at the latter's stamp."""
     if not problem.has_imu:
         return None
-    graph, rows = factors(problem), []
+    graph, rows = build_graph(problem), []
     for k in range(graph.size()):
         factor = graph.at(k)
         if isinstance(factor, gtsam.CombinedImuFactor):
             whitened = factor.noiseModel().whiten(factor.unwhitenedError(state.values))
             rows.append(np.sqrt((whitened[:IMU_PARTS].reshape(3, 3) ** 2).mean(axis=1)))
     tied = [part is not None for part in problem.preintegrated]
-    return InSigmas(("turn", "way", "speed"), problem.stamp_ns[1:][tied], np.array(rows).reshape(-1, 3))
+    return NormalisedResiduals(
+        ("turn", "way", "speed"), problem.stamp_ns[1:][tied], np.array(rows).reshape(-1, 3)
+    )
 
 
-def encoders_in_sigmas(node_ns: Int64, placed: tuple[Placed, ...], off_m: Float64) -> InSigmas | None:
-    """off_m: (P, 3) as `encoders.disagreement` has it."""
+def normalised_encoders(
+    node_ns: Int64, placed: tuple[EncoderPosition, ...], off_m: Float64
+) -> NormalisedResiduals | None:
+    """Normalise the encoders' residuals. off_m: (P, 3) as `encoders.disagreement` has it."""
     if not placed:
         return None
     sigma = np.array([place.sigma_m for place in placed])
-    return InSigmas(("x", "y", "z"), node_ns[[place.node for place in placed]], off_m / sigma[:, None])
+    return NormalisedResiduals(
+        ("x", "y", "z"), node_ns[[place.node for place in placed]], off_m / sigma[:, None]
+    )

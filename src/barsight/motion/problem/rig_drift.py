@@ -1,4 +1,4 @@
-"""The rig's drift in the batch estimate: a yaw between the cameras and a scale, unknowns like the poses.
+"""Estimate the rig's drift in the batch: a yaw between the cameras and a scale.
 
 The same point seen from several places of a known way has a depth without stereo; the disparity that this
 depth asks for against the measured one shows the yaw (px nearly the same everywhere) and the scale (px in
@@ -13,7 +13,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.types import RigDrift
-from barsight.motion.problem.problem import Problem, StereoSightings
+from barsight.motion.problem.problem import Problem, StereoObservations
 
 HUBER_SIGMAS = 2.2
 """For the length of three whitened numbers, of which 19 % are longer; 1.345 is for one."""
@@ -27,16 +27,16 @@ COMMON_BIAS_PX = 0.01
 """What of it all pieces of the yard share, where each one's own is an unknown."""
 
 
-def columns(seen: StereoSightings) -> Float64:
-    """(N, 2) px by which the right picture's columns move per rad of yaw and per share of scale."""
+def drift_jacobian(seen: StereoObservations) -> Float64:
+    """Differentiate right columns (N, 2) px by the rig's yaw (rad) and scale ratio."""
     camera = seen.camera
     x = (seen.stereo[:, 2] - camera.doffs_px - camera.cx_px) / camera.focal_px
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + camera.doffs_px
     return np.column_stack([-camera.focal_px * (1 + x**2), -disparity])
 
 
-def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
-    """The drift seen, weighed against what the calibration may be off by.
+def combine_with_prior(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
+    """Combine the drift seen with the calibration's prior.
 
     Matching has a bias of its own, and another one for what lies nearer, glossy bars say: both pass for
     drift (`_floor`). Where pieces' disparities are unknowns, only what they share does. Without
@@ -60,9 +60,9 @@ def weigh(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
     return RigDrift(yaw, scale, combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency))
 
 
-def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
-    """The drift as it is told: by it people judge heights, which what single pieces' disparities are off by
-    falsifies too.
+def with_matching_bias(drift: RigDrift, problem: Problem) -> RigDrift:
+    """Add matching bias to the drift's covariance as reported: by it people judge heights, which what single
+    pieces' disparities are off by falsifies too.
     """
     seen = problem.sightings
     if problem.pieces is None or seen is None:
@@ -78,7 +78,9 @@ def with_own_bias(drift: RigDrift, problem: Problem) -> RigDrift:
 
 
 def _weighed(theta: Float64, covariance: Float64, prior: Float64) -> tuple[float, float, Float64]:
-    """Yaw, scale and their covariance (2, 2), from those seen, their covariance and the prior information."""
+    """Compute yaw, scale and their covariance (2, 2) from those seen, their covariance and the prior
+    information.
+    """
     information = np.linalg.inv(covariance)
     combined = np.linalg.inv(information + prior).astype(np.float64)
     yaw, scale = combined @ information @ theta
@@ -86,7 +88,9 @@ def _weighed(theta: Float64, covariance: Float64, prior: Float64) -> tuple[float
 
 
 def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:
-    """(2, 2) of yaw and scale: a matching bias at the mean disparity and another over its spread."""
+    """Compute the covariance floor (2, 2) of yaw and scale: a matching bias at the mean disparity, another
+    over its spread.
+    """
     per_px = near_px / max(float(disparity.std()), 1e-3)
     by = np.array([[-1 / focal_px, float(disparity.mean()) / focal_px], [0.0, -1.0]])
     floor: Float64 = by @ np.diag([everywhere_px**2, per_px**2]) @ by.T

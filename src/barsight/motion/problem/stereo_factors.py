@@ -1,24 +1,24 @@
-"""Points seen by both cameras: where they begin, which count, and what residuals say of their noise."""
+"""Initialise points, select sightings, and estimate their noise from residuals."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64, kernel
-from barsight.features.guided_matching import triangulate
-from barsight.motion.problem.problem import Problem, StereoSightings
+from barsight.features.guided_matching import triangulate_stereo
+from barsight.motion.problem.problem import Problem, StereoObservations
 
-LEAST_SIGHTINGS = 2
-LEAST_PERSISTENT = 5
-LEAST_PAIRS = 300
+MIN_SIGHTINGS = 2
+MIN_PERSISTENT = 5
+MIN_PAIRS = 300
 CELLS = 8
-MOST_WHITENED = 4.0
+MAX_WHITENED = 4.0
 """Single far residuals say nothing of what neighbours share."""
 
 
-def start_points(problem: Problem, poses: Float64 | None = None, which: Int64 | None = None) -> Float64:
-    """(T, 4) place in the reference as the first sighting has it, and slide: none. poses: (M, 4, 4), the
-    problem's own start if None. which: (T,) points, all if None.
+def initial_points(problem: Problem, poses: Float64 | None = None, which: Int64 | None = None) -> Float64:
+    """Initialise points (T, 4): place in the reference as the first sighting has it, and slide: none. poses:
+    (M, 4, 4), the problem's own start if None. which: (T,) points, all if None.
     """
     seen = problem.sightings
     if seen is None:
@@ -26,22 +26,22 @@ def start_points(problem: Problem, poses: Float64 | None = None, which: Int64 | 
     if poses is None:
         poses = np.array([pose.matrix for pose in problem.start])
     begin = seen.first[:-1] if which is None else seen.first[which]
-    in_body = seen.body_from_rect0.apply(triangulate(seen.stereo[begin], seen.camera))
+    in_body = seen.body_from_rect0.apply(triangulate_stereo(seen.stereo[begin], seen.camera))
     first = poses[seen.node[begin]]
     points = (first[:, :3, :3] @ in_body[:, :, None])[:, :, 0] + first[:, :3, 3]
     return np.column_stack([points, np.zeros(len(points))])
 
 
-def often(seen: StereoSightings, used: Bool) -> Bool:
-    """Sightings of points that are seen often enough to check each other."""
+def well_observed(seen: StereoObservations, used: Bool) -> Bool:
+    """Select sightings of points that are seen often enough to check each other."""
     counts = np.bincount(seen.track[used], minlength=len(seen.first) - 1)
-    result: Bool = used & (counts[seen.track] >= LEAST_SIGHTINGS)
+    result: Bool = used & (counts[seen.track] >= MIN_SIGHTINGS)
     return result
 
 
-def taken_up(seen: StereoSightings, used: Bool) -> float:
-    """By how much errors are larger than the residuals that a fit of points (three unknowns) and frames (six)
-    leaves of them; at most sqrt(3).
+def dof_correction(seen: StereoObservations, used: Bool) -> float:
+    """Compute the degrees-of-freedom correction of residuals: by how much errors are larger than the
+    residuals that a fit of points (three unknowns) and frames (six) leaves of them; at most sqrt(3).
     """
     rows = 3 * int(used.sum())
     points, frames = np.bincount(seen.track[used]) > 0, np.bincount(seen.node[used]) > 0
@@ -49,8 +49,8 @@ def taken_up(seen: StereoSightings, used: Bool) -> float:
     return float((rows / max(rows - unknowns, rows / 3, 1)) ** 0.5)
 
 
-def nearness(residual: Float64, seen: StereoSightings, used: Bool) -> float:
-    """By how much errors that neighbours in a picture share widen sigma, at least 1.
+def spatial_inflation(residual: Float64, seen: StereoObservations, used: Bool) -> float:
+    """Estimate the sigma inflation by errors that neighbours in a picture share, at least 1.
 
     Points of one bar share its gloss, and corners less than a patch apart share pixels. So the residuals of a
     cell, an eighth of the picture wide, don't add up like independent ones: the sums' squares over the
@@ -62,15 +62,15 @@ def nearness(residual: Float64, seen: StereoSightings, used: Bool) -> float:
     return float(max(1.0, sums / max(single, 1e-12)) ** 0.5)
 
 
-def persistence(residual: Float64, seen: StereoSightings, used: Bool) -> float:
-    """By how much errors that persist from view to view widen sigma, at least 1.
+def temporal_inflation(residual: Float64, seen: StereoObservations, used: Bool) -> float:
+    """Estimate the sigma inflation by errors that persist from view to view, at least 1.
 
     A highlight or a shadow edge moves with the view: it pulls a point alike in neighbouring views. With a
     correlation r between neighbours n sightings are worth n (1 - r) / (1 + r) [AR(1)]. The fitted points
     take off each track's mean, which lowers the correlation seen by about 1 / n.
     """
     pairs, product, squares, shorter = _neighbours(residual, seen.sigma_px, seen.track, used)
-    if pairs < LEAST_PAIRS:
+    if pairs < MIN_PAIRS:
         return 1.0
     correlation = min(max(2 * product / squares + shorter / pairs, 0.0), 0.8)
     return float(((1 + correlation) / (1 - correlation)) ** 0.5)
@@ -80,7 +80,7 @@ def persistence(residual: Float64, seen: StereoSightings, used: Bool) -> float:
 def _shared_squares(
     residual: Float64, sigma: Float64, stereo: Float64, node: Int64, used: Bool, per_px: float
 ) -> tuple[float, float]:
-    """Of the used residuals over their sigmas: the squares of each cell's sum, and of single ones."""
+    """Sum used residuals over their sigmas: the squares of each cell's sum, and of single ones."""
     low, high, last = np.full(2, 1 << 40), np.full(2, -(1 << 40)), 0
     for k in range(len(used)):
         if used[k]:
@@ -93,7 +93,7 @@ def _shared_squares(
         if used[k]:
             across, down = int(stereo[k, 0] * per_px) - low[0], int(stereo[k, 1] * per_px) - low[1]
             for i in range(3):
-                scaled = min(max(residual[k, i] / sigma[k], -MOST_WHITENED), MOST_WHITENED)
+                scaled = min(max(residual[k, i] / sigma[k], -MAX_WHITENED), MAX_WHITENED)
                 sums[node[k], across, down, i] += scaled
                 single += scaled**2
     return (sums**2).sum(), single
@@ -103,8 +103,8 @@ def _shared_squares(
 def _neighbours(
     residual: Float64, sigma: Float64, track: Int64, used: Bool
 ) -> tuple[int, float, float, float]:
-    """Pairs of neighbouring used sightings of points seen often: how many, their residuals' products and
-    squares, over their sigmas, and one over the point's sightings, all summed.
+    """Sum over pairs of neighbouring used sightings of points seen often: how many, their residuals' products
+    and squares, over their sigmas, and one over the point's sightings, all summed.
     """
     counts = np.zeros(0 if len(track) == 0 else track[-1] + 1, np.int64)
     for k in range(len(used)):
@@ -113,7 +113,7 @@ def _neighbours(
     for k in range(len(used)):
         if not used[k]:
             continue
-        if old >= 0 and track[old] == track[k] and counts[track[k]] >= LEAST_PERSISTENT:
+        if old >= 0 and track[old] == track[k] and counts[track[k]] >= MIN_PERSISTENT:
             pairs += 1
             shorter += 1 / counts[track[k]]
             for i in range(3):

@@ -1,4 +1,4 @@
-"""Has the rig drifted? Rows of matches and the crane's known travel, judged line by line."""
+"""Check the rig for drift: rows of matches and the crane's known travel, judged line by line."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.types import RectifiedCamera, RigDrift
-from barsight.motion.batch.fusion import FusedTrajectory, FusionSettings
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.rig_check.epipolar_error import RowDrift, look_at_rows
-from barsight.motion.rig_check.self_calibration import turned_right
+from barsight.motion.rig_check.epipolar_error import RowDrift, measure_row_drift
+from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.base import Recording
-from barsight.recording.rig_override import Rigged
+from barsight.recording.rig_override import RecordingWithRig
 
 
-class State(StrEnum):
+class DriftState(StrEnum):
     """Good: go on. Recalibrate: it has drifted and that costs. Contradiction: two sensors disagree. Not seen:
     this recording can't tell."""
 
@@ -31,13 +31,13 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """When a drift matters."""
+    """Limits from which a drift matters."""
 
     range_m: float | None = None
     """Where the rig measures; the median depth of what it saw when not given."""
-    most_mm: float = 3.0
+    max_depth_error_mm: float = 3.0
     """A drift that costs more depth than this, and is beyond 3 sigma, asks for a new calibration."""
-    most_off_row_px: float = 0.3
+    max_row_error_px: float = 0.3
     """Matches further off their rows than this spoil stereo matching."""
     frames: int = 30
     """Pairs whose rows are looked at."""
@@ -45,8 +45,8 @@ class CheckSettings:
     def __post_init__(self) -> None:
         if self.range_m is not None and not 0.1 <= self.range_m <= 1000:
             raise ConfigError(f"range_m {self.range_m:g} can't be; give the working distance in metres")
-        if min(self.most_mm, self.most_off_row_px) <= 0 or self.frames < 1:
-            raise ConfigError("most_mm, most_off_row_px and frames must be positive")
+        if min(self.max_depth_error_mm, self.max_row_error_px) <= 0 or self.frames < 1:
+            raise ConfigError("max_depth_error_mm, max_row_error_px and frames must be positive")
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class CheckLine:
     sigma: float
     unit: str
     cost_mm: float
-    state: State
+    state: DriftState
     reason: str
 
 
@@ -73,25 +73,25 @@ class RigCheck:
     range_m: float
 
     @property
-    def state(self) -> State:
-        """The worst of the lines; what one line doesn't see is no fault of the rig."""
+    def state(self) -> DriftState:
+        """Return the worst of the lines; what one line doesn't see is no fault of the rig."""
         found = {line.state for line in self.lines}
-        order = (State.RECALIBRATE, State.CONTRADICTION, State.GOOD)
-        return next((state for state in order if state in found), State.NOT_SEEN)
+        order = (DriftState.RECALIBRATE, DriftState.CONTRADICTION, DriftState.GOOD)
+        return next((state for state in order if state in found), DriftState.NOT_SEEN)
 
 
 def check_rig(
     recording: Recording, fusion: FusionSettings, settings: CheckSettings, advance: Callable[[], None]
 ) -> RigCheck:
-    """Look for drift. Raises MeasurementError where neither rows nor travel show anything."""
+    """Check for drift. Raises MeasurementError where neither rows nor travel show anything."""
     rig = recording.rig
-    rows = look_at_rows(recording, Rectifier(rig), settings.frames)
+    rows = measure_row_drift(recording, Rectifier(rig), settings.frames)
     if not isinstance(rows, Failed):
         # The yaw is sought on rows that match; the rows' own yaw waits for the travel's word.
         pitch, roll = rows.values[:2]
-        rig = turned_right(rig, np.array([pitch, 0.0, roll]))
+        rig = turn_right_camera(rig, np.array([pitch, 0.0, roll]))
     rectifier = Rectifier(rig)
-    drift = _by_travel(Rigged(recording, rig), rectifier, fusion, advance)
+    drift = _by_travel(RecordingWithRig(recording, rig), rectifier, fusion, advance)
     if isinstance(rows, Failed) and isinstance(drift, Failed):
         raise MeasurementError(f"{recording.path}: nothing to check by: {rows.reason}; {drift.reason}")
     range_m = settings.range_m or (drift.range_m if isinstance(drift, RigDrift) else np.nan)
@@ -105,7 +105,7 @@ def _by_travel(
 ) -> RigDrift | Failed:
     if recording.crane() is None:
         return Failed("no-encoders", "the recording has no encoders, so no travel is known")
-    trajectory = FusedTrajectory(fusion, CraneSettings())(recording, rectifier, advance)
+    trajectory = BatchFusion(fusion, CraneSettings())(recording, rectifier, advance)
     if trajectory.drift is None or not trajectory.drift.by_encoders:
         return Failed("no-travel", "pictures and encoders together place too little of the way")
     if trajectory.length_m < recording.rig.baseline_m:
@@ -128,14 +128,19 @@ def _row_lines(
         cost = 1e3 * abs(value) * off_column[name] * range_m**2 / baseline
         px = abs(value) * off_row[name]
         real = abs(value) > 3 * sigma
-        bad = real and (px > settings.most_off_row_px or cost > settings.most_mm)
+        bad = real and (px > settings.max_row_error_px or cost > settings.max_depth_error_mm)
         scale, unit = (1e2, "%") if name == "focal ratio" else (float(np.degrees(1)), "deg")
         lines.append(
             CheckLine(
-                name, scale * value, scale * sigma, unit, cost, State.RECALIBRATE if bad else State.GOOD,
-                f"rows are off by up to {px:.2f} px ({settings.most_off_row_px:g} are fine)",
+                name,
+                scale * value,
+                scale * sigma,
+                unit,
+                cost,
+                DriftState.RECALIBRATE if bad else DriftState.GOOD,
+                f"rows are off by up to {px:.2f} px ({settings.max_row_error_px:g} are fine)",
             )
-        )  # fmt: skip
+        )
     return lines
 
 
@@ -147,12 +152,12 @@ def _travel_lines(
         return [_unseen("yaw", "deg", drift.reason), _unseen("baseline", "%", drift.reason)]
     yaw, sigma = np.degrees([drift.yaw_rad, drift.yaw_sigma_rad])
     cost = 1e3 * drift.depth_error_m(range_m)
-    bad = abs(yaw) > 3 * sigma and abs(cost) > settings.most_mm
+    bad = abs(yaw) > 3 * sigma and abs(cost) > settings.max_depth_error_mm
     reason = "the crane's known travel against the disparities"
     if bad:
         reason += "; measure --self-calibrate yaw takes it off"
     lines = [
-        CheckLine("yaw", yaw, sigma, "deg", cost, State.RECALIBRATE if bad else State.GOOD, reason),
+        CheckLine("yaw", yaw, sigma, "deg", cost, DriftState.RECALIBRATE if bad else DriftState.GOOD, reason),
         _scale_line(drift, range_m),
     ]
     if not isinstance(rows, Failed):
@@ -166,7 +171,7 @@ def _travel_lines(
         lines.append(
             CheckLine(
                 "yaw, rows minus travel", float(np.degrees(off)), float(np.degrees(spread)), "deg", np.nan,
-                State.GOOD if agree else State.CONTRADICTION, why,
+                DriftState.GOOD if agree else DriftState.CONTRADICTION, why,
             )
         )  # fmt: skip
     return lines
@@ -176,12 +181,15 @@ def _scale_line(drift: RigDrift, range_m: float) -> CheckLine:
     share = drift.scale_sigma / float(drift.prior_sigma[1])
     contradicts = abs(drift.scale) > 3 * drift.scale_sigma
     if contradicts:
-        state, reason = State.CONTRADICTION, "baseline and encoders disagree: one of them has a wrong metre"
+        state, reason = (
+            DriftState.CONTRADICTION,
+            "baseline and encoders disagree: one of them has a wrong metre",
+        )
     elif share > 0.8:
-        state = State.NOT_SEEN
+        state = DriftState.NOT_SEEN
         reason = f"not told apart from the yaw by these depths: held at ± {100 * drift.prior_sigma[1]:.2g} %"
     else:
-        state, reason = State.GOOD, "baseline and encoders agree"
+        state, reason = DriftState.GOOD, "baseline and encoders agree"
     return CheckLine(
         "baseline", 100 * drift.scale, 100 * drift.scale_sigma, "%", 1e3 * abs(drift.scale) * range_m, state,
         reason,
@@ -189,4 +197,4 @@ def _scale_line(drift: RigDrift, range_m: float) -> CheckLine:
 
 
 def _unseen(name: str, unit: str, reason: str) -> CheckLine:
-    return CheckLine(name, np.nan, np.nan, unit, np.nan, State.NOT_SEEN, reason)
+    return CheckLine(name, np.nan, np.nan, unit, np.nan, DriftState.NOT_SEEN, reason)

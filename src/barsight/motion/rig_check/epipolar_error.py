@@ -1,4 +1,4 @@
-"""What the rows of matches show of the rig: pitch, roll and focal ratio between the cameras.
+"""Measure pitch, roll and focal ratio between the cameras from the rows of matches.
 
 A point of the scene lies on the same row in both pictures of a rectified pair, at any depth. Where it
 doesn't, the right camera has turned or zoomed: at x, y (right picture, in focal lengths) the row is off by
@@ -15,18 +15,18 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
-from barsight.features.patch_alignment import locate, patch_image
+from barsight.features.patch_alignment import align_patches, patch_image
 from barsight.features.tracks import TrackSettings, detect_corners
 from barsight.recording.base import Recording
 from barsight.stereo.search_range import coarse_disparity
 
 COLUMNS, ROWS = 8, 6
-LEAST_IN_CELL = 8
-LEAST_CELLS = 12
+MIN_IN_CELL = 8
+MIN_CELLS = 12
 TRIM_SIGMAS = 4.0
 MATCHING_BIAS_PX = 0.015
 """Rows that matching leaves off everywhere alike."""
-LEAST_SIGMA_PX = 0.002
+MIN_SIGMA_PX = 0.002
 """What a cell's mean is not better than, however many matches it has."""
 
 
@@ -50,14 +50,14 @@ class RowDrift:
 
     @property
     def sigmas(self) -> Float64:
-        """(4,) standard deviations of the values."""
+        """Return standard deviations (4,) of the values."""
         return np.sqrt(np.diag(self.covariance))
 
 
-def look_at_rows(recording: Recording, rectifier: Rectifier, most_frames: int) -> RowDrift | Failed:
+def measure_row_drift(recording: Recording, rectifier: Rectifier, max_frames: int) -> RowDrift | Failed:
     """Fit the rows of corners matched across at most so many pairs, evenly spread over the recording."""
     total = len(recording.index.stamps_ns)
-    chosen = set(np.linspace(0, total - 1, min(most_frames, total)).astype(int).tolist())
+    chosen = set(np.linspace(0, total - 1, min(max_frames, total)).astype(int).tolist())
     found = []
     for number, frame in enumerate(recording.frames()):
         if number not in chosen or isinstance(frame, RefusedFrame):
@@ -65,14 +65,14 @@ def look_at_rows(recording: Recording, rectifier: Rectifier, most_frames: int) -
         pair = rectifier(frame)
         if isinstance(pair, Failed):
             return pair
-        found.append(match_freely(pair))
+        found.append(match_off_rows(pair))
     if not found:
         return Failed("no-frames", "no pair can be read")
     return fit_rows(np.vstack(found), rectifier.camera, len(found))
 
 
-def match_freely(pair: RectifiedPair) -> Float64:
-    """(N, 3) right u, right v (px) and right v minus left v of corners, wherever within a few rows."""
+def match_off_rows(pair: RectifiedPair) -> Float64:
+    """Match corners within a few rows: right u, right v (px) and right v minus left v (N, 3)."""
     corners = detect_corners(pair.left, TrackSettings(), np.empty((0, 2))).astype(np.float64)
     coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px)
     row = (corners[:, 1] * coarse.shape[0] / pair.camera.height).astype(int)
@@ -80,14 +80,14 @@ def match_freely(pair: RectifiedPair) -> Float64:
     guess = coarse[row, column].astype(np.float64)
     places, guess = corners[np.isfinite(guess)], guess[np.isfinite(guess)]
     start = places - np.column_stack([guess, np.zeros_like(guess)])
-    right = locate(patch_image(pair.left), patch_image(pair.right), places, start)
+    right = align_patches(patch_image(pair.left), patch_image(pair.right), places, start)
     off = right.pixels[:, 1] - places[:, 1]
     matches: Float64 = np.column_stack([right.pixels, off])[right.found]
     return matches
 
 
 def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift | Failed:
-    """The drift that explains matches (N, 3) as `match_freely` gives them.
+    """Fit the drift to matches (N, 3) as `match_off_rows` gives them.
 
     Matches are averaged over the cells of a grid first. A cell's mean has its noise and a part that more
     matches don't average out (lens, texture), found from how far the cells scatter beyond their noise
@@ -97,7 +97,7 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
     kept = np.ones(len(matches), np.bool_)
     values = np.zeros(4)
     for _ in range(5):
-        if kept.sum() < LEAST_CELLS * LEAST_IN_CELL:
+        if kept.sum() < MIN_CELLS * MIN_IN_CELL:
             return Failed("few-matches", f"only {int(kept.sum())} corners match between left and right")
         values = np.linalg.lstsq(design[kept], matches[kept, 2], rcond=None)[0]
         off = matches[:, 2] - design @ values
@@ -105,7 +105,7 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
         spread = 1.4826 * float(np.median(np.abs(off[kept] - middle)))
         kept = np.abs(off - middle) < TRIM_SIGMAS * max(spread, 0.01)
     cells, rows, means, variances = _cells(matches[kept], design[kept], camera)
-    if len(means) < LEAST_CELLS:
+    if len(means) < MIN_CELLS:
         return Failed(
             "few-matches", f"matches fill only {len(means)} of {COLUMNS * ROWS} parts of the picture"
         )
@@ -127,7 +127,7 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
 
 
 def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
-    """(N, 4) px per unit of pitch, roll, focal ratio and yaw."""
+    """Compute the design (N, 4) px per unit of pitch, roll, focal ratio and yaw."""
     f = camera.focal_px
     x = (matches[:, 0] - camera.cx_px - camera.doffs_px) / f
     y = (matches[:, 1] - camera.cy_px) / f
@@ -137,15 +137,15 @@ def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
 def _cells(
     matches: Float64, design: Float64, camera: RectifiedCamera
 ) -> tuple[list[int], Float64, Float64, Float64]:
-    """The cells that hold enough matches, their design (C, 4), mean (C,) and the mean's variance (C,)."""
+    """Average matches by cell: design (C, 4), mean (C,) and the mean's variance (C,)."""
     column = np.clip(matches[:, 0] * COLUMNS / camera.width, 0, COLUMNS - 1).astype(int)
     row = np.clip(matches[:, 1] * ROWS / camera.height, 0, ROWS - 1).astype(int)
     cells, rows, means, variances = [], [], [], []
     for cell in range(COLUMNS * ROWS):
         inside = row * COLUMNS + column == cell
-        if (count := int(inside.sum())) >= LEAST_IN_CELL:
+        if (count := int(inside.sum())) >= MIN_IN_CELL:
             cells.append(cell)
             rows.append(design[inside].mean(0))
             means.append(matches[inside, 2].mean())
-            variances.append(matches[inside, 2].var(ddof=1) / count + LEAST_SIGMA_PX**2)
+            variances.append(matches[inside, 2].var(ddof=1) / count + MIN_SIGMA_PX**2)
     return cells, np.array(rows).reshape(-1, 4), np.array(means), np.array(variances)

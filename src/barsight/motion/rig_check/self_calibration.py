@@ -1,5 +1,5 @@
-"""What follows from a rig's drift: a warning where it matters, a rig turned back where that is asked, and how
-far disparities may still be off.
+"""Apply a rig's drift: a warning where it matters, a rig turned back where that is asked, and how far
+disparities may still be off.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py)
 
 
 @dataclass(frozen=True)
-class SelfCalibrated:
+class SelfCalibration:
     """The rectifier to measure with, sentences where the drift needs any, and the disparity error (px, one
     sigma) that the rig may still cause everywhere alike."""
 
@@ -31,26 +31,29 @@ class SelfCalibrated:
     sigma_px: float
 
 
-def self_calibrated(
+def self_calibrate(
     rig: StereoRig, rectifier: Rectifier, drift: RigDrift | None, calibration_px: float, *, correct: bool
-) -> SelfCalibrated:
-    """The rig turned by the drift's yaw if `correct`, else as it is; encoders must have shown the drift.
+) -> SelfCalibration:
+    """Turn the rig by the drift's yaw if `correct`, else leave it; encoders must have shown the drift.
 
     calibration_px: the disparity error (1 sigma) that the calibration itself admits.
     """
     if drift is None or not drift.by_encoders:
         reason = "nothing is self-calibrated: the yaw shows only with encoders in the fused estimate"
-        return SelfCalibrated(rectifier, (reason,) if correct else (), calibration_px)
-    seen, sigma_px = describe(drift), left_open_px(drift, rectifier.camera.focal_px, calibration_px, correct)
+        return SelfCalibration(rectifier, (reason,) if correct else (), calibration_px)
+    seen, sigma_px = (
+        describe_drift(drift),
+        residual_sigma_px(drift, rectifier.camera.focal_px, calibration_px, correct),
+    )
     if correct:
-        turned = turned_right(rig, np.array([0.0, drift.yaw_rad, 0.0]))
-        return SelfCalibrated(Rectifier(turned), (f"the rig is self-calibrated: {seen}",), sigma_px)
+        turned = turn_right_camera(rig, np.array([0.0, drift.yaw_rad, 0.0]))
+        return SelfCalibration(Rectifier(turned), (f"the rig is self-calibrated: {seen}",), sigma_px)
     warnings = (f"{seen}; calibrate anew",) if is_drifted(drift) else ()
-    return SelfCalibrated(rectifier, warnings, sigma_px)
+    return SelfCalibration(rectifier, warnings, sigma_px)
 
 
-def left_open_px(drift: RigDrift, focal_px: float, calibration_px: float, corrected: bool) -> float:
-    """The disparity error (1 sigma) that yaw and scale may cause straight ahead at the points' median depth.
+def residual_sigma_px(drift: RigDrift, focal_px: float, calibration_px: float, corrected: bool) -> float:
+    """Compute the disparity error (1 sigma) left by yaw and scale straight ahead at the points' median depth.
 
     Where the travel agrees with the calibration, both are believed, the calibration for the yaw. Where it
     contradicts, the travel alone is, and what it found counts as error unless it is `corrected`.
@@ -67,13 +70,13 @@ def left_open_px(drift: RigDrift, focal_px: float, calibration_px: float, correc
 
 
 def is_drifted(drift: RigDrift) -> bool:
-    """Whether the yaw is beyond 3 sigma and costs more than a few millimetres."""
+    """Check whether the yaw is beyond 3 sigma and costs more than a few millimetres."""
     significant = abs(drift.yaw_rad) > SIGNIFICANT_SIGMAS * drift.yaw_sigma_rad
     return significant and abs(1e3 * drift.depth_error_m(drift.range_m)) > WORTH_MM
 
 
-def describe(drift: RigDrift) -> str:
-    """The yaw and its cost as a sentence."""
+def describe_drift(drift: RigDrift) -> str:
+    """Describe the yaw and its cost in a sentence."""
     yaw, sigma = np.degrees([drift.yaw_rad, drift.yaw_sigma_rad])
     cost = 1e3 * drift.depth_error_m(drift.range_m)
     return (
@@ -82,8 +85,8 @@ def describe(drift: RigDrift) -> str:
     )
 
 
-def turned_right(rig: StereoRig, turn_rad: np.ndarray) -> StereoRig:
-    """The rig whose right camera has turned by a rotation vector (3,) in its rectified axes."""
+def turn_right_camera(rig: StereoRig, turn_rad: np.ndarray) -> StereoRig:
+    """Turn the rig's right camera by a rotation vector (3,) in its rectified axes."""
     cam1_from_rect1 = right_from_rectified(rig)
     rotation = cam1_from_rect1 @ Rotation.from_rotvec(turn_rad).as_matrix() @ cam1_from_rect1.T
     return replace(rig, body_from_cam1=rig.body_from_cam1 @ Pose("cam1", "cam1", rotation, np.zeros(3)))

@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags with Kalibr's calibration.
+"""Read ROS 1 and ROS 2 bags with Kalibr's calibration.
 
 A bag is read from front to back twice: once for the stamps and the slow sensors when one of them is first
 asked for, once for the pictures. Nothing but the pictures that wait for their partner is held.
@@ -69,18 +69,18 @@ class BagRecording:
 
     @property
     def rig(self) -> StereoRig:
-        """See `Recording.rig`."""
+        """Return the rig; see `Recording.rig`."""
         return self._calibration.chain.rig
 
     @cached_property
     def is_simulated(self) -> bool:
-        """`is_simulated` of a `body.yaml` in the bag's folder; False where it isn't said."""
+        """Return `is_simulated` of a `body.yaml` in the bag's folder; False where it isn't said."""
         path = self._folder / "body.yaml"
         return path.is_file() and read_document(path).values.get("is_simulated") is True
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """See `Recording.notes`."""
+        """Return the notes; see `Recording.notes`."""
         if not self._calibration.chain.knows_imu:
             return ("the camchain has no T_cam_imu: the body is cam0 and an IMU in the bag isn't used",)
         return ()
@@ -109,17 +109,20 @@ class BagRecording:
 
     @cached_property
     def camera_stamps(self) -> PairedStamps:
-        """All pictures' stamps, paired or not."""
+        """Return all pictures' stamps, paired or not."""
         left, right = (self._scan[name].stamp_ns() for name in (self._topics.cam0, self._topics.cam1))
         return pair_cameras(self.path, left, right, self._settings.pair_tolerance_s)
 
     @property
     def index(self) -> FrameIndex:
-        """See `Recording.index`."""
+        """Return the index; see `Recording.index`."""
         return self.camera_stamps.index
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
-        """See `Recording.frames`. The bag is read once; a picture waits undecoded for its partner."""
+        """Yield frames as `Recording.frames`.
+
+        The bag is read once; a picture waits undecoded for its partner.
+        """
         pairs = self.camera_stamps
         turns = (
             {int(pairs.left_ns[k]): turn for turn, k in enumerate(pairs.pairing.left)},
@@ -147,7 +150,9 @@ class BagRecording:
                 )
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Every picture as a file's bytes, in the bag's order; raw pixels as a PNG, torn ones left out."""
+        """Yield every picture as a file's bytes, in the bag's order; raw pixels as a PNG, torn ones
+        left out.
+        """
         for message in self._pictures():
             try:
                 kind, data = file_of(message.kind, self._picture(message))
@@ -166,15 +171,15 @@ class BagRecording:
         return make_imu(self._bag.path, stamps, table[:, :3].copy(), table[:, 3:].copy(), identity)
 
     def imu(self) -> ImuSamples | None:
-        """See `Recording.imu`."""
+        """Read the IMU; see `Recording.imu`."""
         return self._imu
 
     def imu_noise(self) -> ImuNoise | None:
-        """See `Recording.imu_noise`."""
+        """Read the IMU's noise; see `Recording.imu_noise`."""
         return self._calibration.imu.noise if self._calibration.imu and self._topics.imu else None
 
     def crane(self) -> CraneSamples | None:
-        """See `Recording.crane`."""
+        """Read the encoders; see `Recording.crane`."""
         name = self._topics.crane
         if name is None:
             return None
@@ -182,7 +187,7 @@ class BagRecording:
         return make_crane(document, self._scan[name].stamp_ns(), self._finite(name, 3))
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """See `Recording.laser`."""
+        """Read the laser; see `Recording.laser`."""
         name = self._topics.laser
         if name is None:
             return ()
@@ -192,7 +197,7 @@ class BagRecording:
         return make_laser(rows[:, 0].astype(np.int64), rows[:, 1:], std)
 
     def digests(self) -> dict[str, str]:
-        """See `Recording.digests`."""
+        """Compute digests; see `Recording.digests`."""
         extra = [self._folder / name for name in ("crane0.yaml", "laser0.yaml", "body.yaml")]
         bags = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
         bags = [

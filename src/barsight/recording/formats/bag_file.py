@@ -1,4 +1,4 @@
-"""A bag file of any kind as a stream of messages; `rosbags` reads it, no ROS is needed.
+"""Stream a bag file of any kind as messages; `rosbags` reads it, no ROS is needed.
 
 A torn bag makes the parsers below raise all kinds of errors; every one becomes an `InputError` here.
 """
@@ -64,7 +64,7 @@ class BagFile:
         self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
     def messages(self, names: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of these topics in the order of their receipt."""
+        """Yield the messages of these topics in the order of their receipt."""
         with self._opened() as reader:
             chosen = [connection for connection in reader.connections if connection.topic in names]
             stream = reader.messages(connections=chosen)
@@ -81,7 +81,10 @@ class BagFile:
                 yield RawMessage(connection.topic, connection.msgtype, stamp, data)
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object with the fields of its definition. Raises ValueError where it is torn."""
+        """Decode the message to an object with the fields of its definition.
+
+        Raises ValueError where it is torn.
+        """
         typestore = self._typestore
         read = typestore.deserialize_ros1 if self._is_ros1 else typestore.deserialize_cdr
         try:
@@ -92,7 +95,9 @@ class BagFile:
             raise ValueError(f"is a torn message ({_short(error)})") from error
 
     def _header_stamp(self, data: bytes) -> int:
-        """Both ROS 1 (after `seq`) and CDR (after four bytes that say the byte order) put it at byte 4."""
+        """Read the header's stamp: ROS 1 (after `seq`) and CDR (after four bytes of byte order) put it at
+        byte 4.
+        """
         if len(data) < 12:
             raise ValueError("a message is too short for a header")
         seconds, nanoseconds = struct.unpack_from("<II" if self._is_ros1 or data[1] & 1 else ">II", data, 4)
@@ -120,14 +125,17 @@ class BagFile:
 
 
 def _files(path: Path) -> list[Path]:
-    """What to hand to rosbags, which takes a ROS 2 folder for a ROS 1 file where its name ends in `.bag`."""
+    """List the files to hand to rosbags, which takes a ROS 2 folder for a ROS 1 file where its name ends in
+    `.bag`.
+    """
     if path.is_dir() and path.suffix == ".bag":
         return sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
     return [path]
 
 
 def _expect_whole_database(paths: list[Path]) -> None:
-    """SQLite reads a file that lost its last pages without a word until a lost page is needed.
+    """Refuse a torn database: SQLite reads a file that lost its last pages without a word until a lost page
+    is needed.
 
     Its header says the page size (byte 16) and the count of pages (byte 28) [SQLite file format 1.3].
     """

@@ -1,4 +1,4 @@
-"""ROS picture messages to gray pictures, and to PNG files for copying."""
+"""Convert ROS picture messages to gray pictures, and to PNG files for copying."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ ENCODINGS: dict[str, tuple[type[np.generic], int, int | None]] = {
 
 
 def gray_of(kind: str, message: Any) -> UInt8:
-    """(H, W) uint8 of a decoded `Image` or `CompressedImage`. Raises `TornImageError`."""
+    """Decode an `Image` or `CompressedImage` to (H, W) uint8. Raises `TornImageError`."""
     if kind == COMPRESSED_TYPE:
         return decode_gray(message.data.tobytes())
     return to_gray(_pixels(message))
 
 
 def file_of(kind: str, message: Any) -> tuple[str, bytes]:
-    """(suffix, bytes) of a file with the same pixels: a compressed picture's own bytes, else a PNG.
+    """Encode as a file (suffix, bytes) of the same pixels: a compressed picture's own bytes, else a PNG.
 
     Raises `TornImageError`.
     """
@@ -62,7 +62,7 @@ def file_of(kind: str, message: Any) -> tuple[str, bytes]:
 
 
 def _pixels(message: Any) -> NDArray[Any]:
-    """The message's pixels as OpenCV orders them: (H, W) or (H, W, C), BGR."""
+    """View the message's pixels as OpenCV orders them: (H, W) or (H, W, C), BGR."""
     if message.encoding not in ENCODINGS:
         raise TornImageError(f"has the encoding {message.encoding!r}; {', '.join(ENCODINGS)} are read")
     dtype, channels, conversion = ENCODINGS[message.encoding]

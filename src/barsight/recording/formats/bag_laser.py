@@ -1,4 +1,4 @@
-"""The laser's profiles as a ROS point cloud."""
+"""Read the laser's profiles from a ROS point cloud."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def laser_rows(path: Path, cloud: Any) -> Float64:
-    """(N, 4) profile, x, y, z (m, `yard`) of a decoded PointCloud2. Raises `InputError` about `path`."""
+    """Read profile, x, y, z (N, 4) (m, `yard`) of a decoded PointCloud2. Raises `InputError` about `path`."""
     order = ">" if cloud.is_bigendian else "<"
     fields = {field.name: field for field in cloud.fields}
     missing = [name for name in NAMES if name not in fields or fields[name].datatype not in KINDS]

@@ -1,4 +1,4 @@
-"""What a bag needs beside its messages: Kalibr's files and which topic is which sensor."""
+"""Find a bag's Kalibr files and assign topics to sensors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from barsight.calibration.files.kalibr import CamChain, ImuFile, read_camchain, read_imu_file
-from barsight.calibration.files.rig_formats import body_is_cam0, chosen_rig, read_rig_file
+from barsight.calibration.files.rig_formats import body_is_cam0, read_rig_file, select_rig
 from barsight.core.errors import InputError
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.bag_file import (
@@ -44,7 +44,7 @@ class BagTopics:
 
 
 def find_calibration(path: Path, settings: RecordingSettings) -> BagCalibration:
-    """Kalibr's files, named by the settings or found in the bag's folder, then beside it.
+    """Find Kalibr's files, named by the settings or in the bag's folder, then beside it.
 
     Raises `InputError` where there is no camchain or several that could be meant.
     """
@@ -63,14 +63,14 @@ def find_calibration(path: Path, settings: RecordingSettings) -> BagCalibration:
     imu = read_imu_file(imu_path) if imu_path else None
     files = (chain_path, imu_path) if imu_path else (chain_path,)
     chain = read_camchain(chain_path)
-    chain = replace(chain, rig=chosen_rig(settings.rig, chain.rig))
+    chain = replace(chain, rig=select_rig(settings.rig, chain.rig))
     return BagCalibration(chain, imu, files if settings.rig is None else (*files, settings.rig))
 
 
 def choose_topics(
     path: Path, topics: Sequence[Topic], calibration: BagCalibration, settings: RecordingSettings
 ) -> BagTopics:
-    """Which topic is which sensor: as the settings say, else the camchain, else by the message types.
+    """Assign topics to sensors: as the settings say, else the camchain, else by the message types.
 
     Raises `InputError` for a topic that isn't there and where several could be meant.
     """
@@ -95,7 +95,7 @@ def choose_topics(
 
 
 def _find(folders: Sequence[Path], patterns: tuple[str, ...], without: tuple[str, ...]) -> Path | None:
-    """The file of the nearest folder and the most exact pattern; several of one kind are refused."""
+    """Find the file of the nearest folder and the most exact pattern; several of one kind are refused."""
     for folder in folders:
         for pattern in patterns:
             found = [
@@ -124,13 +124,13 @@ def _named(path: Path, topics: Sequence[Topic], name: str, setting: str) -> str:
 
 
 def _stated(topics: Sequence[Topic], name: str | None) -> str | None:
-    """The camchain's topic, or its compressed copy; calibration is often done on another recording."""
+    """Find the camchain's topic, or its compressed copy; calibration is often done on another recording."""
     names = {topic.name for topic in topics}
     return next((n for n in (name, f"{name}/compressed") if n in names), None)
 
 
 def _two_cameras(path: Path, pictures: Sequence[Topic]) -> list[str | None]:
-    """The two picture topics of a bag that has just two, the left one first."""
+    """Find the two picture topics of a bag that has just two, the left one first."""
     names = {topic.name for topic in pictures}
     bases = sorted(name for name in names if name.removesuffix("/compressed") not in names - {name})
     if len(bases) != 2:
@@ -146,7 +146,7 @@ def _two_cameras(path: Path, pictures: Sequence[Topic]) -> list[str | None]:
 def _imu_topic(
     path: Path, topics: Sequence[Topic], calibration: BagCalibration, settings: RecordingSettings
 ) -> str | None:
-    """The IMU's topic; None too where the camchain does not say where the IMU sits."""
+    """Find the IMU's topic; None too where the camchain does not say where the IMU sits."""
     imus = [topic for topic in topics if topic.kind == IMU_TYPE and topic.count]
     if settings.imu_topic:
         return _named(path, imus, settings.imu_topic, "recording.imu_topic")

@@ -1,4 +1,4 @@
-"""Recordings of a board's corners instead of pictures: `camN_detections.npz` and `imu0.csv`.
+"""Read recordings of a board's corners instead of pictures: `camN_detections.npz` and `imu0.csv`.
 
 The corners are known one from another, so the motion can be estimated from them; nothing can be mapped.
 """
@@ -55,12 +55,12 @@ class CornerRecording(PairedAtOpening):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """See `Recording.notes`."""
+        """Return the notes; see `Recording.notes`."""
         imu = self._imu
         return () if imu is None else imu.notes
 
     def points(self) -> Iterator[NamedPoints]:
-        """What both cameras see at each of the index's stamps."""
+        """Yield what both cameras see at each of the index's stamps."""
         pairing = self._pairs.pairing
         seen = [_by_stamp(rows) for rows in self._rows]
         for left, right in zip(pairing.left, pairing.right, strict=True):
@@ -70,13 +70,13 @@ class CornerRecording(PairedAtOpening):
             yield NamedPoints(int(self._pairs.left_ns[left]), both, pixels[first], other_pixels[second])
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
-        """All refused: there are no pictures."""
+        """Refuse all frames: there are no pictures."""
         for stamp in self.index.stamps_ns:
             if wanted is None or stamp in wanted:
                 yield RefusedFrame(stamp, NO_PICTURES)
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Raises InputError: there are no pictures."""
+        """Raise InputError: there are no pictures."""
         raise InputError(self.path, NO_PICTURES, "give a recording with pictures")
 
     @cached_property
@@ -85,29 +85,29 @@ class CornerRecording(PairedAtOpening):
         return read_imu_log(path) if path.is_file() else None
 
     def imu(self) -> ImuSamples | None:
-        """See `Recording.imu`."""
+        """Read the IMU; see `Recording.imu`."""
         log = self._imu
         return None if log is None else log.samples
 
     def imu_noise(self) -> ImuNoise | None:
-        """Of the settings' imu.yaml: the folder holds none."""
+        """Read the settings' imu.yaml: the folder holds none."""
         return None if self._imu_yaml is None else read_imu_file(self._imu_yaml).noise
 
     def crane(self) -> CraneSamples | None:
-        """None."""
+        """Return None: there is no crane."""
         return None
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """None."""
+        """Return nothing: there is no laser."""
         return ()
 
     def digests(self) -> dict[str, str]:
-        """See `Recording.digests`."""
+        """Compute digests; see `Recording.digests`."""
         return file_digests(self.path, [self.path / name for name in (*NAMES, "imu0.csv")])
 
 
 def _by_stamp(rows: Any) -> dict[int, tuple[Any, Any]]:
-    """Names (N,) and pixels (N, 2) at each stamp."""
+    """Group names (N,) and pixels (N, 2) by stamp."""
     order = np.argsort(rows["stamp_ns"], kind="stable")
     stamps, first = np.unique(rows["stamp_ns"][order], return_index=True)
     names = rows["tag"].astype(np.int64) * CORNERS_A_TAG + rows["corner"]

@@ -1,4 +1,4 @@
-"""Recordings in EuRoC's (ASL's) folder layout, with the crane and the laser of Barsight's contract."""
+"""Read recordings in EuRoC's (ASL's) folder layout, with crane and laser."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from barsight.calibration.files.euroc import read_imu, read_rig
-from barsight.calibration.files.rig_formats import chosen_rig
+from barsight.calibration.files.rig_formats import select_rig
 from barsight.calibration.files.yaml_document import read_document
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
@@ -40,7 +40,7 @@ class EurocRecording(PictureFiles):
                 raise InputError(
                     self._root, f"has no folder {camera}", "a stereo recording needs both cam0 and cam1"
                 )
-        self.rig: StereoRig = chosen_rig(settings.rig, read_rig(self._root))
+        self.rig: StereoRig = select_rig(settings.rig, read_rig(self._root))
         left_ns, left_names = read_image_list(self._root / "cam0" / "data.csv")
         right_ns, right_names = read_image_list(self._root / "cam1" / "data.csv")
         self._left = self._image_paths("cam0", left_names)
@@ -49,7 +49,7 @@ class EurocRecording(PictureFiles):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """See `Recording.notes`."""
+        """Return the notes; see `Recording.notes`."""
         mount = self._imu_file("sensor.yaml")
         if mount and read_imu(mount).body_from_imu.translation.any():
             return ("the IMU sits away from the body's origin: its lever arm is neglected",)
@@ -57,7 +57,7 @@ class EurocRecording(PictureFiles):
 
     @cached_property
     def is_simulated(self) -> bool:
-        """`is_simulated` of `body.yaml`; False where it isn't said."""
+        """Return `is_simulated` of `body.yaml`; False where it isn't said."""
         path = self._root / "body.yaml"
         return path.is_file() and read_document(path).values.get("is_simulated") is True
 
@@ -71,16 +71,16 @@ class EurocRecording(PictureFiles):
         return make_imu(path, table.first, table.rest[:, :3], table.rest[:, 3:], mount)
 
     def imu(self) -> ImuSamples | None:
-        """See `Recording.imu`."""
+        """Read the IMU; see `Recording.imu`."""
         return self._imu
 
     def imu_noise(self) -> ImuNoise | None:
-        """See `Recording.imu_noise`."""
+        """Read the IMU's noise; see `Recording.imu_noise`."""
         path = self._imu_file("sensor.yaml")
         return read_imu(path).noise if path else None
 
     def crane(self) -> CraneSamples | None:
-        """See `Recording.crane`."""
+        """Read the encoders; see `Recording.crane`."""
         folder = self._root / "crane0"
         if not folder.is_dir():
             return None
@@ -88,7 +88,7 @@ class EurocRecording(PictureFiles):
         return make_crane(read_document(folder / "sensor.yaml"), table.first, table.rest)
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """See `Recording.laser`."""
+        """Read the laser; see `Recording.laser`."""
         folder = self._root / "laser0"
         if not folder.is_dir():
             return ()
@@ -99,7 +99,7 @@ class EurocRecording(PictureFiles):
         return make_laser(table.first, table.rest, std)
 
     def digests(self) -> dict[str, str]:
-        """See `Recording.digests`."""
+        """Compute digests; see `Recording.digests`."""
         names = [
             f"{sensor}/{name}"
             for sensor in ("cam0", "cam1", "imu0", "crane0", "laser0")

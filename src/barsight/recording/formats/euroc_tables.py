@@ -1,4 +1,4 @@
-"""EuRoC's CSV files: read fast, stamps exact, and a wrong line named by its number."""
+"""Read EuRoC's CSV files: fast, stamps exact, and a wrong line named by its number."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Table:
     rest: Float64
 
     def line(self, row: int) -> int:
-        """The line of the file (from 1) that holds a row."""
+        """Return the line of the file (from 1) that holds a row."""
         for k, (number, _) in enumerate(_data_lines(self.path)):
             if k == row:
                 return number
@@ -74,7 +74,10 @@ def read_table(path: Path, columns: tuple[str, ...], *, extra_allowed: bool = Fa
 
 
 def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
-    """A camera's `data.csv`: increasing stamps (N,) and file names. Raises `InputError` as `read_table`."""
+    """Read a camera's `data.csv`: increasing stamps (N,) and file names.
+
+    Raises `InputError` as `read_table`.
+    """
     require_file(path)
     stamps: list[int] = []
     names: list[str] = []
@@ -122,13 +125,13 @@ def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _is_header(text: str) -> bool:
-    """A first line of names that lacks its `#`."""
+    """Check for a first line of names that lacks its `#`."""
     first = text.partition(",")[0].strip().lower()
     return first.startswith(("timestamp", "time", "profile", "stamp"))
 
 
 def _header_lines(path: Path) -> int:
-    """How many lines to pass over so that a header without `#` does not reach the number parser."""
+    """Count lines to pass over so that a header without `#` does not reach the number parser."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
             text = line.partition("#")[0].strip()
@@ -138,7 +141,7 @@ def _header_lines(path: Path) -> int:
 
 
 def _diagnosis(path: Path, columns: tuple[str, ...], extra_allowed: bool) -> InputError:
-    """Why the fast parser refused the file: the first line that is wrong."""
+    """Find why the fast parser refused the file: the first line that is wrong."""
     empty = True
     for number, text in _data_lines(path):
         empty = False

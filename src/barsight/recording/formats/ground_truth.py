@@ -1,4 +1,4 @@
-"""True trajectories, for evaluation only: no reader and no measuring stage imports this file."""
+"""Read true trajectories, for evaluation only: no reader and no measuring stage imports this file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class GroundTruth:
 
 
 def find_ground_truth(recording: Path) -> Path | None:
-    """The truth that lies with a recording of any format, or None."""
+    """Find the truth that lies with a recording of any format, or None."""
     candidates = (
         recording / "mav0" / EUROC_FOLDER / "data.csv",
         recording / EUROC_FOLDER / "data.csv",
@@ -37,7 +37,7 @@ def find_ground_truth(recording: Path) -> Path | None:
 
 
 def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: str = "world") -> GroundTruth:
-    """A trajectory file: EuRoC's `data.csv`, TUM's lines of eight, or KITTI's `poses.txt` of twelve.
+    """Read a trajectory file: EuRoC's `data.csv`, TUM's lines of eight, or KITTI's `poses.txt` of twelve.
 
     path: the file, or a recording that holds one. stamp_ns: KITTI's file has no times; give the frames'.
     reference: the name of the frame the poses are in. The body is the IMU (KITTI: cam0).
@@ -65,7 +65,7 @@ def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: s
 
 
 def truth_as_euroc(path: Path, stamp_ns: Int64) -> str:
-    """The text of EuRoC's `data.csv` for a trajectory of another format, one pose per stamp for KITTI's."""
+    """Format a trajectory as EuRoC's `data.csv`, one pose per stamp for KITTI's."""
     truth = read_ground_truth(path, stamp_ns)
     lines = ["#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"]
     for stamp, pose in zip(truth.stamp_ns.tolist(), truth.poses, strict=True):

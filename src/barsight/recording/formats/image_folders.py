@@ -1,4 +1,4 @@
-"""What readers share whose pictures are files of their own: EuRoC's and KITTI's folders."""
+"""Read pictures that are files of their own: EuRoC's and KITTI's folders."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.types import RefusedFrame, StereoFrame
 from barsight.recording.image_decoding import TornImageError
 from barsight.recording.pairing import PairedAtOpening, decode_for
-from barsight.recording.stored_images import StoredImage, merged
+from barsight.recording.stored_images import StoredImage, merge_cameras
 
 
 class PictureFiles(PairedAtOpening):
@@ -24,20 +24,20 @@ class PictureFiles(PairedAtOpening):
     _right: Sequence[Path]
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
-        """See `Recording.frames`."""
+        """Yield frames; see `Recording.frames`."""
         pairing = self._pairs.pairing
         for stamp, left, right in zip(self.index.stamps_ns, pairing.left, pairing.right, strict=True):
             if wanted is None or stamp in wanted:
                 yield self._read_pair(stamp, self._left[left], self._right[right])
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Every picture's bytes as stored, both cameras in time's order, missing files left out."""
-        for camera, stamp, path in merged(self._pairs, self._left, self._right):
+        """Yield every picture's bytes as stored, both cameras in time's order, missing files left out."""
+        for camera, stamp, path in merge_cameras(self._pairs, self._left, self._right):
             if path.is_file():
                 yield StoredImage(camera, stamp, path.suffix.lstrip(".").lower(), path.read_bytes())
 
     def _read_pair(self, stamp_ns: int, left: Path, right: Path) -> StereoFrame | RefusedFrame:
-        """One pair; refused, with the file's name, where either picture can't be used."""
+        """Read one pair; refused, with the file's name, where either picture can't be used."""
         images = []
         for path, camera in ((left, self.rig.cam0), (right, self.rig.cam1)):
             name = path.relative_to(self._root)

@@ -1,4 +1,4 @@
-"""Pairs of pictures that no calibration goes with yet: what `barsight calibrate` reads."""
+"""Find pairs of pictures that no calibration goes with yet: what `barsight calibrate` reads."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ReadPair:
 
 
 def find_pairs(path: Path) -> tuple[PicturePair, ...]:
-    """The pairs below `path`, in the order of their names (numbers by value).
+    """Find the pairs below `path`, in the order of their names (numbers by value).
 
     Two folders pair by equal names, with `left`/`right` taken off. Raises InputError where there are none.
     """

@@ -1,4 +1,4 @@
-"""An IMU's log at rest of any writer: CSV or columns, s or ns, g or m/s^2, degrees or radians."""
+"""Read an IMU's log at rest of any writer: CSV or columns, s or ns, g or m/s^2, degrees or radians."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _file(path: Path) -> Path:
 
 
 def _rows(path: Path) -> tuple[str, Int64, Float64]:
-    """(header text, stamps (N,) ns in time's order, values (N, 6))."""
+    """Read header text, stamps (N,) ns in time's order and values (N, 6)."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

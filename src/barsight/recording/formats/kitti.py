@@ -1,4 +1,4 @@
-"""KITTI's odometry recordings: rectified pairs, a `calib.txt`, no IMU. The body is the left camera.
+"""Read KITTI's odometry recordings: rectified pairs, a `calib.txt`, no IMU. The body is the left camera.
 
 The standard layout has `P0:` ... `P3:` in calib.txt, `image_0`, `image_1` (gray; else `image_2`, `image_3`)
 and `times.txt`. A second layout has two bare lines of twelve numbers, `image_l`, `image_r` and no times.
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.calibration.files.euroc import build_rig
-from barsight.calibration.files.rig_formats import chosen_rig
+from barsight.calibration.files.rig_formats import select_rig
 from barsight.calibration.files.yaml_document import canonical_pose
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.imu_noise import ImuNoise
@@ -38,7 +38,7 @@ PICTURE = re.compile(r"(\d+)\.(png|jpg|jpeg)$", re.IGNORECASE)
 
 
 def is_kitti(path: Path) -> bool:
-    """Whether a folder looks like a KITTI odometry sequence."""
+    """Check whether a folder looks like a KITTI odometry sequence."""
     return (path / "calib.txt").is_file() or any((path / names[0]).is_dir() for names in FOLDERS)
 
 
@@ -72,31 +72,31 @@ class KittiRecording(PictureFiles):
         )
         projections = _read_projections(path / "calib.txt", (keys[0], keys[1]))
         own = _rig(path / "calib.txt", projections, (_size(self._left), _size(self._right)))
-        self.rig = chosen_rig(settings.rig, own)
+        self.rig = select_rig(settings.rig, own)
 
     def imu(self) -> ImuSamples | None:
-        """None: KITTI's odometry recordings have no IMU."""
+        """Return None: KITTI's odometry recordings have no IMU."""
         return None
 
     def imu_noise(self) -> ImuNoise | None:
-        """None: there is no IMU."""
+        """Return None: there is no IMU."""
         return None
 
     def crane(self) -> CraneSamples | None:
-        """None: there is no crane."""
+        """Return None: there is no crane."""
         return None
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """Empty: there is no laser."""
+        """Return nothing: there is no laser."""
         return ()
 
     def digests(self) -> dict[str, str]:
-        """See `Recording.digests`."""
+        """Compute digests; see `Recording.digests`."""
         return file_digests(self.path, [self.path / "calib.txt", self.path / "times.txt"])
 
 
 def _pictures(folder: Path) -> dict[int, Path]:
-    """The pictures by their number, in its order."""
+    """List the pictures by their number, in its order."""
     found = {
         int(match[1]): path for path in folder.iterdir() if (match := PICTURE.match(path.name)) is not None
     }
@@ -106,7 +106,7 @@ def _pictures(folder: Path) -> dict[int, Path]:
 
 
 def _read_times(path: Path) -> Int64 | None:
-    """(N,) ns; exact although the file writes `1.036224e-01`."""
+    """Read stamps (N,) ns; exact although the file writes `1.036224e-01`."""
     if not path.is_file():
         return None
     stamps = []
@@ -139,7 +139,7 @@ def _stamps(root: Path, pictures: dict[int, Path], times: Int64 | None) -> Int64
 
 
 def _read_projections(path: Path, keys: tuple[str, str]) -> tuple[Float64, Float64]:
-    """Two (3, 4) matrices. Bare lines are the left and the right one in this order."""
+    """Read two (3, 4) matrices. Bare lines are the left and the right one in this order."""
     if not path.is_file():
         raise CalibrationError(path, "no such file", "copy the sequence's calib.txt beside its pictures")
     named: dict[str, Float64] = {}
@@ -193,7 +193,7 @@ def _rig(path: Path, projections: tuple[Float64, Float64], sizes: tuple[tuple[in
 
 
 def _size(paths: list[Path]) -> tuple[int, int]:
-    """(width, height) of the first picture that is whole: KITTI's calibration does not state it."""
+    """Read (width, height) of the first picture that is whole: KITTI's calibration does not state it."""
     for path in paths:
         try:
             height, width = decode_gray(path.read_bytes()).shape

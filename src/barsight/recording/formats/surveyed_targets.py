@@ -1,4 +1,4 @@
-"""Surveyed targets: where each lies in the yard, and where the rig saw it."""
+"""Read surveyed targets: their places in the yard, and where the rig saw them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class Targets:
 
 
 def read_targets(path: Path) -> Targets:
-    """A CSV with a header, m: `name,yard_x,yard_y,yard_z,x,y,z`, optionally `sigma_m` and `check` (1 or 0).
+    """Read a CSV with a header, m: `name,yard_x,yard_y,yard_z,x,y,z`, optionally `sigma_m` and `check` (1 or
+    0).
 
     Raises `InputError` naming the line.
     """

@@ -1,4 +1,4 @@
-"""Writing a recording as a ROS bag with Kalibr's files; `rosbags` writes it, no ROS is needed."""
+"""Write a recording as a ROS bag with Kalibr's files; `rosbags` writes it, no ROS is needed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.formats.bag_file import CLOUD_TYPE, COMPRESSED_TYPE, IMU_TYPE, POINT_TYPE
 from barsight.recording.formats.bag_laser import NAMES
 from barsight.recording.formats.bag_setup import CRANE_TOPIC, LASER_TOPIC
-from barsight.recording.stored_images import Source
+from barsight.recording.stored_images import StoredPictures
 from barsight.recording.writers.euroc import (
     copy_truth,
     laser_table,
@@ -35,7 +35,7 @@ from barsight.recording.writers.euroc import (
 CAMERA_TOPICS = ("/cam0/image_raw", "/cam1/image_raw")
 IMU_TOPIC = "/imu0"
 FLOAT64 = 8
-MOST_NS = 2**31 * NS_PER_S
+MAX_NS = 2**31 * NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ Item = tuple[int, int, str, str, Any]
 
 
 def write_bag(
-    recording: Source, folder: Path, name: str, flavour: BagFlavour, progress: Callable[[int], None]
+    recording: StoredPictures, folder: Path, name: str, flavour: BagFlavour, progress: Callable[[int], None]
 ) -> int:
     """Write the bag `name` and its calibration into `folder`; returns the number of pictures written.
 
@@ -85,15 +85,15 @@ def write_bag(
 
 
 def _expect_ros_times(path: Path, stamps: Int64) -> None:
-    """Increasing stamps (N,); ROS has unsigned times whose seconds end at 2^31."""
+    """Refuse stamps (N,) that ROS can't hold: unsigned, increasing, seconds below 2^31."""
     for stamp in (int(stamps[0]), int(stamps[-1])):
-        if not 0 <= stamp < MOST_NS:
+        if not 0 <= stamp < MAX_NS:
             raise InputError(
                 path, f"the stamp {stamp} ns can't be held by a ROS bag", "shift all stamps to after 1970"
             )
 
 
-def _write_descriptions(recording: Source, folder: Path) -> None:
+def _write_descriptions(recording: StoredPictures, folder: Path) -> None:
     write_camchain(folder / "camchain-imucam.yaml", recording.rig, CAMERA_TOPICS)
     if (noise := recording.imu_noise()) is not None:
         write_imu_file(folder / "imu.yaml", noise, IMU_TOPIC)
@@ -121,7 +121,7 @@ class _Messages:
         time = self._types["builtin_interfaces/msg/Time"](stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
         return self._types["std_msgs/msg/Header"](*self._leading, time, frame)
 
-    def images(self, recording: Source) -> Iterator[Item]:
+    def images(self, recording: StoredPictures) -> Iterator[Item]:
         make = self._types[COMPRESSED_TYPE]
         for image in recording.stored_images():
             kind = "jpeg" if image.kind in ("jpg", "jpeg") else image.kind
@@ -155,7 +155,9 @@ class _Messages:
             yield stamp, 3, CRANE_TOPIC, POINT_TYPE, make(self._header(stamp, "yard"), point(*place))
 
     def laser(self, stamp_ns: int, laser: tuple[LaserProfile, ...]) -> Iterator[Item]:
-        """One cloud of all profiles, at the first picture's stamp: the contract gives the laser no times."""
+        """Make one cloud of all profiles, at the first picture's stamp: the contract gives the laser no
+        times.
+        """
         profile, xyz = laser_table(laser)
         rows = np.column_stack([profile.astype("<f8"), xyz.astype("<f8")])
         make_field = self._types["sensor_msgs/msg/PointField"]
@@ -174,7 +176,10 @@ def _write(
     items: Iterator[Item],
     progress: Callable[[int], None],
 ) -> int:
-    """The bag itself. rosbags names the files of a ROS 2 bag after its folder, so it gets one of its own."""
+    """Write the bag itself.
+
+    rosbags names the files of a ROS 2 bag after its folder, so it gets one of its own.
+    """
     place = folder / name
     writer: Any
     if flavour.storage is None:

@@ -1,4 +1,4 @@
-"""One recording format from another, without loss and without holding more than a picture at a time.
+"""Convert a recording to another format, without loss and without holding more than a picture at a time.
 
 Stored pictures are copied byte for byte, stamps as integers, the slow sensors' numbers as float64, and the
 rig so that it reads back bit for bit; a round trip is the same recording. Pictures that are missing or torn
@@ -14,7 +14,7 @@ from typing import Literal
 
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
-from barsight.recording.stored_images import Source
+from barsight.recording.stored_images import StoredPictures
 from barsight.recording.writers.bag import BAG_FLAVOURS, write_bag
 from barsight.recording.writers.euroc import write_euroc
 
@@ -31,7 +31,7 @@ class ConversionReport:
 
 
 def convert(
-    recording: Source,
+    recording: StoredPictures,
     out: Path,
     target: Target,
     progress: Callable[[int, int], None] | None = None,

@@ -1,4 +1,4 @@
-"""Writing a recording as an EuRoC folder."""
+"""Write a recording as an EuRoC folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from barsight.calibration.files.yaml_document import write_document
 from barsight.core.arrays import Float64, Int64
 from barsight.core.types import CraneSamples, LaserProfile
 from barsight.recording.formats.ground_truth import EUROC_FOLDER, find_ground_truth, truth_as_euroc
-from barsight.recording.stored_images import Source
+from barsight.recording.stored_images import StoredPictures
 
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -24,7 +24,7 @@ CRANE_HEADER = "#timestamp [ns],bridge_x [m],trolley_y [m],hoist_z [m]"
 LASER_HEADER = "#profile,x [m],y [m],z [m]"
 
 
-def write_euroc(recording: Source, folder: Path, progress: Callable[[int], None]) -> int:
+def write_euroc(recording: StoredPictures, folder: Path, progress: Callable[[int], None]) -> int:
     """Write `folder/mav0`; returns the number of pictures written."""
     mav0 = folder / "mav0"
     stamps = recording.camera_stamps.left_ns
@@ -47,19 +47,19 @@ def write_euroc(recording: Source, folder: Path, progress: Callable[[int], None]
 
 
 def median_rate(stamp_ns: Int64) -> float:
-    """Samples per second, from the median interval; 0 for fewer than two samples."""
+    """Compute samples per second from the median interval; 0 for fewer than two samples."""
     return 1e9 / float(np.median(np.diff(stamp_ns))) if stamp_ns.size > 1 else 0.0
 
 
 def laser_table(laser: Iterable[LaserProfile]) -> tuple[Int64, Float64]:
-    """All profiles as rows: numbers (N,) and x, y, z (N, 3)."""
+    """Flatten all profiles to rows: numbers (N,) and x, y, z (N, 3)."""
     profiles = tuple(laser)
     numbers = np.concatenate([np.full(p.x_m.size, p.profile, dtype=np.int64) for p in profiles])
     return numbers, np.concatenate([np.column_stack([p.x_m, p.y_m, p.z_m]) for p in profiles])
 
 
 def write_crane_description(path: Path, crane: CraneSamples) -> None:
-    """The crane's `sensor.yaml` of the contract."""
+    """Write the crane's `sensor.yaml` of the contract."""
     write_document(
         path,
         {
@@ -73,14 +73,14 @@ def write_crane_description(path: Path, crane: CraneSamples) -> None:
 
 
 def write_laser_description(path: Path, laser: tuple[LaserProfile, ...]) -> None:
-    """The laser's `sensor.yaml`."""
+    """Write the laser's `sensor.yaml`."""
     values: dict[str, object] = {"sensor_type": "laser"}
     if np.isfinite(laser[0].range_std_m):
         values["range_std_m"] = laser[0].range_std_m
     write_document(path, values)
 
 
-def copy_truth(recording: Source, folder: Path) -> None:
+def copy_truth(recording: StoredPictures, folder: Path) -> None:
     """Carry ground truth along as EuRoC's file; KITTI's `poses.txt` is turned into one."""
     source = find_ground_truth(recording.path)
     if source is None:
@@ -97,7 +97,7 @@ def copy_truth(recording: Source, folder: Path) -> None:
         )
 
 
-def _write_images(recording: Source, mav0: Path, progress: Callable[[int], None]) -> int:
+def _write_images(recording: StoredPictures, mav0: Path, progress: Callable[[int], None]) -> int:
     done = 0
     with ExitStack() as stack:
         lists = []

@@ -1,4 +1,6 @@
-"""The page of a camera-IMU calibration: verdicts, mountings, residuals over time; and the same as JSON."""
+"""Write the page of a camera-IMU calibration: verdicts, mountings, residuals over time; and the
+same as JSON.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +15,15 @@ from barsight.calibration.camera_imu.problem import MOUNT
 from barsight.calibration.camera_imu.verdict import CameraImuAssessment
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.report.page import Figure, number, write_summary_page
-from barsight.report.plots import SERIES, Plot, keep_extremes, numbers
+from barsight.report.page import KeyFigure, format_number, write_summary_page
+from barsight.report.plots import SERIES, Plot, json_numbers, keep_extremes
 
-MOST_POINTS = 6000
+MAX_POINTS = 6000
 SENSORS = ("pictures", "gyro", "accel")
 
 
 def camera_imu_summary(calibration: CameraImuCalibration, assessment: CameraImuAssessment) -> dict[str, Any]:
-    """Everything of the report as JSON values."""
+    """Collect everything of the report as JSON values."""
     problem, state = calibration.problem, calibration.solution.state
     known, sigma, halves = calibration.uncertainty, calibration.sigma, assessment.halves
     names = problem.parameter_names
@@ -101,7 +103,7 @@ def write_camera_imu_report(
 
 
 def camera_imu_plots(calibration: CameraImuCalibration) -> list[Plot]:
-    """Residuals over time in sigma: pictures, gyro, accelerometer; and their autocorrelations."""
+    """Draw residuals over time in sigma: pictures, gyro, accelerometer; and their autocorrelations."""
     samples, problem = calibration.solution.linearised.samples, calibration.problem
     count = problem.imu.time_s.size
     traces = []
@@ -141,23 +143,27 @@ def _over_time(name: str, traces: list[dict[str, Any]], caption: str) -> Plot:
 
 
 def _line(name: str, x: Float64, y: Float64, colour: int) -> dict[str, Any]:
-    kept = keep_extremes(y, MOST_POINTS)
+    kept = keep_extremes(y, MAX_POINTS)
     return {
-        "type": "scatter", "mode": "lines", "name": name, "x": numbers(x[kept], 3),
-        "y": numbers(y[kept], 3), "line": {"color": SERIES[colour], "width": 1.0},
+        "type": "scatter", "mode": "lines", "name": name, "x": json_numbers(x[kept], 3),
+        "y": json_numbers(y[kept], 3), "line": {"color": SERIES[colour], "width": 1.0},
     }  # fmt: skip
 
 
-def _figures(summary: dict[str, Any]) -> list[Figure]:
-    rotation = number(float(np.max(summary["rotation_sigma_deg"])), 3, "°")
-    translation = number(float(np.max(summary["translation_sigma_mm"])), 2, "mm")
+def _figures(summary: dict[str, Any]) -> list[KeyFigure]:
+    rotation = format_number(float(np.max(summary["rotation_sigma_deg"])), 3, "°")
+    translation = format_number(float(np.max(summary["translation_sigma_mm"])), 2, "mm")
     shift, shift_sigma = summary["timeshift_cam_imu_s"][0] * 1e3, summary["timeshift_sigma_s"][0] * 1e3
-    baseline_sigma = number(summary["baseline_sigma_mm"], 2, "mm")
+    baseline_sigma = format_number(summary["baseline_sigma_mm"], 2, "mm")
     return [
-        Figure("Verdict", summary["verdict"]),
-        Figure("Rotation", rotation, "one sigma, worst axis"),
-        Figure("Translation", translation, "one sigma, worst axis"),
-        Figure("Time shift", number(shift, 3, "ms"), f"sigma {number(shift_sigma, 3, 'ms')}"),
-        Figure("Baseline", number(summary["baseline_mm"], 2, "mm"), f"sigma {baseline_sigma}"),
-        Figure("Two halves", number(summary["two_halves"].get("ratio"), 2, "sigma"), "solved apart"),
+        KeyFigure("Verdict", summary["verdict"]),
+        KeyFigure("Rotation", rotation, "one sigma, worst axis"),
+        KeyFigure("Translation", translation, "one sigma, worst axis"),
+        KeyFigure(
+            "Time shift", format_number(shift, 3, "ms"), f"sigma {format_number(shift_sigma, 3, 'ms')}"
+        ),
+        KeyFigure("Baseline", format_number(summary["baseline_mm"], 2, "mm"), f"sigma {baseline_sigma}"),
+        KeyFigure(
+            "Two halves", format_number(summary["two_halves"].get("ratio"), 2, "sigma"), "solved apart"
+        ),
     ]

@@ -1,4 +1,4 @@
-"""The page of an IMU's noise: Allan deviations with their fits, and the same as JSON."""
+"""Write the page of an IMU's noise: Allan deviations with their fits, and the same as JSON."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 import barsight
 from barsight.calibration.camera_imu.allan_deviation import AxisNoise, ImuNoiseFit
-from barsight.report.page import Figure, number, write_summary_page
+from barsight.report.page import KeyFigure, format_number, write_summary_page
 from barsight.report.plots import Plot
 
 UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 
 
 def imu_noise_summary(fit: ImuNoiseFit, source: str, notes: tuple[str, ...]) -> dict[str, Any]:
-    """Everything of the report as JSON values; SI units."""
+    """Collect everything of the report as JSON values; SI units."""
     keys = ("density", "walk", "instability")
     return {
         "schema": 1,
@@ -44,11 +44,15 @@ def write_imu_noise_report(
     plots = [_allan_plot("gyro", fit.axes[:3]), _allan_plot("accel", fit.axes[3:])]
     noise = fit.noise
     figures = [
-        Figure("Gyro density", f"{noise.gyro_density:.3e}", "rad/s/√Hz, noisiest axis"),
-        Figure("Gyro walk", f"{noise.gyro_walk:.3e}", "rad/s²/√Hz"),
-        Figure("Accel density", f"{noise.accel_density:.3e}", "m/s²/√Hz"),
-        Figure("Accel walk", f"{noise.accel_walk:.3e}", "m/s³/√Hz"),
-        Figure("Log", number(fit.duration_s, 0, "s"), f"{number(fit.rate_hz, 2, 'Hz')}, {fit.gaps} gaps"),
+        KeyFigure("Gyro density", f"{noise.gyro_density:.3e}", "rad/s/√Hz, noisiest axis"),
+        KeyFigure("Gyro walk", f"{noise.gyro_walk:.3e}", "rad/s²/√Hz"),
+        KeyFigure("Accel density", f"{noise.accel_density:.3e}", "m/s²/√Hz"),
+        KeyFigure("Accel walk", f"{noise.accel_walk:.3e}", "m/s³/√Hz"),
+        KeyFigure(
+            "Log",
+            format_number(fit.duration_s, 0, "s"),
+            f"{format_number(fit.rate_hz, 2, 'Hz')}, {fit.gaps} gaps",
+        ),
     ]
     write_summary_page("imu_noise_page.html.jinja", summary, figures, plots, html, data)
 

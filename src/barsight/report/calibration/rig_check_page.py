@@ -1,4 +1,6 @@
-"""The page of a check for drift: every line with its cost, the rows over the picture, depth against range."""
+"""Write the page of a check for drift: every line with its cost, the rows over the picture, depth against
+range.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +16,15 @@ from barsight.core.json_values import json_value
 from barsight.core.types import RigDrift
 from barsight.motion.rig_check.drift_check import RigCheck
 from barsight.motion.rig_check.epipolar_error import COLUMNS, ROWS, RowDrift
-from barsight.report.page import Figure, number, write_summary_page
-from barsight.report.plots import BAND_SIGMAS, Plot, numbers
+from barsight.report.page import KeyFigure, format_number, write_summary_page
+from barsight.report.plots import BAND_SIGMAS, Plot, json_numbers
 
 FARTHEST = 2.0
 """Times the working range that the plot of depth shows."""
 
 
 def rig_check_summary(check: RigCheck, source: str) -> dict[str, Any]:
-    """Everything of the report as JSON values: angles in degrees, shares in %, costs in mm."""
+    """Collect everything of the report as JSON values: angles in degrees, ratios in %, costs in mm."""
     return {
         "schema": 1,
         "software": {"name": "barsight", "version": barsight.__version__},
@@ -36,16 +38,18 @@ def rig_check_summary(check: RigCheck, source: str) -> dict[str, Any]:
 def write_rig_check_report(check: RigCheck, source: str, html: Path, data: Path) -> None:
     """Write the page to `html` and its numbers to `data`, each whole or not at all."""
     rows, summary = check.rows, rig_check_summary(check, source)
-    figures = [Figure("State", check.state)]
+    figures = [KeyFigure("State", check.state)]
     if not isinstance(rows, Failed):
         figures.append(
-            Figure("Rows", number(rows.rms_px, 3, "px"), f"{rows.matches} matches of {rows.frames} pairs")
+            KeyFigure(
+                "Rows", format_number(rows.rms_px, 3, "px"), f"{rows.matches} matches of {rows.frames} pairs"
+            )
         )
     figures += [
-        Figure(
+        KeyFigure(
             line.name.capitalize(),
-            number(line.value, 4, line.unit),
-            f"± {number(line.sigma, 4)}, {line.state}",
+            format_number(line.value, 4, line.unit),
+            f"± {format_number(line.sigma, 4)}, {line.state}",
         )
         for line in check.lines
     ]
@@ -56,14 +60,18 @@ def write_rig_check_report(check: RigCheck, source: str, html: Path, data: Path)
 
 
 def _rows_plot(rows: RowDrift, left: bool) -> Plot:
-    """How far matches lie off their rows over the picture: as seen, or what the fitted drift leaves."""
+    """Plot row errors of matches over the picture: as seen, or what the fitted drift leaves."""
     values = rows.left_px if left else rows.seen_px
     reach = float(np.nanmax(np.abs(rows.seen_px)))
     trace = {
-        "type": "heatmap", "z": [numbers(row, 4) for row in values.reshape(ROWS, COLUMNS)], "zmin": -reach,
-        "zmax": reach, "colorscale": "RdBu", "colorbar": {"title": {"text": "px"}, "thickness": 12},
+        "type": "heatmap",
+        "z": [json_numbers(row, 4) for row in values.reshape(ROWS, COLUMNS)],
+        "zmin": -reach,
+        "zmax": reach,
+        "colorscale": "RdBu",
+        "colorbar": {"title": {"text": "px"}, "thickness": 12},
         "hovertemplate": "%{z:.3f} px<extra></extra>",
-    }  # fmt: skip
+    }
     axis = {"showticklabels": False, "ticks": "", "constrain": "domain"}
     layout = {
         "xaxis": axis,
@@ -81,13 +89,28 @@ def _depth_plot(drift: RigDrift, range_m: float) -> Plot:
     reach = np.linspace(0, FARTHEST * range_m, 60)
     cost = 1e3 * np.array([drift.depth_error_m(at) for at in reach])
     band = BAND_SIGMAS * 1e3 * drift.yaw_sigma_rad * reach**2 / drift.baseline_m
-    x = numbers(np.concatenate([reach, reach[::-1]]), 3)
-    y = numbers(np.concatenate([cost - band, (cost + band)[::-1]]), 3)
+    x = json_numbers(np.concatenate([reach, reach[::-1]]), 3)
+    y = json_numbers(np.concatenate([cost - band, (cost + band)[::-1]]), 3)
     traces: list[dict[str, Any]] = [
-        {"type": "scatter", "mode": "lines", "x": x, "y": y, "fill": "toself", "hoverinfo": "skip",
-         "fillcolor": "--band", "line": {"width": 0}, "name": f"± {BAND_SIGMAS} sigma"},
-        {"type": "scatter", "mode": "lines", "x": numbers(reach, 3), "y": numbers(cost, 3), "name": "yaw",
-         "line": {"color": "--series-0", "width": 1.4}},
-    ]  # fmt: skip
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": x,
+            "y": y,
+            "fill": "toself",
+            "hoverinfo": "skip",
+            "fillcolor": "--band",
+            "line": {"width": 0},
+            "name": f"± {BAND_SIGMAS} sigma",
+        },
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": json_numbers(reach, 3),
+            "y": json_numbers(cost, 3),
+            "name": "yaw",
+            "line": {"color": "--series-0", "width": 1.4},
+        },
+    ]
     layout = {"xaxis": {"title": {"text": "range / m"}}, "yaxis": {"title": {"text": "depth error / mm"}}}
     return Plot("depth", traces, layout, 360, f"What the yaw costs; the rig measures at {range_m:.1f} m.")

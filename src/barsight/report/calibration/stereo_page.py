@@ -1,4 +1,6 @@
-"""The page of a stereo calibration: verdicts, residuals, coverage, uncertainty; and the same as JSON."""
+"""Write the page of a stereo calibration: verdicts, residuals, coverage, uncertainty; and the same
+as JSON.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,8 @@ from barsight.calibration.stereo.verdict import Assessment, tilts
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
-from barsight.report.page import Figure, number, write_summary_page
-from barsight.report.plots import Plot, numbers
+from barsight.report.page import KeyFigure, format_number, write_summary_page
+from barsight.report.plots import Plot, json_numbers
 
 SCHEMA = 1
 HEAT = [[0.0, "#f7fbff"], [0.35, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
@@ -24,7 +26,7 @@ ARROW_LENGTH_PX = 40.0
 
 
 def calibration_summary(calibration: StereoCalibration, assessment: Assessment) -> dict[str, Any]:
-    """Everything of the report as JSON values."""
+    """Collect everything of the report as JSON values."""
     cross = assessment.cross
     rig = calibration.rig
     errors = view_rms(calibration.observed, calibration.residuals_px, len(calibration.views))
@@ -102,7 +104,7 @@ def write_calibration_report(
 
 
 def calibration_plots(calibration: StereoCalibration, assessment: Assessment) -> list[Plot]:
-    """The page's figures: two per camera, then views, epipolar errors and depth."""
+    """Draw the page's figures: two per camera, then views, epipolar errors and depth."""
     plots = []
     for camera in (0, 1):
         plots += [
@@ -112,23 +114,29 @@ def calibration_plots(calibration: StereoCalibration, assessment: Assessment) ->
     return [*plots, _view_plot(calibration), _epipolar_plot(assessment), _depth_plot(assessment)]
 
 
-def _figures(summary: dict[str, Any]) -> list[Figure]:
+def _figures(summary: dict[str, Any]) -> list[KeyFigure]:
     removed = f"{len(summary['removed'])} removals"
-    sigma = number(summary["baseline_sigma_mm"], 2, "mm")
-    alone = " and ".join(number(value, 2) for value in summary["rms_alone_px"])
+    sigma = format_number(summary["baseline_sigma_mm"], 2, "mm")
+    alone = " and ".join(format_number(value, 2) for value in summary["rms_alone_px"])
     cross = summary["cross_validation"]
     return [
-        Figure("Verdict", summary["verdict"]),
-        Figure("Reprojection", number(summary["rms_px"], 3, "px"), f"each camera alone {alone} px"),
-        Figure("Baseline", number(summary["baseline_mm"], 2, "mm"), f"sigma {sigma}"),
-        Figure("Epipolar error", number(summary["epipolar_rms_px"], 3, "px"), "after rectification"),
-        Figure("Cross-validation", number(cross.get("ratio"), 2, "sigma"), "two halves solved apart"),
-        Figure("Views", str(len(summary["views"])), removed),
+        KeyFigure("Verdict", summary["verdict"]),
+        KeyFigure("Reprojection", format_number(summary["rms_px"], 3, "px"), f"each camera alone {alone} px"),
+        KeyFigure("Baseline", format_number(summary["baseline_mm"], 2, "mm"), f"sigma {sigma}"),
+        KeyFigure(
+            "Epipolar error", format_number(summary["epipolar_rms_px"], 3, "px"), "after rectification"
+        ),
+        KeyFigure(
+            "Cross-validation", format_number(cross.get("ratio"), 2, "sigma"), "two halves solved apart"
+        ),
+        KeyFigure("Views", str(len(summary["views"])), removed),
     ]
 
 
 def _residual_plot(calibration: StereoCalibration, camera: int) -> Plot:
-    """Corners over the picture with their residuals as lines: coverage and reprojection in one figure."""
+    """Draw corners over the picture with their residuals as lines: coverage and reprojection in one
+    figure.
+    """
     seen, residual = calibration.observed[camera].pixels, calibration.residuals_px[camera]
     most = 4000
     kept = np.linspace(0, len(seen) - 1, min(most, len(seen))).astype(int)
@@ -157,8 +165,8 @@ def _sigma_plot(calibration: StereoCalibration, sigma: Float64, camera: int) -> 
     grid = picture_grid(calibration, camera)
     highest = float(min(np.percentile(sigma, 95), 5 * np.median(sigma)))
     trace = {
-        "type": "heatmap", "x": numbers(grid.x_px, 1), "y": numbers(grid.y_px, 1),
-        "z": [numbers(row, 4) for row in sigma], "zmin": 0, "zmax": highest, "colorscale": HEAT,
+        "type": "heatmap", "x": json_numbers(grid.x_px, 1), "y": json_numbers(grid.y_px, 1),
+        "z": [json_numbers(row, 4) for row in sigma], "zmin": 0, "zmax": highest, "colorscale": HEAT,
         "colorbar": {"title": {"text": "px"}, "thickness": 12}, "hovertemplate": "%{z:.3f} px<extra></extra>",
     }  # fmt: skip
     layout = {**_picture_layout(calibration, camera), "showlegend": False}
@@ -186,7 +194,7 @@ def _view_plot(calibration: StereoCalibration) -> Plot:
         values = [rms(residual[view == n]) if (view == n).any() else float("nan") for n in range(len(names))]
         colour = f"--series-{camera}"
         traces.append({
-            "type": "bar", "name": f"cam{camera}", "x": names, "y": numbers(np.array(values), 4),
+            "type": "bar", "name": f"cam{camera}", "x": names, "y": json_numbers(np.array(values), 4),
             "marker": {"color": colour},
         })  # fmt: skip
     layout = {"xaxis": {"type": "category"}, "yaxis": {"title": {"text": "RMS / px"}, "rangemode": "tozero"}}
@@ -226,6 +234,6 @@ def _depth_plot(assessment: Assessment) -> Plot:
 
 def _line(name: str, x: Float64, y: Float64, colour: str) -> dict[str, Any]:
     return {
-        "type": "scatter", "mode": "lines", "name": name, "x": numbers(x, 3), "y": numbers(y, 4),
+        "type": "scatter", "mode": "lines", "name": name, "x": json_numbers(x, 3), "y": json_numbers(y, 4),
         "line": {"color": colour, "width": 1.4},
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""The page of a yard calibration: what each point is off, in plan and along the list."""
+"""Write the page of a yard calibration: each point's residual, in plan and along the list."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 import barsight
 from barsight.registration.yard import YardCalibration
-from barsight.report.page import Figure, number, write_summary_page
-from barsight.report.plots import SERIES, Plot, numbers
+from barsight.report.page import KeyFigure, format_number, write_summary_page
+from barsight.report.plots import SERIES, Plot, json_numbers
 
-ARROW_SHARE = 0.15
+ARROW_RATIO = 0.15
 """How much of the plan the longest arrow takes."""
-MOST_ROWS = 200
+MAX_ROWS = 200
 
 
 def write_yard_report(found: YardCalibration, verdict: str, source: str, html: Path, data: Path) -> None:
@@ -39,17 +39,19 @@ def write_yard_report(found: YardCalibration, verdict: str, source: str, html: P
             for name, check, off, sigma in zip(
                 found.names, found.checks.tolist(), found.off_m, found.sigma_m, strict=True
             )
-        ][:MOST_ROWS],
+        ][:MAX_ROWS],
     }  # fmt: skip
     figures = [
-        Figure("Verdict", verdict),
-        Figure("Turned to", f"± {number(found.turn_sigma_deg, 4, 'deg')}", "one sigma, worst axis"),
-        Figure("Placed to", f"± {number(1e3 * found.place_sigma_m, 1, 'mm')}", "one sigma, worst axis"),
-        Figure("Points off", number(1e3 * rms, 1, "mm"), "RMS of their distances"),
-        Figure(
+        KeyFigure("Verdict", verdict),
+        KeyFigure("Turned to", f"± {format_number(found.turn_sigma_deg, 4, 'deg')}", "one sigma, worst axis"),
+        KeyFigure(
+            "Placed to", f"± {format_number(1e3 * found.place_sigma_m, 1, 'mm')}", "one sigma, worst axis"
+        ),
+        KeyFigure("Points off", format_number(1e3 * rms, 1, "mm"), "RMS of their distances"),
+        KeyFigure(
             "Scale",
-            number(found.alignment.scale, 5),
-            f"± {number(found.alignment.scale_sigma, 5)}, not applied",
+            format_number(found.alignment.scale, 5),
+            f"± {format_number(found.alignment.scale_sigma, 5)}, not applied",
         ),
     ]
     plots = [_plan(found), _axes(found)]
@@ -59,21 +61,27 @@ def write_yard_report(found: YardCalibration, verdict: str, source: str, html: P
 def _plan(found: YardCalibration) -> Plot:
     yard_m = found.yard_m
     longest = max(float(np.linalg.norm(found.off_m[:, :2], axis=1).max()), 1e-9)
-    gain = float(f"{ARROW_SHARE * float(np.ptp(yard_m[:, :2], axis=0).max()) / longest:.1g}")
+    gain = float(f"{ARROW_RATIO * float(np.ptp(yard_m[:, :2], axis=0).max()) / longest:.1g}")
     ends = yard_m + gain * found.off_m
     gap = np.full(len(yard_m), np.nan)
     x, y = (np.column_stack([yard_m[:, k], ends[:, k], gap]).ravel() for k in (0, 1))
     traces: list[dict[str, Any]] = [
-        {"type": "scatter", "mode": "lines", "x": numbers(x, 4), "y": numbers(y, 4), "name": "off",
+        {"type": "scatter", "mode": "lines", "x": json_numbers(x, 4), "y": json_numbers(y, 4), "name": "off",
          "line": {"color": "--series-1", "width": 1.2}, "hoverinfo": "skip"}
     ]  # fmt: skip
     for kind, chosen, symbol in (("target", ~found.checks, "circle"), ("check", found.checks, "diamond")):
         if chosen.any():
-            traces.append({
-                "type": "scatter", "mode": "markers", "name": kind, "x": numbers(yard_m[chosen, 0], 4),
-                "y": numbers(yard_m[chosen, 1], 4), "text": [found.names[k] for k in np.flatnonzero(chosen)],
-                "marker": {"color": "--series-0", "size": 6, "symbol": symbol},
-            })  # fmt: skip
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": kind,
+                    "x": json_numbers(yard_m[chosen, 0], 4),
+                    "y": json_numbers(yard_m[chosen, 1], 4),
+                    "text": [found.names[k] for k in np.flatnonzero(chosen)],
+                    "marker": {"color": "--series-0", "size": 6, "symbol": symbol},
+                }
+            )
     layout = {
         "xaxis": {"title": {"text": "yard x / m"}, "constrain": "domain"},
         "yaxis": {"title": {"text": "yard y / m"}, "scaleanchor": "x"},
@@ -86,7 +94,7 @@ def _plan(found: YardCalibration) -> Plot:
 def _axes(found: YardCalibration) -> Plot:
     order, off_mm = list(range(len(found.names))), 1e3 * found.off_m
     traces: list[dict[str, Any]] = [
-        {"type": "scatter", "mode": "markers", "name": axis, "x": order, "y": numbers(off_mm[:, k], 2),
+        {"type": "scatter", "mode": "markers", "name": axis, "x": order, "y": json_numbers(off_mm[:, k], 2),
          "marker": {"color": SERIES[k], "size": 5}}
         for k, axis in enumerate("xyz")
     ]  # fmt: skip

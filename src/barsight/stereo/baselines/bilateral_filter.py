@@ -1,4 +1,4 @@
-"""Bilateral filtering of the cost space min(T, (d - D)^2), without the cost space [paper Eq. 5, Figure 2].
+"""Filter the cost space min(T, (d - D)^2) bilaterally, without the cost space [paper Eq. 5, Figure 2].
 
 A pixel's filtered cost at d is the weighted mean over its window. A neighbour q whose D_q is further than
 sqrt(T) from d adds T and nothing else, so C(d) = T - sum w_q max(0, T - (d - D_q)^2) / sum w_q: only the
@@ -30,7 +30,7 @@ def bilateral_update(
     sigma_px: float,
     sigma_gray: float,
 ) -> Float32:
-    """One round: cost space from (H, W) disparity_px, filtered, winner, parabola. (H, W) float32.
+    """Run one round: cost space from (H, W) disparity_px, filtered, winner, parabola. (H, W) float32.
 
     limit: T in px squared. Weights are exp(-(r / sigma_px)^2 / 2 - (gray difference / sigma_gray)^2 / 2).
     A neighbour without disparity (NaN) adds the same to all candidates; NaN where no neighbour has one.
@@ -68,7 +68,7 @@ def bilateral_update(
 def _weighted_means(
     values: Float32, present: Float32, grays: UInt8, near: Float32, alike: Float32, means: Float32
 ) -> None:
-    """The weighted mean of the window's known values; NaN (0 / 0) where there is none."""
+    """Average the window's known values, weighted; NaN (0 / 0) where there is none."""
     height, width = means.shape
     side = near.shape[0]
     radius = side // 2
@@ -125,7 +125,7 @@ def _compete_at_edges(
     count: int,
     updated: Float32,
 ) -> None:
-    """Where the window's values are spread wider, let the candidates that the truncation leaves compete.
+    """Search the candidates that the truncation leaves where the window's values are spread wider.
 
     A neighbour's credit w (T - (d - D)^2) is a polynomial in d between its two ends: its three coefficients
     are added where it begins and taken off where it ends, and running sums over d give all credits.
@@ -168,9 +168,9 @@ def _compete_at_edges(
 
 @kernel()
 def _is_one_parabola(lowest: float, highest: float, mean: float, reach: float) -> bool:
-    """Whether the winner is the whole candidate nearest to the mean and no truncation touches it nor its
-    neighbours. With all values within `reach` of one another, the credits are those of the parabola at every
-    candidate between them and fall outside.
+    """Check whether the winner is the whole candidate nearest to the mean and no truncation touches it nor
+    its neighbours. With all values within `reach` of one another, the credits are those of the parabola at
+    every candidate between them and fall outside.
     """
     winner = np.rint(mean)
     near_enough = winner + 1 - lowest <= reach and highest - winner + 1 <= reach
@@ -179,7 +179,7 @@ def _is_one_parabola(lowest: float, highest: float, mean: float, reach: float) -
 
 @kernel()
 def _run_up(starts: Float64, credit: Float64, begin: int, end: int) -> None:
-    """The credits of begin...end out of the coefficients' changes, which are zero afterwards."""
+    """Integrate the credits of begin...end from the coefficients' changes, which are zero afterwards."""
     level, slope, bend = 0.0, 0.0, 0.0
     for index in range(end - begin):
         level += starts[index, 0]
@@ -192,7 +192,7 @@ def _run_up(starts: Float64, credit: Float64, begin: int, end: int) -> None:
 
 @kernel()
 def _best_place(credit: Float64, begin: int, end: int) -> np.float32:
-    """The highest credit's index and the parabola through it and its neighbours [paper Eq. 4]."""
+    """Find the highest credit's index and the parabola through it and its neighbours [paper Eq. 4]."""
     best = begin
     for index in range(begin, end):
         if credit[index] > credit[best]:

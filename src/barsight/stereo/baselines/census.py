@@ -1,4 +1,4 @@
-"""Improved Census with outlier elimination, in the way of [Peng, Han, Tang, Shang, Yu 2017].
+"""Match by improved Census with outlier elimination, in the way of [Peng, Han, Tang, Shang, Yu 2017].
 
 A noise-tolerant Census against a weighted mean, aggregation over cross-shaped regions, winner takes all,
 left-right check, region voting on what fails it, filling with a weighted median, a parabola below a pixel.
@@ -16,8 +16,18 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.census_transform import census_codes, census_cost
 from barsight.stereo.baselines.cross_aggregation import CrossRegions, cross_filter, cross_regions
-from barsight.stereo.baselines.left_right_check import agreement, filled_from_behind, weighted_median
-from barsight.stereo.baselines.postprocessing import OutputSettings, assemble, fits, mirrored_pair, nothing
+from barsight.stereo.baselines.left_right_check import (
+    fill_from_background,
+    left_right_agreement,
+    weighted_median,
+)
+from barsight.stereo.baselines.postprocessing import (
+    OutputSettings,
+    assemble_disparity,
+    mirror_pair,
+    no_match,
+    overlaps_image,
+)
 from barsight.stereo.baselines.region_voting import region_vote
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
 from barsight.stereo.noise import has_texture, image_noise
@@ -44,9 +54,9 @@ class CensusSettings:
     """Gray difference that ends a long arm."""
     rounds: int = 2
     """Rounds of aggregation."""
-    fewest_votes: int = 20
+    min_votes: int = 20
     """An outlier's region votes when it has more reliable pixels than this."""
-    vote_share: float = 0.4
+    min_vote_ratio: float = 0.4
     """The winning disparity needs more than this share of the votes."""
     vote_rounds: int = 5
     """Rounds of voting."""
@@ -61,8 +71,8 @@ class CensusSettings:
             )
         if not 0 < self.short_arm_px <= self.long_arm_px or self.long_arm_px > 1000:
             raise ConfigError("census needs 0 < short_arm_px <= long_arm_px <= 1000")
-        if self.loose_gray < 0 or self.tight_gray < 0 or not 0 <= self.vote_share <= 1:
-            raise ConfigError("census's gray limits can't be negative, vote_share must lie in 0...1")
+        if self.loose_gray < 0 or self.tight_gray < 0 or not 0 <= self.min_vote_ratio <= 1:
+            raise ConfigError("census's gray limits can't be negative, min_vote_ratio must lie in 0...1")
 
 
 @dataclass(frozen=True)
@@ -72,40 +82,40 @@ class Census:
     settings: CensusSettings
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`."""
+        """Match; see `StereoMethod`."""
         settings = self.settings
-        if not has_texture(pair) or not fits(candidates, pair.left.shape[1]):
-            return nothing(pair)
+        if not has_texture(pair) or not overlaps_image(candidates, pair.left.shape[1]):
+            return no_match(pair)
         tolerance = settings.tolerance_sigmas * image_noise(pair.left)
         regions = _regions(pair, settings)
         winners = census_winners(pair, regions, candidates, tolerance, settings.rounds)
-        mirror = mirrored_pair(pair)
+        mirror = mirror_pair(pair)
         mirrored = census_winners(mirror, _regions(mirror, settings), candidates, tolerance, settings.rounds)
         right = np.ascontiguousarray(mirrored.candidate_px[:, ::-1])
-        matched = agreement(winners.candidate_px, right, tolerance_px=1)
+        matched = left_right_agreement(winners.candidate_px, right, tolerance_px=1)
         voted, reliable = region_vote(
             winners.candidate_px,
             matched,
             regions,
-            settings.fewest_votes,
-            settings.vote_share,
+            settings.min_votes,
+            settings.min_vote_ratio,
             settings.vote_rounds,
         )
         chosen = weighted_median(
-            filled_from_behind(voted, reliable),
+            fill_from_background(voted, reliable),
             pair.left,
             ~reliable,
             _MEDIAN_RADIUS_PX,
             _MEDIAN_SIGMA_PX,
             _MEDIAN_SIGMA_GRAY,
         )
-        return assemble(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+        return assemble_disparity(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
 
 
 def census_winners(
     pair: RectifiedPair, regions: CrossRegions, candidates: DisparityRange, tolerance: float, rounds: int
 ) -> Winners:
-    """The left image's winners; tolerance in gray levels."""
+    """Select the left image's winners; tolerance in gray levels."""
     left, right = census_codes(pair.left, tolerance), census_codes(pair.right, tolerance)
     aggregate = cross_filter(regions, rounds)
 

@@ -1,4 +1,4 @@
-"""A Census transform that bears noise, and its Hamming distance as a matching cost [Peng et al. 2017].
+"""Compute a noise-tolerant Census transform and its Hamming distance as a matching cost [Peng et al. 2017].
 
 The neighbours are compared with a weighted mean of the 3x3 pixels in the middle instead of the middle pixel,
 and within a tolerance they count as equal: each of the 62 neighbours of the 9x7 window gives two bits,
@@ -20,7 +20,8 @@ WORST = 2 * (WIDTH_PX * HEIGHT_PX - 1)
 
 
 def census_codes(image: UInt8, tolerance: float) -> UInt64:
-    """(2, H, W) uint64: the bits `brighter` and `darker` of each pixel's window, replicated at the border.
+    """Encode (2, H, W) uint64: the bits `brighter` and `darker` of each pixel's window, replicated at the
+    border.
 
     tolerance: in gray levels; a neighbour differs when it is further than that from the reference.
     """
@@ -44,7 +45,7 @@ def census_cost(
 
 @kernel()
 def _ones(word: np.uint64) -> np.uint64:
-    """The number of set bits: by twos, fours and bytes, the bytes added up by a product [Warren 2012]."""
+    """Count set bits: by twos, fours and bytes, the bytes added up by a product [Warren 2012]."""
     pairs = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     fours = (pairs & np.uint64(0x3333333333333333)) + (
         (pairs >> np.uint64(2)) & np.uint64(0x3333333333333333)

@@ -1,4 +1,4 @@
-"""Cross-shaped supports and the mean cost over them [Zhang 2009, Mei 2011].
+"""Build cross-shaped supports and average the cost over them [Zhang 2009, Mei 2011].
 
 Each pixel has four arms that end where the gray value leaves the pixel's own; its region is the union of the
 horizontal arms of all pixels on its vertical arms (or the other way round).
@@ -43,7 +43,7 @@ class CrossFilter:
 
 
 def cross_filter(regions: CrossRegions, rounds: int) -> CrossFilter:
-    """The aggregation over `regions`."""
+    """Make the aggregation over `regions`."""
     sizes = np.ones((2, *regions.arms.shape[1:]), dtype=np.float32)
     total = np.empty((sizes.shape[1] + 1, sizes.shape[2]), dtype=np.float32)
     _along_rows(sizes[0], regions.arms)
@@ -56,8 +56,9 @@ def cross_filter(regions: CrossRegions, rounds: int) -> CrossFilter:
 def cross_regions(
     guide: UInt8, long_px: int, short_px: int, loose_gray: int, tight_gray: int
 ) -> CrossRegions:
-    """Arms up to long_px while the gray value stays within loose_gray of the pixel and of the one before,
-    beyond short_px within tight_gray of the pixel [Mei 2011, section 3.2]. An arm is one pixel long at least.
+    """Grow arms up to long_px while the gray value stays within loose_gray of the pixel and of the one
+    before, beyond short_px within tight_gray of the pixel [Mei 2011, section 3.2]. An arm is one pixel long
+    at least.
     """
     arms = np.zeros((4, *guide.shape), dtype=np.int16)
     _grow(guide, long_px, short_px, loose_gray, tight_gray, arms)
@@ -103,7 +104,7 @@ def _aggregate(slices: Float32, arms: Arms, shares: Float32, rounds: int) -> Non
 
 @kernel(fastmath=True)
 def _along_rows(cost: Float32, arms: Arms) -> None:
-    """Sums over the horizontal arms, in place."""
+    """Sum over the horizontal arms, in place."""
     height, width = cost.shape
     total = np.zeros(width + 1, dtype=np.float32)
     for row in range(height):
@@ -116,7 +117,7 @@ def _along_rows(cost: Float32, arms: Arms) -> None:
 
 @kernel(fastmath=True)
 def _along_columns(cost: Float32, arms: Arms, total: Float32) -> None:
-    """Sums over the vertical arms, in place. total: (H + 1, W) scratch."""
+    """Sum over the vertical arms, in place. total: (H + 1, W) scratch."""
     height, width = cost.shape
     total[0] = 0
     for row in range(height):

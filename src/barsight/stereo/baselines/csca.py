@@ -1,4 +1,4 @@
-"""Cross-scale cost aggregation [Zhang, Fang, Min, Sun, Yang, Yan, Tian, CVPR 2014].
+"""Aggregate costs across scales [Zhang, Fang, Min, Sun, Yang, Yan, Tian, CVPR 2014].
 
 Costs are aggregated at each scale of a pyramid on their own, then tied: the costs z_s of one place at the
 scales s minimise sum_s |z_s - a_s|^2 + lambda sum_s |z_s - z_(s-1)|^2, a tridiagonal system; the first row of
@@ -30,8 +30,18 @@ from barsight.stereo.baselines.gradient_cost import (
     gradient_cost,
 )
 from barsight.stereo.baselines.guided_filter import colour_guided_filter, guided_filter
-from barsight.stereo.baselines.left_right_check import agreement, filled_from_behind, weighted_median
-from barsight.stereo.baselines.postprocessing import OutputSettings, assemble, fits, mirrored_pair, nothing
+from barsight.stereo.baselines.left_right_check import (
+    fill_from_background,
+    left_right_agreement,
+    weighted_median,
+)
+from barsight.stereo.baselines.postprocessing import (
+    OutputSettings,
+    assemble_disparity,
+    mirror_pair,
+    no_match,
+    overlaps_image,
+)
 from barsight.stereo.baselines.spanning_tree import spanning_tree, tree_filter
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
 from barsight.stereo.noise import has_texture
@@ -42,7 +52,7 @@ _SUPPORT_RADIUS_PX = 4
 
 @dataclass(frozen=True)
 class CscaSettings:
-    """Cross-scale cost aggregation."""
+    """Settings of cross-scale cost aggregation."""
 
     aggregation: Literal["guided", "tree"] = "guided"
     """How each scale's costs are aggregated."""
@@ -83,27 +93,29 @@ class Csca:
     settings: CscaSettings
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`."""
+        """Match; see `StereoMethod`."""
         settings = self.settings
-        if not has_texture(pair) or not fits(candidates, pair.left.shape[1]):
-            return nothing(pair)
+        if not has_texture(pair) or not overlaps_image(candidates, pair.left.shape[1]):
+            return no_match(pair)
         winners = cross_scale_winners(pair, candidates, settings)
-        mirrored = cross_scale_winners(mirrored_pair(pair), candidates, settings)
+        mirrored = cross_scale_winners(mirror_pair(pair), candidates, settings)
         right = np.ascontiguousarray(mirrored.candidate_px[:, ::-1])
-        matched = agreement(winners.candidate_px, right)
+        matched = left_right_agreement(winners.candidate_px, right)
         chosen = weighted_median(
-            filled_from_behind(winners.candidate_px, matched),
+            fill_from_background(winners.candidate_px, matched),
             pair.left,
             ~matched,
             settings.median_radius_px,
             settings.median_sigma_px,
             settings.median_sigma_gray,
         )
-        return assemble(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+        return assemble_disparity(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
 
 
 def scale_weights(scales: int, regulariser: float) -> Float64:
-    """(scales,) the weight of each scale's cost in the finest's: the inverse's first row [Zhang, Eq. 12]."""
+    """Compute the weight (scales,) of each scale's cost in the finest's: the inverse's first row [Zhang, Eq.
+    12].
+    """
     system = np.eye(scales)
     for scale in range(scales - 1):
         system[scale : scale + 2, scale : scale + 2] += regulariser * np.array([[1, -1], [-1, 1]])
@@ -112,7 +124,7 @@ def scale_weights(scales: int, regulariser: float) -> Float64:
 
 
 def cross_scale_winners(pair: RectifiedPair, candidates: DisparityRange, settings: CscaSettings) -> Winners:
-    """The left image's winners on the tied costs."""
+    """Select the left image's winners on the tied costs."""
     pyramid = _pyramid(pair, candidates, settings.scales)
     weights = scale_weights(len(pyramid), settings.regulariser).astype(np.float32)
     tied: _Scale | None = None
@@ -144,7 +156,7 @@ class _Scale:
 
 
 def _pyramid(pair: RectifiedPair, candidates: DisparityRange, scales: int) -> list[_Scale]:
-    """The finest first, without costs."""
+    """Build the pyramid, the finest first, without costs."""
     images = cost_images(
         pair.left.astype(np.float32), pair.right.astype(np.float32), pair.left_valid, pair.right_valid
     )
@@ -172,7 +184,8 @@ def _aggregation(scale: _Scale, settings: CscaSettings) -> Callable[[Float32], F
 
 
 def _tie(slices: Float32, weight: float, lowest_px: int, coarser: _Scale | None) -> None:
-    """slices = weight * slices + the coarser scale's tied costs at half the place and half the candidate.
+    """Combine slices = weight * slices + the coarser scale's tied costs at half the place and half the
+    candidate.
 
     An odd candidate takes the mean of its two neighbours there. The authors' program rounds it up instead,
     which moves all disparities below a pixel by about -0.12 px.

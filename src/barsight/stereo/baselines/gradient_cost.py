@@ -1,4 +1,4 @@
-"""Truncated differences of gray value and of horizontal gradient as a matching cost [Hosni 2013, Zhang 2014].
+"""Compute truncated differences of gray and horizontal gradient as a matching cost [Hosni 2013, Zhang 2014].
 
 Costs are laid out candidate by candidate, (K, H, W) float32: aggregation works slice by slice.
 """
@@ -16,9 +16,9 @@ from barsight.core.errors import ConfigError
 
 @dataclass(frozen=True)
 class GradientCostSettings:
-    """The cost of one pixel against another."""
+    """Settings of the cost of one pixel against another."""
 
-    gray_share: float = 0.11
+    gray_weight: float = 0.11
     """Weight of the gray difference; the rest is the gradient's."""
     gray_limit: float = 7.0
     """Gray differences count up to this."""
@@ -26,20 +26,20 @@ class GradientCostSettings:
     """Differences of the gradient, next pixel minus previous, count up to this."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.gray_share <= 1:
-            raise ConfigError(f"gray_share must lie in 0...1, not {self.gray_share}")
+        if not 0 <= self.gray_weight <= 1:
+            raise ConfigError(f"gray_weight must lie in 0...1, not {self.gray_weight}")
         if self.gray_limit <= 0 or self.gradient_limit <= 0:
             raise ConfigError("gray_limit and gradient_limit must be positive")
 
     @property
     def worst(self) -> float:
-        """The cost where both differences are truncated, or nothing can be compared."""
-        return self.gray_share * self.gray_limit + (1 - self.gray_share) * self.gradient_limit
+        """Return the cost where both differences are truncated, or nothing can be compared."""
+        return self.gray_weight * self.gray_limit + (1 - self.gray_weight) * self.gradient_limit
 
 
 @dataclass(frozen=True, eq=False)
 class CostImages:
-    """What the cost compares, of one pair: gray and gradient (H, W) float32, valid (H, W) bool."""
+    """Inputs of the cost, of one pair: gray and gradient (H, W) float32, valid (H, W) bool."""
 
     left: Float32
     right: Float32
@@ -50,14 +50,14 @@ class CostImages:
 
 
 def cost_images(left: Float32, right: Float32, left_valid: Bool, right_valid: Bool) -> CostImages:
-    """left, right: (H, W) float32 gray values 0...255."""
+    """Prepare (H, W) float32 gray values 0...255, left and right."""
     return CostImages(
         left, right, horizontal_gradient(left), horizontal_gradient(right), left_valid, right_valid
     )
 
 
 def horizontal_gradient(image: Float32) -> Float32:
-    """(H, W) next pixel minus previous; zero in the first and last column."""
+    """Subtract the previous pixel from the next (H, W); zero in the first and last column."""
     gradient = np.zeros_like(image)
     gradient[:, 1:-1] = image[:, 2:] - image[:, :-2]
     return gradient
@@ -77,7 +77,7 @@ def gradient_cost(
         images.left_valid,
         images.right_valid,
         lowest_px,
-        np.float32(settings.gray_share),
+        np.float32(settings.gray_weight),
         np.float32(settings.gray_limit),
         np.float32(settings.gradient_limit),
         slices,

@@ -1,4 +1,4 @@
-"""The guided filter on slices of costs [He 2010]: a local linear model of the cost in the image.
+"""Filter slices of costs by the guided filter [He 2010]: a local linear model of the cost in the image.
 
 The gray guide's is our own, four times as fast as OpenCV's; the colour guide's is OpenCV's. With ours each
 slice is filtered in one sweep over its rows with ring buffers of 2 r + 1 rows, which stay in the cache.
@@ -36,7 +36,7 @@ class GuidedFilter:
 
 
 def guided_filter(guide: Float32, radius_px: int, epsilon: float) -> GuidedFilter:
-    """The filter for one image. epsilon: in the guide's units squared; smaller keeps weaker edges."""
+    """Make the filter for one image. epsilon: in the guide's units squared; smaller keeps weaker edges."""
     mean = box_mean(guide, radius_px)
     variance = box_mean(guide * guide, radius_px) - mean * mean
     inverse = 1 / (variance.clip(0, None) + epsilon)
@@ -44,7 +44,7 @@ def guided_filter(guide: Float32, radius_px: int, epsilon: float) -> GuidedFilte
 
 
 def colour_guided_filter(guide: Float32, radius_px: int, epsilon: float) -> Callable[[Float32], Float32]:
-    """The same for a guide in colour, (H, W, 3) float32."""
+    """Make the filter for a guide in colour, (H, W, 3) float32."""
     one = cv2.ximgproc.createGuidedFilter(guide, radius_px, epsilon)
 
     def filtered(slices: Float32) -> Float32:
@@ -56,7 +56,7 @@ def colour_guided_filter(guide: Float32, radius_px: int, epsilon: float) -> Call
 
 
 def box_mean(image: Float32, radius_px: int) -> Float64:
-    """(H, W) float64 means over the windows of 2 r + 1, cut off at the border."""
+    """Average (H, W) float64 over the windows of 2 r + 1, cut off at the border."""
     total = np.zeros((image.shape[0] + 1, image.shape[1] + 1))
     total[1:, 1:] = image.astype(np.float64).cumsum(0).cumsum(1)
     ends = [np.arange(length) for length in image.shape]
@@ -80,9 +80,9 @@ def _filter(slices: Float32, guide: Float32, mean: Float32, inverse: Float32, ra
 
 @kernel(fastmath=True)
 def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
-    """Row by row: the window sums of cost and guide * cost give the model of the row `radius` above; the
-    window sums of the models give the filtered row `radius` above that, which the ring remembers as long as
-    it is needed.
+    """Filter row by row: the window sums of cost and guide * cost give the model of the row `radius` above;
+    the window sums of cost and guide * cost give the model of the row `radius` above; the window sums of the
+    models give the filtered row `radius` above that, which the ring remembers as long as it is needed.
     """
     height, width = cost.shape
     ring = 2 * radius + 1
@@ -191,7 +191,7 @@ def _pairs(values: Float32, size: int, sums: Float32) -> None:
 
 @kernel(fastmath=True)
 def _window_sums(padded: Float32, sums: Float32, radius: int, scratch: Float32) -> None:
-    """Sums over 2 r + 1 neighbours of `padded`, which has r zeros at both ends: out of sums over 1, 2, 4...
+    """Sum over 2 r + 1 neighbours of `padded`, which has r zeros at both ends: out of sums over 1, 2, 4...
     neighbours, so that the adds are few and none waits for the one before, as in a running sum.
     """
     width = sums.shape[0]

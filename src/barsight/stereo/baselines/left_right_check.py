@@ -1,4 +1,4 @@
-"""Left-right agreement of whole disparities, and what to do where there is none [Hosni 2013]."""
+"""Check whole disparities left to right, and fill where they disagree [Hosni 2013]."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Int32, UInt8, kernel
 
 
-def agreement(left_px: Int32, right_px: Int32, tolerance_px: int = 0) -> Bool:
-    """(H, W) True where the right image's disparity at x - d is within the tolerance of the left's d.
+def left_right_agreement(left_px: Int32, right_px: Int32, tolerance_px: int = 0) -> Bool:
+    """Check (H, W) that the right image's disparity at x - d is within the tolerance of the left's d.
 
     right_px: (H, W) whole disparities of the right image (its pixel x matches the left's x + d).
     """
@@ -18,8 +18,8 @@ def agreement(left_px: Int32, right_px: Int32, tolerance_px: int = 0) -> Bool:
     return agrees
 
 
-def filled_from_behind(values: Int32, usable: Bool) -> Int32:
-    """Where not usable, the lower (further) of the nearest usable values to the left and right in the row.
+def fill_from_background(values: Int32, usable: Bool) -> Int32:
+    """Fill by the lower (further) of the nearest usable values to the left and right in the row.
 
     A row without any usable value keeps what it has.
     """
@@ -31,8 +31,8 @@ def filled_from_behind(values: Int32, usable: Bool) -> Int32:
 def weighted_median(
     values: Int32, guide: UInt8, where: Bool, radius_px: int, sigma_px: float, sigma_gray: float
 ) -> Int32:
-    """The median of the window's values where `where` is True, each weighted by exp(-(r / sigma_px)^2 -
-    (gray difference / sigma_gray)^2) [Hosni 2013]; elsewhere the values as they are.
+    """Apply the weighted median of the window's values where `where` is True, each weighted by exp(-(r /
+    sigma_px)^2 - (gray difference / sigma_gray)^2) [Hosni 2013]; elsewhere the values as they are.
     """
     lowest = int(values.min())
     count = int(values.max()) - lowest + 1

@@ -1,4 +1,4 @@
-"""Non-local cost aggregation [Yang, "A non-local cost aggregation method for stereo matching", CVPR 2012].
+"""Aggregate costs non-locally [Yang, "A non-local cost aggregation method for stereo matching", CVPR 2012].
 
 Costs are aggregated over the minimum spanning tree of the image, exactly. Where left and right agree, a
 second cost |d - D| holds the disparity D found; everywhere else it is zero, and aggregated over the same tree
@@ -18,8 +18,14 @@ from barsight.core.arrays import Bool, Float32, Int32, kernel
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.gradient_cost import GradientCostSettings, cost_images, gradient_cost
-from barsight.stereo.baselines.left_right_check import agreement
-from barsight.stereo.baselines.postprocessing import OutputSettings, assemble, fits, mirrored_pair, nothing
+from barsight.stereo.baselines.left_right_check import left_right_agreement
+from barsight.stereo.baselines.postprocessing import (
+    OutputSettings,
+    assemble_disparity,
+    mirror_pair,
+    no_match,
+    overlaps_image,
+)
 from barsight.stereo.baselines.spanning_tree import SpanningTree, spanning_tree, tree_filter
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
 from barsight.stereo.noise import has_texture
@@ -30,10 +36,10 @@ _MEDIAN_PX = 5
 
 @dataclass(frozen=True)
 class NonlocalSettings:
-    """Non-local aggregation on the spanning tree."""
+    """Settings of non-local aggregation on the spanning tree."""
 
     cost: GradientCostSettings = field(
-        default_factory=lambda: GradientCostSettings(gray_share=0.2, gray_limit=7.0, gradient_limit=4.0)
+        default_factory=lambda: GradientCostSettings(gray_weight=0.2, gray_limit=7.0, gradient_limit=4.0)
     )
     """The author's: 0.11 and 0.89, the gradient being half the difference of the next and previous pixel."""
     sigma: float = 0.1
@@ -54,27 +60,27 @@ class Nonlocal:
     settings: NonlocalSettings
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`."""
+        """Match; see `StereoMethod`."""
         settings = self.settings
-        if not has_texture(pair) or not fits(candidates, pair.left.shape[1]):
-            return nothing(pair)
+        if not has_texture(pair) or not overlaps_image(candidates, pair.left.shape[1]):
+            return no_match(pair)
         tree = spanning_tree(pair.left)
         winners = tree_winners(pair, tree, candidates, settings)
-        mirror = mirrored_pair(pair)
+        mirror = mirror_pair(pair)
         mirrored = tree_winners(mirror, spanning_tree(mirror.left), candidates, settings)
         smooth = _median(winners.candidate_px)
         right = _median(np.ascontiguousarray(mirrored.candidate_px[:, ::-1]))
-        matched = agreement(smooth, right)
-        chosen = _median(refined(smooth, matched, tree, candidates, settings.sigma * 255 / 2))
+        matched = left_right_agreement(smooth, right)
+        chosen = _median(refine_nonlocal(smooth, matched, tree, candidates, settings.sigma * 255 / 2))
         # A pixel is as sure as a match only where refinement has left what both images agreed on.
         matched &= chosen == smooth
-        return assemble(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+        return assemble_disparity(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
 
 
 def tree_winners(
     pair: RectifiedPair, tree: SpanningTree, candidates: DisparityRange, settings: NonlocalSettings
 ) -> Winners:
-    """The left image's winners on the aggregated costs."""
+    """Select the left image's winners on the aggregated costs."""
     images = cost_images(
         pair.left.astype(np.float32), pair.right.astype(np.float32), pair.left_valid, pair.right_valid
     )
@@ -87,10 +93,10 @@ def tree_winners(
     return sweep(pair.left.shape, candidates, fill)
 
 
-def refined(
+def refine_nonlocal(
     values: Int32, matched: Bool, tree: SpanningTree, candidates: DisparityRange, sigma_gray: float
 ) -> Int32:
-    """The non-local refinement: each pixel's weighted median of the matched values over the tree, whole."""
+    """Refine non-locally: each pixel's weighted median of the matched values over the tree, whole."""
     aggregate = tree_filter(tree, sigma_gray)
 
     def fill(lowest_px: int, slices: Float32) -> None:
@@ -101,7 +107,7 @@ def refined(
 
 
 def _median(values: Int32) -> Int32:
-    """Of 5x5 pixels; OpenCV's takes up to 32 bits of float there."""
+    """Apply a 5x5 median; OpenCV's takes up to 32 bits of float there."""
     median: Int32 = np.rint(cv2.medianBlur(values.astype(np.float32), _MEDIAN_PX)).astype(np.int32)
     return median
 

@@ -1,4 +1,4 @@
-"""The paper's method, literally [paper Figure 2, Eq. 4, Eq. 5; the loop is Yang, CVPR 2007].
+"""Match by the paper's method, literally [paper Figure 2, Eq. 4, Eq. 5; the loop is Yang, CVPR 2007].
 
 An initial disparity D makes a cost space C(d) = min(eta L, (d - D)^2); the cost space is filtered
 bilaterally, guided by the image; the winner takes all and the parabola through its neighbours gives a new D,
@@ -18,18 +18,18 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.bilateral_filter import bilateral_update
 from barsight.stereo.baselines.census import Census, CensusSettings
-from barsight.stereo.baselines.postprocessing import OutputSettings, fits, nothing
+from barsight.stereo.baselines.postprocessing import OutputSettings, no_match, overlaps_image
 from barsight.stereo.noise import has_texture, noise_sigma
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 _SUPPORT_RADIUS_PX = 4
-_SETTLED_SHARE = 0.95
+_SETTLED_RATIO = 0.95
 _NARROWEST_PX = 16  # OpenCV rounds the candidates up to so many.
 
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """The paper's loop."""
+    """Settings of the paper's loop."""
 
     initial: Literal["sgbm", "census"] = "sgbm"
     """What makes the first disparity."""
@@ -43,7 +43,7 @@ class PaperSettings:
     """How fast its weights fall with the distance."""
     sigma_gray: float = 10.0
     """How fast its weights fall with the gray difference."""
-    most_rounds: int = 3
+    max_rounds: int = 3
     """The loop ends after this many rounds at the latest."""
     settled_px: float = 0.05
     """It has settled when 95 % of the disparities change by less than this."""
@@ -55,8 +55,8 @@ class PaperSettings:
     def __post_init__(self) -> None:
         if self.eta <= 0 or self.sigma_px <= 0 or self.sigma_gray <= 0 or self.settled_px <= 0:
             raise ConfigError("the paper's eta, sigmas and settled_px must be positive")
-        if self.radius_px < 1 or self.most_rounds < 1:
-            raise ConfigError("the paper's loop needs a radius_px and most_rounds of 1 or more")
+        if self.radius_px < 1 or self.max_rounds < 1:
+            raise ConfigError("the paper's loop needs a radius_px and max_rounds of 1 or more")
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,15 @@ class Paper:
     settings: PaperSettings
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`. Without `output.fill`, NaN where the initial disparity has none."""
+        """Match; see `StereoMethod`. Without `output.fill`, NaN where the initial disparity has none."""
         settings = self.settings
         width = pair.left.shape[1]
         too_narrow = width + min(candidates.lowest_px, 0) <= _NARROWEST_PX
-        if not has_texture(pair) or not fits(candidates, width) or too_narrow:
-            return nothing(pair)
+        if not has_texture(pair) or not overlaps_image(candidates, width) or too_narrow:
+            return no_match(pair)
         start: Sgbm | Census = Sgbm(settings.sgbm) if settings.initial == "sgbm" else Census(settings.census)
         initial = start(pair, candidates)
-        values = settle(pair, initial.disparity_px, candidates, settings)
+        values = iterate_bilateral(pair, initial.disparity_px, candidates, settings)
         matched = np.isfinite(initial.disparity_px)
         output = settings.output
         sigma = np.hypot(noise_sigma(pair.left, _SUPPORT_RADIUS_PX), np.float32(output.subpixel_sigma_px))
@@ -87,19 +87,19 @@ class Paper:
         return Disparity(values, sigma)
 
 
-def settle(
+def iterate_bilateral(
     pair: RectifiedPair, initial_px: Float32, candidates: DisparityRange, settings: PaperSettings
 ) -> Float32:
-    """(H, W) float32: rounds of `bilateral_update` until few disparities move or `most_rounds` are done."""
+    """Iterate (H, W) float32 `bilateral_update` until few disparities move or `max_rounds` are done."""
     limit = settings.eta * candidates.count
     values = initial_px
-    for _ in range(settings.most_rounds):
+    for _ in range(settings.max_rounds):
         before = values
         values = bilateral_update(
             values, pair.left, candidates, limit, settings.radius_px, settings.sigma_px, settings.sigma_gray
         )
         known = np.isfinite(before)
         still = np.abs(values[known] - before[known]) < settings.settled_px
-        if np.count_nonzero(still) >= _SETTLED_SHARE * still.size:
+        if np.count_nonzero(still) >= _SETTLED_RATIO * still.size:
             break
     return values

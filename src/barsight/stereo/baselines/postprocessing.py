@@ -1,4 +1,4 @@
-"""From whole winners to `Disparity`: what the peers' pipelines have in common at their end."""
+"""Assemble `Disparity` from whole winners: the common end of the peers' pipelines."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Int32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
-from barsight.stereo.baselines.winner_takes_all import Winners, between_candidates
+from barsight.stereo.baselines.winner_takes_all import Winners, subpixel_winners
 from barsight.stereo.noise import noise_sigma
 
-_LEAST_RELIABLE = 0.01
+_MIN_RELIABLE = 0.01
 
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What comes out of a method, and how sure it says to be.
+    """Settings of a method's output and its sigma.
 
     Each method has its own sigmas, measured on Middlebury's motorcycle as what 68 % of the errors stay below.
     """
@@ -35,7 +35,7 @@ class OutputSettings:
             raise ConfigError("sigmas can't be negative")
 
 
-def assemble(
+def assemble_disparity(
     pair: RectifiedPair,
     winners: Winners,
     chosen_px: Int32,
@@ -43,16 +43,17 @@ def assemble(
     radius_px: int,
     settings: OutputSettings,
 ) -> Disparity:
-    """chosen_px: (H, W) whole disparities after post-processing. matched: where left and right agree.
+    """Assemble. chosen_px: (H, W) whole disparities after post-processing. matched: where left and right
+    agree.
 
     Matched pixels that kept their winner get the parabola's disparity, the rest stays whole or NaN. sigma is
     the noise's bound over a window of radius_px together with the settings' constant.
     """
-    matched = matched & lands_on_valid(chosen_px, pair)
-    if matched.sum() < _LEAST_RELIABLE * matched.size:
-        return nothing(pair)
+    matched = matched & hits_valid_pixel(chosen_px, pair)
+    if matched.sum() < _MIN_RELIABLE * matched.size:
+        return no_match(pair)
     kept = matched & (chosen_px == winners.candidate_px)
-    disparity = np.where(kept, between_candidates(winners), chosen_px.astype(np.float32))
+    disparity = np.where(kept, subpixel_winners(winners), chosen_px.astype(np.float32))
     sigma = np.hypot(noise_sigma(pair.left, radius_px), np.float32(settings.subpixel_sigma_px))
     sigma = np.where(matched, sigma, np.float32(settings.filled_sigma_px)).astype(np.float32)
     missing = ~pair.left_valid if settings.fill else ~(pair.left_valid & matched)
@@ -61,14 +62,14 @@ def assemble(
     return Disparity(disparity.astype(np.float32), sigma)
 
 
-def nothing(pair: RectifiedPair) -> Disparity:
-    """No match anywhere."""
+def no_match(pair: RectifiedPair) -> Disparity:
+    """Return a disparity without any match."""
     empty: Float32 = np.full(pair.left.shape, np.nan, dtype=np.float32)
     return Disparity(empty, empty.copy())
 
 
-def lands_on_valid(disparity_px: Int32, pair: RectifiedPair) -> Bool:
-    """(H, W) True where x - d is a valid pixel of the right image."""
+def hits_valid_pixel(disparity_px: Int32, pair: RectifiedPair) -> Bool:
+    """Check (H, W) whether x - d is a valid pixel of the right image."""
     width = disparity_px.shape[1]
     there = np.arange(width, dtype=np.int32)[None, :] - disparity_px
     inside = (there >= 0) & (there < width)
@@ -76,8 +77,8 @@ def lands_on_valid(disparity_px: Int32, pair: RectifiedPair) -> Bool:
     return landed
 
 
-def mirrored_pair(pair: RectifiedPair) -> RectifiedPair:
-    """Right for left as in a mirror: its left disparities are the pair's right ones, mirrored."""
+def mirror_pair(pair: RectifiedPair) -> RectifiedPair:
+    """Swap and mirror the pair: its left disparities are the pair's right ones, mirrored."""
 
     def mirrored(image: UInt8) -> UInt8:
         return np.ascontiguousarray(image[:, ::-1])
@@ -94,6 +95,6 @@ def mirrored_pair(pair: RectifiedPair) -> RectifiedPair:
     )
 
 
-def fits(candidates: DisparityRange, width: int) -> bool:
-    """Whether any candidate leaves an overlap of the two images."""
+def overlaps_image(candidates: DisparityRange, width: int) -> bool:
+    """Check whether any candidate leaves an overlap of the two images."""
     return candidates.lowest_px < width and candidates.highest_px > -width

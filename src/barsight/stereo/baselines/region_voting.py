@@ -1,4 +1,4 @@
-"""Elimination of outliers in a map of whole disparities: region voting [Mei 2011, Peng 2017]."""
+"""Eliminate outliers of whole disparities by region voting [Mei 2011, Peng 2017]."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from barsight.stereo.baselines.cross_aggregation import Arms, CrossRegions
 def region_vote(
     values: Int32, reliable: Bool, regions: CrossRegions, fewest: int, share: float, rounds: int
 ) -> tuple[Int32, Bool]:
-    """Outliers take the commonest of the reliable values in their region, where it has more than `fewest` of
-    them and the commonest more than `share`; they count as reliable in the next round. New arrays: values,
-    and reliable with what was voted.
+    """Replace outliers by the commonest of the reliable values in their region, where it has more than
+    `fewest` of them and the commonest more than `share`; they count as reliable in the next round. New
+    arrays: values, and reliable with what was voted.
     """
     lowest = int(values.min())
     count = int(values.max()) - lowest + 1

@@ -1,4 +1,4 @@
-"""Aggregation over a minimum spanning tree of the image, exact in two passes [Yang, CVPR 2012].
+"""Aggregate over a minimum spanning tree of the image, exact in two passes [Yang, CVPR 2012].
 
 The pixels are the nodes, neighbours in the row and column are joined by edges as heavy as their gray values
 differ; the tree keeps the lightest edges. Two pixels support one another by exp(-D / sigma), D the sum of the
@@ -50,13 +50,15 @@ class TreeFilter:
 
 
 def tree_filter(tree: SpanningTree, sigma_gray: float) -> TreeFilter:
-    """Aggregation over `tree` with support exp(-D / sigma_gray), D in gray levels."""
+    """Make the aggregation over `tree` with support exp(-D / sigma_gray), D in gray levels."""
     table = np.exp(-np.arange(_HEAVIEST) / sigma_gray).astype(np.float32)
     return TreeFilter(tree, table[tree.weight])
 
 
 def spanning_tree(guide: UInt8) -> SpanningTree:
-    """The minimum spanning tree of the 4-connected (H, W) image [Kruskal 1956]; edges sorted by counting."""
+    """Build the minimum spanning tree of the 4-connected (H, W) image [Kruskal 1956]; edges sorted by
+    counting.
+    """
     size = guide.size
     node, parent = np.empty(size, dtype=np.int32), np.empty(size, dtype=np.int32)
     weight = np.empty(size, dtype=np.uint8)
@@ -66,7 +68,9 @@ def spanning_tree(guide: UInt8) -> SpanningTree:
 
 @kernel()
 def _kept_edges(guide: UInt8) -> UInt8:
-    """(H, W) uint8: 1 where the tree keeps the edge to the right neighbour, plus 2 for the one below."""
+    """Select edges (H, W) uint8: 1 where the tree keeps the edge to the right neighbour, plus 2 for the one
+    below.
+    """
     height, width = guide.shape
     starts = np.zeros(_HEAVIEST + 1, dtype=np.int64)
     for y in range(height):
@@ -117,7 +121,9 @@ def _chief_of(chief: Int32, member: int) -> int:
 
 @kernel()
 def _walk(guide: UInt8, kept: UInt8, node: Int32, parent: Int32, weight: UInt8) -> None:
-    """Preorder from the middle pixel, so that a node's parent is mostly still in the cache."""
+    """Order the nodes in preorder from the middle pixel, so that a node's parent is mostly still in the
+    cache.
+    """
     height, width = guide.shape
     gray, edges = guide.ravel(), kept.ravel()
     stack = np.empty(height * width, dtype=np.int32)
@@ -175,7 +181,9 @@ def _two_passes(node: Int32, parent: Int32, similarity: Float32, costs: Float32,
 
 @kernel()
 def _to_lanes(slices: Float32, costs: Float32) -> None:
-    """(K, H, W) to (H * W, lanes), a tile of a row at a time so that each cache line is read once."""
+    """Transpose (K, H, W) to (H * W, lanes), a tile of a row at a time so that each cache line is
+    read once.
+    """
     count, height, width = slices.shape
     for y in range(height):
         for start in range(0, width, _TILE):

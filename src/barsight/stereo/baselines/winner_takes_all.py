@@ -1,4 +1,4 @@
-"""Winner takes all over slices of costs, as they come, and the parabola below a pixel [paper Eq. 4].
+"""Take the winner over slices of costs, as they come, and the parabola below a pixel [paper Eq. 4].
 
 Only the best cost, its neighbours and the last slice are kept, so that no cost volume has to be: memory is
 five float32 images whatever the number of candidates.
@@ -34,7 +34,7 @@ class Winners:
 
 
 def no_winners(height: int, width: int) -> Winners:
-    """Before the first slice."""
+    """Initialise winners before the first slice."""
     shape = (height, width)
     cost, below, above, last = (np.full(shape, np.inf, dtype=np.float32) for _ in range(4))
     return Winners(np.zeros(shape, dtype=np.int32), cost, below, above, last)
@@ -56,7 +56,7 @@ def take_slices(winners: Winners, slices: Float32, lowest_px: int) -> None:
 def sweep(
     shape: tuple[int, ...], candidates: DisparityRange, fill: Callable[[int, Float32], None]
 ) -> Winners:
-    """The winners of all candidates; `fill(lowest_px, slices)` writes the costs of the next K of them.
+    """Select the winners of all candidates; `fill(lowest_px, slices)` writes the costs of the next K of them.
 
     shape: of the image, (H, W). K is 16 at most: the memory of the sweep is 21 float32 images.
     """
@@ -70,8 +70,8 @@ def sweep(
     return winners
 
 
-def between_candidates(winners: Winners) -> Float32:
-    """(H, W) float32: the winners below a pixel by the parabola through three costs [paper Eq. 4].
+def subpixel_winners(winners: Winners) -> Float32:
+    """Interpolate the winners (H, W) float32 below a pixel by the parabola through three costs [paper Eq. 4].
 
     Whole where a neighbour is missing or the costs don't curve upwards; never further than half a pixel.
     """

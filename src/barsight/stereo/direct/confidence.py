@@ -1,4 +1,4 @@
-"""What noise doesn't explain: the method's own error, seen where the truth is known.
+"""Estimate the method's own error beyond noise, calibrated where the truth is known.
 
 In a rectified pair the vertical disparity is zero. Where the images, matched, still show a vertical shift
 beyond what noise makes, something that no model of ours covers (gloss, distortion left over, interpolation,
@@ -20,11 +20,11 @@ _EVERY_PX = 10
 _STRIPES = 4
 _STRIPE_ROWS = 81
 _OUTLIER_GREY = np.float32(8)
-_LEAST_SLOPE_POWER = 4.0
-_LEAST_INDEPENDENCE = 0.05
+_MIN_SLOPE_POWER = 4.0
+_MIN_INDEPENDENCE = 0.05
 _LARGEST_VARIANCE_PX2 = 0.1
 _FEWEST_WINDOWS = 30
-_NOISE_SHARE = 4.5
+_NOISE_RATIO = 4.5
 _BEND_PX = 3
 _START_WINDOW_PX = 9
 _EDGE_REACH_PX = 3.0
@@ -34,7 +34,7 @@ _UNSURE_SIDE_PX = 2.5
 
 
 def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bool) -> float:
-    """Robust sigma (px) of the vertical shifts between the matched images, less what noise explains.
+    """Estimate the robust sigma (px) of vertical shifts between the matched images, less what noise explains.
 
     disparity: (H, W), no NaN. 0 where fewer than 30 windows of 21 px tell anything. Of a large image four
     stripes are asked: one number for the whole needs no more.
@@ -49,12 +49,12 @@ def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bo
     if shift.size < _FEWEST_WINDOWS:
         return 0.0
     spread = 1.4826 * float(np.median(np.abs(shift)))
-    return float(np.sqrt(max(spread * spread - _NOISE_SHARE * float(np.median(variance)), 0.0)))
+    return float(np.sqrt(max(spread * spread - _NOISE_RATIO * float(np.median(variance)), 0.0)))
 
 
-def bend_around(disparity: Float32, widest_px: float) -> Float32:
-    """(H, W) how far the disparity lies off the middle of its neighbours 3 px to both sides, the larger of
-    along rows and along columns, at most widest_px; no NaN in or out.
+def disparity_bend(disparity: Float32, widest_px: float) -> Float32:
+    """Compute the bend (H, W) of the disparity off the middle of its neighbours 3 px to both sides, the
+    larger of along rows and along columns, at most widest_px; no NaN in or out.
 
     Zero on a plane. On a bend or an edge a match that sits one pixel beside its place errs by as much.
     """
@@ -67,7 +67,8 @@ def bend_around(disparity: Float32, widest_px: float) -> Float32:
 
 
 def start_disagreement(start: Float32, refined: Float32) -> Float32:
-    """(H, W) how far refinement moved the start in windows of 9 px, px. start: (H, W), NaN where unmatched.
+    """Compute how far (H, W) refinement moved the start in windows of 9 px, px. start: (H, W), NaN where
+    unmatched.
 
     Two estimates from the same images that gloss, blur and depth edges bend differently: where they disagree
     over a whole window, noise isn't why, and either may be wrong.
@@ -80,11 +81,11 @@ def start_disagreement(start: Float32, refined: Float32) -> Float32:
     return disagreement
 
 
-def beside_edges(disparity: Float32, jump_px: float, other_side: bool = True) -> tuple[Float32, Float32]:
-    """Two arrays (H, W) for pixels that may have been given to the wrong side of a jump of more than jump_px
-    between neighbours: 1 on the jump, falling to 1 / e within 3 px; and how far away (px) the other side lies
-    within 4 px, zero further than 2.5 px from the jump, or everywhere where that isn't asked for. NaN in
-    `disparity` is no jump.
+def edge_risk(disparity: Float32, jump_px: float, other_side: bool = True) -> tuple[Float32, Float32]:
+    """Estimate the risk at depth edges: two arrays (H, W) for pixels that may have been given to the wrong
+    side of a jump of more than jump_px between neighbours: 1 on the jump, falling to 1 / e within 3 px; and
+    how far away (px) the other side lies within 4 px, zero further than 2.5 px from the jump, or everywhere
+    where that isn't asked for. NaN in `disparity` is no jump.
     """
     known = np.isfinite(disparity)
     for_highest = np.where(known, disparity, np.float32(-_FAR_PX))
@@ -104,7 +105,7 @@ def beside_edges(disparity: Float32, jump_px: float, other_side: bool = True) ->
 def _vertical_shifts(
     left: UInt8, right: UInt8, disparity: Float32, usable: Float32
 ) -> tuple[Float32, Float32]:
-    """Vertical shifts (N,) and their noise variances, solved with the horizontal ones in windows."""
+    """Solve vertical shifts (N,) and their noise variances with the horizontal ones in windows."""
     left_grey, right_grey = (
         cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR_PX) for image in (left, right)
     )
@@ -119,7 +120,7 @@ def _vertical_shifts(
     xx, xy, yy, xr, yr, power = window_means(products, trust, _WINDOW_PX, _EVERY_PX)
     chosen = (slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX))
     determinant = xx * yy - xy * xy
-    told = (usable[chosen] > 0) & (determinant > _LEAST_INDEPENDENCE * xx * yy) & (yy > _LEAST_SLOPE_POWER)
+    told = (usable[chosen] > 0) & (determinant > _MIN_INDEPENDENCE * xx * yy) & (yy > _MIN_SLOPE_POWER)
     # Half of these windows is a mirror image.
     told[[0, -1]] = False
     xx, xy, yy, xr, yr, power, determinant = (a[told] for a in (xx, xy, yy, xr, yr, power, determinant))

@@ -1,4 +1,4 @@
-"""What a match must pass before it is believed: the other image agrees, and it isn't an island."""
+"""Check matches: left-right consistency, and no islands (speckles)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ _STEPS = 16
 _NONE = -32768
 
 
-def agrees(left_px: Float32, right_px: Float32, tolerance_px: float) -> Bool:
-    """(H, W) bool: where the right image's disparity at the match is the same within the tolerance.
+def is_consistent(left_px: Float32, right_px: Float32, tolerance_px: float) -> Bool:
+    """Check left-right consistency (H, W): the right image's disparity at the match is the same within the
+    tolerance.
 
     No NaN in left_px.
     """
@@ -21,8 +22,8 @@ def agrees(left_px: Float32, right_px: Float32, tolerance_px: float) -> Bool:
     return same
 
 
-def lands_on(valid: Bool, disparity: Float32) -> Bool:
-    """(H, W) bool: where the match, or the border's pixel beside it, is valid in the right image. No NaN."""
+def hits_valid(valid: Bool, disparity: Float32) -> Bool:
+    """Check (H, W) that the match, or the border's pixel beside it, is valid in the right image. No NaN."""
     landed = np.empty(valid.shape, dtype=np.bool_)
     _land(valid, disparity, landed)
     return landed
@@ -47,13 +48,13 @@ def _land(valid: Bool, disparity: Float32, landed: Bool) -> None:
             landed[y, x] = valid[y, min(max(column, 0), width - 1)]
 
 
-def without_islands(disparity: Float32, least_size_px: int, step_px: float) -> Float32:
-    """NaN in place of connected patches smaller than least_size_px; neighbours within step_px connect."""
+def remove_islands(disparity: Float32, min_size_px: int, step_px: float) -> Float32:
+    """Remove connected patches smaller than min_size_px; neighbours within step_px connect."""
     known = np.isfinite(disparity)
-    if not known.any() or least_size_px < 2:
+    if not known.any() or min_size_px < 2:
         return disparity
     offset = cv2.mean(disparity, known.view(np.uint8))[0]
     fixed = cv2.addWeighted(disparity, _STEPS, disparity, 0, -_STEPS * offset, dtype=cv2.CV_16S)
     fixed[~known] = _NONE
-    cv2.filterSpeckles(fixed, _NONE, least_size_px, step_px * _STEPS)
+    cv2.filterSpeckles(fixed, _NONE, min_size_px, step_px * _STEPS)
     return np.where(fixed == _NONE, np.float32(np.nan), disparity)

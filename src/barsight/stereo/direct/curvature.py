@@ -1,4 +1,4 @@
-"""How round a disparity is across the axis of its tile."""
+"""Estimate the curvature of a disparity across the axis of its tile."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ _ROUNDEST_PX = np.float32(0.75)
 
 @kernel()
 def curvature_row(disparity: Float32, axes: Float32, y: int, curvature: Float32) -> None:
-    """(W,) second derivative (1 / px) of row y across each tile's axis, out of points 5 px to both sides; 0
-    beside jumps, where it says nothing. disparity: (H, W), no NaN."""
+    """Compute the second derivative (W,) (1 / px) of row y across each tile's axis, out of points 5 px to
+    both sides; 0 beside jumps, where it says nothing. disparity: (H, W), no NaN.
+    """
     height, width = disparity.shape
     middle = disparity[y]
     for tile_x in range(axes.shape[1]):

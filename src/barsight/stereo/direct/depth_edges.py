@@ -1,4 +1,4 @@
-"""Depth edges put where the image has them: a weighted median beside every jump of the disparity."""
+"""Sharpen depth edges to the image's: a weighted median beside every jump of the disparity."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from barsight.core.arrays import Bool, Float32, UInt8, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.kernels.vectors import FLOAT, FLOAT_LANES, Vectors, bytes_of
 
 _RADIUS_PX = 5
@@ -26,8 +26,9 @@ _BAND_ROWS = 32
 
 
 def sharpen_edges(disparity: Float32, grey: UInt8, jump_px: float) -> Float32:
-    """Beside jumps of more than jump_px the weighted median of the known disparities around: near and alike
-    in grey counts more [Ma 2013], to 0.02 px. NaN stays NaN; elsewhere nothing changes."""
+    """Apply, beside jumps of more than jump_px, the weighted median of the known disparities around: near and
+    alike in grey counts more [Ma 2013], to 0.02 px. NaN stays NaN; elsewhere nothing changes.
+    """
     sharpened = disparity.copy()
     offset = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
     near = np.zeros((_SIDE_PX, FLOAT_LANES), dtype=np.float32)
@@ -41,7 +42,7 @@ def sharpen_edges(disparity: Float32, grey: UInt8, jump_px: float) -> Float32:
     def work(first: int, end: int) -> None:
         _weighted_medians(around, shades, wanted, near.reshape(-1), sharpened, first, end)
 
-    in_bands(work, len(disparity), _BAND_ROWS)
+    parallel_bands(work, len(disparity), _BAND_ROWS)
     return sharpened
 
 
@@ -57,8 +58,9 @@ def _beside_jumps(disparity: Float32, jump_px: float) -> Bool:
 
 
 def _falling(v: Vectors, gap: Any) -> Any:
-    """exp(-gap / _GREY) to 1 % where it exceeds 1 %: the sixteenth power of a cubic, since vectors have no
-    exponential."""
+    """Approximate exp(-gap / _GREY) to 1 % where it exceeds 1 %: the sixteenth power of a cubic, since
+    vectors have no exponential.
+    """
     small = v.product(gap, v.all(-1 / (16 * _GREY), v.floats))
     power = v.all(1 / 6, v.floats)
     for factor in (1 / 2, 1.0, 1.0):
@@ -72,8 +74,8 @@ def _falling(v: Vectors, gap: Any) -> Any:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _median(_: Any, theres: Any, greys: Any, at: Any, stride: Any, near: Any) -> Any:
-    """The weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GREY), of its
-    grey's gap to that of the window's middle, times `near`. All arrays are flat.
+    """Compute the weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GREY),
+    of its grey's gap to that of the window's middle, times `near`. All arrays are flat.
 
     The interval of values is quartered until it is short enough: faster than to sort a hundred of them. The
     window stays in registers, where there are as many.
@@ -112,7 +114,7 @@ def _median(_: Any, theres: Any, greys: Any, at: Any, stride: Any, near: Any) ->
         high = cgutils.alloca_once_value(builder, v.extreme_of(builder.load(highest), "max"))
 
         def has_half(level: Any) -> Any:
-            """Whether the values up to a level have half of the weight."""
+            """Return whether the values up to a level have half of the weight."""
             every = v.all(level, v.floats)
             below = [
                 builder.select(builder.fcmp_ordered("<=", value, every), weight, nothing)
@@ -140,7 +142,7 @@ def _median(_: Any, theres: Any, greys: Any, at: Any, stride: Any, near: Any) ->
 
 
 def _summed(v: Vectors, terms: list[Any]) -> Any:
-    """In pairs, so that no sum waits for all before it."""
+    """Sum in pairs, so that no sum waits for all before it."""
     while len(terms) > 1:
         pairs = zip(terms[::2], terms[1::2], strict=False)
         terms = [v.sum(*pair) for pair in pairs] + terms[len(terms) // 2 * 2 :]
@@ -152,7 +154,10 @@ def _weighted_medians(
     disparity: Float32, grey: UInt8, wanted: Bool, near: Float32, medians: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
-    """disparity, grey: with a margin of _RADIUS_PX before and FLOAT_LANES after; the unknown is _UNKNOWN."""
+    """Fill the medians.
+
+    disparity, grey: with a margin of _RADIUS_PX before and FLOAT_LANES after; the unknown is _UNKNOWN.
+    """
     framed_width = disparity.shape[1]
     theres, shades = disparity.reshape(-1), grey.reshape(-1)
     for y in range(first, end):

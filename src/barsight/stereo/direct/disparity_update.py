@@ -1,19 +1,19 @@
-"""From the fitted planes to the next disparity: which support to follow, and what roundness takes off."""
+"""Update the disparity from the fitted planes: choose the support, correct curvature."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from barsight.core.arrays import Float32, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.curvature import curvature_row
 from barsight.stereo.direct.kernels.box_sums import (
     BAND_ROWS,
-    fresh_columns,
-    mirrored,
+    allocate_columns,
+    mirror_index,
     roll_product,
     roll_sum,
-    slide,
+    slide_window,
 )
 from barsight.stereo.direct.support_regions import MARGIN
 
@@ -26,28 +26,28 @@ _LONGEST_STEP_PX = np.float32(1.5)
 _SUPPORT = np.float32(0.5 * 1.87)
 """Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
 cost: measured on rendered planes. What noise in the slopes costs grows with what a step falls short of."""
-_LEAST_INFORMATION = np.float32(0.5)
+_MIN_INFORMATION = np.float32(0.5)
 
 Fit = tuple[Float32, Float32]
 """A fitted disparity and its information, (H, W)."""
 
 
-def variances(power: Float32, information: Float32) -> Float32:
-    """(H, W) of a fit, px^2."""
-    return np.asarray(_SUPPORT * power / np.maximum(information, _LEAST_INFORMATION), dtype=np.float32)
+def fit_variance(power: Float32, information: Float32) -> Float32:
+    """Compute the variance (H, W) of a fit, px^2."""
+    return np.asarray(_SUPPORT * power / np.maximum(information, _MIN_INFORMATION), dtype=np.float32)
 
 
-def blend(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[Float32, Float32]:
-    """The fitted disparity and its variance: of the long support, and of the short one as far as both differ
-    by more than the short one's noise: there the surface is no plane over the long one. All (H, W). Which of
-    the two is right isn't known where they share: the variance is that of the mixture.
+def blend_fits(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[Float32, Float32]:
+    """Blend the fitted disparities and their variances: of the long support, and of the short one as far as
+    both differ by more than the short one's noise: there the surface is no plane over the long one. All (H,
+    W). Which of the two is right isn't known where they share: the variance is that of the mixture.
     """
     fitted, variance = np.empty_like(power), np.empty_like(power)
 
     def work(first: int, end: int) -> None:
         _blend(*long, *short, power, usable, _BLEND_REACH_PX, fitted, variance, first, end)
 
-    in_bands(work, len(power), BAND_ROWS)
+    parallel_bands(work, len(power), BAND_ROWS)
     return fitted, variance
 
 
@@ -55,7 +55,7 @@ def blend(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[Float
 def _excess(long: Float32, short: Float32, power: Float32, information: Float32, excess: Float32) -> None:
     for x in range(len(excess)):
         gap = long[x] - short[x]
-        excess[x] = gap * gap - _SLACK * (_SUPPORT * power[x] / max(information[x], _LEAST_INFORMATION))
+        excess[x] = gap * gap - _SLACK * (_SUPPORT * power[x] / max(information[x], _MIN_INFORMATION))
 
 
 @kernel(fastmath=True)
@@ -64,13 +64,13 @@ def _blend(
     usable: Float32, reach: int, fitted: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = power.shape
-    columns = fresh_columns(2, width, reach)
+    columns = allocate_columns(2, width, reach)
     rows = np.zeros((5, width), dtype=np.float32)
     none, ahead, behind, mean, seen = rows[0], rows[1], rows[2], rows[3], rows[4]
     zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
     for coming in range(first - reach, end + reach):
         y, going = coming - reach, coming - 2 * reach - 1
-        a, b = mirrored(coming, height), mirrored(going, height)
+        a, b = mirror_index(coming, height), mirror_index(going, height)
         came, gone = usable[a], none
         _excess(long[a], short[a], power[a], short_information[a], ahead)
         if going >= first - reach:
@@ -80,26 +80,26 @@ def _blend(
         roll_sum(columns[1], reach, came, gone)
         if y < first:
             continue
-        slide(columns[0], reach, mean)
-        slide(columns[1], reach, seen)
+        slide_window(columns[0], reach, mean)
+        slide_window(columns[1], reach, seen)
         noise, far, near, certain = power[y], long[y], short[y], short_information[y]
         for x in range(width):
             # Both variances are so much of the noise's power per information.
-            own = _SUPPORT * noise[x] / max(certain[x], _LEAST_INFORMATION)
+            own = _SUPPORT * noise[x] / max(certain[x], _MIN_INFORMATION)
             excess = max(mean[x] / (seen[x] + tiny), zero)
             mean[x] = own / (own + excess + np.float32(1e-9))
         blended, unsure, long_certain = fitted[y], variance[y], long_information[y]
         for x in range(width):
             blended[x] = near[x] + mean[x] * (far[x] - near[x])
         for x in range(width):
-            own = _SUPPORT * noise[x] / max(certain[x], _LEAST_INFORMATION)
-            other = _SUPPORT * noise[x] / max(long_certain[x], _LEAST_INFORMATION)
+            own = _SUPPORT * noise[x] / max(certain[x], _MIN_INFORMATION)
+            other = _SUPPORT * noise[x] / max(long_certain[x], _MIN_INFORMATION)
             gap, share = near[x] - far[x], one - mean[x]
             unsure[x] = other + share * (own - other) + share * mean[x] * gap * gap
 
 
-def settle(fitted: Float32, axes: Float32, disparity: Float32, variance: Float32) -> None:
-    """Move the disparity (a frame) to what was fitted, put right for curvature; add to the variance.
+def update_disparity(fitted: Float32, axes: Float32, disparity: Float32, variance: Float32) -> None:
+    """Move the disparity (a frame) to what was fitted, corrected for curvature; add to the variance.
 
     A plane over the support takes off a surface that is round across the axis half its curvature times the
     support's mean square width. A bar's curvature is the same all along, so that its mean over a window adds
@@ -109,7 +109,7 @@ def settle(fitted: Float32, axes: Float32, disparity: Float32, variance: Float32
     def work(first: int, end: int) -> None:
         _settle(fitted, axes, _SAG_REACH_PX, disparity, variance, first, end)
 
-    in_bands(work, len(fitted), BAND_ROWS)
+    parallel_bands(work, len(fitted), BAND_ROWS)
 
 
 @kernel(fastmath=True)
@@ -117,21 +117,21 @@ def _settle(
     fitted: Float32, axes: Float32, reach: int, disparity: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = fitted.shape
-    column = fresh_columns(1, width, reach)[0]
+    column = allocate_columns(1, width, reach)[0]
     rows = np.zeros((4, width), dtype=np.float32)
     none, ahead, behind, sag = rows[0], rows[1], rows[2], rows[3]
     half, quarter = np.float32(0.5) * _SPREAD_ACROSS_PX2, np.float32(0.25)
     for coming in range(first - reach, end + reach):
         y, going = coming - reach, coming - 2 * reach - 1
-        curvature_row(fitted, axes, mirrored(coming, height), ahead)
+        curvature_row(fitted, axes, mirror_index(coming, height), ahead)
         gone = none
         if going >= first - reach:
-            curvature_row(fitted, axes, mirrored(going, height), behind)
+            curvature_row(fitted, axes, mirror_index(going, height), behind)
             gone = behind
         roll_sum(column, reach, ahead, gone)
         if y < first:
             continue
-        slide(column, reach, sag)
+        slide_window(column, reach, sag)
         wanted, unsure = fitted[y], variance[y]
         here = disparity[y + MARGIN, MARGIN : MARGIN + width]
         for x in range(width):

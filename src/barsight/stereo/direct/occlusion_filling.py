@@ -1,4 +1,4 @@
-"""Filling: what only one image sees is guessed from the surfaces around it, and said to be a guess.
+"""Fill occlusions by extrapolating the surfaces around, marked as guesses.
 
 From a hole, rays go out in 16 directions to the first matched pixel; the plane through the surface there is
 continued into the hole. The guess is a weighted quantile of these candidates: near and alike in grey counts
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int32, UInt8, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 
 _RAYS = 16
 _REACH_PX = 200
@@ -25,15 +25,15 @@ _SAME_SURFACE_PX = 1.0
 _SLOPE_LENGTH_PX = 50.0
 _GREY = 12.0
 _HIDDEN_QUANTILE = 0.3
-_SEEN_SHARE = 0.03
-_SPREAD_SHARE = 2.0
+_SEEN_RATIO = 0.03
+_SPREAD_RATIO = 2.0
 _BAND_ROWS = 32
 
 
-def fill(
+def fill_occlusions_by_planes(
     disparity: Float32, grey: UInt8, right_px: Float32, lowest_px: float, highest_px: float
 ) -> tuple[Float32, Float32]:
-    """`disparity` (H, W) with its NaN filled, as far as any ray finds a match, and the guesses' sigma (px;
+    """Fill the NaN of `disparity` (H, W), as far as any ray finds a match, and give the guesses' sigma (px;
     NaN where nothing was guessed): twice the spread of the candidates, since the truth may be none of them,
     and at least 1 px. Inputs stay as they are.
 
@@ -45,7 +45,7 @@ def fill(
     def find_slopes(first: int, end: int) -> None:
         _slopes_beside_holes(disparity, _PLANE_RADIUS_PX, _SAME_SURFACE_PX, slope_x, slope_y, first, end)
 
-    in_bands(find_slopes, len(disparity), _BAND_ROWS)
+    parallel_bands(find_slopes, len(disparity), _BAND_ROWS)
     filled = disparity.copy()
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS
@@ -64,13 +64,15 @@ def fill(
             first, end,
         )  # fmt: skip
 
-    in_bands(guess, len(disparity), _BAND_ROWS)
+    parallel_bands(guess, len(disparity), _BAND_ROWS)
     return filled, sigma
 
 
-def with_row_holes_filled(disparity: Float32) -> Float32:
-    """NaN take the smaller, farther, neighbour in their row: what is hidden lies behind. Rows without any
-    disparity take the median of all; a map without any is zero."""
+def fill_row_holes(disparity: Float32) -> Float32:
+    """Fill NaN by the smaller, farther, neighbour in their row: what is hidden lies behind.
+
+    Rows without any disparity take the median of all; a map without any is zero.
+    """
     filled = np.empty_like(disparity)
     if not _fill_rows(disparity, filled):
         known, empty = np.isfinite(disparity), np.isnan(filled)
@@ -80,7 +82,7 @@ def with_row_holes_filled(disparity: Float32) -> Float32:
 
 @kernel()
 def _fill_rows(disparity: Float32, filled: Float32) -> bool:
-    """Whether every row had a disparity; those that had none are NaN."""
+    """Check whether every row had a disparity; those that had none are NaN."""
     height, width = disparity.shape
     complete = True
     for y in range(height):
@@ -110,9 +112,10 @@ def _slopes_beside_holes(
     disparity: Float32, radius: int, same_surface_px: float, slope_x: Float32, slope_y: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
-    """Slopes (px per px) of the plane around each matched pixel that touches a hole: three rounds of least
-    squares, each on the pixels near the plane before, held to zero slope where there are few. Every third
-    pixel in each direction is enough for a slope."""
+    """Fit slopes (px per px) of the plane around each matched pixel that touches a hole: three rounds of
+    least squares, each on the pixels near the plane before, held to zero slope where there are few. Every
+    third pixel in each direction is enough for a slope.
+    """
     height, width = disparity.shape
     for y in range(first, end):
         for x in range(width):
@@ -214,7 +217,7 @@ def _fill(
                     if column >= 0:
                         beyond_border = False
                         if right_px[y, min(column, width - 1)] < value:
-                            weight *= _SEEN_SHARE
+                            weight *= _SEEN_RATIO
                     values[found], weights[found] = value, weight
                     found += 1
                     break
@@ -231,4 +234,4 @@ def _fill(
             spread = 0.0
             for i in range(found):
                 spread += weights[i] * (values[i] - filled[y, x]) ** 2
-            sigma[y, x] = math.sqrt(1.0 + _SPREAD_SHARE**2 * spread / weights[:found].sum())
+            sigma[y, x] = math.sqrt(1.0 + _SPREAD_RATIO**2 * spread / weights[:found].sum())

@@ -1,4 +1,4 @@
-"""What each pixel asks for: the difference of both images there, and the pull that it makes of it.
+"""Compute photometric residuals and their robustly weighted Gauss-Newton terms, pixel by pixel.
 
 Each pass rolls over bands of rows (`box_sums.py`). `Frames` are images with the supports' margin around them.
 """
@@ -10,36 +10,36 @@ import math
 import numpy as np
 
 from barsight.core.arrays import Float32, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.kernels.box_sums import (
     BAND_ROWS,
-    fresh_columns,
-    mirrored,
+    allocate_columns,
+    mirror_index,
     roll_product,
     roll_square,
     roll_sum,
-    slide,
+    slide_window,
 )
 from barsight.stereo.direct.support_regions import MARGIN
 
 _CONTRAST_FLOOR = np.float32(4)
 _BLOCK_PX = 3
-_MOST_UNDAMPED = np.float32(3)
+_MAX_UNDAMPED = np.float32(3)
 
 
-def compare(
+def photometric_residual(
     left: Float32, right: Float32, usable: Float32, side: int, outlier_grey: float, residual: Float32,
     trust: Float32,
 ) -> None:  # fmt: skip
-    """Left minus right after the means and contrasts of what is `usable` (0...1) in a window of side x side
-    pixels are made equal, and how far that is to be trusted: half at outlier_grey. Both contrasts are raised
-    by 2 grey levels. (H, W) in, frames out.
+    """Subtract right from left after the means and contrasts of what is `usable` (0...1) in a window of side
+    x side pixels are made equal, and how far that is to be trusted: half at outlier_grey. Both contrasts are
+    raised by 2 grey levels. (H, W) in, frames out.
     """
 
     def work(first: int, end: int) -> None:
         _compare(left, right, usable, side // 2, np.float32(outlier_grey), residual, trust, first, end)
 
-    in_bands(work, len(left), BAND_ROWS)
+    parallel_bands(work, len(left), BAND_ROWS)
 
 
 @kernel(fastmath=True)
@@ -48,13 +48,13 @@ def _compare(
     trust: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = left.shape
-    columns = fresh_columns(5, width, reach)
+    columns = allocate_columns(5, width, reach)
     means = np.empty((5, width), dtype=np.float32)
     none = np.zeros(width, dtype=np.float32)
     one, zero, floor = np.float32(1), np.float32(0), _CONTRAST_FLOOR
     for coming in range(first - reach, end + reach):
         y, going = coming - reach, coming - 2 * reach - 1
-        a, b = mirrored(coming, height), mirrored(going, height)
+        a, b = mirror_index(coming, height), mirror_index(going, height)
         came = usable[a]
         gone = usable[b] if going >= first - reach else none
         roll_sum(columns[0], reach, came, gone)
@@ -65,7 +65,7 @@ def _compare(
         if y < first:
             continue
         for part in range(5):
-            slide(columns[part], reach, means[part])
+            slide_window(columns[part], reach, means[part])
         here, there, use = left[y], right[y], usable[y]
         apart = residual[y + MARGIN, MARGIN : MARGIN + width]
         trusted = trust[y + MARGIN, MARGIN : MARGIN + width]
@@ -81,11 +81,12 @@ def _compare(
             trusted[x] = use[x] / (one + scaled * scaled)
 
 
-def weigh(
+def robust_weights(
     residual: Float32, slope: Float32, trust: Float32, means: tuple[Float32, Float32], side: int,
     gloss_px: float, gloss_trust: float, weight: Float32, pull: Float32,
 ) -> None:  # fmt: skip
-    """Each pixel's weight and pull, with what is constant along the axis weighed by how well it agrees.
+    """Weight residuals: each pixel's weight and pull, with what is constant along the axis weighed by how
+    well it agrees.
 
     means: (H, W) of residual and slope along the axis. Frames in and out.
     """
@@ -98,7 +99,7 @@ def weigh(
             end,
         )  # fmt: skip
 
-    in_bands(work, len(means[0]), BAND_ROWS)
+    parallel_bands(work, len(means[0]), BAND_ROWS)
 
 
 @kernel(fastmath=True)
@@ -108,7 +109,7 @@ def _weigh(
     end: int,
 ) -> None:  # fmt: skip
     height, width = residual_mean.shape
-    columns = fresh_columns(2, width, reach)
+    columns = allocate_columns(2, width, reach)
     powers = np.empty((2, width), dtype=np.float32)
     rows = np.zeros((4, width), dtype=np.float32)
     none, coming_detail, going_detail, share = rows[0], rows[1], rows[2], rows[3]
@@ -116,7 +117,7 @@ def _weigh(
     inner = slice(MARGIN, MARGIN + width)
     for coming in range(first - reach, end + reach):
         y, going = coming - reach, coming - 2 * reach - 1
-        a, b = mirrored(coming, height), mirrored(going, height)
+        a, b = mirror_index(coming, height), mirror_index(going, height)
         came = trust[a + MARGIN, inner]
         gone = trust[b + MARGIN, inner] if going >= first - reach else none
         coming_residual, coming_mean = residual[a + MARGIN, inner], residual_mean[a]
@@ -130,7 +131,7 @@ def _weigh(
         if y < first:
             continue
         for part in range(2):
-            slide(columns[part], reach, powers[part])
+            slide_window(columns[part], reach, powers[part])
         trusted, own, own_slope = (
             trust[y + MARGIN, inner],
             residual[y + MARGIN, inner],
@@ -148,13 +149,13 @@ def _weigh(
             pulls[x] = -trusted[x] * (detail + share[x] * mean_slope[x] * mean[x])
 
 
-def lengthen(
+def step_gain(
     weight: Float32, trust: Float32, slope_noise: float, side: int, is_last: bool, pull: Float32,
     mean_weight: Float32,
 ) -> Float32:  # fmt: skip
-    """(H, W) what a step must be multiplied by: noise in the slopes adds to the weights and nothing to the
-    pulls, so that each step falls short by its share of the weights; 3 at most. The pulls, unless the step is
-    the last, are multiplied by it.
+    """Compute the step's gain (H, W): noise in the slopes adds to the weights and nothing to the pulls, so
+    that each step falls short by its share of the weights; 3 at most. The pulls, unless the step is the last,
+    are multiplied by it.
 
     mean_weight: (H, W), is given the weights' means over the windows. The others are frames.
     """
@@ -174,7 +175,7 @@ def lengthen(
             end,
         )
 
-    in_bands(work, len(mean_weight), BAND_ROWS)
+    parallel_bands(work, len(mean_weight), BAND_ROWS)
     return short_of
 
 
@@ -184,21 +185,21 @@ def _lengthen(
     mean_weight: Float32, short_of: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = mean_weight.shape
-    columns = fresh_columns(2, width, reach)
+    columns = allocate_columns(2, width, reach)
     rows = np.zeros((2, width), dtype=np.float32)
     none, spurious = rows[0], rows[1]
-    inner, share = slice(MARGIN, MARGIN + width), np.float32(1) / _MOST_UNDAMPED
+    inner, share = slice(MARGIN, MARGIN + width), np.float32(1) / _MAX_UNDAMPED
     for coming in range(first - reach, end + reach):
         y, going = coming - reach, coming - 2 * reach - 1
-        a, b = mirrored(coming, height) + MARGIN, mirrored(going, height) + MARGIN
+        a, b = mirror_index(coming, height) + MARGIN, mirror_index(going, height) + MARGIN
         has_gone = going >= first - reach
         roll_sum(columns[0], reach, weight[a, inner], weight[b, inner] if has_gone else none)
         roll_sum(columns[1], reach, trust[a, inner], trust[b, inner] if has_gone else none)
         if y < first:
             continue
         mean, longer, pulls = mean_weight[y], short_of[y], pull[y + MARGIN, inner]
-        slide(columns[0], reach, mean)
-        slide(columns[1], reach, spurious)
+        slide_window(columns[0], reach, mean)
+        slide_window(columns[1], reach, spurious)
         for x in range(width):
             sound = max(mean[x] - slope_noise * spurious[x], mean[x] * share + np.float32(1e-6))
             longer[x] = mean[x] / sound
@@ -210,29 +211,29 @@ def _lengthen(
 def noise_power(
     pull: Float32, usable: Float32, mean_usable: Float32, mean_weight: Float32, hold: float, side: int
 ) -> Float32:
-    """(H, W) the noise power (grey levels^2) that the pulls show, per unit of what holds a disparity in
-    place: from their sums over blocks, so that neighbours which err alike count as what they are. Where the
-    images say little the plain hold takes their place and the power grows. pull is a frame.
+    """Estimate the noise power (H, W) (grey levels^2) that the pulls show, per unit of what holds a disparity
+    in place: from their sums over blocks, so that neighbours which err alike count as what they are. Where
+    the images say little the plain hold takes their place and the power grows. pull is a frame.
     """
     power = np.empty_like(usable)
 
     def work(first: int, end: int) -> None:
         _noise_power(pull, usable, mean_usable, mean_weight, np.float32(hold), side // 2, power, first, end)
 
-    in_bands(work, len(usable), BAND_ROWS)
+    parallel_bands(work, len(usable), BAND_ROWS)
     return power
 
 
 @kernel()
 def _blocks(pull: Float32, y: int, height: int, line: Float32, blocks: Float32) -> None:
-    """(W,) sums over 3 x 3 pixels around row y. line: (W + 2,) for use inside."""
+    """Sum (W,) over 3 x 3 pixels around row y. line: (W + 2,) for use inside."""
     width = len(blocks)
     inner = slice(MARGIN, MARGIN + width)
-    above, below = mirrored(y - 1, height) + MARGIN, mirrored(y + 1, height) + MARGIN
+    above, below = mirror_index(y - 1, height) + MARGIN, mirror_index(y + 1, height) + MARGIN
     one, two, three = pull[above, inner], pull[y + MARGIN, inner], pull[below, inner]
     for x in range(width):
         line[x + 1] = one[x] + two[x] + three[x]
-    line[0], line[width + 1] = line[1 + mirrored(-1, width)], line[1 + mirrored(width, width)]
+    line[0], line[width + 1] = line[1 + mirror_index(-1, width)], line[1 + mirror_index(width, width)]
     for x in range(width):
         blocks[x] = line[x] + line[x + 1] + line[x + 2]
 
@@ -243,14 +244,14 @@ def _noise_power(
     power: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     height, width = usable.shape
-    column = fresh_columns(1, width, reach)[0]
+    column = allocate_columns(1, width, reach)[0]
     rows = np.zeros((3, width), dtype=np.float32)
     none, ahead, behind = rows[0], rows[1], rows[2]
     line = np.empty(width + 2, dtype=np.float32)
     size, one = np.float32(_BLOCK_PX * _BLOCK_PX), np.float32(1)
     for coming in range(first - reach, end + reach):
         y, going = coming - reach, coming - 2 * reach - 1
-        a, b = mirrored(coming, height), mirrored(going, height)
+        a, b = mirror_index(coming, height), mirror_index(going, height)
         _blocks(pull, a, height, line, ahead)
         gone = none
         if going >= first - reach:
@@ -260,7 +261,7 @@ def _noise_power(
         if y < first:
             continue
         found, weights, seen = power[y], mean_weight[y], mean_usable[y]
-        slide(column, reach, found)
+        slide_window(column, reach, found)
         for x in range(width):
             each = one / (weights[x] + np.float32(1e-3))
             found[x] = found[x] / size * each * (one + hold * (seen[x] + np.float32(1e-6)) * each)

@@ -1,4 +1,5 @@
-"""Barsight's own dense stereo: semi-global start, consistency, direct refinement along the bars, sharp edges.
+"""Match densely by our own method: semi-global start, consistency, direct refinement along the bars, sharp
+edges.
 
 What only one image sees stays NaN; with `fill_occlusions` it is guessed and given a large sigma.
 """
@@ -13,25 +14,25 @@ import numpy as np
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
-from barsight.stereo.direct.confidence import bend_around, beside_edges, start_disagreement, vertical_error_px
-from barsight.stereo.direct.consistency import agrees, lands_on, without_islands
+from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement, vertical_error_px
+from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove_islands
 from barsight.stereo.direct.depth_edges import sharpen_edges
-from barsight.stereo.direct.kernels.pyramid import halved
-from barsight.stereo.direct.occlusion_filling import fill, with_row_holes_filled
-from barsight.stereo.direct.refinement import Refined, RefinementSettings, refine
-from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match
+from barsight.stereo.direct.kernels.pyramid import halve
+from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes, fill_row_holes
+from barsight.stereo.direct.refinement import IcpResult, RefinementSettings, refine_disparity
+from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 
 _NAN = np.float32(np.nan)
 _FAST_STEPS = 2
 _JUMP_PX = 1.0
 _FURTHEST_FROM_START_PX = 2.0
-_LEAST_CONTRAST_GREY = 0.5
-_LEAST_HALVED_PX = 128
+_MIN_CONTRAST_GREY = 0.5
+_MIN_HALVED_PX = 128
 
 
 @dataclass(frozen=True)
 class BarsightSettings:
-    """Barsight's own stereo."""
+    """Settings of Barsight's own stereo."""
 
     preset: Literal["best", "fast"] = "best"
     """`fast` starts at half the size, refines in two steps with the long support alone, leaves the edges."""
@@ -43,17 +44,17 @@ class BarsightSettings:
     """Connected patches smaller than this many pixels are dropped."""
     model_sigma_px: float = 0.005
     """The least error of the method itself (1 sigma)."""
-    vertical_share: float = 1.5
+    vertical_error_ratio: float = 1.5
     """Error of the disparity per vertical error that the images show: parallax adds its own."""
-    edge_share: float = 0.55
+    edge_error_ratio: float = 0.55
     """Error per pixel by which the disparity bends within 3 px."""
-    widest_edge_px: float = 0.5
+    max_edge_px: float = 0.5
     """A bend or an edge counts as no more than this."""
-    start_share: float = 0.09
+    start_error_ratio: float = 0.09
     """Error per pixel by which the start and its refinement disagree over a window."""
     wrong_side_px: float = 0.3
     """Error on a depth edge, where a pixel may belong to either side; it falls to 1 / e within 3 px."""
-    other_side_share: float = 0.5
+    other_side_error_ratio: float = 0.5
     """Error within 2.5 px of a depth edge per pixel that its other side lies away: with a half, 2 sigma
     reach across. None for a map, which outvotes wrong sides."""
     max_sigma_px: float = 1.0
@@ -64,8 +65,13 @@ class BarsightSettings:
     def __post_init__(self) -> None:
         if min(self.consistency_px, self.max_sigma_px) <= 0:
             raise ConfigError("consistency_px and max_sigma_px must be positive")
-        shares = (self.vertical_share, self.edge_share, self.start_share, self.other_side_share)
-        lengths = (self.widest_edge_px, self.wrong_side_px)
+        shares = (
+            self.vertical_error_ratio,
+            self.edge_error_ratio,
+            self.start_error_ratio,
+            self.other_side_error_ratio,
+        )
+        lengths = (self.max_edge_px, self.wrong_side_px)
         if min(self.model_sigma_px, self.island_px, *shares, *lengths) < 0:
             raise ConfigError("model_sigma_px, island_px and the shares of sigma can't be negative")
 
@@ -80,18 +86,18 @@ class _Start:
 
 @dataclass(frozen=True)
 class BarsightStereo:
-    """`StereoMethod` of our own."""
+    """`StereoMethod` of Barsight: direct refinement of a semi-global start."""
 
     settings: BarsightSettings
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """See `StereoMethod`. Candidates beyond the image's width are left out.
+        """Match; see `StereoMethod`. Candidates beyond the image's width are left out.
 
         Memory: the semi-global stripes (about 130 MB per thread) and some thirty float32 images.
         """
         settings = self.settings
         candidates = _inside(candidates, pair.camera.width)
-        if min(_contrast(pair.left), _contrast(pair.right)) < _LEAST_CONTRAST_GREY:
+        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GREY:
             nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
             return Disparity(nothing, nothing.copy())
         start = self._start(pair, candidates)
@@ -100,7 +106,7 @@ class BarsightStereo:
         if settings.preset == "fast":
             steps = min(refinement.steps, _FAST_STEPS)
             refinement = replace(refinement, steps=steps, short_px=0.0, first_at_half_size=True)
-        refined = refine(pair.left, pair.right, with_row_holes_filled(start.left_px), matched, refinement)
+        refined = refine_disparity(pair.left, pair.right, fill_row_holes(start.left_px), matched, refinement)
         sigma = self._sigma(pair, refined, start.left_px)
         kept = matched & (np.abs(refined.disparity_px - start.left_px) < _FURTHEST_FROM_START_PX)
         if not settings.fill_occlusions:
@@ -108,51 +114,57 @@ class BarsightStereo:
         disparity, sigma = np.where(kept, refined.disparity_px, _NAN), np.where(kept, sigma, _NAN)
         if settings.fill_occlusions:
             limits = float(candidates.lowest_px), float(candidates.highest_px)
-            disparity, guessed = fill(disparity, pair.left, start.right_px, *limits)
+            disparity, guessed = fill_occlusions_by_planes(disparity, pair.left, start.right_px, *limits)
             sigma = np.where(np.isfinite(guessed), guessed, sigma)
         if settings.preset == "best":
             disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
-        beside, other_side = beside_edges(disparity, _JUMP_PX, settings.other_side_share > 0)
+        beside, other_side = edge_risk(disparity, _JUMP_PX, settings.other_side_error_ratio > 0)
         sigma = _both(sigma, np.float32(settings.wrong_side_px) * beside)
-        sigma = _both(sigma, np.float32(settings.other_side_share) * other_side)
+        sigma = _both(sigma, np.float32(settings.other_side_error_ratio) * other_side)
         disparity, sigma = np.where(pair.left_valid, disparity, _NAN), np.where(pair.left_valid, sigma, _NAN)
         return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
 
-    def _sigma(self, pair: RectifiedPair, refined: Refined, start_px: Float32) -> Float32:
-        """Noise, what noise doesn't explain, and what a bend costs. start_px: NaN where unmatched."""
+    def _sigma(self, pair: RectifiedPair, refined: IcpResult, start_px: Float32) -> Float32:
+        """Combine noise, what noise doesn't explain, and what a bend costs. start_px: NaN where unmatched."""
         settings = self.settings
         matched = np.isfinite(start_px)
         vertical_px = vertical_error_px(pair.left, pair.right, refined.disparity_px, matched)
-        unexplained = settings.model_sigma_px**2 + (settings.vertical_share * vertical_px) ** 2
-        bend = bend_around(refined.disparity_px, settings.widest_edge_px)
+        unexplained = settings.model_sigma_px**2 + (settings.vertical_error_ratio * vertical_px) ** 2
+        bend = disparity_bend(refined.disparity_px, settings.max_edge_px)
         bent = np.maximum(bend * bend - refined.variance_px2, 0)
-        variance = refined.variance_px2 + np.float32(unexplained) + np.float32(settings.edge_share**2) * bent
-        moved = settings.start_share * start_disagreement(start_px, refined.disparity_px)
+        variance = (
+            refined.variance_px2 + np.float32(unexplained) + np.float32(settings.edge_error_ratio**2) * bent
+        )
+        moved = settings.start_error_ratio * start_disagreement(start_px, refined.disparity_px)
         variance += np.square(moved, dtype=np.float32)
         sigma: Float32 = np.sqrt(variance, dtype=np.float32)
         return sigma
 
     def _start(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         settings = self.settings
-        if settings.preset == "fast" and min(pair.left.shape) >= _LEAST_HALVED_PX:
+        if settings.preset == "fast" and min(pair.left.shape) >= _MIN_HALVED_PX:
             return self._start_at_half_size(pair, candidates)
-        found = match(pair.left, pair.right, candidates.lowest_px, candidates.count, settings.semiglobal)
-        believed = agrees(found.left_px, found.right_px, settings.consistency_px) & pair.left_valid
-        believed &= lands_on(pair.right_valid, found.left_px)
+        found = match_semiglobal(
+            pair.left, pair.right, candidates.lowest_px, candidates.count, settings.semiglobal
+        )
+        believed = is_consistent(found.left_px, found.right_px, settings.consistency_px) & pair.left_valid
+        believed &= hits_valid(pair.right_valid, found.left_px)
         left_px = np.where(believed, found.left_px, _NAN)
-        return _Start(without_islands(left_px, settings.island_px, 1.0), found.right_px)
+        return _Start(remove_islands(left_px, settings.island_px, 1.0), found.right_px)
 
     def _start_at_half_size(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
-        """The same, an eighth of the work: refinement makes up for the coarser steps."""
+        """Match the start at half size, an eighth of the work: refinement makes up for the coarser steps."""
         settings, shape = self.settings, pair.left.shape
-        left, right = (halved(image) for image in (pair.left, pair.right))
+        left, right = (halve(image) for image in (pair.left, pair.right))
         lowest = candidates.lowest_px // 2
-        found = match(left, right, lowest, -(-candidates.highest_px // 2) - lowest, settings.semiglobal)
-        believed = agrees(found.left_px, found.right_px, settings.consistency_px)
+        found = match_semiglobal(
+            left, right, lowest, -(-candidates.highest_px // 2) - lowest, settings.semiglobal
+        )
+        believed = is_consistent(found.left_px, found.right_px, settings.consistency_px)
         left_px = np.where(believed, found.left_px, _NAN)
-        left_px = _doubled(without_islands(left_px, settings.island_px // 4, 1.0), shape)
+        left_px = _doubled(remove_islands(left_px, settings.island_px // 4, 1.0), shape)
         believed = pair.left_valid & np.isfinite(left_px)
-        believed &= lands_on(pair.right_valid, np.where(believed, left_px, np.float32(0)))
+        believed &= hits_valid(pair.right_valid, np.where(believed, left_px, np.float32(0)))
         return _Start(np.where(believed, left_px, _NAN), _doubled(found.right_px, shape))
 
 
@@ -162,7 +174,7 @@ def _doubled(disparity: Float32, shape: tuple[int, ...]) -> Float32:
 
 
 def _contrast(image: UInt8) -> float:
-    """Standard deviation of the grey values; a black or a blown-out image has none."""
+    """Compute the standard deviation of the grey values; a black or a blown-out image has none."""
     return float(image[::2, ::2].std())
 
 
@@ -172,12 +184,12 @@ def _inside(candidates: DisparityRange, width: int) -> DisparityRange:
 
 
 def _both(one: Float32, other: Float32) -> Float32:
-    """Two sigmas together. NumPy's hypot, which minds overflow, takes several times as long."""
+    """Add two sigmas in quadrature. NumPy's hypot, which minds overflow, takes several times as long."""
     together: Float32 = np.sqrt(one * one + other * other)
     return together
 
 
 def _with_sharp_edges(disparity: Float32, sigma: Float32, pair: RectifiedPair) -> tuple[Float32, Float32]:
-    """Edges sharpened; what a pixel was moved by counts as one sigma more."""
+    """Sharpen edges; what a pixel was moved by counts as one sigma more."""
     sharp = sharpen_edges(disparity, pair.left, _JUMP_PX)
     return sharp, _both(sigma, sharp - disparity)

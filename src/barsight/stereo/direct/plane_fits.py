@@ -1,4 +1,4 @@
-"""Planes fitted to the pixels' answers on supports that follow a bar and don't cross a depth edge."""
+"""Fit planes to the pixels' disparity steps on supports that follow a bar and don't cross a depth edge."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int64, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
 from barsight.stereo.direct.support_regions import BAND_TILES, MARGIN, TILE_COLUMNS, TILE_ROWS
 
@@ -38,7 +38,7 @@ def fit_planes(
     fitted: Float32,
     information: Float32,
 ) -> None:
-    """A plane through the evidence of each pixel's support: its disparity there, and its information.
+    """Fit a plane through the evidence of each pixel's support: its disparity there, and its information.
 
     Pixel i says: disparity[i] + pull[i] / weight[i], with weight[i] (0 = nothing). Its share falls with the
     distance (Gaussian) and with the difference of disparity (Tukey's biweight that ends at same_surface_px),
@@ -56,7 +56,7 @@ def fit_planes(
         def sum_up(first: int, end: int) -> None:
             _sum_near(disparity, weight, pull, axes, near, fitted.shape, *room, first, end)
 
-        in_bands(sum_up, len(axes), BAND_TILES)
+        parallel_bands(sum_up, len(axes), BAND_TILES)
         weight, pull = room
     alongs, acrosses, factors = _pairs(shape)
 
@@ -65,14 +65,15 @@ def fit_planes(
             disparity, weight, pull, axes, alongs, acrosses, factors, step, fitted, information, first, end
         )
 
-    in_bands(gather, len(axes), BAND_TILES)
+    parallel_bands(gather, len(axes), BAND_TILES)
     if unit != 1:
         fitted *= unit
 
 
 def _pairs(shape: SupportShape) -> tuple[Int64, Int64, Float32]:
-    """Of each pair of points (a, c) and (-a, -c) that a support has beside its middle: a along and c across
-    the axis, (K,) px each, and its share times 1, a, c, a a, a c, c c (6, K)."""
+    """List each pair of points (a, c) and (-a, -c) that a support has beside its middle: a along and c across
+    the axis, (K,) px each, and its share times 1, a, c, a a, a c, c c (6, K).
+    """
     furthest = min(int(_REACH * shape.along_px), MARGIN - 8) // shape.step
     reach = int(_REACH * shape.across_px + 0.5)
     c, a = np.mgrid[-reach : reach + 1, -furthest : furthest + 1].reshape(2, -1)
@@ -88,9 +89,9 @@ def _fit(
     _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, factors: Any, planes: Any,
     certain: Any, at: Any,
 ) -> Any:  # fmt: skip
-    """The planes' disparities and information for 16 pixels from `middle` on, written from `at` on, out of
-    the nine sums of a plane's normal equations: the weights times 1, a, c, a a, a c, c c and the pulls times
-    1, a, c; a along, c across the axis.
+    """Solve the planes' disparities and information for 16 pixels from `middle` on, written from `at` on, out
+    of the nine sums of a plane's normal equations: the weights times 1, a, c, a a, a c, c c and the pulls
+    times 1, a, c; a along, c across the axis.
 
     Points come in pairs on both sides of the middle: what a pair has in common is worked out once. offsets:
     (K,), from a pixel to one point of each pair. factors: see `_pairs`. All arrays are flat.
@@ -135,8 +136,10 @@ def _fit(
 def _solved(
     v: Vectors, s: Any, sa: Any, sc: Any, saa: Any, sac: Any, scc: Any, r: Any, ra: Any, rc: Any
 ) -> tuple[Any, Any]:
-    """A plane's height at the pixel and its information, vectors all. A slope of zero is held with a small
-    weight, so that a line of pixels still has a plane."""
+    """Solve a plane's height at the pixel and its information, vectors all.
+
+    A slope of zero is held with a small weight, so that a line of pixels still has a plane.
+    """
     less, times = v.difference, v.product
     held = v.sum(times(v.all(0.02, v.floats), v.sum(saa, scc)), v.all(1e-3, v.floats))
     aa, cc = v.sum(saa, held), v.sum(scc, held)
@@ -151,8 +154,9 @@ def _solved(
 def _add_near(
     _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, weight_sums: Any, pull_sums: Any
 ) -> Any:
-    """The sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written to the
-    same places. All arrays are flat."""
+    """Add the sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written to
+    the same places. All arrays are flat.
+    """
     signature = types.void(theres, weights, pulls, middle, offsets, weight_sums, pull_sums)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -180,7 +184,7 @@ def _sum_near(
     disparity: Float32, weight: Float32, pull: Float32, axes: Float32, near: Int64,
     shape: tuple[int, int], weight_sum: Float32, pull_sum: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
-    """Sums of weights and of pulls from each pixel's own disparity over the points `near` along the axis.
+    """Sum weights and pulls from each pixel's own disparity over the points `near` along the axis.
     Frames in and out."""
     height, width = shape
     framed_width = disparity.shape[1]

@@ -1,4 +1,4 @@
-"""Direct refinement: the disparity that makes both images agree, to a few hundredths of a pixel.
+"""Refine disparity directly on both images, to a few hundredths of a pixel.
 
 Each step warps the right image with the current disparity and asks every pixel how far it should move
 (Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
@@ -24,12 +24,17 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
-from barsight.stereo.direct.disparity_update import Fit, blend, settle, variances
+from barsight.stereo.direct.disparity_update import Fit, blend_fits, fit_variance, update_disparity
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
-from barsight.stereo.direct.kernels.pyramid import carried_up, halved
-from barsight.stereo.direct.photometric_residuals import compare, lengthen, noise_power, weigh
+from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
+from barsight.stereo.direct.photometric_residuals import (
+    noise_power,
+    photometric_residual,
+    robust_weights,
+    step_gain,
+)
 from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
-from barsight.stereo.direct.support_regions import MARGIN, axis_means, empty_frame, inside, tile_axes
+from barsight.stereo.direct.support_regions import MARGIN, allocate_frame, axis_means, inside, tile_axes
 from barsight.stereo.noise import image_noise
 
 Image = UInt8 | Float32
@@ -44,18 +49,18 @@ _HALF_HOLD = 4
 """A pixel at half the size stands for four."""
 _LONGEST_HALF_STEP_PX = 0.4
 """In pixels of half the size: a longer step takes places beside depth edges to the other side."""
-_LEAST_HALVED_PX = 128
+_MIN_HALVED_PX = 128
 _ALIKE_BLUR_PX = 1.5
 _HOLD = 0.1
 _HOLD_UNMATCHED = 0.02
-_MOST_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
+_MAX_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
 """What steps fall short of counts as noise up to here, measured on rendered planes. Beyond, a sixth of it is
 taken off again, measured on rendered bars: a step that is short by half damps its own noise."""
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Direct refinement on both images."""
+    """Settings of direct refinement on both images."""
 
     steps: int = 3
     """Gauss-Newton steps."""
@@ -96,16 +101,18 @@ class RefinementSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class IcpResult:
     """disparity_px: (H, W), no NaN. variance_px2: (H, W), what the residual in each support explains."""
 
     disparity_px: Float32
     variance_px2: Float32
 
 
-def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings) -> Refined:
+def refine_disparity(
+    left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
+) -> IcpResult:
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
-    at_half_size = settings.first_at_half_size and min(left.shape) >= _LEAST_HALVED_PX and settings.steps > 1
+    at_half_size = settings.first_at_half_size and min(left.shape) >= _MIN_HALVED_PX and settings.steps > 1
     if at_half_size:
         start = _after_half_size_step(left, right, start, matched, settings)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
@@ -115,14 +122,15 @@ def refine(left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: R
         remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
         blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
         variance = work.step(left, right, blur_px, noise * _slope_gain(blur_px), remaining == 0)
-    return Refined(inside(work.disparity, start.shape).copy(), variance)
+    return IcpResult(inside(work.disparity, start.shape).copy(), variance)
 
 
 def _after_half_size_step(
     left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
 ) -> Float32:
-    """`start` after a step at half the size with the long support: a quarter of the work, and softer images
-    carry further."""
+    """Run one step at half the size with the long support: a quarter of the work, and softer images carry
+    further.
+    """
     half = replace(
         settings,
         along_px=settings.along_px / 2,
@@ -131,19 +139,19 @@ def _after_half_size_step(
         same_surface_px=settings.same_surface_px / 2,
         window_px=max(settings.window_px // 4 * 2 + 1, 3),
     )
-    small_left, small_right = (halved(image.astype(np.float32)) for image in (left, right))
-    started = np.float32(0.5) * halved(start)
-    work = _Work.of(small_left, started, halved(matched.astype(np.float32)), half, _HALF_HOLD * _HOLD)
+    small_left, small_right = (halve(image.astype(np.float32)) for image in (left, right))
+    started = np.float32(0.5) * halve(start)
+    work = _Work.of(small_left, started, halve(matched.astype(np.float32)), half, _HALF_HOLD * _HOLD)
     slope_noise = _noise(small_left, small_right) * _slope_gain(_BLUR_PX)
     work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
     fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
     moved = np.clip(fitted - started, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
-    return carried_up(started, moved, start, settings.same_surface_px)
+    return upsample_update(started, moved, start, settings.same_surface_px)
 
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """What the steps share. usable, its mean over windows, hold: (H, W). The rest are frames."""
+    """State shared by the steps. usable, its mean over windows, hold: (H, W). The rest are frames."""
 
     settings: RefinementSettings
     axes: Float32
@@ -163,20 +171,20 @@ class _Work:
         cls, left: Float32, start: Float32, usable: Float32, settings: RefinementSettings, hold: float = _HOLD
     ) -> _Work:
         mean_usable = cv2.boxFilter(usable, -1, (settings.window_px, settings.window_px))
-        frames = [empty_frame(start.shape) for _ in range(7)]
+        frames = [allocate_frame(start.shape) for _ in range(7)]
         inside(frames[0], start.shape)[:] = start
         hold_each = np.float32(hold) * (usable + np.float32(_HOLD_UNMATCHED))
         return cls(settings, tile_axes(left), usable, mean_usable, hold_each, *frames)
 
     def step(self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool) -> Float32:
-        """One step of the disparity; its variance. slope_noise: variance of the left image's slope."""
+        """Run one step of the disparity; its variance. slope_noise: variance of the left image's slope."""
         shape, side = self.usable.shape, self.settings.window_px
         short_of, mean_weight = self.pulls(left, right, blur_px, slope_noise, is_last)
         power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
-        power *= np.minimum(short_of, _MOST_NOISIER - (short_of - _MOST_NOISIER) / _DAMPED)
+        power *= np.minimum(short_of, _MAX_NOISIER - (short_of - _MAX_NOISIER) / _DAMPED)
         fitted, variance = self._fit(power)
         before = inside(self.disparity, shape).copy()
-        settle(fitted, self.axes, self.disparity, variance)
+        update_disparity(fitted, self.axes, self.disparity, variance)
         if is_last:
             self._complete(before, short_of)
         return variance
@@ -184,8 +192,10 @@ class _Work:
     def pulls(
         self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool
     ) -> tuple[Float32, Float32]:
-        """Weights and pulls of this step, weights with the hold. What a step falls short by, and the
-        weights' means over windows, (H, W)."""
+        """Compute weights and pulls of this step, weights with the hold.
+
+        What a step falls short by, and the weights' means over windows, (H, W).
+        """
         settings, shape = self.settings, self.usable.shape
         left_grey = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
         warped, right_slope = value_and_slope(row_coefficients(right, blur_px), self.disparity, MARGIN)
@@ -196,25 +206,28 @@ class _Work:
             slope *= np.float32(0.5)
             slope_noise *= 0.5
         side = settings.window_px
-        compare(left_grey, warped, self.usable, side, settings.outlier_grey, self.residual, self.trust)
+        photometric_residual(
+            left_grey, warped, self.usable, side, settings.outlier_grey, self.residual, self.trust
+        )
         gloss = settings.gloss_px, settings.gloss_trust
         evidence = self.residual, self.slope, self.trust
-        weigh(*evidence, self._along(left_grey), side, *gloss, self.weight, self.pull)
+        robust_weights(*evidence, self._along(left_grey), side, *gloss, self.weight, self.pull)
         mean_weight = np.empty(shape, dtype=np.float32)
-        short_of = lengthen(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
+        short_of = step_gain(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
         weight = inside(self.weight, shape)
         weight += self.hold
         return short_of, mean_weight
 
     def _complete(self, before: Float32, short_of: Float32) -> None:
-        """Go the rest of a step that fell short, in the mean over a window: a start that gloss has bent is
-        off as a whole, while each pixel's own rest is mostly noise."""
+        """Complete a step that fell short, in the mean over a window: a start that gloss has bent is off as a
+        whole, while each pixel's own rest is mostly noise.
+        """
         now, side = inside(self.disparity, before.shape), self.settings.window_px
         moved = cv2.boxFilter(self.usable * (now - before), -1, (side, side))
         now += (short_of - 1) * moved / (self.mean_usable + np.float32(1e-6))
 
     def _along(self, grey: Float32) -> tuple[Float32, Float32]:
-        """Means of residual and slope along the axis, (H, W)."""
+        """Average residual and slope along the axis, (H, W)."""
         settings, shape = self.settings, grey.shape
         means = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         if settings.gloss_px > 0:
@@ -228,9 +241,9 @@ class _Work:
         settings = self.settings
         long = self.planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX))
         if settings.short_px == 0:
-            return long[0], variances(power, long[1])
+            return long[0], fit_variance(power, long[1])
         short = self.planes(SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX))
-        return blend(long, short, power, self.usable)
+        return blend_fits(long, short, power, self.usable)
 
     def planes(self, support: SupportShape) -> Fit:
         found = np.empty_like(self.usable), np.empty_like(self.usable)
@@ -244,13 +257,13 @@ class _Work:
 
 
 def _noise(left: Image, right: Image) -> float:
-    """Mean variance of both images' noise."""
+    """Average the variance of both images' noise."""
     return 0.5 * (image_noise(left) ** 2 + image_noise(right) ** 2)
 
 
 @lru_cache
 def _slope_gain(blur_px: float) -> float:
-    """Variance of `row_slope` per variance of a white noise in the image."""
+    """Compute the variance of `row_slope` per variance of a white noise in the image."""
     impulse = np.zeros((33, 33), dtype=np.uint8)
     impulse[16, 16] = 100
     return float(np.square(row_slope(impulse, blur_px) / 100).sum())

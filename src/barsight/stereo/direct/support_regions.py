@@ -1,8 +1,8 @@
-"""Supports that follow a bar: tiles with an axis, and means along it.
+"""Build supports that follow a bar: tiles with an axis, and means along it.
 
 The image is cut into tiles; each has one axis, the direction in which the image changes least. A support is
 a fixed pattern of whole-pixel offsets turned to that axis, so the innermost loop runs along a row of the tile
-and the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`empty_frame`).
+and the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`allocate_frame`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int64, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
 
 TILE_ROWS = 16
@@ -25,11 +25,12 @@ MARGIN = 48
 _LINE_FLOATS = 16
 BAND_TILES = 16
 """Rows of tiles that are worked through column by column: what their supports read fits into the cache."""
-_LEAST_COHERENCE = 0.35
+_MIN_COHERENCE = 0.35
 
 
 def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
-    """(tile rows, tile columns, 2) unit vector (x, y) along which the image changes least around each tile.
+    """Compute the unit vector (tile rows, tile columns, 2) (x, y) along which the image changes least around
+    each tile.
 
     From the structure tensor [Foerstner 1987] averaged over scale_px. Where no direction stands out it is the
     column's, across the baseline: there a mean along the axis costs the match least.
@@ -50,12 +51,12 @@ def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
     across = 0.5 * np.arctan2(2 * xy, xx - yy)
     coherence = np.hypot(xx - yy, 2 * xy) / (xx + yy + np.float32(1e-3))
     axes = np.stack([-np.sin(across), np.cos(across)], axis=-1).astype(np.float32)
-    axes[coherence < _LEAST_COHERENCE] = (0, 1)
+    axes[coherence < _MIN_COHERENCE] = (0, 1)
     return axes
 
 
-def empty_frame(shape: tuple[int, ...]) -> Float32:
-    """Room for an image, with a margin of zeros that every support offset stays within.
+def allocate_frame(shape: tuple[int, ...]) -> Float32:
+    """Allocate an image with a margin of zeros that every support offset stays within.
 
     Rows begin with a cache line and take an odd number of them: with most even ones a column's rows compete
     for a few of the nearest cache's places.
@@ -69,7 +70,7 @@ def empty_frame(shape: tuple[int, ...]) -> Float32:
 
 
 def inside(frame: Float32, shape: tuple[int, ...]) -> Float32:
-    """View of the image in a frame."""
+    """View the image in a frame."""
     return frame[MARGIN : MARGIN + shape[0], MARGIN : MARGIN + shape[1]]
 
 
@@ -77,7 +78,7 @@ def axis_means(
     first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, sigma_px: float,
     means: tuple[Float32, Float32],
 ) -> None:  # fmt: skip
-    """Weighted Gaussian means of two images along each tile's axis. Frames in, no NaN; (H, W) each out.
+    """Average two images along each tile's axis with Gaussian weights. Frames in, no NaN; (H, W) each out.
 
     alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at 1), so that
     a strap or a shadow across the bars has a mean of its own.
@@ -88,7 +89,7 @@ def axis_means(
     def work(first_tile: int, end_tile: int) -> None:
         _axis_means(first, second, weight, alike, axes, steps, shares, *means, first_tile, end_tile)
 
-    in_bands(work, len(axes), BAND_TILES)
+    parallel_bands(work, len(axes), BAND_TILES)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -96,7 +97,7 @@ def _take_means(
     _: Any, theres: Any, firsts: Any, seconds: Any, weights: Any, middle: Any, offsets: Any, shares: Any,
     first_mean: Any, second_mean: Any, at: Any,
 ) -> Any:  # fmt: skip
-    """The means of the first and of the second image for 16 pixels from `middle` on, written from `at` on.
+    """Average the first and the second image for 16 pixels from `middle` on, written from `at` on.
     offsets: from a pixel to its support's points on one side; the other side's are mirror images. All arrays
     are flat."""
     signature = types.void(

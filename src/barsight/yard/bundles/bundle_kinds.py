@@ -1,4 +1,4 @@
-"""Kinds of bundles: neighbours mostly hold the same bars, so some settle what others leave open."""
+"""Group bundles by kind: neighbours mostly hold the same bars, so some settle what others leave open."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _ALIKE_LOG = 0.08
 """Standard deviation of the logarithm of diameters read for one kind of bar."""
 _SHARPNESS = 12.0
 _BONUS = 0.5
-_PRIOR_SHARE = 0.015
+_PRIOR_RATIO = 0.015
 """How much bars of one kind differ, as a share of the diameter."""
-_LEAST_MEMBERS = 3
+_MIN_MEMBERS = 3
 _SAME_WIDTH = 0.2
 _AS_WELL, _AS_WELL_SINGLE, _AS_WELL_THIN = 0.95, 0.85, 0.6
 
 
-def with_company(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64) -> Float64:
-    """Weights, raised by up to a half the more places hold bundles of the same rings and diameter.
+def reinforce_kinds(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64) -> Float64:
+    """Raise weights by up to a half the more places hold bundles of the same rings and diameter.
 
     overlaps: (chosen, N) share of the chosen reading's place that each reading wants. A place speaks for
     every kind that explains it nearly as well as the best does.
@@ -41,7 +41,7 @@ def with_company(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Flo
 def other_packings(
     fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64, resolved_m: float
 ) -> list[int | None]:
-    """For each chosen reading the rings of another packing that explains the places of its kind as well.
+    """Find for each chosen reading the rings of another packing that explains the places of its kind as well.
 
     weights: as explained, without company. As well: not 5 % less over all those places together; a single
     bar must lead by 15 %, and bars thinner than resolved_m by 40 %, since a smoothed map flatters them.
@@ -71,10 +71,12 @@ def _alike(fit: Fit, other: Fit) -> bool:
 
 
 def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
-    """Median diameter of the bundles of the fit's kind and its sigma; None for fewer than three."""
+    """Compute the median diameter of the bundles of the fit's kind and its sigma; None for fewer
+    than three.
+    """
     alike = [other.values[DIAMETER] for other in others if _alike(fit, other)]
-    if len(alike) < _LEAST_MEMBERS:
+    if len(alike) < _MIN_MEMBERS:
         return None
     spread = 1.25 * np.std(alike) / np.sqrt(len(alike))
     middle = float(np.median(alike))
-    return middle, float(np.hypot(_PRIOR_SHARE * middle, spread))
+    return middle, float(np.hypot(_PRIOR_RATIO * middle, spread))

@@ -1,4 +1,4 @@
-"""From fitted outlines to bundles: ends, layers, what lies on what, how sure all of it is."""
+"""Describe fitted outlines as bundles: ends, layers, what lies on what, how sure all of it is."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from barsight.yard.bundles.fitting.outline_fit import (
     SLOPE_U,
     SLOPE_Z,
     Fit,
-    Found,
+    FittedOutline,
     U,
     Z,
 )
-from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.bundles.layers import find_layers, neighbours_of, on_top_of
-from barsight.yard.sections import Stretch
+from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours
+from barsight.yard.sections import MapStretch
 from barsight.yard.types import Bundle, BundleSigma
 
 _NARROW_M = 0.3
@@ -40,15 +40,17 @@ class Reading:
     other_packing: rings of another packing that explains the bundles of this kind as well, if any does.
     """
 
-    found: Found
+    found: FittedOutline
     weight: float
-    rival: Found | None
+    rival: FittedOutline | None
     rival_weight: float
     other_packing: int | None
 
 
-def described(bundles: list[Bundle], floor_m: float | None, parts: list[Stretch]) -> tuple[Bundle, ...]:
-    """The bundles, numbered by rising x of their centres, and what each of them is to its neighbours."""
+def describe_bundles(
+    bundles: list[Bundle], floor_m: float | None, parts: list[MapStretch]
+) -> tuple[Bundle, ...]:
+    """Number the bundles by rising x of their centres and relate each to its neighbours."""
     ordered = sorted(bundles, key=lambda b: tuple(b.centre_m))
     ordered = [replace(bundle, id=k) for k, bundle in enumerate(ordered)]
     out = list(ordered)
@@ -56,16 +58,16 @@ def described(bundles: list[Bundle], floor_m: float | None, parts: list[Stretch]
         near = [bundle for bundle in ordered if part.reaches(bundle.centre_m)]
         for bundle, layer in zip(near, find_layers(near, floor_m), strict=True):
             if part.owns(bundle.centre_m):
-                on_top, why = on_top_of(bundle, near)
+                on_top, why = check_uncovered(bundle, near)
                 out[bundle.id] = replace(
-                    bundle, layer=layer, on_top=on_top, neighbours=neighbours_of(bundle, near),
+                    bundle, layer=layer, on_top=on_top, neighbours=list_neighbours(bundle, near),
                     reasons=bundle.reasons + why,
                 )  # fmt: skip
     return tuple(out)
 
 
-def record(reading: Reading, settings: BundleSettings) -> Bundle:
-    """The chosen reading as a bundle, without its number and what follows from its neighbours."""
+def make_bundle(reading: Reading, settings: BundleSettings) -> Bundle:
+    """Make a bundle of the chosen reading, without its number and what follows from its neighbours."""
     sheet, fit = reading.found.sheet, reading.found.fit
     ends = [find_end(sheet, fit, step, settings) for step in (-1, 1)]
     outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), 0.0)
@@ -105,13 +107,13 @@ def record(reading: Reading, settings: BundleSettings) -> Bundle:
     )
 
 
-def _in_map(sheet: Sheet, fit: Fit, v_m: float) -> Float64:
+def _in_map(sheet: AlignedMap, fit: Fit, v_m: float) -> Float64:
     u, z = fit.at(v_m)
     return np.append(sheet.to_map(np.array([[u, v_m]]))[0], z)
 
 
-def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings, sheet: Sheet) -> BundleSigma:
-    """The fit's covariance carried to each figure, and the parts that the whole map shares."""
+def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings, sheet: AlignedMap) -> BundleSigma:
+    """Propagate the fit's covariance to each figure, with the parts that the whole map shares."""
     along = (ends[0].v_m + ends[1].v_m) / 2 - fit.v_m
     covariance = fit.covariance
     at_middle = np.zeros((2, 6))
@@ -133,7 +135,7 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings, shee
 
 
 def _top_changes(fit: Fit, top: float) -> tuple[float, float]:
-    """Change of the highest line over the axis by roll and by diameter."""
+    """Differentiate the highest line over the axis by roll and by diameter."""
     step = 0.01
     diameter, roll = float(fit.values[DIAMETER]), float(fit.values[ROLL])
     if fit.rings == 0:
@@ -143,7 +145,7 @@ def _top_changes(fit: Fit, top: float) -> tuple[float, float]:
 
 
 def _count(reading: Reading) -> tuple[int, tuple[str, ...]]:
-    """Bars by the outline; 0 and a sentence where another packing explains its kind as well."""
+    """Count bars by the outline; 0 and a sentence where another packing explains its kind as well."""
     fit, other = reading.found.fit, reading.other_packing
     if other is None:
         return fit.bars, ()
@@ -154,8 +156,8 @@ def _count(reading: Reading) -> tuple[int, tuple[str, ...]]:
     )
 
 
-def _doubts(reading: Reading, rows: UInt8, ends: list[End], sheet: Sheet) -> tuple[str, ...]:
-    """What speaks against the bundle as described."""
+def _doubts(reading: Reading, rows: UInt8, ends: list[End], sheet: AlignedMap) -> tuple[str, ...]:
+    """List what speaks against the bundle as described."""
     out = []
     known = (rows != 0).mean()
     if known < _SURE_KNOWN:
@@ -182,7 +184,9 @@ def _doubts(reading: Reading, rows: UInt8, ends: list[End], sheet: Sheet) -> tup
 
 
 def _confidence(reading: Reading, rows: UInt8) -> float:
-    """Probability from how much of the length agrees and how far the next other reading is behind."""
+    """Estimate the probability from how much of the length agrees and how far the next other reading is
+    behind.
+    """
     agrees = float((rows == AGREES).sum() / max((rows != 0).sum(), 1))
     fit, rival = reading.found.fit, reading.rival
     lead = 1.0
@@ -193,6 +197,6 @@ def _confidence(reading: Reading, rows: UInt8) -> float:
 
 
 def _runs(flags: Bool) -> list[tuple[int, int]]:
-    """First and one-past-last index of each run of True."""
+    """Find first and one-past-last index of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,4 +1,4 @@
-"""Where something long lies across the bundles, and which way: bundles there have a heading of their own."""
+"""Find long objects across the bundles and their headings: bundles there have a heading of their own."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
 from barsight.yard.bundles.fitting.outline_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
-from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.types import HeightMap
 
@@ -21,12 +21,12 @@ _FURTHER_M = 1.5
 """So far beyond where a bundle was followed to it may go on under what lies there."""
 _STEP_M = 0.06
 """Heights of neighbouring cells that differ more belong to different things."""
-_LEAST_CELLS = 30
+_MIN_CELLS = 30
 _FLANK = (0.3, 0.45)
 """Of the width to either side: where a bundle falls off as round bars do."""
 _FOLLOWS_M = 0.03
-_FOLLOWED_SHARE = 0.4
-_READ_SHARE = 0.5
+_FOLLOWED_RATIO = 0.4
+_READ_RATIO = 0.5
 _GAP_CELLS, _THIN_CELLS = 7, 5
 _LEVEL_M = 0.008
 _MARGIN_M = 0.6
@@ -35,11 +35,11 @@ _SLENDER = 1.8
 
 def crossing_pieces(
     height_map: HeightMap,
-    kept: list[tuple[Sheet, Fit]],
+    kept: list[tuple[AlignedMap, Fit]],
     headings: tuple[float, ...],
     settings: BundleSettings,
 ) -> Iterator[tuple[float, HeightMap]]:
-    """For each long thing over the kept outlines its heading (rad) and the map around it.
+    """Cut out each long thing over the kept outlines: its heading (rad) and the map around it.
 
     Left out is what runs as most bundles do, which is found with these, and what a kept outline follows.
     """
@@ -49,10 +49,10 @@ def crossing_pieces(
             mask[cells] = 1
     read = np.zeros(height_map.z_m.shape, bool)
     for row, column in _pieces(_level(height_map), over):
-        heading = _heading(row, column, settings.least_length_m / height_map.cell_m)
+        heading = _heading(row, column, settings.min_length_m / height_map.cell_m)
         if heading is None or _is_near(heading, headings[:1], settings.max_skew_deg):
             continue
-        if followed[row, column].mean() > _FOLLOWED_SHARE or read[row, column].mean() > _READ_SHARE:
+        if followed[row, column].mean() > _FOLLOWED_RATIO or read[row, column].mean() > _READ_RATIO:
             continue
         if _is_level(height_map.z_m[row, column], row, column, heading):
             continue
@@ -61,9 +61,11 @@ def crossing_pieces(
 
 
 def _cells_over(
-    sheet: Sheet, fit: Fit, settings: BundleSettings, height_map: HeightMap
+    sheet: AlignedMap, fit: Fit, settings: BundleSettings, height_map: HeightMap
 ) -> tuple[tuple[Int64, Int64], tuple[Int64, Int64]]:
-    """Rows and columns of the map's cells over the outline or where it may go on, and of those on it."""
+    """Select rows and columns of the map's cells over the outline or where it may go on, and of
+    those on it.
+    """
     further = round(_FURTHER_M / sheet.cell_m)
     rows = np.arange(max(fit.first - further, 0), min(fit.last + further + 1, sheet.z_m.shape[0]))
     v = sheet.v0_m + sheet.cell_m * rows
@@ -80,8 +82,8 @@ def _cells_over(
     return cells(rise > OVER_M), cells(np.abs(rise) <= OVER_M)
 
 
-def rise_over(sheet: Sheet, fit: Fit, rows: Int64, u: Float64, settings: BundleSettings) -> Float64:
-    """(R, N) measured heights over the outline at rows (R,) and places across u (R, N); NaN where unknown."""
+def rise_over(sheet: AlignedMap, fit: Fit, rows: Int64, u: Float64, settings: BundleSettings) -> Float64:
+    """Sample heights (R, N) over the outline at rows (R,) and places across u (R, N); NaN where unknown."""
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
@@ -96,12 +98,12 @@ def rise_over(sheet: Sheet, fit: Fit, rows: Int64, u: Float64, settings: BundleS
     return rise
 
 
-def is_beam(sheet: Sheet, fit: Fit, settings: BundleSettings) -> bool:
-    """Whether the mean section is level to where it ends, not round: a flank leaves the outline, the middle
-    is nearer to level than to the outline, or only bars thinner than any would make it so level. Where both
-    flanks fall off as the outline does, the middle may be level: two bars side by side are.
+def is_beam(sheet: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
+    """Check whether the mean section is level to where it ends, not round: a flank leaves the outline, the
+    middle is nearer to level than to the outline, or only bars thinner than any would make it so level. Where
+    both flanks fall off as the outline does, the middle may be level: two bars side by side are.
     """
-    if fit.rings > 0 and fit.values[DIAMETER] < settings.least_bar_m:
+    if fit.rings > 0 and fit.values[DIAMETER] < settings.min_bar_diameter_m:
         return True
     rows = np.flatnonzero(fit.state == AGREES)
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
@@ -129,8 +131,8 @@ def is_beam(sheet: Sheet, fit: Fit, settings: BundleSettings) -> bool:
 
 
 def _level(height_map: HeightMap) -> UInt8:
-    """1 where measured heights have no step beside them: surfaces that steps bound."""
-    measured = height_map.source == Source.VISION
+    """Mark 1 where measured heights have no step beside them: surfaces that steps bound."""
+    measured = height_map.source == HeightSource.VISION
     z = height_map.z_m
     around = np.ones((3, 3), np.uint8)
     far = np.float32(1e6)
@@ -140,7 +142,8 @@ def _level(height_map: HeightMap) -> UInt8:
 
 
 def _pieces(level: UInt8, over: UInt8) -> Iterator[tuple[Int64, Int64]]:
-    """Rows and columns of the surfaces of which a part lies over an outline; then of what lies over, as one.
+    """Group rows and columns of the surfaces of which a part lies over an outline; then of what lies over, as
+    one.
 
     Noise may join a thing's surface to those beneath it. Over the outlines alone it stands by itself.
     """
@@ -150,19 +153,21 @@ def _pieces(level: UInt8, over: UInt8) -> Iterator[tuple[Int64, Int64]]:
         _, parts, boxes, _ = cv2.connectedComponentsWithStats(whole, connectivity=4)
         cells = np.bincount(parts[over > 0], minlength=len(boxes))
         cells[0] = 0
-        for number in np.flatnonzero(cells >= _LEAST_CELLS):
+        for number in np.flatnonzero(cells >= _MIN_CELLS):
             x, y, width, height = boxes[number, :4]
             row, column = np.nonzero(parts[y : y + height, x : x + width] == number)
             yield row + y, column + x
 
 
-def _heading(row: Int64, column: Int64, least_cells: float) -> float | None:
-    """The long axis's angle from +y, in (-pi/2, pi/2]; None for what is short or about as wide as long."""
-    if row.size < least_cells:
+def _heading(row: Int64, column: Int64, min_cells: float) -> float | None:
+    """Compute the long axis's angle from +y, in (-pi/2, pi/2]; None for what is short or about as wide as
+    long.
+    """
+    if row.size < min_cells:
         return None
     places: Float64 = np.stack([column, row]).astype(np.float64)
     spread, axes = np.linalg.eigh(np.cov(places))
-    if 12 * spread[1] < least_cells**2 or spread[1] < _SLENDER**2 * spread[0]:
+    if 12 * spread[1] < min_cells**2 or spread[1] < _SLENDER**2 * spread[0]:
         return None
     x, y = axes[:, 1]
     heading = float(np.arctan2(-x, y))
@@ -170,7 +175,7 @@ def _heading(row: Int64, column: Int64, least_cells: float) -> float | None:
 
 
 def _is_level(z: Float32, row: Int64, column: Int64, heading: float) -> bool:
-    """Whether the middle of the section is level, as a beam's: reading it would be in vain."""
+    """Check whether the middle of the section is level, as a beam's: reading it would be in vain."""
     across = np.rint(np.cos(heading) * column + np.sin(heading) * row).astype(np.int64)
     low, high = np.quantile(across, [0.15, 0.85])
     heights = [float(np.median(z[across == u])) for u in range(int(np.ceil(low)), int(high) + 1)]

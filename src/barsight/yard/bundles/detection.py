@@ -1,4 +1,4 @@
-"""Bundles found in the height map: guesses in cross-sections, grown along the bars, the best set kept."""
+"""Find bundles in the height map: candidates in cross-sections, grown along the bars, the best set kept."""
 
 from __future__ import annotations
 
@@ -8,32 +8,45 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.parallel import ordered_map
-from barsight.core.types import Source
-from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, with_company
-from barsight.yard.bundles.bundle_record import Reading, described, record
+from barsight.core.types import HeightSource
+from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, reinforce_kinds
+from barsight.yard.bundles.bundle_record import Reading, describe_bundles, make_bundle
 from barsight.yard.bundles.crossing_bundles import OVER_M, crossing_pieces, is_beam, rise_over
-from barsight.yard.bundles.fitting.growth import grow
+from barsight.yard.bundles.fitting.growth import grow_outline
 from barsight.yard.bundles.fitting.outline import bundle_width
-from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, Found, U, Z, refine, widened
-from barsight.yard.bundles.fitting.rotated_map import Sheet, turn
+from barsight.yard.bundles.fitting.outline_fit import (
+    AGREES,
+    Fit,
+    FittedOutline,
+    U,
+    Z,
+    refine_outline,
+    widen_fit,
+)
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap, align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.bundles.fitting.template_matching import Guess, Templates, guess, make_templates
+from barsight.yard.bundles.fitting.template_matching import (
+    BundleCandidate,
+    Templates,
+    make_templates,
+    propose_candidates,
+)
 from barsight.yard.bundles.floor import find_floor
-from barsight.yard.bundles.gully_shading import as_pictured, seen_smoothing
+from barsight.yard.bundles.gully_shading import estimate_smoothing, refit_with_packing
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import same_place
-from barsight.yard.bundles.set_packing import choose, overlaps, strongest_rivals, without_slivers
-from barsight.yard.sections import stretches
+from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
+from barsight.yard.sections import split_map
 from barsight.yard.types import Bundle, HeightMap, YardMap
 
 _EDGE_CELLS = 3.0
 """What a bundle costs per row: its edges explain nothing."""
 _CLAIM_M = 0.02
-_RIVAL_SHARE = 0.8
-_SUNKEN_M, _SUNKEN_SHARE = 0.04, 0.2
+_RIVAL_RATIO = 0.8
+_SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
 """How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
 _RESOLVED_CELLS = 4.0
-_SLIVER_SHARE = 0.03
+_SLIVER_RATIO = 0.03
 _CROSSING_STEP_M = 0.4
 """What lies across may be short: cross-sections this far apart meet it."""
 _SEAM_M = 0.1
@@ -41,77 +54,79 @@ _SEAM_M = 0.1
 
 
 def find_bundles(yard: YardMap, settings: BundleSettings) -> tuple[Bundle, ...]:
-    """All bundles that the map shows, in the map's frame, from low to high x; empty where there are none.
+    """Find all bundles that the map shows, in the map's frame, from low to high x; empty where there are
+    none.
 
     A bundle is an outline of round bars in hexagonal packing (or one bar) that the measured heights follow.
     Outlines are guessed in cross-sections, grown along the bars by least squares, and of those that want the
     same place the set is kept that explains most heights. A long yard is searched stretch by stretch; where
     two stretches read a place differently the first one holds.
     """
-    if yard.cell_m > settings.coarsest_cell_m:
+    if yard.cell_m > settings.max_cell_m:
         return ()
     floor = find_floor(yard)
     templates = make_templates(settings, yard.cell_m)
-    parts, found = stretches(yard), list[Bundle]()
+    parts, found = split_map(yard), list[Bundle]()
     for part in parts:
         read = _search(yard.part(part.rows, part.columns), floor, templates, settings)
         own = [bundle for bundle in read if part.owns(bundle.centre_m, _SEAM_M)]
         before = [bundle for bundle in found if part.reaches(bundle.centre_m)]
         found += [bundle for bundle in own if not any(same_place(bundle, one) for one in before)]
-    return described(found, floor, parts)
+    return describe_bundles(found, floor, parts)
 
 
 def _search(
     height_map: HeightMap, floor: float | None, templates: Templates, settings: BundleSettings
 ) -> list[Bundle]:
-    """What a map shows that is short enough to be held."""
-    if not (height_map.source == Source.VISION).any():
+    """Search a map that is short enough to be held."""
+    if not (height_map.source == HeightSource.VISION).any():
         return []
-    found: list[Found] = []
+    found: list[FittedOutline] = []
     headings = find_headings(height_map, settings.max_skew_deg)
     for heading in headings:
         found += _found(height_map, heading, floor, templates, settings)
     places = [_claims(one, settings) for one in found]
-    chosen = choose(_weights(found), without_slivers(places, _SLIVER_SHARE))
+    chosen = choose_readings(_weights(found), without_slivers(places, _SLIVER_RATIO))
     kept = [(found[k].sheet, found[k].fit) for k in chosen]
     close = replace(settings, slice_step_m=_CROSSING_STEP_M)
     for heading, part in crossing_pieces(height_map, kept, headings, settings):
         across = _found(part, heading, floor, templates, close)
         found += [one for one in across if not is_beam(one.sheet, one.fit, settings)]
     places += [_claims(one, settings) for one in found[len(places) :]]
-    readings = _settled(found, without_slivers(places, _SLIVER_SHARE), height_map, settings)
-    return [record(reading, settings) for reading in readings]
+    readings = _settled(found, without_slivers(places, _SLIVER_RATIO), height_map, settings)
+    return [make_bundle(reading, settings) for reading in readings]
 
 
 def _found(
     height_map: HeightMap, heading: float, floor: float | None, templates: Templates, settings: BundleSettings
-) -> list[Found]:
-    """Every outline that runs about as `heading` does."""
-    sheet = turn(height_map, heading, -np.inf if floor is None else floor + settings.least_rise_m)
-    return [Found(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
+) -> list[FittedOutline]:
+    """Find every outline that runs about as `heading` does."""
+    sheet = align_map(height_map, heading, -np.inf if floor is None else floor + settings.min_rise_m)
+    return [FittedOutline(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
 
 
-def _weights(found: list[Found]) -> Float64:
-    """What each explains."""
+def _weights(found: list[FittedOutline]) -> Float64:
+    """Compute the number of cells that each explains."""
     return np.array([_weight(one.fit) for one in found])
 
 
 def _settled(
-    found: list[Found], claims: list[Int64], height_map: HeightMap, settings: BundleSettings
+    found: list[FittedOutline], claims: list[Int64], height_map: HeightMap, settings: BundleSettings
 ) -> list[Reading]:
-    """The best set of readings, once by itself and once more with regard to the kinds of bundles in it.
+    """Select the best set of readings, once by itself and once more with regard to the kinds of bundles in
+    it.
 
     Which bars an outline holds is settled by the pictures where they show it, else by its neighbours.
     """
     fits, weights = [one.fit for one in found], _weights(found)
-    first = choose(weights, claims)
-    raised = with_company(fits, weights, first, overlaps(first, claims))
-    chosen = choose(raised, claims)
+    first = choose_readings(weights, claims)
+    raised = reinforce_kinds(fits, weights, first, overlaps(first, claims))
+    chosen = choose_readings(raised, claims)
     wanted = overlaps(chosen, claims)
     best = (found[k] for k in chosen)
-    kept = list(ordered_map(lambda one: as_pictured(one, height_map, settings), best))
-    smoothed = replace(settings, smoothing_m=seen_smoothing(kept, settings))
-    again = ordered_map(lambda one: refine(one.sheet, one.fit, smoothed) or one.fit, kept)
+    kept = list(ordered_map(lambda one: refit_with_packing(one, height_map, settings), best))
+    smoothed = replace(settings, smoothing_m=estimate_smoothing(kept, settings))
+    again = ordered_map(lambda one: refine_outline(one.sheet, one.fit, smoothed) or one.fit, kept)
     kept = [replace(one, fit=fit) for one, fit in zip(kept, again, strict=True)]
     resolved = 0.0 if settings.catalogue_mm else _RESOLVED_CELLS * height_map.cell_m
     readings = []
@@ -130,23 +145,23 @@ def _settled(
     return readings
 
 
-def _finished(one: Found, kept: list[Fit], settings: BundleSettings) -> Found:
-    """Fitted again with the diameter that the bundles of its kind have in common."""
+def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> FittedOutline:
+    """Fit again with the diameter that the bundles of its kind have in common."""
     fit = one.fit
     common = common_diameter(fit, kept)
     if common is not None and not settings.catalogue_mm:
-        fit = refine(one.sheet, fit, settings, common=common) or fit
-    return replace(one, fit=widened(fit, settings))
+        fit = refine_outline(one.sheet, fit, settings, common=common) or fit
+    return replace(one, fit=widen_fit(fit, settings))
 
 
 def _on(floor_m: float | None, fit: Fit) -> bool:
-    """Whether the whole packing lies over the floor: its top rises from it by about its own height."""
-    sunken = min(_SUNKEN_M, _SUNKEN_SHARE * fit.width_m)
+    """Check that the whole packing lies over the floor: its top rises from it by about its own height."""
+    sunken = min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
     return floor_m is None or fit.values[Z] - fit.width_m / 2 > floor_m - sunken
 
 
-def _readings(sheet: Sheet, templates: Templates, settings: BundleSettings) -> list[Fit]:
-    """Every outline that could be grown, of at least the least length."""
+def _readings(sheet: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:
+    """Grow every outline that reaches at least the least length."""
     fits: list[Fit] = []
     rows = sheet.z_m.shape[0]
     step = max(round(settings.slice_step_m / sheet.cell_m), 1)
@@ -155,22 +170,24 @@ def _readings(sheet: Sheet, templates: Templates, settings: BundleSettings) -> l
         return []
     for row in range(int(known[0]) + min(step, known.size) // 2, int(known[-1]) + 1, step):
         v = sheet.v0_m + row * sheet.cell_m
-        candidates = _worth_growing(guess(sheet, templates, v, settings))
+        candidates = _worth_growing(propose_candidates(sheet, templates, v, settings))
         taken = _taken(fits, row, v)
         fresh = [one for one in candidates if not _is_taken(one, taken)]
         seeds = (_seed(one, row, rows, sheet, settings) for one in fresh)
-        grown = ordered_map(lambda seed: grow(sheet, seed, settings), seeds)
+        grown = ordered_map(lambda seed: grow_outline(sheet, seed, settings), seeds)
         for one, fit in zip(fresh, grown, strict=True):
             if fit is None or _is_taken(one, taken):
                 continue
-            if (fit.last - fit.first + 1) * sheet.cell_m >= settings.least_length_m:
+            if (fit.last - fit.first + 1) * sheet.cell_m >= settings.min_length_m:
                 fits.append(fit)
                 for rings, places in _taken([fit], row, v).items():
                     taken.setdefault(rings, []).extend(places)
     return fits
 
 
-def _seed(candidate: Guess, row: int, rows: int, sheet: Sheet, settings: BundleSettings) -> Fit:
+def _seed(
+    candidate: BundleCandidate, row: int, rows: int, sheet: AlignedMap, settings: BundleSettings
+) -> Fit:
     half = max(round(settings.slice_m / sheet.cell_m / 2), 1)
     first, last = max(row - half, 0), min(row + half, rows - 1)
     values = np.array([candidate.u_m, 0.0, candidate.z_m, 0.0, candidate.roll_rad, candidate.diameter_m])
@@ -180,8 +197,10 @@ def _seed(candidate: Guess, row: int, rows: int, sheet: Sheet, settings: BundleS
     )
 
 
-def _worth_growing(guesses: list[Guess]) -> list[Guess]:
-    """The best set of guesses that don't overlap, and other packings that do nearly as well there."""
+def _worth_growing(guesses: list[BundleCandidate]) -> list[BundleCandidate]:
+    """Select the best set of candidates that don't overlap, and other packings that do nearly as
+    well there.
+    """
     if not guesses:
         return []
     u, gain = np.array([(g.u_m, g.gain) for g in guesses]).T
@@ -190,7 +209,7 @@ def _worth_growing(guesses: list[Guess]) -> list[Guess]:
     kept = [guesses[k] for k in best]
     for k in best:
         seen = {guesses[k].rings}
-        for n in np.flatnonzero((np.abs(u - u[k]) < reach[k]) & (gain > _RIVAL_SHARE * gain[k])):
+        for n in np.flatnonzero((np.abs(u - u[k]) < reach[k]) & (gain > _RIVAL_RATIO * gain[k])):
             if guesses[n].rings not in seen:
                 kept.append(guesses[n])
                 seen.add(guesses[n].rings)
@@ -198,7 +217,7 @@ def _worth_growing(guesses: list[Guess]) -> list[Guess]:
 
 
 def _best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
-    """Weighted interval scheduling: the disjoint intervals that together weigh most."""
+    """Schedule weighted intervals: the disjoint intervals that together weigh most."""
     order = np.argsort(high, kind="stable")
     before = np.searchsorted(high[order], low[order], side="right")
     total = np.zeros(order.size + 1)
@@ -216,7 +235,9 @@ def _best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
 
 
 def _taken(fits: list[Fit], row: int, v_m: float) -> dict[int, list[tuple[float, float, float]]]:
-    """By rings: where the outlines that cross a row have their axes there, and how near one is the same."""
+    """Group by rings: where the outlines that cross a row have their axes there, and how near one is the
+    same.
+    """
     taken: dict[int, list[tuple[float, float, float]]] = {}
     for fit in fits:
         if fit.first <= row <= fit.last:
@@ -224,19 +245,19 @@ def _taken(fits: list[Fit], row: int, v_m: float) -> dict[int, list[tuple[float,
     return taken
 
 
-def _is_taken(candidate: Guess, taken: dict[int, list[tuple[float, float, float]]]) -> bool:
+def _is_taken(candidate: BundleCandidate, taken: dict[int, list[tuple[float, float, float]]]) -> bool:
     places = taken.get(candidate.rings, ())
     return any(abs(candidate.u_m - u) < near and abs(candidate.z_m - z) < near for u, z, near in places)
 
 
 def _weight(fit: Fit) -> float:
-    """Cells explained beyond the price of the bundle's edges."""
+    """Count cells explained beyond the price of the bundle's edges."""
     agreeing = fit.state[fit.first : fit.last + 1] == AGREES
     return float((fit.gain[fit.first : fit.last + 1] - _EDGE_CELLS)[agreeing].sum())
 
 
-def _claims(reading: Found, settings: BundleSettings) -> Int64:
-    """Numbers of the map's patches of 20 mm that lie well inside the outline and near it in height."""
+def _claims(reading: FittedOutline, settings: BundleSettings) -> Int64:
+    """Number the map's patches of 20 mm that lie well inside the outline and near it in height."""
     sheet, fit = reading.sheet, reading.fit
     rows = np.arange(fit.first, fit.last + 1)
     rows = rows[fit.state[rows] == AGREES]

@@ -1,23 +1,23 @@
-"""The floor under the stack, where the map shows some of it."""
+"""Find the floor under the stack, where the map shows some of it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from barsight.core.arrays import Float32
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.sections import patches
 from barsight.yard.types import HeightMap, YardMap
 
 _BLOCK_M = 0.3
 _FLAT_M = 0.012
 _LEVEL_M = 0.03
-_KNOWN_SHARE = 0.6
+_KNOWN_RATIO = 0.6
 _PATCH_BLOCKS = 64
 
 
 def find_floor(yard: YardMap) -> float | None:
-    """Height (m) of the lowest level ground in the map; None where no block of 0.3 m is level.
+    """Find the height (m) of the lowest level ground in the map; None where no block of 0.3 m is level.
 
     No bundle has a level top of 0.3 m, so level blocks are floor (or a platform: the lowest counts).
     """
@@ -30,14 +30,14 @@ def find_floor(yard: YardMap) -> float | None:
 
 
 def _levels(height_map: HeightMap, block: int) -> Float32:
-    """The heights of those blocks that are level."""
+    """Compute the heights of those blocks that are level."""
     rows, columns = (n // block for n in height_map.shape)
     part = np.s_[: rows * block, : columns * block]
-    z = np.where(height_map.source[part] == Source.VISION, height_map.z_m[part], np.nan)
+    z = np.where(height_map.source[part] == HeightSource.VISION, height_map.z_m[part], np.nan)
     cut = z.reshape(rows, block, columns, block)
     blocks = cut.transpose(0, 2, 1, 3).reshape(rows * columns, block * block)
     known = np.isfinite(blocks).sum(axis=1)
-    enough = known >= _KNOWN_SHARE * blocks.shape[1]
+    enough = known >= _KNOWN_RATIO * blocks.shape[1]
     ordered, at = np.sort(blocks[enough], axis=1), known[enough] - 1  # NaN last
     low, middle, high = (ordered[np.arange(at.size), np.rint(q * at).astype(int)] for q in (0.1, 0.5, 0.9))
     level: Float32 = middle[high - low < 2 * _FLAT_M]

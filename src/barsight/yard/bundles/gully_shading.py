@@ -1,4 +1,4 @@
-"""What the pictures say of a bundle's bars: the orthophoto is dark along the lines where bars meet.
+"""Read a bundle's packing from the orthophoto: it is dark along the lines where bars meet.
 
 The shading across a bundle says which packing lies there, which a smoothed surface often can't. With the
 packing known, the surface says how much it smooths, and so how thick the bars are.
@@ -25,37 +25,39 @@ from barsight.yard.bundles.fitting.outline_fit import (
     ROLL,
     SLOPE_U,
     Fit,
-    Found,
-    Shades,
+    FittedOutline,
+    ShadeProfile,
     U,
-    refine,
+    refine_outline,
 )
-from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.types import HeightMap
 
 _BIN_M = 0.002
-_LEAST_CELLS = 8
+_MIN_CELLS = 8
 """A place across the bundle needs so many cells along it for its median."""
-_LEAST_PLACES = 10
+_MIN_PLACES = 10
 _PIXEL_M = 0.003
 """Blur by lens and pixel, standard deviation on the surface."""
 _INSIDE = 0.46
 _WIDER = np.arange(-0.04, 0.041, 0.02)
 _SHIFTS_M = np.arange(-0.004, 0.0041, 0.002)
 _ROLLS_RAD = np.radians(np.arange(-6.0, 6.1, 3.0))
-_MOST_REST = 0.4
+_MAX_REST = 0.4
 """Of the shades' variance: what the best packing may leave."""
-_MOST_DOUBTING = 0.5
+_MAX_DOUBTING = 0.5
 """The same for a packing that is not sure, but speaks against the surface's."""
 _SURE = 4.5
 """Logarithm of how much likelier the best packing must be than the next."""
 _SMOOTHINGS_M = np.array([0.004, 0.007, 0.010, 0.013, 0.016])
-_MOST_SMOOTHED = 8
+_MAX_SMOOTHED = 8
 
 
-def shades_across(height_map: HeightMap, sheet: Sheet, fit: Fit) -> Shades | None:
-    """The orthophoto's shades over the rows that agree with the fit; None where too little was seen."""
+def shade_profile(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> ShadeProfile | None:
+    """Sample the orthophoto's shades over the rows that agree with the fit; None where too little
+    was seen.
+    """
     if height_map.grey is None:
         return None
     rows = np.flatnonzero(fit.state == AGREES)
@@ -83,25 +85,25 @@ def shades_across(height_map: HeightMap, sheet: Sheet, fit: Fit) -> Shades | Non
     agrees[rows] = True
     wanted = agrees[number] & (np.abs(beside) < half)
     places, levels = _medians(beside[wanted], grey[row[wanted], column[wanted]])
-    return Shades(places, levels) if places.size >= _LEAST_PLACES else None
+    return ShadeProfile(places, levels) if places.size >= _MIN_PLACES else None
 
 
 def _medians(beside: Float64, grey: UInt8) -> tuple[Float64, Float64]:
-    """Mean place and logarithm of the median grey level of each 2 mm that has enough cells."""
+    """Compute mean place and logarithm of the median grey level of each 2 mm that has enough cells."""
     number = np.floor(beside / _BIN_M).astype(np.int64)
     order = np.lexsort((grey, number))
     first = np.flatnonzero(np.diff(number[order], prepend=np.iinfo(np.int64).min))
     count = np.diff(first, append=order.size)
     places = np.add.reduceat(beside[order], first) / count if order.size else np.empty(0)
-    enough = count >= _LEAST_CELLS
+    enough = count >= _MIN_CELLS
     middle = grey[order][(first + count // 2)[enough]].astype(np.float64)
     return places[enough], np.log(middle + 5.0)
 
 
 @dataclass(frozen=True)
 class Packing:
-    """What the shades say. rest: share of their variance that the packing leaves; lead: logarithm of how much
-    likelier it is than the next.
+    """Packing by the shades. rest: share of their variance that the packing leaves; lead: logarithm of how
+    much likelier it is than the next.
     """
 
     rings: int
@@ -111,8 +113,8 @@ class Packing:
     lead: float
 
 
-def packing_by_shades(shades: Shades, fit: Fit, cell_m: float, settings: BundleSettings) -> Packing:
-    """The packing whose shading explains most of the shades within the fit's width, place and roll.
+def packing_by_shades(shades: ShadeProfile, fit: Fit, cell_m: float, settings: BundleSettings) -> Packing:
+    """Fit the packing whose shading explains most of the shades within the fit's width, place and roll.
 
     Each visible bar counts as two independent shades: its sides.
     """
@@ -142,7 +144,7 @@ def _rests(
     places: Float64, levels: Float64, packing: Float64, diameters: Float64, rolls: Float64, shifts: Float64,
     blur: float,
 ) -> Float64:  # fmt: skip
-    """(diameters, rolls) share of the shades' variance that the best shift leaves unexplained.
+    """Compute the fraction (diameters, rolls) of the shades' variance that the best shift leaves unexplained.
 
     The model: round bars lit from above and from a side, both fading smoothly across the bundle.
     """
@@ -180,7 +182,9 @@ def _rests(
 
 @kernel()
 def _shading(packing: Float64, diameter: float, roll: float, blur: float) -> tuple[Float64, Float64]:
-    """How much each place faces up, and how much sideways, STEP_M apart about the axis, blurred; 0 beside."""
+    """Render how much each place faces up, and how much sideways, STEP_M apart about the axis, blurred; 0
+    beside.
+    """
     c, s = np.cos(roll), np.sin(roll)
     radius = diameter / 2
     half = int((np.abs(packing).max() * diameter + radius) / STEP_M) + 20
@@ -209,45 +213,47 @@ def _shading(packing: Float64, diameter: float, roll: float, blur: float) -> tup
     return above / total, aside / total
 
 
-def as_pictured(found: Found, height_map: HeightMap, settings: BundleSettings) -> Found:
-    """The same, fitted again with the packing that the shades show, where they show one surely."""
-    shades = shades_across(height_map, found.sheet, found.fit)
+def refit_with_packing(
+    found: FittedOutline, height_map: HeightMap, settings: BundleSettings
+) -> FittedOutline:
+    """Fit again with the packing that the shades show, where they show one surely."""
+    shades = shade_profile(height_map, found.sheet, found.fit)
     if shades is None:
         return found
     fit = found.fit
     packing = packing_by_shades(shades, fit, height_map.cell_m, settings)
-    if packing.rest > _MOST_REST or packing.lead < _SURE:
-        doubts = packing.rest < _MOST_DOUBTING and packing.rings != fit.rings
+    if packing.rest > _MAX_REST or packing.lead < _SURE:
+        doubts = packing.rest < _MAX_DOUBTING and packing.rings != fit.rings
         return replace(found, doubt=packing.rings if doubts else None)
     if packing.rings != fit.rings:
         values = fit.values.copy()
         values[DIAMETER], values[ROLL] = packing.diameter_m, packing.roll_rad
-        again = refine(found.sheet, replace(fit, rings=packing.rings, values=values), settings)
+        again = refine_outline(found.sheet, replace(fit, rings=packing.rings, values=values), settings)
         if again is None:
             return found
         fit = again
-    return Found(found.sheet, fit, shades)
+    return FittedOutline(found.sheet, fit, shades)
 
 
 def _visible(rings: int, diameter_m: float, roll_rad: float) -> int:
-    """How many bars show from above."""
+    """Count the bars that show from above."""
     axes = turned_hexagon(rings, diameter_m, roll_rad)
     reach = bundle_width(rings, diameter_m) / 2
     highest, _ = highest_bars(axes, diameter_m / 2, np.arange(-reach, reach, STEP_M))
     return int(np.unique(highest[highest >= 0]).size)
 
 
-def seen_smoothing(found: list[Found], settings: BundleSettings) -> float:
-    """How far the map smooths across the bars (m, standard deviation): what fits best where pictures settled
-    the packing. The settings' own where they settled none.
+def estimate_smoothing(found: list[FittedOutline], settings: BundleSettings) -> float:
+    """Estimate the map's smoothing across the bars (m, standard deviation): what fits best where pictures
+    settled the packing. The settings' own where they settled none.
 
     Without the packing it can't be told: thin bars under little smoothing look like thick ones under much.
     """
     known = [one for one in found if one.shades is not None and one.fit.rings > 0]
-    known = known[:: 1 + len(known) // _MOST_SMOOTHED]
+    known = known[:: 1 + len(known) // _MAX_SMOOTHED]
     misfits = []
     for one in known:
-        tried = [refine(one.sheet, one.fit, replace(settings, smoothing_m=s)) for s in _SMOOTHINGS_M]
+        tried = [refine_outline(one.sheet, one.fit, replace(settings, smoothing_m=s)) for s in _SMOOTHINGS_M]
         rms = np.array([np.nan if fit is None else fit.rms_m for fit in tried])
         misfits.append((rms / np.nanmin(rms)) ** 2)
     if not misfits:

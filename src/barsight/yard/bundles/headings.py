@@ -1,4 +1,4 @@
-"""Which way the bars run: the headings that the map's slopes show."""
+"""Find the headings of the bars from the map's slopes."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Float64
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.types import HeightMap
 
 _BLOCK_M = 0.3
 _COHERENT = 0.5
 _STEEPEST = 1.5
 _STRIP_BLOCKS = 64
-_LEAST_SHARE = 0.02
-_LEAST_RELIEF = 0.15
+_MIN_RATIO = 0.02
+_MIN_RELIEF = 0.15
 """Of the mean squared slope where most of the relief is: what a block needs to count."""
 
 
 def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
-    """Headings (rad, in (-pi/2, pi/2], 0 along +y), the commonest first, at least `apart_deg` apart.
+    """Find headings (rad, in (-pi/2, pi/2], 0 along +y), the commonest first, at least `apart_deg` apart.
 
     Bars slope across their axis only: the structure tensor of each block of 0.3 m says which way, and how
     clearly [Bigun 1987]. A heading within `apart_deg` of an axis of the map is that axis.
@@ -36,7 +36,7 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
     # The ripples of a flat floor run as the pictures do, not as the bars: they have little relief.
     usual = float((energy**2).sum() / max(energy.sum(), 1e-12))
     clear = np.hypot(even, odd) > _COHERENT * np.maximum(energy, 1e-12)
-    clear &= energy > _LEAST_RELIEF * usual
+    clear &= energy > _MIN_RELIEF * usual
     if not clear.any():
         return (0.0,)
     across = 0.5 * np.arctan2(odd[clear], even[clear])  # direction of the slope from +x: the heading itself
@@ -46,7 +46,7 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
     found: list[float] = []
     peak = (smooth >= np.roll(smooth, 1)) & (smooth >= np.roll(smooth, -1))
     for index in np.argsort(np.where(peak, -smooth, 0.0), kind="stable"):
-        if not peak[index] or smooth[index] < _LEAST_SHARE * smooth.sum() or len(found) == 4:
+        if not peak[index] or smooth[index] < _MIN_RATIO * smooth.sum() or len(found) == 4:
             break
         near = np.abs((degrees - (index - 89.5) + 90) % 180 - 90) < apart_deg
         offset = np.median((degrees[near] - (index - 89.5) + 90) % 180 - 90) if near.any() else 0.0
@@ -57,10 +57,11 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
 
 
 def _slopes(height_map: HeightMap, block: int, rows: int, first: int, last: int) -> Float64:
-    """(3, rows, last - first): structure tensor of those blocks, as the difference of both axes' squared
-    slopes, twice their product and their sum. By strips: a long yard's slopes are many times its map."""
+    """Compute the structure tensor (3, rows, last - first) of those blocks, as the difference of both axes'
+    squared slopes, twice their product and their sum. By strips: a long yard's slopes are many times its map.
+    """
     low, high = max(first * block - 1, 0), min(last * block + 1, height_map.z_m.shape[1])
-    seen = height_map.source[:, low:high] == Source.VISION
+    seen = height_map.source[:, low:high] == HeightSource.VISION
     z = np.where(seen, height_map.z_m[:, low:high], np.nan).astype(np.float64)
     gy, gx = np.gradient(z, height_map.cell_m)
     usable = np.isfinite(gx) & np.isfinite(gy) & (np.hypot(gx, gy) < _STEEPEST)

@@ -1,4 +1,4 @@
-"""Which bundle lies on which, in which layer, and beside which."""
+"""Relate bundles: which lies on which, in which layer, and beside which."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from barsight.yard.types import Bundle
 _OVERLAP_M = 0.05
 _TOUCH_M = 0.03
 _DUNNAGE_M = 0.1
-_HIGHER_SHARE = 0.4
+_HIGHER_RATIO = 0.4
 _PARALLEL = 0.08
 _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
 
 
 def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
-    """Each bundle's layer by its height over the floor (the lowest bundle's underside where none was seen).
+    """Find each bundle's layer by its height over the floor (the lowest bundle's underside where none was
+    seen).
 
     The distance of the layers is the smallest step between the undersides of bundles of its width and heading
     that one bundle and its dunnage can make, else the bundle's own height and 0.1 m.
@@ -37,18 +38,18 @@ def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
 
 
 def _is_alike(one: Bundle, other: Bundle) -> bool:
-    """As wide, and no crossed one: these lie without dunnage."""
+    """Check for a bundle as wide, and no crossed one: these lie without dunnage."""
     parallel = abs(np.sin(one.yaw_rad - other.yaw_rad)) < _PARALLEL
     return bool(parallel and abs(other.width_m - one.width_m) < 0.15 * one.width_m)
 
 
 def _bottom(bundle: Bundle) -> float:
-    """Height of the underside: a hexagon is as deep below its axis as it rises above it."""
+    """Compute the underside's height: a hexagon is as deep below its axis as it rises above it."""
     return float(2 * bundle.centre_m[2] - bundle.top_z_m)
 
 
-def on_top_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[bool | None, tuple[str, ...]]:
-    """Whether no other lies on the bundle, and why not; None where what covers it isn't known."""
+def check_uncovered(bundle: Bundle, bundles: list[Bundle]) -> tuple[bool | None, tuple[str, ...]]:
+    """Check whether no other lies on the bundle, and why not; None where what covers it isn't known."""
     covers = [other.id for other in bundles if other.id != bundle.id and _lies_on(other, bundle)]
     if covers:
         return False, (f"bundle {', '.join(map(str, covers))} lies on it",)
@@ -58,14 +59,14 @@ def on_top_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[bool | None, tuple
 
 
 def _lies_on(upper: Bundle, lower: Bundle) -> bool:
-    """Whether `upper` is higher and its footprint covers a place on `lower`."""
-    if upper.centre_m[2] - lower.centre_m[2] < _HIGHER_SHARE * (upper.width_m + lower.width_m) / 2:
+    """Check whether `upper` is higher and its footprint covers a place on `lower`."""
+    if upper.centre_m[2] - lower.centre_m[2] < _HIGHER_RATIO * (upper.width_m + lower.width_m) / 2:
         return False
     return _common_length(lower, upper, -0.2 * lower.width_m) > _OVERLAP_M
 
 
-def neighbours_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
-    """Ids of the bundles that lie no more than 30 mm beside it, at about its height."""
+def list_neighbours(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
+    """List ids of the bundles that lie no more than 30 mm beside it, at about its height."""
     return tuple(
         other.id
         for other in bundles
@@ -76,7 +77,7 @@ def neighbours_of(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
 
 
 def same_place(one: Bundle, other: Bundle) -> bool:
-    """Whether both claim to fill one place: the middle of either lies well inside the other."""
+    """Check whether both claim to fill one place: the middle of either lies well inside the other."""
     near = abs(one.centre_m[2] - other.centre_m[2]) < _INSIDE * min(one.width_m, other.width_m)
     return bool(near) and (_holds(one, other.centre_m) or _holds(other, one.centre_m))
 
@@ -87,7 +88,7 @@ def _holds(bundle: Bundle, place: Float64) -> bool:
 
 
 def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:
-    """Length of `bundle` over which the two footprints, grown by margin_m in all, meet."""
+    """Compute the length of `bundle` over which the two footprints, grown by margin_m in all, meet."""
     skew = abs(np.sin(bundle.yaw_rad - other.yaw_rad))
     reach = (other.width_m + bundle.width_m + skew * bundle.length_m) / 2 + max(margin_m, 0.0)
     if _beside(bundle.centre_m[:2], other)[0] > reach:
@@ -103,7 +104,7 @@ def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:
 
 
 def _beside(places: Float64, bundle: Bundle) -> tuple[Float64, Float64]:
-    """Distances of (..., 2) places from the bundle's axis and, along it, from its middle."""
+    """Compute distances of (..., 2) places from the bundle's axis and, along it, from its middle."""
     c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     offset = places - bundle.centre_m[:2]
     return np.abs(offset @ np.array([c, s])), np.abs(offset @ np.array([-s, c]))

@@ -1,4 +1,4 @@
-"""Which of the readings that contradict each other hold: the set that explains most of the map."""
+"""Select among contradicting readings the set that explains most of the map."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from scipy.sparse import csc_matrix, csr_matrix
 from barsight.core.arrays import Float64, Int64
 
 
-def choose(weights: Float64, claims: list[Int64]) -> Int64:
-    """Indices of the readings that together weigh most, no place claimed twice.
+def choose_readings(weights: Float64, claims: list[Int64]) -> Int64:
+    """Choose the readings (indices) that together weigh most, no place claimed twice.
 
     weights: (N,) what a reading explains. claims: for each reading the numbers of the places it takes.
     """
@@ -30,9 +30,9 @@ def choose(weights: Float64, claims: list[Int64]) -> Int64:
     return np.array(useful, np.int64)[np.flatnonzero(solved.x > 0.5)]
 
 
-def without_slivers(claims: list[Int64], least_share: float) -> list[Int64]:
-    """The claims, less what two have in common where that is under least_share of the smaller: there only
-    their edges meet. The larger gives way.
+def without_slivers(claims: list[Int64], min_ratio: float) -> list[Int64]:
+    """Remove from the claims what two have in common where that is under min_ratio of the smaller: there
+    only their edges meet. The larger gives way.
     """
     if not claims:
         return []
@@ -42,13 +42,13 @@ def without_slivers(claims: list[Int64], least_share: float) -> list[Int64]:
     sizes = np.array([claim.size for claim in claims])
     out = list(claims)
     for i, j, cells in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):
-        if cells < least_share * min(sizes[i], sizes[j]) and (sizes[i], i) > (sizes[j], j):
+        if cells < min_ratio * min(sizes[i], sizes[j]) and (sizes[i], i) > (sizes[j], j):
             out[i] = np.setdiff1d(out[i], claims[j], assume_unique=True)
     return out
 
 
 def _rivals(owner: Int64, place: Int64, readings: int) -> csc_matrix:
-    """A row for each set of two or more readings that want the same places, 1 for those in it.
+    """Build a row for each set of two or more readings that want the same places, 1 for those in it.
 
     Places are told apart by the sum of random numbers, one drawn for each reading: 64 bits don't collide.
     """
@@ -61,7 +61,7 @@ def _rivals(owner: Int64, place: Int64, readings: int) -> csc_matrix:
 
 
 def overlaps(chosen: Int64, claims: list[Int64]) -> Float64:
-    """(chosen, N) share of each chosen reading's place that every reading wants."""
+    """Compute the fraction (chosen, N) of each chosen reading's place that every reading wants."""
     if chosen.size == 0:
         return np.empty((0, len(claims)))
     owner, place = _owners(claims)
@@ -72,7 +72,7 @@ def overlaps(chosen: Int64, claims: list[Int64]) -> Float64:
 
 
 def strongest_rivals(chosen: Int64, weights: Float64, wanted: Float64) -> list[int | None]:
-    """For each chosen reading the one that weighs most of those that want most of its place."""
+    """Find for each chosen reading the one that weighs most of those that want most of its place."""
     if chosen.size == 0:
         return []
     wants = wanted > 0.5
@@ -83,7 +83,7 @@ def strongest_rivals(chosen: Int64, weights: Float64, wanted: Float64) -> list[i
 
 
 def _owners(claims: list[Int64]) -> tuple[Int64, Int64]:
-    """Every claim as a pair: the reading's index and the place's, places counted from 0."""
+    """List every claim as a pair: the reading's index and the place's, places counted from 0."""
     owner = np.repeat(np.arange(len(claims), dtype=np.int64), [claim.size for claim in claims])
     _, place = np.unique(np.concatenate(claims), return_inverse=True)
     return owner, place.astype(np.int64)

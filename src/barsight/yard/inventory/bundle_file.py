@@ -1,4 +1,4 @@
-"""`bundles.json`: bundles as other programs read them, and back."""
+"""Read and write `bundles.json`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCHEMA_VERSION = 1
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema of bundles.json."""
+    """Load the JSON Schema of bundles.json."""
     text = resources.files("barsight.yard").joinpath("schemas/bundles.schema.json").read_text("utf-8")
     content: dict[str, Any] = json.loads(text)
     return content
@@ -29,7 +29,7 @@ def schema() -> dict[str, Any]:
 def write_bundles(
     bundles: tuple[Bundle, ...], stock: StockMatch | None, reference: str, target: Path
 ) -> None:
-    """bundles.json whole or not at all. reference: the frame, `yard` or `world`."""
+    """Write bundles.json whole or not at all. reference: the frame, `yard` or `world`."""
     content = {
         "schema_version": SCHEMA_VERSION,
         "reference": reference,
@@ -41,7 +41,7 @@ def write_bundles(
 
 
 def read_bundles(path: Path) -> tuple[Bundle, ...]:
-    """Back from bundles.json. Raises InputError where the file is missing, torn or of another version."""
+    """Read bundles.json. Raises InputError where the file is missing, torn or of another version."""
     remedy = "measure the recording again"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""What changed between two measured yards: bundles moved, settled, taken or added, and how sure that is."""
+"""Compare two measured yards: bundles moved, settled, taken or added, and how sure that is."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Float64
 from barsight.yard.sections import part_about
-from barsight.yard.stability.stability import look_up
+from barsight.yard.stability.stability import lookup_heights
 from barsight.yard.types import Bundle, YardMap
-from barsight.yard.weight import Mass, mass_of
+from barsight.yard.weight import Mass, bundle_mass
 
 Kind = Literal["same", "moved", "settled", "taken", "added", "not-seen"]
-MOST_MOVE_M = 0.5
+MAX_MOVE_M = 0.5
 SAME_WIDTH = 0.15
 SIGNIFICANT = 2.576
 """Sigmas that chance exceeds in one case of a hundred."""
-LEAST_KNOWN = 0.5
+MIN_KNOWN = 0.5
 _NO_PAIR = 1e6
 
 
@@ -47,7 +47,7 @@ class Change:
 
     @property
     def significant(self) -> bool:
-        """Whether chance would do as much in less than one case of a hundred."""
+        """Check whether chance would do as much in less than one case of a hundred."""
         return self.kind in ("taken", "added") or self.z > SIGNIFICANT
 
 
@@ -66,17 +66,17 @@ def compare_yards(
             changes.append(_change(before, new[pairs[k]]))
         else:
             seen = _seen(before, new_heights)
-            changes.append(_alone("taken" if seen else "not-seen", before.id, None, mass_of(before), -1))
+            changes.append(_alone("taken" if seen else "not-seen", before.id, None, bundle_mass(before), -1))
     matched = set(pairs.values())
     for k, after in enumerate(new):
         if k not in matched:
             seen = _seen(after, old_heights)
-            changes.append(_alone("added" if seen else "not-seen", None, after.id, mass_of(after), 1))
+            changes.append(_alone("added" if seen else "not-seen", None, after.id, bundle_mass(after), 1))
     return tuple(changes)
 
 
 def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
-    """Positions in `new` by those in `old`: least way in all, no way further than MOST_MOVE_M."""
+    """Match positions in `new` to those in `old`: least way in all, no way further than MAX_MOVE_M."""
     if not old or not new:
         return {}
     cost = np.full((len(old), len(new)), _NO_PAIR)
@@ -86,14 +86,16 @@ def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
             same = abs(after.width_m - before.width_m) < SAME_WIDTH * before.width_m
             open_end = any(before.ends_open) or any(after.ends_open)
             way = math.hypot(across, 0.0 if open_end else along, 2 * up)
-            if same and way < MOST_MOVE_M and abs(along) < before.length_m / 2:
+            if same and way < MAX_MOVE_M and abs(along) < before.length_m / 2:
                 cost[i, j] = way
     rows, columns = linear_sum_assignment(cost)
     return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if cost[i, j] < _NO_PAIR}
 
 
 def _moved(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
-    """Across, along, up (m) and yaw (rad), in the old bundle's axes; up is of the top."""
+    """Compute the displacement across, along, up (m) and yaw (rad), in the old bundle's axes; up is of the
+    top.
+    """
     away = after.centre_m[:2] - before.centre_m[:2]
     cos, sin = math.cos(before.yaw_rad), math.sin(before.yaw_rad)
     turned = (after.yaw_rad - before.yaw_rad + math.pi / 2) % math.pi - math.pi / 2
@@ -138,11 +140,11 @@ def _alone(kind: Kind, old: int | None, new: int | None, mass: Mass, sign: int) 
 
 
 def _seen(bundle: Bundle, heights: YardMap) -> bool:
-    """Whether a map saw the place where a bundle lies in the other."""
+    """Check whether a map saw the place where a bundle lies in the other."""
     u = np.linspace(-0.4, 0.4, 5) * bundle.width_m
     v = np.linspace(-0.45, 0.45, 40) * bundle.length_m
     vv, uu = np.meshgrid(v, u)
     cos, sin = math.cos(bundle.yaw_rad), math.sin(bundle.yaw_rad)
     x: Float64 = bundle.centre_m[0] + uu * cos - vv * sin
     y: Float64 = bundle.centre_m[1] + uu * sin + vv * cos
-    return bool(np.isfinite(look_up(part_about(heights, x, y), x, y)).mean() >= LEAST_KNOWN)
+    return bool(np.isfinite(lookup_heights(part_about(heights, x, y), x, y)).mean() >= MIN_KNOWN)

@@ -1,4 +1,4 @@
-"""The stock list: what should lie in the yard, held against what was found."""
+"""Compare the stock list, what should lie in the yard, with what was found."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
-class Expected:
+class ListedBundle:
     """A bundle of the stock list: place of its middle (m, yard); the others are None where not listed."""
 
     name: str
@@ -41,7 +41,7 @@ class Expected:
 
 
 @dataclass(frozen=True)
-class Matched:
+class MatchedEntry:
     """A listed bundle and the found one. moved_m: along x, y (and z where listed; else 0).
 
     disagrees: sentences where the found bundle isn't what the list says.
@@ -61,15 +61,18 @@ class StockMatch:
     another bundle, so that the map can't tell; extra: ids of found ones that aren't listed.
     """
 
-    matched: tuple[Matched, ...]
+    matched: tuple[MatchedEntry, ...]
     moved: tuple[str, ...]
     missing: tuple[str, ...]
     hidden: tuple[str, ...]
     extra: tuple[int, ...]
 
 
-def read_stock(path: Path) -> tuple[Expected, ...]:
-    """The list of a CSV or JSON file. Raises InputError where it is missing, torn, or names one twice."""
+def read_stock(path: Path) -> tuple[ListedBundle, ...]:
+    """Read the list of a CSV or JSON file.
+
+    Raises InputError where it is missing, torn, or names one twice.
+    """
     if not path.is_file():
         raise InputError(path, "no such file", _REMEDY)
     try:
@@ -101,7 +104,7 @@ def _json_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _expected(path: Path, number: int, row: dict[str, Any]) -> Expected:
+def _expected(path: Path, number: int, row: dict[str, Any]) -> ListedBundle:
     figures: dict[str, float | None] = {}
     for key in (*_NEEDED[1:], *_OPTIONAL):
         text = row.get(key)
@@ -122,10 +125,10 @@ def _expected(path: Path, number: int, row: dict[str, Any]) -> Expected:
     if not name:
         raise InputError(path, f"bundle {number} has no name", _REMEDY)
     bars = figures.pop("bars")
-    return Expected(name, bars=None if bars is None else int(bars), **figures)  # type: ignore[arg-type]
+    return ListedBundle(name, bars=None if bars is None else int(bars), **figures)  # type: ignore[arg-type]
 
 
-def match_stock(listed: tuple[Expected, ...], bundles: tuple[Bundle, ...]) -> StockMatch:
+def match_stock(listed: tuple[ListedBundle, ...], bundles: tuple[Bundle, ...]) -> StockMatch:
     """Pair listed and found bundles, each once, so that the distances together are least, none over 1 m.
 
     A pair further apart than 50 mm, and than three of the found place's sigmas, has moved.
@@ -137,7 +140,9 @@ def match_stock(listed: tuple[Expected, ...], bundles: tuple[Bundle, ...]) -> St
     matched, moved = [], []
     for i, k in partner.items():
         shift = _shift(listed[i], bundles[k])
-        matched.append(Matched(listed[i].name, bundles[k].id, shift, _disagreements(listed[i], bundles[k])))
+        matched.append(
+            MatchedEntry(listed[i].name, bundles[k].id, shift, _disagreements(listed[i], bundles[k]))
+        )
         if _has_moved(shift, bundles[k]):
             moved.append(listed[i].name)
     absent = [one for i, one in enumerate(listed) if i not in partner]
@@ -152,8 +157,8 @@ def match_stock(listed: tuple[Expected, ...], bundles: tuple[Bundle, ...]) -> St
     )
 
 
-def stock_warnings(listed: tuple[Expected, ...], match: StockMatch | None) -> tuple[str, ...]:
-    """Sentences on where list and map differ. match: None where the map isn't in the yard's frame."""
+def stock_warnings(listed: tuple[ListedBundle, ...], match: StockMatch | None) -> tuple[str, ...]:
+    """Warn where list and map differ. match: None where the map isn't in the yard's frame."""
     if match is None:
         return ("the map isn't in the yard's frame: the stock list can't be held against it",)
     differs = [f"{one.name} ({'; '.join(one.disagrees)})" for one in match.matched if one.disagrees]
@@ -170,7 +175,7 @@ def stock_warnings(listed: tuple[Expected, ...], match: StockMatch | None) -> tu
     )
 
 
-def _shift(one: Expected, bundle: Bundle) -> tuple[float, float, float]:
+def _shift(one: ListedBundle, bundle: Bundle) -> tuple[float, float, float]:
     rise = 0.0 if one.top_z_m is None else bundle.top_z_m - one.top_z_m
     return float(bundle.centre_m[0] - one.x_m), float(bundle.centre_m[1] - one.y_m), float(rise)
 
@@ -180,8 +185,8 @@ def _across_along(shift: tuple[float, float, float], bundle: Bundle) -> tuple[fl
     return float(c * shift[0] + s * shift[1]), float(-s * shift[0] + c * shift[1])
 
 
-def _distance(one: Expected, bundle: Bundle) -> float:
-    """Across and up count fully; along the axis a shift of 1 m is no further than 0.3 m across.
+def _distance(one: ListedBundle, bundle: Bundle) -> float:
+    """Weigh a shift: across and up count fully; along the axis 1 m is no further than 0.3 m across.
 
     What lies higher or lower than listed by half its width is another bundle.
     """
@@ -195,7 +200,7 @@ def _distance(one: Expected, bundle: Bundle) -> float:
 
 
 def _has_moved(shift: tuple[float, float, float], bundle: Bundle) -> bool:
-    """Along the axis only where both ends were seen: else the middle isn't known."""
+    """Check for a move, along the axis only where both ends were seen: else the middle isn't known."""
     across, along = _across_along(shift, bundle)
     sigma = bundle.sigma
     moves: Float64 = np.abs([across, shift[2], 0.0 if any(bundle.ends_open) else along])
@@ -204,7 +209,7 @@ def _has_moved(shift: tuple[float, float, float], bundle: Bundle) -> bool:
     return bool((moves > limits).any())
 
 
-def _disagreements(one: Expected, bundle: Bundle) -> tuple[str, ...]:
+def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
     out = []
     sigma = bundle.sigma
     for name, listed, found, spread in (
@@ -221,8 +226,8 @@ def _disagreements(one: Expected, bundle: Bundle) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _is_covered(one: Expected, bundles: tuple[Bundle, ...]) -> bool:
-    """Whether a found bundle lies over the listed place: at a known height, else anywhere over it."""
+def _is_covered(one: ListedBundle, bundles: tuple[Bundle, ...]) -> bool:
+    """Check whether a found bundle lies over the listed place: at a known height, else anywhere over it."""
     for bundle in bundles:
         shift = _shift(one, bundle)
         across, along = _across_along(shift, bundle)

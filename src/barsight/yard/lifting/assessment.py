@@ -1,4 +1,4 @@
-"""One placement of the magnet, judged: what it would take, how it lies, and every reason not to lift."""
+"""Judge one placement of the magnet: what it would take, how it lies, and every reason not to lift."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.checks import count_vetoes, face_vetoes, load_vetoes
 from barsight.yard.lifting.clearance import clearance_vetoes
-from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, touch
-from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, grip
+from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
+from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
 from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.lifting.travel_accuracy import Travel, travel_vetoes
 from barsight.yard.lifting.validity import Validity, age_vetoes, validity
 from barsight.yard.stability.stability import Footing, footing_vetoes
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
-from barsight.yard.weight import Mass, mass_of
+from barsight.yard.weight import Mass, bundle_mass
 
 SCALES = (1.0, 1.5, 2.5)
 """Multiples of the crane's tolerance that are tried for the box within which a lift stays as checked."""
 
 
 @dataclass(frozen=True, eq=False)
-class Yard:
+class LiftScene:
     """All that lifts are chosen from. vetoes: those that hold for the whole map. travel: None where the map
     is not measured but given. now_ns: when lifts are judged, on the frames' clock.
     """
@@ -69,12 +69,12 @@ class Lift:
     validity: Validity | None = None
 
 
-def assess(
-    place: Placement, yard: Yard, magnet: Magnet, settings: LiftSettings, *, search: bool = True
+def assess_placement(
+    place: Placement, yard: LiftScene, magnet: Magnet, settings: LiftSettings, *, search: bool = True
 ) -> Lift:
     """Judge a placement. Without `search` the tolerance is not looked for (and not vetoed)."""
-    near = near_table(yard.table, place, magnet)
-    contact = touch(yard.heights, place, magnet, settings.contact_gap_m)
+    near = nearby_bundles(yard.table, place, magnet)
+    contact = set_down(yard.heights, place, magnet, settings.contact_gap_m)
     if contact is None:
         unknown = Veto("unknown-under-footprint", "nothing is known under the magnet")
         nothing = Tolerance(0.0, 0.0, 0.0)
@@ -83,7 +83,7 @@ def assess(
             place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0,
             (*yard.vetoes, unknown),
         )  # fmt: skip
-    held = grip(place, magnet, magnet.tolerance, near, contact.z_m)
+    held = count_gripped(place, magnet, magnet.tolerance, near, contact.z_m)
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
     mass, middle = _load(load)
@@ -122,8 +122,8 @@ def assess(
     )  # fmt: skip
 
 
-def near_table(table: BundleTable, place: Placement, magnet: Magnet) -> BundleTable:
-    """The bundles that the magnet may reach or that stand beside those."""
+def nearby_bundles(table: BundleTable, place: Placement, magnet: Magnet) -> BundleTable:
+    """Select the bundles that the magnet may reach or that stand beside those."""
     reach = magnet.half_span_m + 1.0
     away = np.array([place.x_m, place.y_m]) - table.centre
     beside = np.abs(away[:, 0] * table.along[:, 1] - away[:, 1] * table.along[:, 0])
@@ -138,10 +138,10 @@ def near_table(table: BundleTable, place: Placement, magnet: Magnet) -> BundleTa
 
 
 def _load(load: tuple[Bundle, ...]) -> tuple[Mass, Float64]:
-    """The load's mass and its centre (x, y); bundles of unknown mass weigh alike."""
+    """Sum the load's mass and its centre (x, y); bundles of unknown mass weigh alike."""
     if not load:
         return Mass(math.nan, math.nan), np.full(2, np.nan)
-    masses = [mass_of(bundle) for bundle in load]
+    masses = [bundle_mass(bundle) for bundle in load]
     total = masses[0]
     for more in masses[1:]:
         total = total + more
@@ -151,7 +151,7 @@ def _load(load: tuple[Bundle, ...]) -> tuple[Mass, Float64]:
 
 
 def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> float:
-    """The longest way from the outermost pole to an end, upper bound; NaN where nothing is taken."""
+    """Compute the longest way from the outermost pole to an end, upper bound; NaN where nothing is taken."""
     beyond = [
         abs((end[:2] - (place.x_m, place.y_m)) @ place.along) - magnet.half_span_m
         + UPPER * float(np.nan_to_num(bundle.sigma.length_m, nan=0.05)) / 2
@@ -161,19 +161,20 @@ def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> flo
 
 
 def _tolerance(
-    place: Placement, yard: Yard, magnet: Magnet, near: BundleTable, held: Grip, needed_n: float,
+    place: Placement, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip, needed_n: float,
     contact: Contact, settings: LiftSettings,
 ) -> tuple[float, str]:  # fmt: skip
-    """The largest of SCALES times the crane's tolerance within which the lift stays as checked, and what
-    ends it there."""
+    """Find the largest of SCALES times the crane's tolerance within which the lift stays as checked, and what
+    ends it there.
+    """
     found = 0.0
     for scale in SCALES:
         box = Tolerance(
             min(magnet.tolerance.x_m * scale, 1.0), min(magnet.tolerance.y_m * scale, 1.0),
             min(magnet.tolerance.yaw_deg * scale, 20.0),
         )  # fmt: skip
-        sure = grip(place, magnet, box, near, contact.z_m).probability
-        if sure < settings.least_count_probability:
+        sure = count_gripped(place, magnet, box, near, contact.z_m).probability
+        if sure < settings.min_count_probability:
             return found, f"a count of {len(held.gripped)} has the probability {sure:.4f} only"
         changed = _change(place, box, yard, magnet, near, held, needed_n, settings)
         if changed:
@@ -183,22 +184,22 @@ def _tolerance(
 
 
 def _change(
-    place: Placement, box: Tolerance, yard: Yard, magnet: Magnet, near: BundleTable, held: Grip,
+    place: Placement, box: Tolerance, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip,
     needed_n: float, settings: LiftSettings,
 ) -> str:  # fmt: skip
-    """What changes at a corner of the box; empty where nothing does."""
+    """Find what changes at a corner of the box; empty where nothing does."""
     for dx, dy, dyaw in itertools.product((-1, 1), repeat=3):
         moved = replace(
             place, x_m=place.x_m + dx * box.x_m, y_m=place.y_m + dy * box.y_m,
             yaw_rad=place.yaw_rad + dyaw * math.radians(box.yaw_deg),
         )  # fmt: skip
-        contact = touch(yard.heights, moved, magnet, settings.contact_gap_m)
-        if contact is None or contact.unknown_share > settings.max_unknown_share:
+        contact = set_down(yard.heights, moved, magnet, settings.contact_gap_m)
+        if contact is None or contact.unknown_share > settings.max_unknown_ratio:
             return "too much under the poles was not seen"
         vetoes = face_vetoes(contact, needed_n, magnet, settings)
         if vetoes:
             return f"{vetoes[0].reason}"
-        exact = grip(moved, magnet, Tolerance(0.0, 0.0, 0.0), near, contact.z_m)
+        exact = count_gripped(moved, magnet, Tolerance(0.0, 0.0, 0.0), near, contact.z_m)
         if exact.gripped != held.gripped:
             return f"it takes {len(exact.gripped)} bundles"
     return ""

@@ -1,4 +1,4 @@
-"""What is held against a placement: the count under it, how the faces lie, the load, what stands around."""
+"""Check a placement for vetoes: the count under it, how the faces lie, the load, what stands around."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.contact import Contact
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.stability.stability import look_up
+from barsight.yard.stability.stability import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 from barsight.yard.weight import Mass
@@ -26,14 +26,14 @@ def count_vetoes(
     place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, held: Grip,
     settings: LiftSettings,
 ) -> list[Veto]:  # fmt: skip
-    """What the footprint takes: too much, too little, unsure, unseen, unknown."""
+    """Check what the footprint takes: too much, too little, unsure, unseen, unknown."""
     vetoes = []
     count = len(held.gripped)
     ids = ", ".join(str(near.bundles[k].id) for k in held.gripped)
-    if contact.unknown_share > settings.max_unknown_share:
+    if contact.unknown_share > settings.max_unknown_ratio:
         vetoes.append(
             Veto("unknown-under-footprint", f"{100 * contact.unknown_share:.0f} % of the cells under a pole "
-                 f"were not seen, {100 * settings.max_unknown_share:.0f} % are allowed")
+                 f"were not seen, {100 * settings.max_unknown_ratio:.0f} % are allowed")
         )  # fmt: skip
     if count == 0:
         vetoes.append(Veto("no-bundle", "no known bundle lies under the poles within reach"))
@@ -47,14 +47,14 @@ def count_vetoes(
         vetoes.append(
             Veto("count-uncertain", f"the footprint takes {count} bundles, {settings.bundles} are asked for")
         )
-    elif held.probability < settings.least_count_probability:
+    elif held.probability < settings.min_count_probability:
         worst = near.bundles[int(np.argmax(held.flips))].id
         vetoes.append(
             Veto("count-uncertain", f"a count of {count} has the probability {held.probability:.4f} only: "
                  f"bundle {worst} may be in or out")
         )  # fmt: skip
     share = _unexplained(place, heights, magnet, near, contact)
-    if share > settings.max_unexplained_share:
+    if share > settings.max_unexplained_ratio:
         vetoes.append(
             Veto("unexplained-surface", f"{100 * share:.0f} % of what lies within reach of the poles "
                  f"belongs to no known bundle")
@@ -63,7 +63,7 @@ def count_vetoes(
 
 
 def face_vetoes(contact: Contact, needed_n: float, magnet: Magnet, settings: LiftSettings) -> list[Veto]:
-    """How the faces lie and pull."""
+    """Check how the faces lie and pull."""
     vetoes = []
     pitch = abs(math.degrees(contact.pitch_rad))
     if pitch > magnet.limits.pitch_deg:
@@ -101,14 +101,14 @@ def load_vetoes(
     load: tuple[Bundle, ...], mass: Mass, along: float, across: float, overhang: float, magnet: Magnet,
     settings: LiftSettings,
 ) -> list[Veto]:  # fmt: skip
-    """What is to be lifted: covered, doubtful, open, heavy, off balance."""
+    """Check the load: covered, doubtful, open, heavy, off balance."""
     vetoes = []
     limits = magnet.limits
     for bundle in load:
         if bundle.on_top is not True:
             what = "something lies on" if bundle.on_top is False else "it isn't known what lies on"
             vetoes.append(Veto("covered", f"{what} bundle {bundle.id}"))
-        if bundle.confidence < settings.least_confidence:
+        if bundle.confidence < settings.min_confidence:
             vetoes.append(
                 Veto("bundle-doubtful", f"bundle {bundle.id} is {100 * bundle.confidence:.0f} % sure: "
                      + ("; ".join(bundle.reasons) or "no reason is given"))
@@ -151,7 +151,7 @@ def load_vetoes(
 
 @lru_cache(maxsize=64)
 def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
-    """(N, 3) along, across and pole of places over the faces, made wider to either side."""
+    """Sample places (N, 3), along, across and pole, over the faces, made wider to either side."""
     points = []
     for number, pole in enumerate(magnet.poles):
         long, wide = pole.length_m / 2, pole.width_m / 2 + wider_mm / 1e3
@@ -163,18 +163,20 @@ def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
 
 
 def _in_yard(place: Placement, grid: Float64) -> Float64:
-    """(N, 2) x and y of places given along and across the beam."""
+    """Convert places given along and across the beam to x and y (N, 2)."""
     return np.array([place.x_m, place.y_m]) + grid[:, :1] * place.along + grid[:, 1:2] * place.across
 
 
 def _unexplained(
     place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact
 ) -> float:
-    """Share of the places under the poles, within reach, that lie outside all bundles' outlines."""
+    """Compute the fraction of the places under the poles, within reach, that lie outside all bundles'
+    outlines.
+    """
     across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
     grid = _face_grid(magnet, round(1e3 * float(across)))
     points = _in_yard(place, grid)
-    z = look_up(heights, points[:, 0], points[:, 1])
+    z = lookup_heights(heights, points[:, 0], points[:, 1])
     reached = z > contact.z_m[grid[:, 2].astype(np.int64)] - magnet.reach_m
     if not reached.any():
         return 0.0

@@ -17,7 +17,7 @@ from barsight.core.arrays import Bool, Float64, frozen
 from barsight.yard.lifting.contact import Contact
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.stability.stability import look_up, nearest_cells
+from barsight.yard.stability.stability import lookup_heights, nearest_cells
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Veto
 
@@ -43,7 +43,7 @@ def clearance_vetoes(place: Placement, heights: HeightMap, magnet: Magnet, conta
     xy = np.array([place.x_m, place.y_m]) + v * place.along + u * place.across
     slope = np.array([math.tan(contact.pitch_rad), math.tan(contact.roll_rad)])
     plane = contact.centre_z_m + region.grid @ slope
-    rise = look_up(heights, xy[..., 0], xy[..., 1]) - plane
+    rise = lookup_heights(heights, xy[..., 0], xy[..., 1]) - plane
     unseen = np.isnan(rise)
     allowed = np.where(region.faces, MAX_RISE_M, max(magnet.beam.above_faces_m / 2, MAX_RISE_M))
     unproven = unseen & (_free_up_to(heights, xy) - plane > allowed)

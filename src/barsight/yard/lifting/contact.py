@@ -1,4 +1,4 @@
-"""How the magnet's faces lie on what is under them: contact plane, air gaps, pull.
+"""Model the magnet's contact with what is under it: contact plane, air gaps, pull.
 
 The faces are one rigid plane. Set down, it comes to rest where its middle is lowest: on three points of the
 upper envelope around the middle, or on fewer with the suspension holding it.
@@ -15,7 +15,17 @@ from barsight.core.arrays import Float64, kernel
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.lifting.resting_plane import ALL, POLE, SEEN, U, V, Z, profiles, settle, straighten
+from barsight.yard.lifting.resting_plane import (
+    ALL,
+    POLE,
+    SEEN,
+    U,
+    V,
+    Z,
+    profiles,
+    rest_faces,
+    straighten_heights,
+)
 from barsight.yard.types import HeightMap
 
 NEWTON_PER_KG = 9.81
@@ -40,7 +50,8 @@ class PoleContact:
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """How all faces lie. centre_z_m: height of their plane at the magnet's centre, z_m: (P,) at the poles'.
+    """Contact of all faces. centre_z_m: height of their plane at the magnet's centre, z_m: (P,) at the
+    poles'.
 
     pitch_rad: rise along the beam; roll_rad: rise across. rests_off_m: how far beside the middle the faces
     rest, where the suspension's stop holds them, else 0. sigma_m: of the plane over the points.
@@ -58,31 +69,31 @@ class Contact:
 
     @property
     def pull_n(self) -> float:
-        """The pull."""
+        """Sum the pull."""
         return sum(pole.pull_n for pole in self.poles)
 
     @property
     def pull_low_n(self) -> float:
-        """Its lower bound (95 %)."""
+        """Sum its lower bound (95 %)."""
         return sum(pole.pull_low_n for pole in self.poles)
 
     @property
     def unknown_share(self) -> float:
-        """The worst pole's."""
+        """Return the worst pole's."""
         return max(pole.unknown_share for pole in self.poles)
 
     @property
     def contact_share(self) -> float:
-        """Of all faces together."""
+        """Average over all faces together."""
         return sum(pole.contact_share for pole in self.poles) / len(self.poles)
 
     @property
     def widest_gap_m(self) -> float:
-        """The least gap of the pole that is furthest from steel; infinite where a pole knows none."""
+        """Return the least gap of the pole that is furthest from steel; infinite where a pole knows none."""
         return max(pole.least_gap_m for pole in self.poles)
 
 
-def touch(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
+def set_down(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
     """Set the magnet down on the map; None where nothing at all is known under it.
 
     contact_gap_m: a face nearer than this to steel lies on it.
@@ -92,10 +103,10 @@ def touch(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: f
     seen = np.isfinite(points[:, Z])
     if seen.sum() < 3:
         return None
-    noise = straighten(points, seen)
+    noise = straighten_heights(points, seen)
     most = np.tan(np.radians(magnet.limits.roll_deg))
     u, v, z = (np.ascontiguousarray(points[seen, k]) for k in (U, V, Z))
-    height, roll, pitch, rests_off = settle(u, v, z, noise, most)
+    height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
     table, gaps = _gaps(
         points, height, roll, pitch, noise, contact_gap_m + noise, poles,
         np.array(magnet.pull.gap_m), np.array(magnet.pull.kilopascal),
@@ -117,7 +128,9 @@ def _gaps(
     points: Float64, height: float, roll: float, pitch: float, noise: float, near: float, poles: Float64,
     gap_m: Float64, kilopascal: Float64,
 ) -> tuple[Float64, Float64]:  # fmt: skip
-    """(P, 6) mean and least gap, shares of contact and unknown cells, pull and its lower bound; (N,) gaps."""
+    """Compute mean and least gap, ratios of contact and unknown cells, pull and its lower bound (P, 6); (N,)
+    gaps.
+    """
     table, gaps = np.zeros((len(poles), 6)), np.empty(len(points))
     counts = np.zeros((len(poles), 4))
     table[:, 1] = np.inf

@@ -1,4 +1,4 @@
-"""Which bundles lie under a magnet's poles, as an integer with its probability.
+"""Count the bundles under a magnet's poles, with the count's probability.
 
 Poles and bundles are rectangles seen from above; two overlap where no side of either separates them. Each
 overlap has a depth, the depth a sigma (of the bundle's place, yaw, width and ends) and a bound on how much
@@ -17,16 +17,16 @@ from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.types import Bundle
 
 BEYOND_OPEN_END_M = 20.0
-LEAST_SIGMA_M = 0.001
+MIN_SIGMA_M = 0.001
 HEIGHT_SIGMA_M = 0.005
 """How well a bundle's top line stands for its height under a pole, beside its own sigma."""
-MOST_TOP_SIGMA_M = 0.008
+MAX_TOP_SIGMA_M = 0.008
 """Faces rest on the same map: what all places share of a top's sigma says nothing of heights between them."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the magnet's centre is set down: yard axes; yaw from +Y about Z, as a bundle's."""
+    """Magnet's centre as set down: yard axes; yaw from +Y about Z, as a bundle's."""
 
     x_m: float
     y_m: float
@@ -34,17 +34,17 @@ class Placement:
 
     @property
     def yaw_deg(self) -> float:
-        """The yaw for people and plants."""
+        """Return the yaw for people and plants."""
         return math.degrees(self.yaw_rad)
 
     @property
     def along(self) -> Float64:
-        """(2,) unit vector along the beam."""
+        """Return the unit vector (2,) along the beam."""
         return np.array([-np.sin(self.yaw_rad), np.cos(self.yaw_rad)])
 
     @property
     def across(self) -> Float64:
-        """(2,) unit vector across the beam."""
+        """Return the unit vector (2,) across the beam."""
         return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad)])
 
 
@@ -69,7 +69,7 @@ class BundleTable:
 
     @classmethod
     def of(cls, bundles: tuple[Bundle, ...]) -> BundleTable:
-        """A sigma that is unknown counts as 50 mm, 5 mrad: sure enough of nothing."""
+        """Build from bundles; a sigma that is unknown counts as 50 mm, 5 mrad: sure enough of nothing."""
         yaw = np.array([b.yaw_rad for b in bundles])
         sigma = np.array(
             [
@@ -93,14 +93,14 @@ class BundleTable:
             np.array([b.top_z_m for b in bundles]),
             np.tan([b.pitch_rad for b in bundles]),
             np.where(np.isfinite(sigma), sigma, unknown),
-            np.where(np.isfinite(sigma_top), np.minimum(sigma_top, MOST_TOP_SIGMA_M), 0.05),
+            np.where(np.isfinite(sigma_top), np.minimum(sigma_top, MAX_TOP_SIGMA_M), 0.05),
             np.array([b.ends_open for b in bundles], dtype=np.bool_).reshape(-1, 2),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Grip:
-    """What the magnet would take at a placement.
+    """Bundles that the magnet would take at a placement.
 
     gripped: positions in the table of the bundles under a pole and within reach. probability: of exactly
     these. flips: (B,) probability for each bundle that it is wrongly counted in or out.
@@ -111,7 +111,7 @@ class Grip:
     flips: Float64
 
 
-def grip(
+def count_gripped(
     place: Placement, magnet: Magnet, tolerance: Tolerance, table: BundleTable, face_z_m: Float64
 ) -> Grip:
     """Count the bundles under the poles whose top lies within the magnet's reach.
@@ -135,7 +135,7 @@ def _grip(
     along: Float64, half: Float64, top: Float64, slope: Float64, sigma: Float64, sigma_top: Float64,
     open_ends: Bool,
 ) -> tuple[Float64, Bool]:  # fmt: skip
-    """(B,) probability of a wrong count, and whether each bundle is taken."""
+    """Compute the probability (B,) of a wrong count, and whether each bundle is taken."""
     count = len(centre)
     flips, taken = np.zeros(count), np.zeros(count, np.bool_)
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -175,7 +175,7 @@ def _grip(
 
 @kernel()
 def _below(z: float) -> float:
-    """The normal distribution's share below z."""
+    """Evaluate the normal distribution function at z."""
     return 0.5 * math.erfc(-z / math.sqrt(2.0))
 
 
@@ -184,7 +184,7 @@ def overlap(
     dx: float, dy: float, cos: float, sin: float, pole: Float64, along: Float64, half_width: float,
     half_length: float, sigma: Float64, slack: Float64,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Depth of a pole's overlap with a bundle (negative is a distance), its sigma and the crane's slack.
+    """Compute a pole's overlap with a bundle (negative is a distance), its sigma and the crane's slack.
 
     dx, dy: pole's centre minus bundle's. Of the four axes across the rectangles' sides the one with the
     least overlap counts (separating axes).
@@ -208,7 +208,7 @@ def overlap(
         )  # fmt: skip
         if depth < best[0]:
             variance = side**2 * (sigma[0] ** 2 + (away * sigma[2]) ** 2 + sigma[3] ** 2)
-            variance += end**2 * (sigma[1] ** 2 + sigma[4] ** 2) + LEAST_SIGMA_M**2
+            variance += end**2 * (sigma[1] ** 2 + sigma[4] ** 2) + MIN_SIGMA_M**2
             loose = slack[0] * abs(nx) + slack[1] * abs(ny)
             loose += slack[2] * across * (abs(pole[0]) + pole[2] / 2)
             loose += slack[2] * lengthwise * (abs(pole[1]) + pole[3] / 2)

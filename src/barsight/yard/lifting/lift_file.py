@@ -1,4 +1,4 @@
-"""`lifts.json`: ranked lift targets and the refused ones, as other programs read them."""
+"""Read and write `lifts.json`: ranked lift targets and the refused ones."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ SCHEMA_VERSION = 2
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema of lifts.json."""
+    """Load the JSON Schema of lifts.json."""
     text = resources.files("barsight.yard").joinpath("schemas/lifts.schema.json").read_text("utf-8")
     content: dict[str, Any] = json.loads(text)
     return content
 
 
 def write_lifts(plan: LiftPlan, reference: str, target: Path) -> None:
-    """lifts.json whole or not at all. reference: the frame, `yard` or `world`."""
+    """Write lifts.json whole or not at all. reference: the frame, `yard` or `world`."""
     with atomic_path(target) as path:
         text = json.dumps(lifts_content(plan, reference), indent=1, allow_nan=False)
         path.write_text(text + "\n", encoding="utf-8")
 
 
 def read_lifts(path: Path) -> dict[str, Any]:
-    """What lifts.json says. Raises InputError where it is missing, torn or of another version."""
+    """Read lifts.json. Raises InputError where it is missing, torn or of another version."""
     remedy = "run barsight lifts on the folder"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -51,7 +51,7 @@ def read_lifts(path: Path) -> dict[str, Any]:
 
 
 def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
-    """What lifts.json says."""
+    """Build the content of lifts.json."""
     content: dict[str, Any] = json_value(
         {
             "schema_version": SCHEMA_VERSION,

@@ -1,4 +1,4 @@
-"""The magnet as its file describes it: poles, beam, pull against air gap, limits, the crane's tolerance."""
+"""Load the magnet's description: poles, beam, pull against air gap, limits, the crane's tolerance."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Pole:
 
 @dataclass(frozen=True)
 class Beam:
-    """What hangs above the faces: length along, width across, height of its underside over the faces."""
+    """Beam above the faces: length along, width across, height of its underside over the faces."""
 
     length_m: float
     width_m: float
@@ -63,7 +63,7 @@ class Pull:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far off the crane may set the magnet down, to either side, in yard axes."""
+    """Accuracy of the crane when it sets the magnet down, to either side, in yard axes."""
 
     x_m: float
     y_m: float
@@ -122,27 +122,27 @@ class Magnet:
 
     @property
     def reach_m(self) -> float:
-        """The air gap from which on nothing is lifted."""
+        """Return the air gap from which on nothing is lifted."""
         return self.pull.gap_m[-1]
 
     @property
     def pole_table(self) -> Float64:
-        """(P, 4) of along, across, length, width."""
+        """Return along, across, length, width (P, 4)."""
         return np.array([(p.along_m, p.across_m, p.length_m, p.width_m) for p in self.poles])
 
     @property
     def half_span_m(self) -> float:
-        """From the centre to the outermost pole's outer edge, along the beam."""
+        """Return the way from the centre to the outermost pole's outer edge, along the beam."""
         return max(abs(p.along_m) + p.length_m / 2 for p in self.poles)
 
 
 def example_magnet() -> str:
-    """The package's documented example, as TOML."""
+    """Return the package's documented example, as TOML."""
     return _EXAMPLE.read_text("utf-8")
 
 
 def load_magnet(path: Path | None) -> Magnet:
-    """The magnet of a TOML file; the package's documented example where there is none.
+    """Load the magnet of a TOML file; the package's documented example where there is none.
 
     Raises InputError for a file that can't be read, ConfigError for a value that can't be.
     """

@@ -1,4 +1,4 @@
-"""Where a rigid plane comes to rest on the map under the poles.
+"""Rest a rigid plane on the map under the poles.
 
 The noise of a map would hold the plane up: heights are medians along the bars, made straighter by a prior.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.types import HeightMap
 
@@ -27,12 +27,13 @@ NEAR_LINE_M = 0.02
 COLUMNS = 8
 U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)
 _STEEPEST = 0.35
-_UNKNOWN, _FILLED = Source.UNKNOWN, Source.FILLED
+_UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
 def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list[tuple[int, int]], Float64]:
-    """Columns across and parts along of each pole; (N, COLUMNS) of all: place across and along, median
-    height, scatter, cells seen and in all, the cells' mean sigma, the pole."""
+    """Sample columns across and parts along of each pole; (N, COLUMNS) of all: place across and along, median
+    height, scatter, cells seen and in all, the cells' mean sigma, the pole.
+    """
     shape = [
         (max(round(width / STEP_M), 2), max(round(length / SEGMENT_M), 1)) for _, _, length, width in poles
     ]
@@ -49,7 +50,7 @@ def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list
     return shape, points
 
 
-def straighten(points: Float64, seen: Bool) -> float:
+def straighten_heights(points: Float64, seen: Bool) -> float:
     """Correct the heights, in place, towards a straight load; returns the noise that remains.
 
     A load's section is the same under all poles but for a slope along. What departs from that, pole by pole
@@ -65,7 +66,7 @@ def straighten(points: Float64, seen: Bool) -> float:
 
 @kernel()
 def _straight(known: Float64, column: Int64, noise: float) -> Float64:
-    """The heights (N,) as they most likely are; column: (N,) number of the place across."""
+    """Estimate the heights (N,) as they most likely are; column: (N,) number of the place across."""
     v, z = known[:, V], known[:, Z]
     pole = known[:, POLE].astype(np.int64)
     slope = 0.0
@@ -92,22 +93,22 @@ def _straight(known: Float64, column: Int64, noise: float) -> Float64:
 
 @kernel()
 def _likely(measured: float, sigma: float) -> float:
-    """What a departure of `measured` from straight most likely is."""
+    """Estimate what a departure of `measured` from straight most likely is."""
     if abs(measured) > BENT_SIGMA * np.hypot(STRAIGHT_M, sigma):
         return measured
     return measured * STRAIGHT_M**2 / (STRAIGHT_M**2 + sigma**2)
 
 
 @kernel()
-def settle(
-    u: Float64, v: Float64, z: Float64, noise: float, most_roll: float
+def rest_faces(
+    u: Float64, v: Float64, z: Float64, noise: float, max_roll: float
 ) -> tuple[float, float, float, float]:
-    """Height at the centre, roll, pitch, and how far beside the middle the faces rest."""
-    height, roll, pitch = rest(u, v, z, most_roll)
+    """Rest the faces: height at the centre, roll, pitch, and how far beside the middle they rest."""
+    height, roll, pitch = rest_plane(u, v, z, max_roll)
     # The highest of many noisy points is too high.
     height -= noise
     rests_off = 0.0
-    if abs(roll) > 0.999 * most_roll:
+    if abs(roll) > 0.999 * max_roll:
         gap = height + roll * u + pitch * v - z
         rests_off = abs(np.median(u[gap <= gap.min() + noise + 0.0005]))
     return height, roll, pitch, rests_off
@@ -148,13 +149,13 @@ def _profile(
 
 
 @kernel()
-def rest(u: Float64, v: Float64, z: Float64, most_roll: float) -> tuple[float, float, float]:
-    """Height at the origin, slope along u and along v of the plane that rests on the points.
+def rest_plane(u: Float64, v: Float64, z: Float64, max_roll: float) -> tuple[float, float, float]:
+    """Rest a plane on the points: height at the origin, slope along u and along v.
 
     Of all planes on or above the points it has the lowest origin; its slope along u is held within
-    `most_roll`. The height is convex in the slopes: two nested searches find the one lowest place.
+    `max_roll`. The height is convex in the slopes: two nested searches find the one lowest place.
     """
-    low, high = -most_roll, most_roll
+    low, high = -max_roll, max_roll
     for _ in range(26):
         a, b = low + (high - low) * 0.382, low + (high - low) * 0.618
         at_a, at_b = _rest_along(u, v, z, a), _rest_along(u, v, z, b)
@@ -163,8 +164,8 @@ def rest(u: Float64, v: Float64, z: Float64, most_roll: float) -> tuple[float, f
         else:
             low = a
     roll = (low + high) / 2
-    if most_roll - abs(roll) < 1e-3 * most_roll:
-        roll = most_roll if roll > 0 else -most_roll
+    if max_roll - abs(roll) < 1e-3 * max_roll:
+        roll = max_roll if roll > 0 else -max_roll
     height, pitch = _rest_along(u, v, z, roll)
     return height, roll, pitch
 

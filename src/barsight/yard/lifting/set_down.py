@@ -1,4 +1,4 @@
-"""Free places to set a bundle down: known, level and wide enough, ranked."""
+"""Find free places to set a bundle down: known, level and wide enough, ranked."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.sections import patches
 from barsight.yard.types import HeightMap, YardMap
 
 COARSE_M = 0.05
 LEVEL_M = 0.04
 CLEARANCE_M = 0.1
-LEAST_KNOWN = 0.9
+MIN_KNOWN = 0.9
 GULLY_M = 0.4
 """Gullies narrower than this between tops don't make a layer uneven: dunnage bridges them."""
-MOST = 20
+MAX_VALUE = 20
 _PATCH_CELLS = 256
 RULE = (
     "The lowest first, then the most level; at least 90 % seen, level within 40 mm, 100 mm clear all round."
@@ -37,7 +37,7 @@ class FreePlace:
 
 
 def free_places(yard: YardMap, width_m: float, length_m: float) -> tuple[FreePlace, ...]:
-    """Places along Y for a bundle of this size, in `RULE`'s order; at most 20, none over another.
+    """Find places along Y for a bundle of this size, in `RULE`'s order; at most 20, none over another.
 
     On the floor or on a layer of bundles: what counts is the upper envelope, closed over gullies.
     """
@@ -57,7 +57,7 @@ def free_places(yard: YardMap, width_m: float, length_m: float) -> tuple[FreePla
     highest, lowest = cv2.dilate(envelope, window), cv2.erode(envelope, window)
     share = cv2.boxFilter(known, -1, (wide, long))
     level = highest - lowest
-    fits: Bool = (level < LEVEL_M) & (share > LEAST_KNOWN)
+    fits: Bool = (level < LEVEL_M) & (share > MIN_KNOWN)
     rows, columns = long // 2, wide // 2
     inner = np.zeros_like(fits)
     inner[rows : fits.shape[0] - rows, columns : fits.shape[1] - columns] = True
@@ -65,9 +65,9 @@ def free_places(yard: YardMap, width_m: float, length_m: float) -> tuple[FreePla
 
 
 def _coarse(heights: HeightMap, step: int) -> tuple[Float32, Float32]:
-    """Highest seen height and share of seen cells of each block of step x step."""
+    """Compute the highest seen height and fraction of seen cells of each block of step x step."""
     rows, columns = (n // step for n in heights.z_m.shape)
-    seen = (heights.source != Source.UNKNOWN) & (heights.source != Source.FILLED)
+    seen = (heights.source != HeightSource.UNKNOWN) & (heights.source != HeightSource.FILLED)
     z = np.where(seen, heights.z_m, -np.inf)[: rows * step, : columns * step]
     blocks = z.reshape(rows, step, columns, step)
     share = np.isfinite(blocks).mean(axis=(1, 3)).astype(np.float32)
@@ -92,7 +92,7 @@ def _ranked(
         found.append(
             FreePlace(float(x), float(y), float(z[i, j]), float(level[i, j]), float(min(share[i, j], 1.0)))
         )
-        if len(found) == MOST:
+        if len(found) == MAX_VALUE:
             break
         taken[max(i - long + 1, 0) : i + long, max(j - wide + 1, 0) : j + wide] = True
     return tuple(found)

@@ -1,4 +1,6 @@
-"""Lift targets: for every bundle that may be free the best placement of the magnet, ranked, or the vetoes."""
+"""Plan lift targets: for every bundle that may be free the best placement of the magnet, ranked, or the
+vetoes.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift, Yard, assess
+from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.footprint import BundleTable, Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.set_down import FreePlace, free_places
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import age_vetoes
-from barsight.yard.sections import stretches
+from barsight.yard.sections import split_map
 from barsight.yard.stability.pile_sides import PileSide, pile_sides
 from barsight.yard.stability.stability import Footing, footings
 from barsight.yard.types import Bundle, YardMap
@@ -83,7 +85,7 @@ def plan_lifts(
     """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames.
     now_ns: when the lifts are judged, on the frames' clock.
     """
-    parts, stands = stretches(yard), dict[int, Footing]()
+    parts, stands = split_map(yard), dict[int, Footing]()
     for part in parts:
         own = tuple(bundle for bundle in bundles if part.owns(bundle.centre_m))
         stands |= {one.bundle: one for one in footings(yard.part(part.rows, part.columns), own, settings)}
@@ -92,7 +94,7 @@ def plan_lifts(
     for part in parts:
         near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
         heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
-        here = Yard(heights, BundleTable.of(near), standing, (), travel, now_ns)
+        here = LiftScene(heights, BundleTable.of(near), standing, (), travel, now_ns)
         for number, group in enumerate(groups):
             if part.owns(group[0].centre_m):
                 lifts[number] = _best(group, here, magnet, settings)
@@ -129,7 +131,9 @@ def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
-    """Bundles on which nothing lies (or may), each with its next count - 1 neighbours towards high x."""
+    """Group bundles on which nothing lies (or may), each with its next count - 1 neighbours towards
+    high x.
+    """
     free = sorted((b for b in bundles if b.on_top is not False), key=lambda b: float(b.centre_m[0]))
     for place, first in enumerate(free):
         group = [first]
@@ -145,12 +149,12 @@ def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, .
             yield tuple(group)
 
 
-def _best(group: tuple[Bundle, ...], yard: Yard, magnet: Magnet, settings: LiftSettings) -> Lift:
-    """The placement with the fewest vetoes, then the safest."""
+def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift:
+    """Choose the placement with the fewest vetoes, then the safest."""
 
     def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
         places = (_place(group, along, across) for along, across in offsets)
-        found = [assess(place, yard, magnet, settings, search=False) for place in places]
+        found = [assess_placement(place, yard, magnet, settings, search=False) for place in places]
         return sorted(found, key=_worst_first)
 
     limit = magnet.limits.offset_across_m
@@ -163,7 +167,7 @@ def _best(group: tuple[Bundle, ...], yard: Yard, magnet: Magnet, settings: LiftS
     finalists = []
     for lift in quick[:FINALISTS]:
         if not lift.vetoes:
-            finalists.append(assess(lift.place, yard, magnet, settings))
+            finalists.append(assess_placement(lift.place, yard, magnet, settings))
             if not finalists[-1].vetoes:
                 break
     return min(finalists, key=_worst_first)

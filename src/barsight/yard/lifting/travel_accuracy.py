@@ -1,4 +1,6 @@
-"""How sure the map's place is along the crane's way, and whether that is enough for a lift there."""
+"""Estimate the map's position uncertainty along the crane's way, and whether it is enough for a
+lift there.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ MOVING_MPS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Travel:
-    """The frames' way over the yard.
+    """Uncertainty of the frames' poses over the yard.
 
     place_m: (N, 2) the body, x and y. sigma_m: (N, 3) of the ground below it in x, y, z. off_m: (N,) by how
     much the encoders are off the trajectory, NaN where there are none; what a constant latency explains is
@@ -52,7 +54,8 @@ class Travel:
         cls, trajectory: Trajectory, crane: CraneSamples | None, shift_ns: int, window_ns: int,
         range_m: float, camera: RectifiedCamera,
     ) -> Travel:  # fmt: skip
-        """shift_ns: from the camera's clock to the encoders'. window_ns: of readings that make one place.
+        """Build from a trajectory. shift_ns: from the camera's clock to the encoders'. window_ns: of readings
+        that make one place.
         range_m: the surface's depth below the body.
         """
         stamps, places = trajectory.stamp_ns, trajectory.positions_m
@@ -71,7 +74,7 @@ class Travel:
 
     @classmethod
     def read(cls, summary: dict[str, Any]) -> Travel | None:
-        """From result.json; None where it doesn't say."""
+        """Read from result.json; None where it doesn't say."""
         content = summary.get("travel")
         if not isinstance(content, dict) or content.get("stamp_ns") is None:
             return None
@@ -86,12 +89,12 @@ class Travel:
         )  # fmt: skip
 
     def content(self) -> dict[str, Any]:
-        """As result.json says it; NaN is left to the writer."""
+        """Convert to what result.json says; NaN is left to the writer."""
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
 def _places_at(wanted: Int64, stamps: Int64, places: Float64) -> Float64:
-    """(R, 2) x and y at other stamps, on straight lines between and beyond the placed frames."""
+    """Interpolate x and y (R, 2) at other stamps, on straight lines between and beyond the placed frames."""
     if stamps.size < 2:
         return np.empty((0, 2))
     way = interp1d(stamps - stamps[0], places[:, :2], axis=0, fill_value="extrapolate")
@@ -101,7 +104,9 @@ def _places_at(wanted: Int64, stamps: Int64, places: Float64) -> Float64:
 def _disagreement(
     stamps: Int64, places: Float64, crane: CraneSamples | None, shift_ns: int, window_ns: int
 ) -> Float64:
-    """(N,) distance of the encoders' place from the body's, without what a constant latency explains."""
+    """Compute the distance (N,) of the encoders' place from the body's, without what a constant latency
+    explains.
+    """
     if crane is None or stamps.size < 2:
         return np.full(stamps.size, np.nan)
     off = np.full((stamps.size, 3), np.nan)
@@ -123,7 +128,7 @@ def _disagreement(
 def travel_vetoes(
     travel: Travel, place: Placement, magnet: Magnet, settings: LiftSettings
 ) -> tuple[Veto, ...]:
-    """`trajectory-degraded` where the map's place or height isn't sure enough for this lift."""
+    """Return `trajectory-degraded` where the map's place or height isn't sure enough for this lift."""
     here = np.array([place.x_m, place.y_m])
     away = np.linalg.norm(travel.place_m - here, axis=1)
     near = away < travel.reach_m
@@ -133,10 +138,10 @@ def travel_vetoes(
     else:
         reasons += _unsure(np.median(travel.sigma_m[near], axis=0), magnet)
         refused = int((np.linalg.norm(travel.refused_m - here, axis=1) < travel.reach_m).sum())
-        if refused > settings.max_refused_share * (refused + near.sum()):
+        if refused > settings.max_refused_ratio * (refused + near.sum()):
             reasons.append(
                 f"{refused} of {refused + near.sum()} frames that see it were refused, "
-                f"{100 * settings.max_refused_share:.0f} % are allowed"
+                f"{100 * settings.max_refused_ratio:.0f} % are allowed"
             )
     most = min(magnet.tolerance.x_m, magnet.tolerance.y_m)
     known = np.isfinite(travel.off_m)
@@ -157,7 +162,9 @@ def travel_vetoes(
 
 
 def _unsure(sigma: Float64, magnet: Magnet) -> list[str]:
-    """Where the 95 % bound of the map's place is over the crane's tolerance, or its height's over the gap."""
+    """Find where the 95 % bound of the map's place is over the crane's tolerance, or its height's over the
+    gap.
+    """
     out = []
     for name, one, most in (
         ("x", sigma[0], magnet.tolerance.x_m),

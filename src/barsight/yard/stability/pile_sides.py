@@ -1,4 +1,4 @@
-"""The pile's sides: how steep they are, which way they lean, and what stands over at each layer.
+"""Measure the pile's sides: how steep they are, which way they lean, and what stands over at each layer.
 
 A pile is all parallel bundles that lie near each other. From above a lower layer's side shows only where it
 stands out beyond the upper ones; what stands over is inferred from the other side (`stability.Footing`).
@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from barsight.core.arrays import Float64
-from barsight.yard.stability.stability import LEAST_LEDGE_M, STEP_M, Footing
+from barsight.yard.stability.stability import MIN_LEDGE_M, STEP_M, Footing
 from barsight.yard.types import Bundle
 
 NEAR_M = 0.3
@@ -23,8 +23,8 @@ PARALLEL_RAD = np.radians(5.0)
 
 @dataclass(frozen=True)
 class LayerOverhang:
-    """By how much a side's bundle stands over the edge of what carries it; negative: so far the next lower
-    layer stands out beyond it. NaN where it can't be told. sigma_m: one standard deviation.
+    """Overhang of a side's bundle over the edge of what carries it; negative: so far the next lower layer
+    stands out beyond it. NaN where it can't be told. sigma_m: one standard deviation.
     """
 
     bundle: int
@@ -52,7 +52,7 @@ class PileSide:
 
 
 def pile_sides(bundles: tuple[Bundle, ...], standing: tuple[Footing, ...]) -> tuple[PileSide, ...]:
-    """Both sides of each pile, piles from low to high x. standing: how each bundle stands."""
+    """Measure both sides of each pile, piles from low to high x. standing: how each bundle stands."""
     footings = {footing.bundle: footing for footing in standing}
     sides = []
     for pile in _piles(bundles):
@@ -72,7 +72,7 @@ def _piles(bundles: tuple[Bundle, ...]) -> list[list[Bundle]]:
 
 
 def _near(one: Bundle, other: Bundle) -> bool:
-    """Whether two parallel bundles come nearer than NEAR_M sideways and overlap along."""
+    """Check whether two parallel bundles come nearer than NEAR_M sideways and overlap along."""
     turned = (one.yaw_rad - other.yaw_rad + np.pi / 2) % np.pi - np.pi / 2
     if abs(turned) > PARALLEL_RAD:
         return False
@@ -91,7 +91,7 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
     for layer in sorted({b.layer for b in pile}, reverse=True):
         widest = max((b for b in pile if b.layer == layer), key=edge)
         # Behind an upper layer's edge it isn't this side that shows.
-        if not outer or edge(widest) > edge(outer[0]) + LEAST_LEDGE_M:
+        if not outer or edge(widest) > edge(outer[0]) + MIN_LEDGE_M:
             outer.insert(0, widest)
     lowest, highest = outer[0], outer[-1]
     overhangs = []
@@ -131,7 +131,9 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
 
 
 def _lean(lowest: Bundle, highest: Bundle, out_m: float) -> tuple[float, float]:
-    """Of the line between two edges and its sigma, degrees; NaN where one layer shows only."""
+    """Compute the lean of the line between two edges and its sigma, degrees; NaN where one layer
+    shows only.
+    """
     rise = float(highest.centre_m[2] - lowest.centre_m[2])
     if not rise > 0:
         return math.nan, math.nan
@@ -141,5 +143,5 @@ def _lean(lowest: Bundle, highest: Bundle, out_m: float) -> tuple[float, float]:
 
 
 def _edge_sigma(bundle: Bundle) -> float:
-    """Of the edge's place: the axis's and half the width's."""
+    """Compute the sigma of the edge's place: the axis's and half the width's."""
     return math.hypot(bundle.sigma.lateral_m, bundle.sigma.width_m / 2)

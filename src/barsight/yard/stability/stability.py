@@ -1,4 +1,4 @@
-"""How the pile stands: its sides, what carries each bundle, what leans, how far stanchions reach.
+"""Assess how the pile stands: its sides, what carries each bundle, what leans, how far stanchions reach.
 
 From above only tops are seen. What a bundle stands on is inferred from what shows beside it: where the layer
 below sticks out on one side by less than half a bundle and nothing shows on the other, the bundle stands that
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
@@ -23,16 +23,16 @@ LOOK_M = 1.5
 STATIONS = 40
 DUNNAGE_M = 0.3
 """The thickest dunnage that may lie between two layers."""
-LEAST_LEDGE_M = 0.03
-LEAST_KNOWN = 0.3
+MIN_LEDGE_M = 0.03
+MIN_KNOWN = 0.3
 BESIDE_M = 0.3
 
 
 @dataclass(frozen=True)
 class Side:
-    """What lies beside a bundle. drop_m: from its top to the lowest place within 1.5 m; run_m: from its edge
-    to that place's beginning; slope_deg: of the line between (90 is sheer); ledge_m: how far what lies below
-    the bundle shows beyond its edge; known_share: of the places looked at. NaN where unknown.
+    """Surface beside a bundle. drop_m: from its top to the lowest place within 1.5 m; run_m: from its edge to
+    that place's beginning; slope_deg: of the line between (90 is sheer); ledge_m: how far what lies below the
+    bundle shows beyond its edge; known_share: of the places looked at. NaN where unknown.
     """
 
     drop_m: float
@@ -44,9 +44,10 @@ class Side:
 
 @dataclass(frozen=True)
 class Footing:
-    """How a bundle stands. sides: towards low and high x. overhang_m: over the edge of what carries it,
-    towards (overhang_side: -1 low x, 1 high x, 0 none), NaN where it can't be told; lean_deg: of the side
-    below it. freeboard_m: lowest stanchion beside it over its top, NaN where there is none.
+    """Support of a bundle. sides: towards low and high x. overhang_m: over the edge of what carries it,
+    towards low and high x. overhang_m: over the edge of what carries it, towards (overhang_side: -1 low x, 1
+    high x, 0 none), NaN where it can't be told; lean_deg: of the side below it. freeboard_m: lowest stanchion
+    beside it over its top, NaN where there is none.
     """
 
     bundle: int
@@ -58,7 +59,7 @@ class Footing:
 
 
 def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> tuple[Footing, ...]:
-    """How each bundle stands, in the bundles' order."""
+    """Assess how each bundle stands, in the bundles' order."""
     return tuple(_footing(heights, bundle, settings) for bundle in bundles)
 
 
@@ -67,12 +68,12 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
     overhang, side, lean = math.nan, 0, 0.0
     if bundle.layer > 0:
         for sign, outer, inner in ((-1, low, high), (1, high, low)):
-            stands_over = outer.ledge_m < LEAST_LEDGE_M and _is_free(outer, bundle)
-            shifted = LEAST_LEDGE_M <= inner.ledge_m < 0.5 * bundle.width_m + LEAST_LEDGE_M
+            stands_over = outer.ledge_m < MIN_LEDGE_M and _is_free(outer, bundle)
+            shifted = MIN_LEDGE_M <= inner.ledge_m < 0.5 * bundle.width_m + MIN_LEDGE_M
             if stands_over and shifted and _is_free(inner, bundle):
                 overhang, side = inner.ledge_m, sign
                 lean = math.degrees(math.atan2(inner.run_m, inner.drop_m))
-            elif stands_over and inner.ledge_m < LEAST_LEDGE_M and _is_free(inner, bundle):
+            elif stands_over and inner.ledge_m < MIN_LEDGE_M and _is_free(inner, bundle):
                 overhang = 0.0
     tops = [
         z - bundle.top_z_m
@@ -83,18 +84,20 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
 
 
 def _is_free(side: Side, bundle: Bundle) -> bool:
-    """Whether the surface beside the bundle falls below what it stands on."""
+    """Check whether the surface beside the bundle falls below what it stands on."""
     return side.drop_m > 1.2 * bundle.width_m
 
 
 def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
-    """(N, 2) median height of the seen cells and their share, from the edge outwards every STEP_M."""
+    """Compute median height of the seen cells and their fraction (N, 2), from the edge outwards
+    every STEP_M.
+    """
     out = bundle.width_m / 2 + np.arange(0, LOOK_M, STEP_M)
     along = np.linspace(-0.45, 0.45, STATIONS) * bundle.length_m
     cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     x = bundle.centre_m[0] + sign * out[:, None] * cos - along[None] * sin
     y = bundle.centre_m[1] + sign * out[:, None] * sin + along[None] * cos
-    z = look_up(heights, x, y) - along[None] * np.tan(bundle.pitch_rad)
+    z = lookup_heights(heights, x, y) - along[None] * np.tan(bundle.pitch_rad)
     known = np.isfinite(z)
     filled = np.where(known, z, np.inf)
     ordered = np.sort(filled, axis=1)
@@ -112,16 +115,16 @@ def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, In
     return np.where(inside, column, 0), np.where(inside, row, 0), inside
 
 
-def look_up(heights: HeightMap, x: Float64, y: Float64) -> Float64:
-    """Heights of the nearest cells; NaN where they were not seen."""
+def lookup_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
+    """Look up heights of the nearest cells; NaN where they were not seen."""
     column, row, inside = nearest_cells(heights, x, y)
     source = heights.source[row, column]
-    seen = inside & (source != Source.UNKNOWN) & (source != Source.FILLED)
+    seen = inside & (source != HeightSource.UNKNOWN) & (source != HeightSource.FILLED)
     return np.where(seen, heights.z_m[row, column], np.nan).astype(np.float64)
 
 
 def _side(profile: Float64, bundle: Bundle) -> Side:
-    z, known = profile[:, 0], profile[:, 1] >= LEAST_KNOWN
+    z, known = profile[:, 0], profile[:, 1] >= MIN_KNOWN
     share = float(profile[:, 1].mean())
     if known.sum() < 10:
         return Side(math.nan, math.nan, math.nan, math.nan, share)
@@ -139,7 +142,7 @@ def _side(profile: Float64, bundle: Bundle) -> Side:
 
 
 def _distance(bundle: Bundle, x: float, y: float) -> float:
-    """From a place to the bundle's outline, seen from above."""
+    """Compute the distance from a place to the bundle's outline, seen from above."""
     away = np.array([x, y]) - bundle.centre_m[:2]
     cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     beside = abs(away @ (cos, sin)) - bundle.width_m / 2
@@ -150,11 +153,11 @@ def _distance(bundle: Bundle, x: float, y: float) -> float:
 def footing_vetoes(
     target: Bundle, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
 ) -> tuple[Veto, ...]:
-    """What in the pile speaks against lifting this bundle."""
+    """List what in the pile speaks against lifting this bundle."""
     by_id = {footing.bundle: footing for footing in standing}
     vetoes = []
     own = by_id[target.id]
-    limit = settings.max_overhang_share * target.width_m
+    limit = settings.max_overhang_ratio * target.width_m
     upper = own.overhang_m + UPPER * _sure(target.sigma.width_m / 2)
     if own.overhang_m > 0.5 * target.width_m:
         vetoes.append(
@@ -171,17 +174,17 @@ def footing_vetoes(
             Veto("unstable-side", f"the side of the pile below it leans by {own.lean_deg:.1f} deg, "
                  f"{settings.max_lean_deg:g} are allowed")
         )  # fmt: skip
-    if own.freeboard_m < settings.least_freeboard_m:
+    if own.freeboard_m < settings.min_freeboard_m:
         vetoes.append(
             Veto("over-stanchion", f"the stanchion beside it is {1e3 * own.freeboard_m:.0f} mm above its "
-                 f"top, {1e3 * settings.least_freeboard_m:.0f} mm are needed")
+                 f"top, {1e3 * settings.min_freeboard_m:.0f} mm are needed")
         )  # fmt: skip
     for other in bundles:
         leaning = by_id[other.id]
         if other.id == target.id or not leaning.overhang_side or not _beside(target, other):
             continue
         towards = np.sign(target.centre_m[0] - other.centre_m[0]) == leaning.overhang_side
-        over = leaning.overhang_m > settings.max_overhang_share * other.width_m
+        over = leaning.overhang_m > settings.max_overhang_ratio * other.width_m
         if towards and (over or leaning.lean_deg > settings.max_lean_deg):
             vetoes.append(
                 Veto("unstable-side", f"bundle {other.id} stands {1e3 * leaning.overhang_m:.0f} mm over the "
@@ -195,7 +198,7 @@ def _sure(sigma: float) -> float:
 
 
 def _beside(one: Bundle, other: Bundle) -> bool:
-    """Whether the outlines come nearer than BESIDE_M sideways and overlap along."""
+    """Check whether the outlines come nearer than BESIDE_M sideways and overlap along."""
     away = other.centre_m[:2] - one.centre_m[:2]
     cos, sin = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
     clear = abs(away @ (cos, sin)) - (one.width_m + other.width_m) / 2

@@ -1,8 +1,8 @@
-"""Sums over square windows, with nothing but the result written: what several box filters would do in turn.
+"""Average over square windows in one pass, with nothing but the result written.
 
 Beyond the image's ends it goes on mirrored at the last pixel, as OpenCV's filters have it. A band's rows roll
 by: each column's sum over a window's rows takes in the row ahead and lets go of the one behind (`roll_*`),
-and `slide` adds the columns up. The loops stay this short, with one array written in each, because the
+and `slide_window` adds the columns up. The loops stay this short, with one array written in each, because the
 compiler makes vectors of no others.
 """
 
@@ -17,14 +17,14 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Float64, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
 
 BAND_ROWS = 128
 
 
 def window_means(images: Float32, weight: Float32, side: int, every: int) -> Float32:
-    """(K, N, M) means of weight times each of the images (K, H, W) over windows of side x side pixels whose
+    """Average weight times each of the images (K, H, W), (K, N, M), over windows of side x side pixels whose
     middles are every so-manieth row and column, from the first on.
     """
     _, height, width = images.shape
@@ -33,27 +33,27 @@ def window_means(images: Float32, weight: Float32, side: int, every: int) -> Flo
     def add(first: int, end: int) -> None:
         _window_means(images, weight, side // 2, every, sums, first, end)
 
-    in_bands(add, sums.shape[1], 8)
+    parallel_bands(add, sums.shape[1], 8)
     return sums
 
 
 @kernel()
-def mirrored(place: int, count: int) -> int:
-    """The place inside 0...count - 1 that `place` is a mirror image of."""
+def mirror_index(place: int, count: int) -> int:
+    """Mirror `place` into 0...count - 1."""
     while count > 1 and (place < 0 or place >= count):
         place = -place if place < 0 else 2 * (count - 1) - place
     return place if count > 1 else 0
 
 
 @kernel()
-def fresh_columns(count: int, width: int, reach: int) -> Float64:
-    """Columns' sums (count, ...) to begin with, one row for each of the roll_* below."""
+def allocate_columns(count: int, width: int, reach: int) -> Float64:
+    """Allocate columns' sums (count, ...), one row for each of the roll_* below."""
     return np.zeros((count, width + 2 * reach + 2 * FLOAT_LANES))
 
 
 @kernel()
 def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> None:
-    """column: see `fresh_columns`; a row ahead comes in, one behind goes."""
+    """Roll the sum: a row ahead comes in, one behind goes. column: see `allocate_columns`."""
     for x in range(ahead.shape[0]):
         column[reach + x] += np.float64(ahead[x]) - np.float64(behind[x])
 
@@ -62,7 +62,7 @@ def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> No
 def roll_product(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
-    """The same of products."""
+    """Roll the sum of products."""
     for x in range(ahead.shape[0]):
         column[reach + x] += np.float64(ahead[x] * ahead_other[x]) - np.float64(behind[x] * behind_other[x])
 
@@ -71,7 +71,7 @@ def roll_product(
 def roll_square(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
-    """The same of the first times the square of the other."""
+    """Roll the sum of the first times the square of the other."""
     for x in range(ahead.shape[0]):
         coming = ahead[x] * ahead_other[x] * ahead_other[x]
         column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
@@ -79,7 +79,7 @@ def roll_square(
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _add_columns(_: Any, column: Any, threes: Any, side: Any, mean: Any, chunks: Any, scale: Any) -> Any:
-    """Sums of `side` columns, times `scale`, for so many chunks of 16 windows. threes: for use inside."""
+    """Sum `side` columns, times `scale`, for so many chunks of 16 windows. threes: for use inside."""
     signature = types.void(column, threes, side, mean, chunks, scale)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -113,12 +113,12 @@ def _add_columns(_: Any, column: Any, threes: Any, side: Any, mean: Any, chunks:
 
 
 @kernel()
-def slide(column: Float64, reach: int, mean: Float32) -> None:
-    """The means (W,) over windows of 2 reach + 1 columns, whose sums are column[reach : reach + W]."""
+def slide_window(column: Float64, reach: int, mean: Float32) -> None:
+    """Average (W,) over windows of 2 reach + 1 columns, whose sums are column[reach : reach + W]."""
     width, side = mean.shape[0], 2 * reach + 1
     for step in range(1, reach + 1):
-        column[reach - step] = column[reach + mirrored(-step, width)]
-        column[reach + width - 1 + step] = column[reach + mirrored(width - 1 + step, width)]
+        column[reach - step] = column[reach + mirror_index(-step, width)]
+        column[reach + width - 1 + step] = column[reach + mirror_index(width - 1 + step, width)]
     scale, chunks = 1.0 / (side * side), width // FLOAT_LANES
     threes = np.empty(len(column), dtype=np.float32)
     _add_columns(column, threes, side, mean, chunks, np.float32(scale))
@@ -139,7 +139,7 @@ def _window_means(
     for i in range(first, end):
         columns[:] = 0
         for step in range(-reach, reach + 1):
-            y = mirrored(i * every + step, height)
+            y = mirror_index(i * every + step, height)
             for part in range(count):
                 row = columns[part]
                 for x in range(width):
@@ -148,5 +148,5 @@ def _window_means(
             for part in range(count):
                 total = np.float32(0)
                 for step in range(-reach, reach + 1):
-                    total += columns[part, mirrored(j * every + step, width)]
+                    total += columns[part, mirror_index(j * every + step, width)]
                 sums[part, i, j] = scale * total

@@ -1,4 +1,4 @@
-"""Cubic B-splines along the rows: an image read at fractional columns, with its exact derivative.
+"""Interpolate rows by cubic B-splines: an image at fractional columns, with its exact derivative.
 
 Linear or Keys-cubic reading damps fine texture by an amount that depends on the fraction, and that pulls a
 match towards whole or half pixels. A B-spline with its prefilter nearly doesn't [Thevenaz 2000]. The
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 
 _POLE = math.sqrt(3.0) - 2.0
 _PREFILTER_REACH = 12
@@ -23,8 +23,8 @@ _BAND_ROWS = 64
 
 
 def row_coefficients(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
-    """(H, W + 3) spline coefficients of each row of a (H, W) image, mirrored at the ends; of the image
-    blurred both ways by blur_px (one sigma) where that isn't 0.
+    """Compute spline coefficients (H, W + 3) of each row of a (H, W) image, mirrored at the ends; of the
+    image blurred both ways by blur_px (one sigma) where that isn't 0.
 
     Coefficient k of the image is column k + 1, so that a reader needs no bounds check.
     """
@@ -34,7 +34,7 @@ def row_coefficients(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
 
 
 def row_slope(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
-    """(H, W) x derivative at the pixels of the spline that `row_coefficients` gives."""
+    """Compute the x derivative (H, W) at the pixels of the spline that `row_coefficients` gives."""
     along, across = _filters(blur_px)
     slope: Float32 = cv2.sepFilter2D(image, cv2.CV_32F, np.convolve(along, _DIFFERENCE), across)
     return slope
@@ -42,7 +42,7 @@ def row_slope(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
 
 @lru_cache
 def _filters(blur_px: float) -> tuple[Float32, Float32]:
-    """Along the rows: blur and prefilter; across them: the blur."""
+    """Make the filters along the rows, blur and prefilter, and across them, the blur."""
     around = np.abs(np.arange(-_PREFILTER_REACH, _PREFILTER_REACH + 1))
     prefilter = math.sqrt(3.0) * _POLE**around
     if blur_px == 0:
@@ -53,7 +53,7 @@ def _filters(blur_px: float) -> tuple[Float32, Float32]:
 
 
 def value_and_slope(coefficients: Float32, disparity: Float32, margin: int = 0) -> tuple[Float32, Float32]:
-    """The image and its x derivative at column x - disparity of each row, both (H, W) float32.
+    """Interpolate the image and its x derivative at column x - disparity of each row, both (H, W) float32.
 
     Beyond the image's ends the end column is read. `disparity` has no NaN; its pixel (0, 0) lies `margin`
     rows and columns inside.
@@ -64,7 +64,7 @@ def value_and_slope(coefficients: Float32, disparity: Float32, margin: int = 0) 
     def read(first: int, end: int) -> None:
         _read(coefficients, disparity, margin, value, slope, first, end)
 
-    in_bands(read, shape[0], _BAND_ROWS)
+    parallel_bands(read, shape[0], _BAND_ROWS)
     return value, slope
 
 

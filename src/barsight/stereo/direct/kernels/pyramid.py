@@ -1,4 +1,4 @@
-"""Images at half the size, and what was found there carried up again without mixing surfaces."""
+"""Halve images and upsample what was found there without mixing surfaces."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8, kernel
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 
 _BAND_ROWS = 64
 
@@ -16,16 +16,16 @@ _BAND_ROWS = 64
 Image = TypeVar("Image", UInt8, Float32)
 
 
-def halved(image: Image) -> Image:
-    """Means of 2 x 2 pixels; odd images go on with their last row and column."""
+def halve(image: Image) -> Image:
+    """Average 2 x 2 pixels; odd images go on with their last row and column."""
     height, width = image.shape
     framed = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
     size = framed.shape[1] // 2, framed.shape[0] // 2
     return cast(Image, cv2.resize(framed, size, interpolation=cv2.INTER_AREA))
 
 
-def carried_up(started: Float32, moved: Float32, disparity: Float32, same_surface_px: float) -> Float32:
-    """`disparity` (H, W) moved by what was found at half the size: by the bilinear mean of the four nearest
+def upsample_update(started: Float32, moved: Float32, disparity: Float32, same_surface_px: float) -> Float32:
+    """Upsample what was found at half size onto `disparity` (H, W): by the bilinear mean of the four nearest
     places, where those on another surface don't count. started, moved: (H / 2, W / 2), in half pixels.
     """
     result = np.empty_like(disparity)
@@ -36,7 +36,7 @@ def carried_up(started: Float32, moved: Float32, disparity: Float32, same_surfac
     def work(first: int, end: int) -> None:
         _carry_up(seen, pulled, disparity, np.float32(1 / same_surface_px), result, first, end)
 
-    in_bands(work, len(disparity), _BAND_ROWS)
+    parallel_bands(work, len(disparity), _BAND_ROWS)
     return result
 
 

@@ -1,4 +1,4 @@
-"""Vectors in compiled kernels, for the loops that the compiler makes poor vectors of by itself.
+"""Write vector instructions into compiled kernels, for the loops that the compiler vectorises badly.
 
 A few dozen candidates, or a few columns whose sums should stay in registers: the checks for overlapping
 arrays and the rest beyond whole vectors, which an automatic vectorizer adds, cost more than the work. What is
@@ -21,12 +21,12 @@ _FAST = ("fast",)
 
 
 def bytes_of(lanes: int) -> Any:
-    """The kind of a vector of so many bytes."""
+    """Return the kind of a vector of so many bytes."""
     return ir.VectorType(BYTE, lanes)
 
 
 def shorts_of(lanes: int) -> Any:
-    """The same of 16 bit numbers."""
+    """Return the same of 16 bit numbers."""
     return ir.VectorType(SHORT, lanes)
 
 
@@ -50,12 +50,13 @@ class Vectors:
         return array(self._context, self.builder, self._arguments[place]).data
 
     def members(self, place: int) -> list[Any]:
-        """The members of the tuple that is argument number `place`."""
+        """Return the members of the tuple that is argument number `place`."""
         return list(cgutils.unpack_tuple(self.builder, self._arguments[place]))
 
     def by_chunks(self, count: Any, body: Callable[[Any, int], None]) -> None:
-        """Writes the loop over `count` bytes, a multiple of HALF_LANES: body(offset, lanes) for each vector
-        of LANES and for the half vector that may be left."""
+        """Write the loop over `count` bytes, a multiple of HALF_LANES: body(offset, lanes) for each vector of
+        LANES and for the half vector that may be left.
+        """
         chunks = self.builder.udiv(count, count.type(LANES))
         with cgutils.for_range(self.builder, chunks) as loop:
             body(self.builder.mul(loop.index, loop.index.type(LANES)), LANES)
@@ -69,22 +70,22 @@ class Vectors:
         return array(self._context, self.builder, self._arguments[place]).nitems
 
     def number(self, place: int, at: Any, kind: Any) -> Any:
-        """A vector of one element of the array that is argument number `place`."""
+        """Return a vector of one element of the array that is argument number `place`."""
         return self.all(self.builder.load(self.builder.gep(self.data(place), [at])), kind)
 
     def load(self, data: Any, at: Any, kind: Any) -> Any:
-        """A vector that begins with element `at`."""
+        """Return a vector that begins with element `at`."""
         return self.builder.load(self._pointer(data, at, kind), align=1)
 
     def store(self, vector: Any, data: Any, at: Any) -> None:
-        """Writes a vector from element `at` on."""
+        """Write a vector from element `at` on."""
         self.builder.store(vector, self._pointer(data, at, vector.type), align=1)
 
     def _pointer(self, data: Any, at: Any, kind: Any) -> Any:
         return self.builder.bitcast(self.builder.gep(data, [at]), ir.PointerType(kind))
 
     def all(self, value: Any, kind: Any) -> Any:
-        """A vector of one value, or of one number."""
+        """Return a vector of one value, or of one number."""
         if isinstance(value, int | float):
             return ir.Constant(kind, [value] * kind.count)
         first = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
@@ -93,11 +94,11 @@ class Vectors:
         )
 
     def least(self, one: Any, other: Any) -> Any:
-        """The lesser of both, unsigned."""
+        """Return the lesser of both, unsigned."""
         return self.builder.select(self.builder.icmp_unsigned("<", one, other), one, other)
 
     def apart(self, one: Any, other: Any, *, signed: bool = False) -> Any:
-        """The absolute difference."""
+        """Return the absolute difference."""
         compare = self.builder.icmp_signed if signed else self.builder.icmp_unsigned
         forth, back = self.builder.sub(one, other), self.builder.sub(other, one)
         return self.builder.select(compare("<", one, other), back, forth)
@@ -146,23 +147,23 @@ class Vectors:
         return self.builder.call(function, [vector, self.all(least, self.floats)], fastmath=_FAST)
 
     def sum_of(self, vector: Any) -> Any:
-        """The sum of a vector's floats."""
+        """Return the sum of a vector's floats."""
         return self._call(f"llvm.vector.reduce.fadd.v{vector.type.count}f32", FLOAT, FLOAT(0.0), vector)
 
     def extreme_of(self, vector: Any, which: str) -> Any:
-        """The "min" or "max" of a vector's floats."""
+        """Return the "min" or "max" of a vector's floats."""
         return self._call(f"llvm.vector.reduce.f{which}.v{vector.type.count}f32", FLOAT, vector)
 
     def ones(self, vector: Any) -> Any:
-        """The number of bits set in each byte."""
+        """Return the number of bits set in each byte."""
         return self._call(f"llvm.ctpop.v{vector.type.count}i8", vector.type, vector)
 
-    def least_of(self, vector: Any) -> Any:
-        """The least byte of a vector."""
+    def min_of(self, vector: Any) -> Any:
+        """Return the least byte of a vector."""
         return self._call(f"llvm.vector.reduce.umin.v{vector.type.count}i8", BYTE, vector)
 
-    def least_number(self, vector: Any) -> Any:
-        """The least of a vector's signed 32 bit numbers."""
+    def min_number(self, vector: Any) -> Any:
+        """Return the least of a vector's signed 32 bit numbers."""
         return self._call(f"llvm.vector.reduce.smin.v{vector.type.count}i32", NUMBER, vector)
 
     def _call(self, name: str, result: Any, *values: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Semi-global matching [Hirschmueller 2008] on a cost that neither gain nor single bright pixels upset.
+"""Match semi-globally [Hirschmueller 2008] on a cost that neither gain nor single bright pixels upset.
 
 Cost of a candidate: Hamming distance of the 5x5 census [Zabih 1994], plus truncated differences of the x
 gradient and of the grey value. Eight paths; the penalty of a jump falls where the image has an edge. The
@@ -20,16 +20,16 @@ from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int32, UInt8, kernel
 from barsight.core.errors import ConfigError
-from barsight.core.parallel import in_bands
+from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.kernels.vectors import HALF_LANES, NUMBER, Vectors, shorts_of
 from barsight.stereo.direct.semiglobal.cost import (
     BESIDE_COST,
     Int16,
-    candidates_in_order,
-    described,
+    describe_pixels,
+    reverse_rows,
     row_costs,
 )
-from barsight.stereo.direct.semiglobal.paths import UInt16, extend_row, fresh_paths, jump_costs
+from barsight.stereo.direct.semiglobal.paths import UInt16, allocate_paths, extend_row, p2_table
 
 _OVERLAP_ROWS = 20
 _STRIPE_BYTES = 128 * 2**20
@@ -40,24 +40,24 @@ _LARGEST_BYTE = 255
 
 @dataclass(frozen=True)
 class SemiGlobalSettings:
-    """Semi-global matching."""
+    """Settings of semi-global matching."""
 
-    small_jump: int = 22
+    p1: int = 22
     """Penalty of a change by one candidate between neighbours."""
-    large_jump: int = 150
+    p2: int = 150
     """Penalty of a larger change where the image is flat; an edge of 8 grey levels halves it."""
-    least_jump: int = 28
+    min_p2: int = 28
     """Penalty of a larger change across a strong image edge."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.small_jump <= self.least_jump <= self.large_jump:
-            raise ConfigError("the penalties must be 0 < small_jump <= least_jump <= large_jump")
-        if self.small_jump + self.large_jump > _LARGEST_BYTE - BESIDE_COST:
-            raise ConfigError(f"small_jump + large_jump can't exceed {_LARGEST_BYTE - BESIDE_COST}")
+        if not 0 < self.p1 <= self.min_p2 <= self.p2:
+            raise ConfigError("the penalties must be 0 < p1 <= min_p2 <= p2")
+        if self.p1 + self.p2 > _LARGEST_BYTE - BESIDE_COST:
+            raise ConfigError(f"p1 + p2 can't exceed {_LARGEST_BYTE - BESIDE_COST}")
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
+class SemiGlobalMatch:
     """Disparities of both images, (H, W) float32: left_px to a fraction, right_px in whole pixels.
 
     right_px is -1e6 where no candidate falls into the left image.
@@ -67,8 +67,10 @@ class Match:
     right_px: Float32
 
 
-def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiGlobalSettings) -> Match:
-    """The best of `count` candidates from lowest_px on for every pixel, by semi-global matching.
+def match_semiglobal(
+    left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiGlobalSettings
+) -> SemiGlobalMatch:
+    """Match every pixel among `count` candidates from lowest_px on by semi-global matching.
 
     Memory: at most about 130 MB per thread, or 40 rows' cost volume if that is more.
     """
@@ -80,28 +82,31 @@ def match(left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiG
     rows = -(-height // stripes)
     volume = (min(height, rows + 2 * _OVERLAP_ROWS), width, places)
     rooms = [(np.empty(volume, dtype=np.uint8), np.empty(volume, dtype=np.uint16)) for _ in range(threads)]
-    seen, others = described(left), candidates_in_order(described(right), lowest_px, places)
+    seen, others = describe_pixels(left), reverse_rows(describe_pixels(right), lowest_px, places)
 
     def work(first: int, end: int) -> None:
         room = rooms.pop()
         _match_stripe(
             seen.codes, seen.slope, seen.grey, others.codes, others.slope, others.grey, lowest_px, count,
-            settings.small_jump, settings.large_jump, settings.least_jump, *room, left_px, right_px, first,
+            settings.p1, settings.p2, settings.min_p2, *room, left_px, right_px, first,
             end,
         )  # fmt: skip
         rooms.append(room)
 
-    in_bands(work, height, rows)
-    return Match(left_px, right_px)
+    parallel_bands(work, height, rows)
+    return SemiGlobalMatch(left_px, right_px)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _compete(
     _: Any, downs: Any, ups: Any, at: Any, count: Any, places: Any, least: Any, right: Any
 ) -> Any:  # fmt: skip
-    """The least key of one left pixel. Its keys are written to `least` where they are less, that of candidate
-    k at `right` + k. A key is a candidate's sum and below it, in 16 bits, the candidate: the least number is
-    the winner. downs, ups: flat, the pixel's sums from `at` on."""
+    """Find the least key of one left pixel.
+
+    Its keys are written to `least` where they are less, that of candidate k at `right` + k. A key is a
+    candidate's sum and below it, in 16 bits, the candidate: the least number is the winner. downs, ups: flat,
+    the pixel's sums from `at` on.
+    """
     signature = types.int32(downs, ups, at, count, places, least, right)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -128,7 +133,7 @@ def _compete(
             builder.store(smaller(builder.load(winner), key), winner)
             there = builder.add(arguments[6], offset)
             v.store(smaller(v.load(v.data(5), there, kind), key), v.data(5), there)
-        return v.least_number(builder.load(winner))
+        return v.min_number(builder.load(winner))
 
     return signature, generate
 
@@ -137,9 +142,10 @@ def _compete(
 def _choose(
     down: UInt16, up: UInt16, count: int, lowest: int, least: Int32, left_px: Float32, right_px: Float32
 ) -> None:
-    """Winners of one row for both images; the left one to a fraction with the equiangular line fit, which
-    suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that a
-    left pixel's candidates meet them in memory's order. down, up: (W, places) sums of four paths each. least:
+    """Choose winners of one row for both images; the left one to a fraction with the equiangular line fit,
+    which suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that
+    a left pixel's candidates meet them in memory's order. down, up: (W, places) sums of four paths each.
+    least:
     for use inside, with a margin on both sides that takes what falls beside the right image."""
     width, places = down.shape
     downs, ups = down.reshape(-1), up.reshape(-1)
@@ -167,15 +173,16 @@ def _choose(
 @kernel()
 def _match_stripe(
     code: UInt8, slope: Int16, grey: UInt8, codes: UInt8, slopes: Int16, greys: UInt8, lowest: int,
-    count: int, small: int, large: int, least_jump: int, cost: UInt8, down: UInt16, left_px: Float32,
+    count: int, small: int, large: int, min_p2: int, cost: UInt8, down: UInt16, left_px: Float32,
     right_px: Float32, start: int, end: int,
 ) -> None:  # fmt: skip
-    """Once down, where the costs are made, and once up, where the winners are chosen row by row. cost, down:
+    """Match a stripe: once down, where the costs are made, and once up, where the winners are chosen row by
+    row. cost, down:
     volumes for use inside."""
     height, width = left_px.shape
     places = cost.shape[2]
-    jumps = jump_costs(large, least_jump)
-    paths = fresh_paths(width, places, small)
+    jumps = p2_table(large, min_p2)
+    paths = allocate_paths(width, places, small)
     leasts = np.empty((2, width, 3), dtype=np.uint8)
     up = np.empty((width, places), dtype=np.uint16)
     least = np.empty(width + 2 * (abs(lowest) + places), dtype=np.int32)

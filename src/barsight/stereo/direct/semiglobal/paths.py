@@ -1,4 +1,4 @@
-"""The paths of semi-global matching [Hirschmueller 2008], four at once, in bytes.
+"""Aggregate along the paths of semi-global matching [Hirschmueller 2008], four at once, in bytes.
 
 A path's values stay below its least value plus the dearest jump, and each step takes the least off, so a byte
 holds them. Candidates are filled up to whole vectors with places that no path takes.
@@ -28,7 +28,7 @@ def _extend_paths(
     _: Any, cost: Any, at: Any, paths: Any, before: Any, after: Any, least: Any, ceiling: Any, small: Any,
     sums: Any, at_sums: Any, places: Any,
 ) -> Any:  # fmt: skip
-    """One pixel further along four paths [Hirschmueller 2008, Eq. 13]; returns the least value of each.
+    """Step one pixel further along four paths [Hirschmueller 2008, Eq. 13]; returns the least value of each.
 
     before, after: where each path's values at the pixels before and here begin in `paths`, with one place
     before the first. least, ceiling: each path's least value before, the same with the dearest jump. The sum
@@ -64,7 +64,7 @@ def _extend_paths(
 
         v.by_chunks(arguments[10], extend)
         found = [
-            v.least(*(v.least_of(builder.load(lowest[lanes][k])) for lanes in (LANES, HALF_LANES)))
+            v.least(*(v.min_of(builder.load(lowest[lanes][k])) for lanes in (LANES, HALF_LANES)))
             for k in range(_PATHS)
         ]
         return context.make_tuple(builder, signature.return_type, found)
@@ -73,8 +73,8 @@ def _extend_paths(
 
 
 @kernel()
-def jump_costs(large: int, least: int) -> UInt8:
-    """(256,) the penalty of a larger change by the grey levels that the image changes there."""
+def p2_table(large: int, least: int) -> UInt8:
+    """Tabulate the penalty P2 (256,) by the grey levels that the image changes there."""
     jumps = np.empty(256, dtype=np.uint8)
     for contrast in range(256):
         jumps[contrast] = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least)
@@ -82,9 +82,10 @@ def jump_costs(large: int, least: int) -> UInt8:
 
 
 @kernel()
-def fresh_paths(width: int, places: int, small: int) -> UInt8:
-    """Room for the values of `extend_row`: three paths in two rows, one path in two pixels, and zeros for
-    where a path begins; each with a place to either side that no path takes."""
+def allocate_paths(width: int, places: int, small: int) -> UInt8:
+    """Allocate the values of `extend_row`: three paths in two rows, one path in two pixels, and zeros for
+    where a path begins; each with a place to either side that no path takes.
+    """
     side = places + 2
     paths = np.full((6 * width + 3) * side, 255 - small, dtype=np.uint8)
     paths[(6 * width + 2) * side :] = 0
@@ -105,7 +106,7 @@ def extend_row(
     leasts: UInt8,
     sums: UInt16,
 ) -> None:
-    """Four paths through one row: along it and from the three neighbours in the row before.
+    """Extend four paths through one row: along it and from the three neighbours in the row before.
 
     cost, sums: (W, places). paths, leasts (2, W, 3): kept from row to row.
     """
@@ -115,13 +116,13 @@ def extend_row(
     new, old = (1, 0) if is_odd else (0, 1)
     along, begin = 6 * width * side, (6 * width + 2) * side
     zero = np.uint8(0)
-    least_along, dearest = zero, jumps[0]
+    min_along, dearest = zero, jumps[0]
     for j in range(width):
         x = width - 1 - j if backwards else j
         here, at = np.int32(grey[x]), x * places
         start_a, base_a, top_a = begin, zero, dearest
         if j > 0:
-            start_a, base_a = along + (1 - (j & 1)) * side, least_along
+            start_a, base_a = along + (1 - (j & 1)) * side, min_along
             top_a = np.uint8(base_a + jumps[abs(here - np.int32(grey[x + 1 if backwards else x - 1]))])
         start_l, base_l, top_l = begin, zero, dearest
         if not is_first and x > 0:
@@ -145,5 +146,5 @@ def extend_row(
             (base_a, base_l, base_m, base_r), (top_a, top_l, top_m, top_r), np.uint8(small), totals, at,
             places,
         )  # fmt: skip
-        least_along = found[0]
+        min_along = found[0]
         leasts[new, x, 0], leasts[new, x, 1], leasts[new, x, 2] = found[1], found[2], found[3]

@@ -1,4 +1,4 @@
-"""Single bars: which of a bundle's bars are seen from above, and where each of them lies."""
+"""Fit single bars: which of a bundle's bars are seen from above, and their places."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from barsight.yard.bundles.fitting.outline_fit import (
     SLOPE_U,
     SLOPE_Z,
     Fit,
-    Found,
+    FittedOutline,
     U,
     Z,
 )
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.types import Bar
 
-_SEEN_SHARE = 0.3
+_SEEN_RATIO = 0.3
 _RESOLVED_CELLS = 3.0
 _LOOSE_M = 0.001
 """How far a bar lies from its place in the packing."""
 
 
 def visible_bars(fit: Fit) -> Int64:
-    """Numbers of the packing's bars of which at least 30 % of the diameter is seen from straight above."""
+    """Select the packing's bars of which at least 30 % of the diameter is seen from straight above."""
     diameter = float(fit.values[DIAMETER])
     axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
     highest, _ = highest_bars(axes, diameter / 2, np.arange(-fit.width_m / 2, fit.width_m / 2, STEP_M))
     counts = np.bincount(highest[highest >= 0], minlength=len(axes))
-    return np.flatnonzero(counts * STEP_M >= _SEEN_SHARE * diameter)
+    return np.flatnonzero(counts * STEP_M >= _SEEN_RATIO * diameter)
 
 
-def fit_bars(found: Found, settings: BundleSettings) -> tuple[Bar, ...]:
-    """A cylinder for each bar seen from above; none where neither heights nor pictures resolve them.
+def fit_bars(found: FittedOutline, settings: BundleSettings) -> tuple[Bar, ...]:
+    """Fit a cylinder to each bar seen from above; none where neither heights nor pictures resolve them.
 
     The bundle's fit is one of all its cylinders at once: a bar's figures and their covariance follow from the
     bundle's place, slopes, roll and diameter. Fitted one by one, smoothed heights move bars by 4 mm.
@@ -69,7 +69,7 @@ def fit_bars(found: Found, settings: BundleSettings) -> tuple[Bar, ...]:
 
 
 def _covariance(fit: Fit, along: float, side: float, up: float, settings: BundleSettings) -> Float64:
-    """(5, 5) of a bar's place across, height, yaw, pitch and diameter."""
+    """Compute the covariance (5, 5) of a bar's place across, height, yaw, pitch and diameter."""
     change = np.zeros((5, 6))
     change[0, [U, SLOPE_U, ROLL, DIAMETER]] = 1.0, along, -up, side / fit.values[DIAMETER]
     change[1, [Z, SLOPE_Z, ROLL, DIAMETER]] = 1.0, along, side, up / fit.values[DIAMETER]

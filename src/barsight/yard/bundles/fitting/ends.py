@@ -1,4 +1,4 @@
-"""Where a bundle ends, and whether that was seen."""
+"""Find the ends of a bundle, and whether they were seen."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from barsight.core.arrays import Float64, Int64
 from barsight.yard.bundles.fitting.bars import visible_bars
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit
-from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 
 _LOOK_M = 1.3
 _PROOF_M = 0.1
 _RAGGED_M = 0.2
-_SOME, _MOST = 0.3, 0.6
+_SOME, _MAX_VALUE = 0.3, 0.6
 _GROWTH_CELLS = 1.5
 """A map grows over ends by about one and a half cells."""
 _SEEN_SIGMA_M = 0.012
@@ -35,8 +35,8 @@ class End:
     why: str = ""
 
 
-def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End:
-    """The end at the fit's first (step -1) or last row (step 1).
+def find_end(sheet: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -> End:
+    """Find the end at the fit's first (step -1) or last row (step 1).
 
     It is seen where, over most of the bundle's width and for 0.1 m, the surface beyond lies lower than half
     the bundle's height. The bars end unevenly, so the end is put a quarter of the way from the last row that
@@ -57,7 +57,7 @@ def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End
             ragged = k + 1
             if ragged * cell > _RAGGED_M:
                 return End(v, float("nan"), True, "the surface goes on at about its height")
-        elif known[k] >= _MOST:
+        elif known[k] >= _MAX_VALUE:
             lower += 1
             if lower * cell >= _PROOF_M:
                 spread = ragged * cell
@@ -67,8 +67,8 @@ def find_end(sheet: Sheet, fit: Fit, step: int, settings: BundleSettings) -> End
     return End(v, float("nan"), True, "the map doesn't show what lies beyond")
 
 
-def _unevenness(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
-    """How sure the middle of the visible bars' ends is (m), from how far apart they are."""
+def _unevenness(sheet: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
+    """Estimate the sigma (m) of the middle of the visible bars' ends from how far apart they are."""
     first, last = (round(reach / sheet.cell_m) for reach in _UNEVEN_M)
     rows = row + step * np.arange(first, last + 1)
     rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
@@ -80,8 +80,12 @@ def _unevenness(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSet
     return float(1.25 * spread / np.sqrt(max(len(visible_bars(fit)), 1)))
 
 
-def _beyond(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSettings) -> tuple[Float64, Float64]:
-    """For each row beyond: the share of the outline that is known, and the median height over it."""
+def _beyond(
+    sheet: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings
+) -> tuple[Float64, Float64]:
+    """Measure for each row beyond: the fraction of the outline that is known, and the median height
+    over it.
+    """
     rows = row + step * np.arange(1, int(_LOOK_M / sheet.cell_m) + 1)
     rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
     over = _over(sheet, fit, rows, settings)
@@ -91,8 +95,8 @@ def _beyond(sheet: Sheet, fit: Fit, row: int, step: int, settings: BundleSetting
     return known, misfit
 
 
-def _over(sheet: Sheet, fit: Fit, rows: Int64, settings: BundleSettings) -> Float64:
-    """(rows, N) measured heights over the outline across most of its width; NaN where unknown."""
+def _over(sheet: AlignedMap, fit: Fit, rows: Int64, settings: BundleSettings) -> Float64:
+    """Sample measured heights (rows, N) over the outline across most of its width; NaN where unknown."""
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )

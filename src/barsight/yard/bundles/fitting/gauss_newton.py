@@ -1,4 +1,4 @@
-"""The inner part of a bundle's fit: Gauss-Newton over the heights under its outline, compiled."""
+"""Run the Gauss-Newton iterations of a bundle's fit over the heights under its outline, compiled."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from barsight.yard.bundles.fitting.outline import STEP_M, trace_with_changes
 _ROLL, _DIAMETER = 4, 5
 _RIM_M = 0.008
 _STEEPEST = 4.0
-_LEAST_HEIGHTS = 30
+_MIN_HEIGHTS = 30
 _STILL_M = 1e-5
-_LEAST_SCATTER = 0.04
+_MIN_SCATTER = 0.04
 """Of the stated variance."""
 
 
@@ -40,7 +40,7 @@ class Rules(NamedTuple):
     """
 
     packing: Float64
-    width_share: float
+    width_ratio: float
     free: Bool
     steps: int
     gate_m: float
@@ -55,7 +55,8 @@ class Rules(NamedTuple):
 def fit_outline(
     heights: Heights, start: Float64, rules: Rules
 ) -> tuple[bool, Float64, Float64, Float64, float]:
-    """Whether it held, the figures (6,), J'WJ with priors (6, 6), (count, sum w, chi squared), heights alike.
+    """Fit: whether it held, the figures (6,), J'WJ with priors (6, 6), (count, sum w, chi squared), heights
+    alike.
 
     It does not hold where fewer than 30 heights are left or the width leaves its bounds.
     """
@@ -65,10 +66,10 @@ def fit_outline(
     for _ in range(rules.steps):
         tables = trace_with_changes(rules.packing, values[_DIAMETER], values[_ROLL], rules.smoothing_m)
         normal, right, moments = _normal_equations(heights, values, tables, rules.gate_m, rules.placing_m)
-        if moments[0] < _LEAST_HEIGHTS:
+        if moments[0] < _MIN_HEIGHTS:
             return False, values, normal, moments, alike
         # A height's sigma holds what all heights share, too: only what really scatters averages out.
-        alike = rules.alike * max(_LEAST_SCATTER, moments[2] / moments[0])
+        alike = rules.alike * max(_MIN_SCATTER, moments[2] / moments[0])
         weight = alike / rules.common_m[1] ** 2
         normal[_DIAMETER, _DIAMETER] += weight
         right[_DIAMETER] += weight * (rules.common_m[0] - values[_DIAMETER])
@@ -79,7 +80,7 @@ def fit_outline(
             most = 0.05 * values[_DIAMETER]
             change[_DIAMETER] = min(max(change[_DIAMETER], -most), most + 1e-3)
         values += change
-        width = values[_DIAMETER] * rules.width_share
+        width = values[_DIAMETER] * rules.width_ratio
         if not rules.widths_m[0] < width < rules.widths_m[1]:
             return False, values, normal, moments, alike
         if max(abs(change[0]), abs(change[_DIAMETER]), abs(change[1]) * half) < _STILL_M:
@@ -89,7 +90,7 @@ def fit_outline(
 
 @kernel()
 def _hold(normal: Float64, diameter: float, half: float) -> None:
-    """Adds what keeps a step small where the map says nothing of a figure: weak against real evidence."""
+    """Add what keeps a step small where the map says nothing of a figure: weak against real evidence."""
     slope = 0.1 / max(half, 0.1)
     sigmas = (0.05, slope, 0.05, slope, 0.3, 0.1 * diameter)
     for k in range(6):
@@ -98,7 +99,7 @@ def _hold(normal: Float64, diameter: float, half: float) -> None:
 
 @kernel()
 def _step(normal: Float64, right: Float64, free: Bool) -> Float64:
-    """The change of the free figures, 0 of the others."""
+    """Solve for the change of the free figures, 0 of the others."""
     table, wanted = normal.copy(), right.copy()
     for k in range(6):
         if not free[k]:
@@ -115,7 +116,7 @@ def _step(normal: Float64, right: Float64, free: Bool) -> Float64:
 def _normal_equations(
     heights: Heights, values: Float64, tables: Float64, gate: float, placing: float
 ) -> tuple[Float64, Float64, Float64]:
-    """J'WJ (6, 6), J'Wr (6,) and (count, sum w, chi squared) of the heights under the outline.
+    """Form J'WJ (6, 6), J'Wr (6,) and (count, sum w, chi squared) of the heights under the outline.
 
     Along one row the two slopes' columns are the places' times the way along: four sums per row make six.
     """
@@ -160,7 +161,7 @@ def _normal_equations(
 
 @kernel()
 def _add_row(normal: Float64, right: Float64, part: Float64, side: Float64, along: float) -> None:
-    """Spreads a row's sums over place, height, roll and diameter to the figures U ... DIAMETER."""
+    """Spread a row's sums over place, height, roll and diameter to the figures U ... DIAMETER."""
     source = (0, 0, 1, 1, 2, 3)
     times = (1.0, along, 1.0, along, 1.0, 1.0)
     for a in range(6):

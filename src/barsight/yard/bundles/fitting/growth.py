@@ -1,4 +1,4 @@
-"""How far a fitted outline follows the map: from a short piece to the whole bundle."""
+"""Extend a fitted outline from a short piece to the whole bundle."""
 
 from __future__ import annotations
 
@@ -17,21 +17,23 @@ from barsight.yard.bundles.fitting.outline_fit import (
     ROLL,
     SLOPE_U,
     Fit,
-    refine,
+    refine_outline,
 )
-from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 
-_AGREE_SHARE = 0.55
-_KNOWN_SHARE = 0.3
-_MOST_ABOVE_M = 0.8
-_MOST_BELOW_M = 0.04
-_MOST_MIXED_M = 0.2
-_MOST_UNKNOWN_M = 0.6
+_AGREE_RATIO = 0.55
+_KNOWN_RATIO = 0.3
+_MAX_ABOVE_M = 0.8
+_MAX_BELOW_M = 0.04
+_MAX_MIXED_M = 0.2
+_MAX_UNKNOWN_M = 0.6
 
 
-def follow(sheet: Sheet, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
-    """How far the outline follows the map from the fit's rows on, at most reach_m further to either side."""
+def extend_rows(sheet: AlignedMap, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
+    """Find how far the outline follows the map from the fit's rows on, at most reach_m further to either
+    side.
+    """
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
@@ -41,7 +43,7 @@ def follow(sheet: Sheet, fit: Fit, settings: BundleSettings, reach_m: float) -> 
         sheet.z_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, fit.v_m, fit.values,
         outline.seen_m, outline.slope, outline.reach_m, settings.agreement_m,
     )  # fmt: skip
-    runs = np.array([_MOST_UNKNOWN_M, 0.0, _MOST_ABOVE_M, _MOST_BELOW_M, _MOST_MIXED_M]) / sheet.cell_m
+    runs = np.array([_MAX_UNKNOWN_M, 0.0, _MAX_ABOVE_M, _MAX_BELOW_M, _MAX_MIXED_M]) / sheet.cell_m
     agreeing = np.flatnonzero(state[fit.first : fit.last + 1] == AGREES)
     if agreeing.size < 0.5 * (fit.last + 1 - fit.first):
         return None
@@ -54,7 +56,7 @@ def follow(sheet: Sheet, fit: Fit, settings: BundleSettings, reach_m: float) -> 
 
 @kernel()
 def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int:
-    """The last agreeing row before a run of others gets too long for its kind."""
+    """Find the last agreeing row before a run of others gets too long for its kind."""
     last = start
     waiting = np.zeros(5)
     row = start
@@ -75,7 +77,7 @@ def _row_states(
     z: Float32, u0: float, v0: float, cell: float, first: int, last: int, v_middle: float, values: Float64,
     seen: Float64, slope: Float64, reach: float, agreement: float,
 ) -> tuple[UInt8, Float32]:  # fmt: skip
-    """Each row's state and the cells it explains, over the parts of the outline that aren't steep."""
+    """Classify each row and count the cells it explains, over the parts of the outline that aren't steep."""
     rows, columns = z.shape
     state, gain = np.zeros(rows, np.uint8), np.zeros(rows, np.float32)
     cosine = 1.0 / np.sqrt(1.0 + values[1] * values[1])
@@ -104,9 +106,9 @@ def _row_states(
                 above += 1
             else:
                 below += 1
-        if known < _KNOWN_SHARE * count or known == 0:
+        if known < _KNOWN_RATIO * count or known == 0:
             continue
-        if agree >= _AGREE_SHARE * known:
+        if agree >= _AGREE_RATIO * known:
             state[j] = AGREES
             gain[j] = total
         elif above > below and above >= 0.4 * known:
@@ -118,24 +120,24 @@ def _row_states(
     return state, gain
 
 
-def grow(sheet: Sheet, seed: Fit, settings: BundleSettings) -> Fit | None:
-    """From a short piece to the whole bundle: fit, follow, fit again until both ends stand still."""
-    fit = refine(sheet, seed, settings, steps=8, gate_m=3 * settings.agreement_m)
+def grow_outline(sheet: AlignedMap, seed: Fit, settings: BundleSettings) -> Fit | None:
+    """Grow a short piece to the whole bundle: fit, follow, fit again until both ends stand still."""
+    fit = refine_outline(sheet, seed, settings, steps=8, gate_m=3 * settings.agreement_m)
     if fit is None:
         return None
     reach = 0.4
     limit = np.tan(np.radians(settings.max_skew_deg) * 1.5)
     for _ in range(12):
-        longer = follow(sheet, fit, settings, reach)
+        longer = extend_rows(sheet, fit, settings, reach)
         if longer is None:
             return None
         settled = longer.first == fit.first and longer.last == fit.last
-        refined = refine(sheet, longer, settings, steps=6 if settled else 3)
+        refined = refine_outline(sheet, longer, settings, steps=6 if settled else 3)
         if refined is None or abs(refined.values[SLOPE_U]) > limit:
             return None
         fit = refined
         if settled and reach >= sheet.z_m.shape[0] * sheet.cell_m:
-            return follow(sheet, fit, settings, 0.05)
+            return extend_rows(sheet, fit, settings, 0.05)
         reach = reach * 2 if not settled else np.inf if reach > 1.5 else reach * 2
         reach = min(reach, sheet.z_m.shape[0] * sheet.cell_m)
-    return follow(sheet, fit, settings, 0.05)
+    return extend_rows(sheet, fit, settings, 0.05)

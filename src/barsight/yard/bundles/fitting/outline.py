@@ -1,4 +1,4 @@
-"""What a bundle looks like from above: the upper outline of round bars in hexagonal packing."""
+"""Compute a bundle's outline from above: the upper outline of round bars in hexagonal packing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DIAMETER_STEP = 0.01
 
 @lru_cache(maxsize=8)
 def hexagon(rings: int) -> Float64:
-    """(bars, 2) axes of the packing, sideways and up, in diameters, a row lying level."""
+    """Compute axes of the packing (bars, 2), sideways and up, in diameters, a row lying level."""
     cells = [
         (q + r / 2, r * np.sqrt(0.75))
         for q in range(-rings, rings + 1)
@@ -33,17 +33,19 @@ def hexagon(rings: int) -> Float64:
 
 
 def turned_hexagon(rings: int, diameter_m: float, roll_rad: float) -> Float64:
-    """(bars, 2) axes in m, the packing rolled clockwise by roll_rad as seen along the bundle."""
+    """Compute axes (bars, 2) in m, the packing rolled clockwise by roll_rad as seen along the bundle."""
     return _turned(hexagon(rings), diameter_m, roll_rad)
 
 
 def bundle_width(rings: int, diameter_m: float) -> float:
-    """Diameter of the circle around all bars."""
+    """Compute the diameter of the circle around all bars."""
     return diameter_m * (2 * LOOSENESS * rings + 1)
 
 
 def highest_bars(axes_m: Float64, radius_m: float, u_m: Float64) -> tuple[Int64, Float64]:
-    """For each place the bar that is highest there, -1 where none is, and its height (-inf where none)."""
+    """Find for each place the bar that is highest there, -1 where none is, and its height (-inf
+    where none).
+    """
     inside = radius_m**2 - (u_m[:, None] - axes_m[:, 0]) ** 2
     heights = np.where(inside > 0, axes_m[:, 1] + np.sqrt(np.maximum(inside, 0)), -np.inf)
     top: Float64 = heights.max(axis=1)
@@ -64,7 +66,7 @@ class Outline:
 
 
 def make_outline(rings: int, diameter_m: float, roll_rad: float, smoothing_m: float) -> Outline:
-    """The upper outline of a bundle."""
+    """Compute the upper outline of a bundle."""
     axes = turned_hexagon(rings, diameter_m, roll_rad)
     exact, seen, slope = _trace(axes, diameter_m / 2, smoothing_m)
     return Outline(exact.size // 2 * STEP_M, exact, seen, slope)
@@ -72,7 +74,9 @@ def make_outline(rings: int, diameter_m: float, roll_rad: float, smoothing_m: fl
 
 @kernel()
 def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64, Float64]:
-    """Outline, its Gaussian mean over the part that is there, and that mean's slope, at -half ... half."""
+    """Trace the outline, its Gaussian mean over the part that is there, and that mean's slope, at -half ...
+    half.
+    """
     half = int(np.ceil((np.abs(axes[:, 0]).max() + radius) / STEP_M)) + 1
     size = 2 * half + 1
     exact, seen, slope = np.full(size, np.nan), np.full(size, np.nan), np.full(size, np.nan)
@@ -103,7 +107,9 @@ def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64
 
 @kernel()
 def trace_with_changes(packing: Float64, diameter: float, roll: float, sigma: float) -> Float64:
-    """(4, N) seen outline of `packing` (see `hexagon`), its slope, its change by roll and by diameter."""
+    """Trace `packing`'s seen outline (4, N) (see `hexagon`), its slope, its change by roll and by
+    diameter.
+    """
     _, seen, slope = _trace(_turned(packing, diameter, roll), diameter / 2, sigma)
     _, rolled, _ = _trace(_turned(packing, diameter, roll + _ROLL_STEP_RAD), diameter / 2, sigma)
     wide = diameter * (1 + _DIAMETER_STEP)

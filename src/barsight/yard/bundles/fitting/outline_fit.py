@@ -1,4 +1,4 @@
-"""A bundle's outline fitted to the map's heights along its whole length."""
+"""Fit a bundle's outline to the map's heights along its whole length."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.yard.bundles.fitting.gauss_newton import Heights, Rules, fit_outline
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width, hexagon, make_outline
-from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 
 U, SLOPE_U, Z, SLOPE_Z, ROLL, DIAMETER = range(6)
@@ -41,22 +41,22 @@ class Fit:
 
     @property
     def bars(self) -> int:
-        """Bars of the packing."""
+        """Return the bars of the packing."""
         return BARS_OF_RINGS[self.rings]
 
     @property
     def width_m(self) -> float:
-        """Diameter of the circle around all bars."""
+        """Return the diameter of the circle around all bars."""
         return bundle_width(self.rings, self.values[DIAMETER])
 
     def at(self, v_m: float) -> tuple[float, float]:
-        """Place across and height of the axis at v_m."""
+        """Compute the place across and height of the axis at v_m."""
         along = v_m - self.v_m
         return self.values[U] + self.values[SLOPE_U] * along, self.values[Z] + self.values[SLOPE_Z] * along
 
 
 @dataclass(frozen=True, eq=False)
-class Shades:
+class ShadeProfile:
     """Logarithms of grey levels (N,) at places (N,) across a bundle from its axis: medians along it."""
 
     places_m: Float64
@@ -64,28 +64,28 @@ class Shades:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FittedOutline:
     """A fitted outline and the sheet that its figures belong to.
 
     shades: what the pictures show of its bars, where they settle the packing. doubt: rings of another packing
     that the pictures would rather have, where they don't settle it.
     """
 
-    sheet: Sheet
+    sheet: AlignedMap
     fit: Fit
-    shades: Shades | None = None
+    shades: ShadeProfile | None = None
     doubt: int | None = None
 
 
-def refine(
-    sheet: Sheet,
+def refine_outline(
+    sheet: AlignedMap,
     start: Fit,
     settings: BundleSettings,
     steps: int = 6,
     gate_m: float | None = None,
     common: tuple[float, float] | None = None,
 ) -> Fit | None:
-    """Gauss-Newton over the rows first ... last; None where the outline leaves the map or degenerates.
+    """Run Gauss-Newton over the rows first ... last; None where the outline leaves the map or degenerates.
 
     The weight of a height falls with its sigma, with the outline's slope (it may lie beside its place) and,
     by Tukey's biweight, with its misfit over `gate_m`. common: diameter and sigma known from elsewhere.
@@ -102,16 +102,16 @@ def refine(
     free[SLOPE_U] = free[SLOPE_Z] = half > 2 * settings.slice_m
     stride = 1 + (rows[1] - rows[0]) // _ROWS_ENOUGH
     alike = settings.correlated_along_m * settings.correlated_across_m / sheet.cell_m**2 / stride
-    width_share = bundle_width(start.rings, 1.0)
+    width_ratio = bundle_width(start.rings, 1.0)
     held, values, normal, moments, alike = fit_outline(
         Heights(
             sheet.z_m, sheet.sigma_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, rows[0], rows[1], stride, v_m
         ),
         values,
         Rules(
-            hexagon(start.rings), width_share, free, steps, float(gate_m or 2 * settings.agreement_m),
+            hexagon(start.rings), width_ratio, free, steps, float(gate_m or 2 * settings.agreement_m),
             settings.placing_m, settings.smoothing_m, alike, common or (0.0, np.inf),
-            (0.8 * settings.least_single_m, 1.2 * settings.widest_m),
+            (0.8 * settings.min_single_diameter_m, 1.2 * settings.max_width_m),
         ),
     )  # fmt: skip
     if not held:
@@ -125,12 +125,12 @@ def refine(
     )  # fmt: skip
 
 
-def widened(fit: Fit, settings: BundleSettings) -> Fit:
-    """With the error of the width that the map's smoothing leaves: it moves the axis, not the top.
+def widen_fit(fit: Fit, settings: BundleSettings) -> Fit:
+    """Add the error of the width that the map's smoothing leaves: it moves the axis, not the top.
 
     A single bar's top is half as sure: its highlight is measured as far behind as its flanks grow.
     """
-    share = settings.packing_share if fit.rings else settings.single_share
+    share = settings.packing_error_ratio if fit.rings else settings.single_error_ratio
     top_m = float(np.nanmax(make_outline(fit.rings, fit.values[DIAMETER], fit.values[ROLL], 0.0).exact_m))
     change = np.zeros(6)
     change[DIAMETER], change[Z] = share * fit.values[DIAMETER], -share * top_m * (1.0 if fit.rings else 0.5)

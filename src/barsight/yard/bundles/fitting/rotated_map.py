@@ -1,4 +1,4 @@
-"""The height map as one heading sees it: measured heights only, the bars running along the rows' axis."""
+"""Resample the height map along one heading: measured heights only, the bars running along the rows' axis."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
-from barsight.core.types import Source
+from barsight.core.types import HeightSource
 from barsight.yard.types import HeightMap
 
-_VISION = Source.VISION
+_VISION = HeightSource.VISION
 
 
 @dataclass(frozen=True, eq=False)
-class Sheet:
+class AlignedMap:
     """Measured heights [v, u] in a frame turned by heading_rad from the map's, counter-clockwise about Z.
 
     Cell (row, column) has its centre at u = u0_m + column * cell_m across, v = v0_m + row * cell_m along.
@@ -31,20 +31,22 @@ class Sheet:
     stock_over_m: float
 
     def to_map(self, uv_m: Float64) -> Float64:
-        """(N, 2) places u, v to x, y of the map."""
+        """Convert places u, v (N, 2) to x, y of the map."""
         c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
         turned: Float64 = uv_m @ np.array([[c, s], [-s, c]])
         return turned
 
 
-def turn(height_map: HeightMap, heading_rad: float, stock_over_m: float = -np.inf) -> Sheet:
-    """The map's measured heights in a frame whose v axis is (-sin heading, cos heading); nearest cells."""
+def align_map(height_map: HeightMap, heading_rad: float, stock_over_m: float = -np.inf) -> AlignedMap:
+    """Rotate the map's measured heights into a frame whose v axis is (-sin heading, cos heading); nearest
+    cells.
+    """
     cell = height_map.cell_m
     if heading_rad == 0.0:
-        measured = height_map.source == Source.VISION
+        measured = height_map.source == HeightSource.VISION
         z = np.where(measured, height_map.z_m, np.float32(np.nan))
         sigma = np.where(measured, height_map.sigma_m, np.float32(np.nan))
-        return Sheet(0.0, height_map.x0_m, height_map.y0_m, cell, z, sigma, stock_over_m)
+        return AlignedMap(0.0, height_map.x0_m, height_map.y0_m, cell, z, sigma, stock_over_m)
     rows, columns = height_map.z_m.shape
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     x = height_map.x0_m + cell * np.array([0, columns - 1, 0, columns - 1])
@@ -56,7 +58,7 @@ def turn(height_map: HeightMap, heading_rad: float, stock_over_m: float = -np.in
     first_x, first_y = c * u.min() - s * v.min(), s * u.min() + c * v.min()
     first = np.array([(first_x - height_map.x0_m) / cell, (first_y - height_map.y0_m) / cell])
     _turned(height_map.z_m, height_map.sigma_m, height_map.source, first, float(c), float(s), z, sigma)
-    return Sheet(heading_rad, float(u.min()), float(v.min()), cell, z, sigma, stock_over_m)
+    return AlignedMap(heading_rad, float(u.min()), float(v.min()), cell, z, sigma, stock_over_m)
 
 
 @kernel()

@@ -1,4 +1,4 @@
-"""The settings of finding bundles."""
+"""Define the settings of finding bundles."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from barsight.core.errors import ConfigError
 
 @dataclass(frozen=True)
 class BundleSettings:
-    """Bundles of round bars, or single heavy bars, found in the height map."""
+    """Settings of finding bundles of round bars, or single heavy bars, in the height map."""
 
     catalogue_mm: tuple[float, ...] = ()
     """Diameters of bars that may lie here; any diameter when not given."""
     stock_list: Path | None = None
     """CSV or JSON of the bundles that should lie here, to be held against those found."""
-    least_length_m: float = 0.5
+    min_length_m: float = 0.5
     """Shorter pieces aren't reported."""
-    least_bar_m: float = 0.014
+    min_bar_diameter_m: float = 0.014
     """Thinnest bars in a bundle."""
-    least_single_m: float = 0.06
+    min_single_diameter_m: float = 0.06
     """Thinnest bar that counts as a bundle of its own."""
-    narrowest_m: float = 0.09
+    min_width_m: float = 0.09
     """Narrowest bundle of several bars."""
-    widest_m: float = 0.6
+    max_width_m: float = 0.6
     """Widest bundle."""
     slice_step_m: float = 1.0
     """Bundles are first looked for in cross-sections this far apart."""
@@ -48,30 +48,37 @@ class BundleSettings:
     """Error of direction that all of the map shares (one standard deviation)."""
     shared_height_m: float = 0.001
     """The same of height, but for the calibration's part, which moves the whole map."""
-    packing_share: float = 0.025
+    packing_error_ratio: float = 0.025
     """Error of a bundle's width that the map's smoothing leaves, as a share."""
-    single_share: float = 0.05
+    single_error_ratio: float = 0.05
     """The same for a single bar, whose flanks a map shows too wide."""
-    coarsest_cell_m: float = 0.025
+    max_cell_m: float = 0.025
     """In a map of larger cells no bundles are looked for."""
-    least_rise_m: float = 0.03
+    min_rise_m: float = 0.03
     """Heights nearer to the floor than this are floor."""
 
     def __post_init__(self) -> None:
         if any(not 5 <= d <= 500 for d in self.catalogue_mm):
             raise ConfigError("catalogue_mm: a diameter must lie between 5 and 500 mm")
         lengths = (
-            self.least_length_m, self.least_bar_m, self.least_single_m, self.narrowest_m, self.slice_step_m,
-            self.slice_m, self.agreement_m, self.correlated_along_m, self.correlated_across_m,
-            self.coarsest_cell_m,
-        )  # fmt: skip
+            self.min_length_m,
+            self.min_bar_diameter_m,
+            self.min_single_diameter_m,
+            self.min_width_m,
+            self.slice_step_m,
+            self.slice_m,
+            self.agreement_m,
+            self.correlated_along_m,
+            self.correlated_across_m,
+            self.max_cell_m,
+        )
         if (
             min(lengths) <= 0
             or min(self.smoothing_m, self.placing_m, self.shared_lateral_m, self.shared_yaw_deg) < 0
             or self.shared_height_m < 0
         ):
             raise ConfigError("bundles: lengths must be positive, smoothing, placing and shares not negative")
-        if self.widest_m <= self.narrowest_m:
-            raise ConfigError("bundles: widest_m must be over narrowest_m")
+        if self.max_width_m <= self.min_width_m:
+            raise ConfigError("bundles: max_width_m must be over min_width_m")
         if not 0 < self.max_skew_deg <= 15:
             raise ConfigError(f"bundles: max_skew_deg must lie in 0...15, not {self.max_skew_deg}")

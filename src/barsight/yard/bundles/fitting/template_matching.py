@@ -1,4 +1,4 @@
-"""First guesses: cross-sections of the map compared with the outlines of all bundles that may lie there."""
+"""Match cross-sections of the map to the outlines of all bundles that may lie there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from barsight.yard.bundles.fitting.outline import (
     bundle_width,
     make_outline,
 )
-from barsight.yard.bundles.fitting.rotated_map import Sheet
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 
 _RATIO = 1.06
@@ -31,7 +31,7 @@ _BLOCK = 64
 
 
 @dataclass(frozen=True)
-class Guess:
+class BundleCandidate:
     """A bundle that may cross the section at v_m: place, axis height, kind. gain: cells it explains."""
 
     v_m: float
@@ -57,8 +57,10 @@ class Templates:
     heights: Float32
 
 
-def section(sheet: Sheet, v_m: float, length_m: float) -> Float32:
-    """(columns,) median height of each column over `length_m` about v_m; NaN where unknown, and on floor."""
+def cross_section(sheet: AlignedMap, v_m: float, length_m: float) -> Float32:
+    """Compute the median height (columns,) of each column over `length_m` about v_m; NaN where unknown, and
+    on floor.
+    """
     first = round((v_m - length_m / 2 - sheet.v0_m) / sheet.cell_m)
     rows = max(round(length_m / sheet.cell_m), 1)
     part = sheet.z_m[max(first, 0) : first + rows]
@@ -72,7 +74,7 @@ def section(sheet: Sheet, v_m: float, length_m: float) -> Float32:
 
 
 def make_templates(settings: BundleSettings, cell_m: float) -> Templates:
-    """All kinds of bundles that the settings allow, diameters 6 % apart (or the catalogue's)."""
+    """Make all kinds of bundles that the settings allow, diameters 6 % apart (or the catalogue's)."""
     kinds, phases, samples = [], [], []
     for rings in range(len(BARS_OF_RINGS)):
         rolls = PERIOD_RAD * np.arange(_ROLLS) / _ROLLS if rings else np.zeros(1)
@@ -101,17 +103,21 @@ def make_templates(settings: BundleSettings, cell_m: float) -> Templates:
 
 
 def _diameters(rings: int, settings: BundleSettings) -> list[float]:
-    narrowest = settings.least_single_m if rings == 0 else settings.narrowest_m
-    low = max(narrowest / (2 * LOOSENESS * rings + 1), settings.least_bar_m)
-    high = settings.widest_m / (2 * LOOSENESS * rings + 1)
+    narrowest = settings.min_single_diameter_m if rings == 0 else settings.min_width_m
+    low = max(narrowest / (2 * LOOSENESS * rings + 1), settings.min_bar_diameter_m)
+    high = settings.max_width_m / (2 * LOOSENESS * rings + 1)
     if settings.catalogue_mm:
         return [d / 1000 for d in settings.catalogue_mm if low <= d / 1000 <= high]
     return list(np.geomspace(low, high, int(np.log(high / low) / np.log(_RATIO)) + 2))
 
 
-def guess(sheet: Sheet, templates: Templates, v_m: float, settings: BundleSettings) -> list[Guess]:
-    """Bundles that may cross the section at v_m, the best first: local best of each number of rings."""
-    profile = section(sheet, v_m, settings.slice_m)
+def propose_candidates(
+    sheet: AlignedMap, templates: Templates, v_m: float, settings: BundleSettings
+) -> list[BundleCandidate]:
+    """Propose bundles that may cross the section at v_m, the best first: local best of each number
+    of rings.
+    """
+    profile = cross_section(sheet, v_m, settings.slice_m)
     if not np.isfinite(profile).any():
         return []
     classes = np.unique(templates.kinds[:, 0]).astype(np.int64)
@@ -130,12 +136,12 @@ def guess(sheet: Sheet, templates: Templates, v_m: float, settings: BundleSettin
             if score < 0.4 * bundle_width(int(rings), diameter) / sheet.cell_m:
                 continue
             z = float(height[k, column])
-            guesses.append(Guess(v_m, float(u), z, int(rings), float(diameter), float(roll), score))
+            guesses.append(BundleCandidate(v_m, float(u), z, int(rings), float(diameter), float(roll), score))
     return sorted(guesses, key=lambda g: -g.gain)
 
 
 def _peaks(gain: Float32) -> list[int]:
-    """Columns that no other within 30 mm or so beats."""
+    """Find columns that no other within 30 mm or so beats."""
     reach = 3
     padded = np.pad(gain, reach, constant_values=-np.inf)
     best = np.max([padded[k : k + gain.size] for k in range(2 * reach + 1)], axis=0)
@@ -147,7 +153,8 @@ def _match(
     profile: Float32, heights: Float32, offsets: Int64, lengths: Int64, of_class: Int64, classes: int,
     agreement: float,
 ) -> tuple[Float32, Float32, Int64]:  # fmt: skip
-    """(classes, columns): gain in cells of the best template about each column, its axis height, its number.
+    """Match (classes, columns): gain in cells of the best template about each column, its axis height, its
+    number.
 
     Each known cell gains 1 - (misfit / agreement)^2, at least -1.
     """
@@ -184,7 +191,7 @@ def _match(
 
 @kernel()
 def _bounds(profile: Float32, template: Float32) -> tuple[float, float]:
-    """Least and greatest height of the profile over the template at five places; inf, -inf where unknown."""
+    """Bound the height of the profile over the template at five places; inf, -inf where unknown."""
     low, high = np.inf, -np.inf
     for q in range(5):
         i = q * (profile.size - 1) // 4
@@ -198,7 +205,7 @@ def _bounds(profile: Float32, template: Float32) -> tuple[float, float]:
 def _compare(
     surface: Float32, seen: Float32, template: Float32, known: int, low: float, high: float, agreement: float
 ) -> tuple[float, float]:
-    """Height of the axis and gain of a template laid on a piece of the profile.
+    """Compute height of the axis and gain of a template laid on a piece of the profile.
 
     surface: 0 where unknown; seen: 1 where known, else 0. All is finite, so sums may run in any order.
     """

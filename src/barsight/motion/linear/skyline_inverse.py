@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
-from barsight.core.linalg.skyline import Band
+from barsight.core.linalg.skyline import Skyline
 
 
 @kernel(fastmath=True)
 def inverse_blocks(
-    factor: Band, at: Int64, diagonal: Float64, blocks: Float64, pairs: Int64, cross: Float64
+    factor: Skyline, at: Int64, diagonal: Float64, blocks: Float64, pairs: Int64, cross: Float64
 ) -> None:
-    """Parts of the inverse, from the last column back [Takahashi 1973]: only its elements within the band
-    are needed, and of these only those of the rows that a column reaches. diagonal: (n,). blocks: (K, b, b)
-    of the unknowns from at[k] on, at ascending; cross: (P, b, b) those in the rows of block pairs[:, 0],
+    """Compute blocks of the inverse, from the last column back [Takahashi 1973]: only its elements within the
+    band are needed, and of these only those of the rows that a column reaches. diagonal: (n,). blocks: (K, b,
+    b) of the unknowns from at[k] on, at ascending; cross: (P, b, b) those in the rows of block pairs[:, 0],
     ascending, and the columns of the later pairs[:, 1]; NaN beyond the band.
     """
     values, first, offset = factor
@@ -64,7 +64,7 @@ def add_products(
     first: Int64, at: Int64, values: Float64, right: Float64, rows: Float64, gradient: Float64,
     side: Float64, corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
-    """Adds the normal equations of sparse rows to those of one half-width (`even`): row r has values[k] at
+    """Add the normal equations of sparse rows to those of one half-width (`even`): row r has values[k] at
     unknown at[k], first[r] <= k < first[r + 1], and `right`. Unknown n, after the band's, is the border's.
     """
     n, width = rows.shape
@@ -86,8 +86,8 @@ def add_products(
 
 
 @kernel(fastmath=True)
-def add_chain(rows: Float64, at: Int64, band: Band) -> None:
-    """Adds a chain (M n, 2 n) of nodes that bind their neighbours, each node's unknowns from at[k] on."""
+def add_chain(rows: Float64, at: Int64, band: Skyline) -> None:
+    """Add a chain (M n, 2 n) of nodes that bind their neighbours, each node's unknowns from at[k] on."""
     size = rows.shape[1] // 2
     for k in range(len(at)):
         for i in range(size):
