@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
-from barsight.cli.measure import measure_into
+from barsight.measure_folder import measure_into
 from barsight.pipeline import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
@@ -66,8 +65,7 @@ def draw(folder: Path, seed: int) -> tuple[Path, Path]:
         simulate(
             recording, replace(base, seed=seed, bars=BARS[seed % 8], yard=yard), lambda done, total: None
         )
-        console, magnet = Console(quiet=True), folder / "magnet.toml"
-        measure_into(recording, out, MeasureSettings(), console, magnet=magnet, judged_at="end")
+        measure_into(recording, out, MeasureSettings(), magnet=folder / "magnet.toml", judged_at="end")
     return recording, out
 
 

@@ -22,7 +22,7 @@ def test_a_whole_recording_measures(recording: Path, capsys: pytest.CaptureFixtu
     out = recording.parent / "out"
     names = {path.name for path in out.iterdir()}
     assert names == {
-        "result.json", "trajectory.tum", "cloud.ply", "height.tif", "contour.csv",
+        "result.json", "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "contour.csv",
         "laser.csv", "preview.png", "report.html", "bundles.json", "lifts.json", "ortho.tif", "ortho.png",
     }  # fmt: skip
 
@@ -248,7 +248,7 @@ def test_another_run_was_first(
         out.mkdir()
         (out / "result.json").write_text("theirs")
 
-    monkeypatch.setattr("barsight.cli.measure.write_report", meanwhile)
+    monkeypatch.setattr("barsight.measure_folder.write_report", meanwhile)
     assert run(["measure", str(recording), "-o", str(out), *FAST]) == 4
     assert "not empty" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["result.json"]

@@ -83,12 +83,12 @@ def figures(text: str) -> tuple[float, float]:
 
 
 def test_encoders_off_by_a_bar_and_a_torn_imu(yard: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From 10 s on the encoders, and with them all predictions, are one bar further; the IMU stands at the
+    """From 12 s on the encoders, and with them all predictions, are one bar further; the IMU stands at the
     end of its scale for 0.1 s and is silent for 0.3 s.
     """
 
     def jump(time: np.ndarray, place: np.ndarray) -> np.ndarray:
-        return place + np.where(time >= 10, PITCH_M, 0)[:, None] * [1, 0, 0]
+        return place + np.where(time >= 12, PITCH_M, 0)[:, None] * [1, 0, 0]
 
     def tear(time: np.ndarray, values: np.ndarray) -> np.ndarray:
         values[(time > 5) & (time < 5.1), 3] = 39.2
@@ -99,7 +99,7 @@ def test_encoders_off_by_a_bar_and_a_torn_imu(yard: Path, capsys: pytest.Capture
     change(yard, "imu0", tear)
     assert run(["odometry", str(yard)]) == 0
     text = capsys.readouterr().out
-    assert re.search(r"the encoders jump by (8[5-9]|9[0-5]) mm at (9\.9|10\.\d) s", text)
+    assert re.search(r"the encoders jump by (8[5-9]|9[0-5]) mm at (11\.9|12\.\d) s", text)
     assert "19 IMU samples are at the end of their scale" in text
     mm, deg = figures(text)
     assert mm < 4 and deg < 0.05

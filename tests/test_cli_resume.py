@@ -42,13 +42,13 @@ def test_a_killed_run_goes_on(
     in_one_go, out, keep = folder / "one", folder / "out", folder / ".out.resume"
     assert run(["measure", str(recording), "-o", str(in_one_go), *FAST]) == 0
     command = ["measure", str(recording), "-o", str(out), *FAST, "--resume"]
-    for stage, call in (("make_estimator", 1), ("fuse", 2), ("SurfaceElection", 1)):
+    for stage, call in (("make_estimator", 1), ("fuse_view", 2), ("SurfaceElection", 1)):
         with monkeypatch.context() as patch:
             killed_at(patch, stage, call)
             assert run(command) == 130
         assert keep.is_dir() and not out.exists()
     with monkeypatch.context() as patch:
-        fused = killed_at(patch, "fuse", 0)
+        fused = killed_at(patch, "fuse_view", 0)
         matched = counting_matches(patch)
         assert run(command) == 0
     assert (len(fused), len(matched)) == (4, 0)

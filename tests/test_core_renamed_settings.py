@@ -7,7 +7,7 @@ import pytest
 
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError
-from barsight.core.renamed_settings import RENAMED, refuse_old_keys
+from barsight.core.settings.renamed import RENAMED, refuse_old_keys
 from barsight.pipeline import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 

@@ -16,7 +16,7 @@ import pytest
 import tyro
 
 from barsight.cli import main
-from barsight.core.settings_file import read_settings
+from barsight.core.settings.file import read_settings
 from barsight.yard.lifting.magnet import Magnet
 from cli_runs import FAST
 
@@ -99,7 +99,7 @@ def test_shown_commands_parse(
 
 
 def test_named_flags_exist(reference: ModuleType) -> None:
-    known = {"--help", "--quiet", "--constraint", "--editable"}
+    known = {"--help", "--quiet", "--editable", "--require-hashes", "--no-deps", "--no-build-isolation"}
     for kind, reached in reference.settings_uses(list(reference.commands())).items():
         fields = [field.name.replace("_", "-") for field in reference.dataclasses.fields(kind)]
         known |= {f"--{prefix}.{field}".replace("--.", "--") for _, prefix in reached for field in fields}

@@ -28,7 +28,7 @@ ROOMS = {
         ".", "crane", "frontend", "frame_to_frame", "linear", "problem", "batch", "fixed_lag", "rig_check",
         "settings",
     ),
-    "core": (".", "linalg"),
+    "core": (".", "linalg", "settings"),
     "mapping": (".", "surface"),
     "yard": (".", "bundles.fitting", "bundles", "stability", "lifting", "inventory"),
     "report": (".", "calibration"),

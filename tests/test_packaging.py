@@ -27,6 +27,7 @@ EXTRAS = {
     "view": {"viewer/view.py"},
     "export": {"report/export.py"},
     "bench": {"features/detectors.py"},
+    "notebook": {"yard/types.py"},
 }
 """Which modules may import what an extra installs."""
 

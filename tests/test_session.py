@@ -11,7 +11,7 @@ from barsight.api import with_settings
 from barsight.core.types import StereoFrame
 
 SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
-FILES = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply", "bundles.json", "lifts.json")
+FILES = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply", "bundles.json")
 
 
 def test_packets_with_snapshots_end_as_the_batch(whole: Path) -> None:
@@ -32,6 +32,7 @@ def test_packets_with_snapshots_end_as_the_batch(whole: Path) -> None:
     yard = session.finish()
     for name in FILES:
         assert (yard.folder / name).read_bytes() == (batch.folder / name).read_bytes(), name
+    assert [lift.record for lift in yard.lifts.refused] == [lift.record for lift in batch.lifts.refused]
     heights, final = last.height_map, yard.height_map
     assert heights is not None
     x, y = (

@@ -25,7 +25,7 @@ from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.parallel import in_background, prefetched_map
 from barsight.core.pose import Pose
-from barsight.core.settings import expect_numbers
+from barsight.core.settings.numbers import expect_numbers
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 import tyro
 
-from barsight.core.renamed_settings import refuse_old_flags
-from barsight.core.settings_file import read_settings
+from barsight.core.settings.file import read_settings
+from barsight.core.settings.renamed import refuse_old_flags
 
 Settings = TypeVar("Settings")
 

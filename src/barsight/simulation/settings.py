@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from barsight.core.errors import ConfigError
-from barsight.core.settings import expect_numbers
+from barsight.core.settings.numbers import expect_numbers
 
 BARS_OF_RINGS = (1, 7, 19, 37, 61)
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
-from barsight.core.errors import ConfigError
+from barsight.core.extras import extra
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +56,8 @@ class HeightMap:
 
         Raises ConfigError where xarray isn't installed.
         """
-        try:
+        with extra("notebook"):
             from xarray import Dataset
-        except ImportError as error:
-            raise ConfigError("xarray isn't installed; pip install 'barsight[notebook]'") from error
         units = {"z_m": "m", "sigma_m": "m", "views": "1", "source": "0 unknown 1 vision 2 laser 3 filled"}
         layers = {name: (("y", "x"), getattr(self, name), {"units": unit}) for name, unit in units.items()}
         centres = {"y": ("y", self.y_m, {"units": "m"}), "x": ("x", self.x_m, {"units": "m"})}

@@ -29,7 +29,7 @@ from barsight.calibration.camera_imu.problem import (
 from barsight.core.arrays import Float64, Int64
 from barsight.core.linalg.levenberg_marquardt import Options, minimise
 
-OPTIONS = Options(max_steps=60, min_gain_ratio=1e-8, first_damping=1e-6, min_damping=1e-9, max_damping=1e8)
+OPTIONS = Options(max_steps=100, min_gain_ratio=1e-8, first_damping=1e-6, min_damping=1e-9, max_damping=1e8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,8 @@ I = TypeVar("I", bound=Iterate)  # noqa: E741
 @dataclass(frozen=True)
 class Options:
     """max_steps: trials, the refused ones included. min_gain_ratio: the share of the cost below which a
-    step's gain, or loss, ends the search. Damping begins at `first_damping`, falls to 0 below `min_damping`
-    and ends the search above `max_damping`.
+    step's gain, or loss, ends the search. Damping begins at `first_damping`, falls to `min_damping` at least,
+    or to 0 where it began there, and ends the search above `max_damping`.
     """
 
     max_steps: int
@@ -43,6 +43,11 @@ class Options:
     first_damping: float
     min_damping: float
     max_damping: float
+
+    @property
+    def floor(self) -> float:
+        """Return the least damping."""
+        return min(self.first_damping, self.min_damping)
 
 
 class Termination(Enum):
@@ -80,7 +85,7 @@ def minimise(best: I, options: Options) -> Minimum[I]:
         converged = abs(loss) <= options.min_gain_ratio * best.cost + _TINY
         if loss <= 0:
             best = trial
-            damping = damping / _FACTOR if damping > options.min_damping else 0.0
+            damping = damping / _FACTOR if damping > options.min_damping else options.floor
         elif damping > options.max_damping:
             return Minimum(best, steps, failure)
         else:

@@ -65,7 +65,7 @@ class ViewFrusta:
     @property
     def height_m(self) -> float:
         """Return the cameras' median height."""
-        return float(np.median(self.eyes[..., 2]))
+        return float(np.median(self.eyes[..., 2])) if self.eyes.size else 0.0
 
     def pixel_m(self, z_m: Float32, height_m: float) -> Float32:
         """Return the width of a pixel on the ground at heights z_m, m, seen from height_m."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
-from barsight.core.settings import expect_numbers
-from barsight.core.settings_file import read_settings
+from barsight.core.settings.file import read_settings
+from barsight.core.settings.numbers import expect_numbers
 
 _EXAMPLE = resources.files("barsight.yard.lifting").joinpath("example_magnet.toml")
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import cattrs
 
 from barsight.core.errors import BarsightError, ConfigError, InputError
-from barsight.core.renamed_settings import refuse_old_keys
+from barsight.core.settings.renamed import refuse_old_keys
 
 Settings = TypeVar("Settings")
 

@@ -1,0 +1,1 @@
+"""Settings: numbers checked, TOML files read, old names refused with the new one."""
