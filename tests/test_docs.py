@@ -17,7 +17,7 @@ import tyro
 
 from barsight.cli import main
 from barsight.core.settings.file import read_settings
-from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.lifting.magnet import Magnet, example_magnet
 from cli_runs import FAST
 
 ROOT = Path(__file__).parents[1]
@@ -50,6 +50,9 @@ def reference() -> ModuleType:
 @pytest.mark.parametrize("page", [p for p in MANUALS if blocks(p, "python")], ids=name)
 def test_python_blocks_run(page: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(recording.parent)
+    Path("demo").mkdir()
+    Path("demo/recording").symlink_to(recording)
+    Path("demo/magnet.toml").write_text(example_magnet(), encoding="utf-8")
     if "demo/result" in page.read_text(encoding="utf-8"):
         assert main.run(["measure", str(recording), "-o", "demo/result", *FAST]) == 0
     namespace: dict[str, object] = {}
