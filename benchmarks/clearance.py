@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from barsight.measure_folder import measure_into
-from barsight.pipeline import MeasureSettings
+from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
 from barsight.yard.lifting.magnet import example_magnet

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import pytest
 
-from barsight import pipeline
+from barsight import map_building, pipeline
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.checkpoint import checkpoint_folder, checkpointed
 from barsight.cli.main import run
@@ -23,7 +23,8 @@ SAME = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
 
 def killed_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int]:
     """Let the pipeline's function `name` be interrupted at its call-th call (0: never); the calls made."""
-    whole, calls = getattr(pipeline, name), []
+    room = pipeline if hasattr(pipeline, name) else map_building
+    whole, calls = getattr(room, name), []
 
     def counted(*arguments: Any, **named: Any) -> Any:
         calls.append(1)
@@ -31,7 +32,7 @@ def killed_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int
             raise KeyboardInterrupt
         return whole(*arguments, **named)
 
-    monkeypatch.setattr(pipeline, name, counted)
+    monkeypatch.setattr(room, name, counted)
     return calls
 
 
@@ -68,7 +69,7 @@ def test_what_is_matched_early_changes_nothing(
         with monkeypatch.context() as patch:
             if early is not None:
                 guess = frozenset(stamps[k] for k in early)
-                patch.setattr(pipeline, "_known_early", lambda *_, guess=guess: guess)
+                patch.setattr(map_building, "_known_early", lambda *_, guess=guess: guess)
             matched = counting_matches(patch)
             assert run(["measure", str(recording), "-o", str(out), *FAST, "--map.min-shift", "0.2"]) == 0
         written[early] = [(out / name).read_bytes() for name in SAME]
@@ -80,13 +81,13 @@ def test_what_is_matched_early_changes_nothing(
 
 
 def counting_matches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    whole, calls = pipeline.Matcher.__call__, []
+    whole, calls = map_building.Matcher.__call__, []
 
     def counted(self: Any, *arguments: Any) -> Any:
         calls.append(1)
         return whole(self, *arguments)
 
-    monkeypatch.setattr(pipeline.Matcher, "__call__", counted)
+    monkeypatch.setattr(map_building.Matcher, "__call__", counted)
     return calls
 
 

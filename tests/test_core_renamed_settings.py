@@ -8,7 +8,7 @@ import pytest
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError
 from barsight.core.settings.renamed import RENAMED, refuse_old_keys
-from barsight.pipeline import MeasureSettings
+from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 
 

@@ -13,7 +13,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera
 from barsight.mapping.scene_extent import select_keyframes, select_keyframes_by_encoders
 from barsight.mapping.settings import MapSettings
-from barsight.pipeline import MeasureSettings
+from barsight.measure_settings import MeasureSettings
 
 CAMERA = RectifiedCamera(1000.0, 499.5, 399.5, 0.5, 0.0, 1000, 800)
 RANGE_M = 8.0

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from barsight.calibration.stereo.calibration import StereoCalibration
     from barsight.core.errors import BarsightError
     from barsight.core.types import Contour, Disparity
-    from barsight.pipeline import MeasureSettings
+    from barsight.measure_settings import MeasureSettings
     from barsight.result import Lifts, LiftTarget, Yard
     from barsight.result_folder import CameraPath
     from barsight.session import Session, Snapshot
@@ -37,7 +37,7 @@ _HOMES = {
     "barsight.calibration.stereo.calibration": ("StereoCalibration",),
     "barsight.core.errors": ("BarsightError",),
     "barsight.core.types": ("Contour", "Disparity"),
-    "barsight.pipeline": ("MeasureSettings",),
+    "barsight.measure_settings": ("MeasureSettings",),
     "barsight.result": ("LiftTarget", "Lifts", "Yard"),
     "barsight.result_folder": ("CameraPath",),
     "barsight.session": ("Session", "Snapshot"),

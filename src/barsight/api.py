@@ -19,9 +19,10 @@ from barsight.calibration.stereo.calibration import calibrate_stereo as solve_st
 from barsight.core.arrays import UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity
+from barsight.map_building import Advance
 from barsight.measure_folder import measure_into, unheard
+from barsight.measure_settings import MeasureSettings
 from barsight.pair_matching import match_pictures
-from barsight.pipeline import Advance, MeasureSettings
 from barsight.recording.open import open_recording as open_path
 from barsight.recording.packets import packets as packets
 from barsight.recording.stored_images import StoredPictures

@@ -9,7 +9,9 @@ from typing import Any, Literal
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
 from barsight.evaluation.score import score_folder
-from barsight.pipeline import Advance, MeasureSettings, measure
+from barsight.map_building import Advance
+from barsight.measure_settings import MeasureSettings
+from barsight.pipeline import measure
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report

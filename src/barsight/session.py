@@ -22,6 +22,7 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import CraneSamples, PosedFrame, StereoFrame
+from barsight.map_building import checkpoint_key, matching
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.scene_extent import (
     RecordingProbe,
@@ -36,9 +37,9 @@ from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import MatchedFrame, Matcher, PointBinner
 from barsight.measure_folder import write_measured
+from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal, to_json
 from barsight.motion.crane.encoder_trajectory import EncoderOdometry
-from barsight.pipeline import MeasureSettings, checkpoint_key, matching
 from barsight.recording.base import FrameIndex
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.wrapper import RecordingProxy

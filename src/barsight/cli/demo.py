@@ -15,7 +15,7 @@ from barsight.cli.progress import stages
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_path
 from barsight.measure_folder import measure_into
-from barsight.pipeline import MeasureSettings
+from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
 from barsight.yard.lifting.magnet import example_magnet

@@ -15,7 +15,7 @@ from rich.table import Table
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
 from barsight.measure_folder import measure_into
-from barsight.pipeline import MeasureSettings
+from barsight.measure_settings import MeasureSettings
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -25,7 +25,7 @@ from barsight.benchmarks.yard.bundle_scores import (
 from barsight.benchmarks.yard.yard_speed import time_yard
 from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
-from barsight.pipeline import MeasureSettings
+from barsight.measure_settings import MeasureSettings
 from barsight.result_folder import read_heights
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate

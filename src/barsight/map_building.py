@@ -1,0 +1,258 @@
+"""The first half of the way of the data: recording -> trajectory and matched pairs -> votes in the map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, replace
+from itertools import chain, islice, pairwise, takewhile
+from pathlib import Path
+from typing import Any
+
+import barsight
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
+from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
+from barsight.core.errors import Failed, MeasurementError
+from barsight.core.memory import trim_heap
+from barsight.core.parallel import prefetched_map
+from barsight.core.pose import Pose
+from barsight.core.timing import Stopwatch
+from barsight.core.types import PosedFrame, RefusedFrame, StereoFrame, Trajectory
+from barsight.mapping.free_space import FreeSpace
+from barsight.mapping.fusion import fuse_view
+from barsight.mapping.scene_extent import (
+    RecordingProbe,
+    choose_cell_size,
+    points_per_pixel,
+    probe_recording,
+    select_keyframes,
+    select_keyframes_by_encoders,
+)
+from barsight.mapping.surface.height_selection import ViewFrusta
+from barsight.mapping.tiles import TileStore
+from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner
+from barsight.measure_settings import MeasureSettings
+from barsight.measurement import Preview, Refusal, json_digest, to_json
+from barsight.motion.rig_check.self_calibration import self_calibrate
+from barsight.motion.settings import make_estimator
+from barsight.recording.base import Recording
+from barsight.recording.sensor_samples import imu_hints
+from barsight.recording.sensor_selection import SelectedSensors
+from barsight.stereo.settings import StereoSettings, make_method
+
+Advance = Callable[[str, int, int], None]
+"""Told of progress: stage, frames done, frames in all."""
+
+_MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
+"""Pairs that may wait, matched, beside the trajectory and after it: 13 MB each at 1280x1024."""
+_TIDIED_EVERY = 8
+"""Frames between which freed memory may pile up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
+    inputs: SHA-256 of the files. kept: folder of checkpoints, if any. watch: times the stages.
+    """
+
+    source: Recording
+    rectifier: Rectifier
+    first: RecordingProbe
+    cell_m: float
+    calibration_px: float
+    imu_hints: tuple[str, ...]
+    configuration: dict[str, Any]
+    inputs: dict[str, str]
+    kept: Path | None
+    watch: Stopwatch
+
+    @property
+    def per_pixel(self) -> int:
+        """Return the points per pixel and side that the cells need."""
+        return points_per_pixel(self.first, self.cell_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """The trajectory, and the pairs that the map is made of. rectifier: as corrected in service. stereo: with
+    the disparity's calibration sigma. poses: of the frames taken, by stamp. matched: those frames, in order.
+    """
+
+    trajectory: Trajectory
+    rectifier: Rectifier
+    stereo: StereoSettings
+    drift_warnings: tuple[str, ...]
+    poses: dict[int, PosedFrame]
+    matched: Iterator[MatchedFrame | Refusal]
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltMap:
+    """All views' votes. placed: reference_from_rect0 of the views used. preview: of a view in the middle."""
+
+    store: TileStore
+    free: FreeSpace
+    placed: tuple[Pose, ...]
+    refusals: tuple[Refusal, ...]
+    preview: Preview | None
+
+
+def probe(recording: Recording, settings: MeasureSettings, resume: Path | None) -> Scene:
+    """Look at a recording: how far the scene is, how large the cells, how sure the calibration."""
+    source, watch = SelectedSensors(recording, settings.use), Stopwatch()
+    with watch("look"):
+        rectifier = Rectifier(source.rig)
+        first = probe_recording(source, rectifier)
+        imu = source.imu()
+        hints = imu_hints(imu) if imu is not None else ()
+        cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
+    known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
+    configuration, inputs = to_json(asdict(settings)), source.digests()
+    kept = None
+    if resume is not None:
+        kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
+    calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
+    return Scene(
+        source, rectifier, first, cell_m, calibration_px, tuple(hints), configuration, inputs, kept, watch
+    )
+
+
+@contextmanager
+def follow(scene: Scene, settings: MeasureSettings, advance: Advance) -> Iterator[Way]:
+    """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
+    source, rectifier, watch = scene.source, scene.rectifier, scene.watch
+    total = len(source.index.stamps_ns)
+    matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), rectifier, watch)
+    early = _known_early(source, settings, rectifier, scene.first.range_m)
+    begun = islice(source.frames(early), len(early))
+    with ExitStack() as pools:
+        ahead = pools.enter_context(prefetched_map(matching(matcher, scene.kept), begun, _MATCHED_AHEAD))
+        with watch("trajectory", total):
+            estimate = make_estimator(settings.motion)
+            count = _counter("trajectory", total, advance)
+            trajectory = checkpointed(scene.kept, "trajectory", lambda: estimate(source, rectifier, count))
+            trim_heap()
+            calibrated = self_calibrate(
+                source.rig, rectifier, trajectory.drift, scene.calibration_px,
+                correct=settings.self_calibrate == "yaw",
+            )  # fmt: skip
+        rectifier = calibrated.rectifier
+        stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
+        taken = select_keyframes(trajectory.frames, rectifier, scene.first.range_m, settings.map.min_shift)
+        poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
+        late = min((stamp for stamp in poses if stamp not in early), default=None)
+        matched: Iterator[MatchedFrame | Refusal] = ahead
+        if late is not None:
+            rest = source.frames({stamp for stamp in poses if stamp >= late})
+            match = matching(replace(matcher, rectifier=rectifier), scene.kept)
+            after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
+            matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
+        yield Way(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
+
+
+def build_map(scene: Scene, way: Way, settings: MeasureSettings, scratch: Path, advance: Advance) -> BuiltMap:
+    """Fuse each matched pair into the map's tiles, and carve its lines of sight.
+
+    Raises MeasurementError where no frame could be measured.
+    """
+    source, watch = scene.source, scene.watch
+    body_from_rect0, camera = way.rectifier.body_from_rect0, way.rectifier.camera
+    refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
+    refusals += [Refusal("trajectory", frame) for frame in way.trajectory.refused]
+    placer = PointBinner(
+        way.stereo, body_from_rect0, scene.cell_m, scene.per_pixel, settings.map.max_sigma_m, watch
+    )
+    store, free = TileStore(scratch, settings.map.resident_tiles), FreeSpace(scene.cell_m)
+    preview = None
+    placed: list[Pose] = []
+    for done, (frame, posed, neighbours) in enumerate(_placed(way.matched, way.poses), start=1):
+        view = frame if isinstance(frame, Refusal) else placer(frame, posed, neighbours)
+        if isinstance(view, Failed):
+            view = Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
+        if isinstance(view, Refusal):
+            refusals.append(view)
+        else:
+            with watch("fuse", 1):
+                fuse_view(store, view.cells, settings.map)
+            placed.append(posed.reference_from_body @ body_from_rect0)
+            with watch("free space", 1):
+                free.carve(view.cells, ViewFrusta.of([placed[-1]], camera).eyes[0])
+            if preview is None or abs(done - len(way.poses) / 2) < 1:
+                preview = Preview(view.left, view.disparity_px)
+        if done % _TIDIED_EVERY == 1:
+            trim_heap()
+        advance("map", done, len(way.poses))
+    if not placed:
+        raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
+    return BuiltMap(store, free, tuple(placed), tuple(refusals), preview)
+
+
+def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
+    """Return a digest of all that trajectory and disparities depend on."""
+    stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
+    rig = to_json(asdict(recording.rig))
+    return json_digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
+
+
+def _known_early(
+    source: Recording, settings: MeasureSettings, rectifier: Rectifier, range_m: float
+) -> frozenset[int]:
+    """Select stamps of frames that may be matched before the trajectory is known: all, or the first few that
+    lie apart by the encoders. Where the trajectory says otherwise, it decides.
+    """
+    stamps, min_shift = source.index.stamps_ns, settings.map.min_shift
+    if settings.self_calibrate != "none":
+        return frozenset()
+    if min_shift == 0:
+        return frozenset(stamps)
+    crane = source.crane()
+    if crane is None or crane.stamp_ns.size == 0:
+        return frozenset()
+    shift_ns = source.rig.timeshift_cam_imu_ns
+    chosen = select_keyframes_by_encoders(stamps, crane, shift_ns, rectifier.camera, range_m, min_shift)
+    return frozenset(chosen[:_MATCHED_AHEAD])
+
+
+def matching(
+    matcher: Matcher, kept: Path | None
+) -> Callable[[StereoFrame | RefusedFrame], MatchedFrame | Refusal]:
+    """Match frames, each once for all runs that keep checkpoints in `kept`."""
+
+    def match(frame: StereoFrame | RefusedFrame) -> MatchedFrame | Refusal:
+        if isinstance(frame, RefusedFrame):
+            return Refusal("recording", frame)
+        matched = checkpointed(kept, f"matched_{frame.stamp_ns}", lambda: matcher(frame))
+        if isinstance(matched, Failed):
+            return Refusal("stereo", RefusedFrame(frame.stamp_ns, matched.reason))
+        return matched
+
+    return match
+
+
+def _placed(
+    matched: Iterator[MatchedFrame | Refusal], poses: dict[int, PosedFrame]
+) -> Iterator[tuple[MatchedFrame | Refusal, PosedFrame, list[Neighbour]]]:
+    """Yield the posed frames, each with those before and after it."""
+    known = ((frame, poses[frame.stamp_ns]) for frame in matched if frame.stamp_ns in poses)
+    before = None
+    for here, after in pairwise(chain(known, (None,))):
+        assert here is not None
+        both = (other for other in (before, after) if other is not None)
+        yield *here, [(frame, pose) for frame, pose in both if not isinstance(frame, Refusal)]
+        before = here
+
+
+def _counter(stage: str, total: int, advance: Advance) -> Callable[[], None]:
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        advance(stage, done, total)
+
+    return count
+
+
+def _first_reason(refusals: list[Refusal]) -> str:
+    return f"first: {refusals[0].frame.reason}" if refusals else "it has no frames"

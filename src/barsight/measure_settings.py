@@ -1,0 +1,48 @@
+"""The settings of a measurement."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Literal
+
+from barsight.core.errors import ConfigError
+from barsight.core.settings.numbers import expect_numbers
+from barsight.mapping.settings import MapSettings
+from barsight.motion.settings import MotionSettings
+from barsight.recording.base import RecordingSettings
+from barsight.stereo.settings import StereoSettings
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.lift_settings import LiftSettings
+
+_FAST_SHIFT = 0.1
+
+
+@dataclass(frozen=True)
+class MeasureSettings:
+    """Settings of `barsight measure`; each stage gets its own part only."""
+
+    preset: Literal["best", "fast"] = "best"
+    """fast: the stereo preset `fast`, and no more pictures matched than lie a tenth apart."""
+    use: tuple[Literal["stereo", "imu", "crane"], ...] = ("stereo", "imu", "crane")
+    """Sensors that may be used, where the recording has them."""
+    self_calibrate: Literal["none", "yaw"] = "none"
+    """yaw: turn the right camera as the crane's known travel asks for (see `barsight calibrate check`)."""
+    recording: RecordingSettings = field(default_factory=RecordingSettings)
+    stereo: StereoSettings = field(default_factory=StereoSettings)
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    map: MapSettings = field(default_factory=MapSettings)
+    bundles: BundleSettings = field(default_factory=BundleSettings)
+    lift: LiftSettings = field(default_factory=LiftSettings)
+
+    def __post_init__(self) -> None:
+        if "stereo" not in self.use:
+            raise ConfigError("stereo can't be left out of --use: it is what measures")
+        expect_numbers(asdict(self))
+
+    def chosen(self) -> MeasureSettings:
+        """Apply the preset to the settings."""
+        if self.preset == "best":
+            return self
+        stereo = replace(self.stereo, barsight=replace(self.stereo.barsight, preset="fast"))
+        shift = max(self.map.min_shift, _FAST_SHIFT)
+        return replace(self, stereo=stereo, map=replace(self.map, min_shift=shift))
