@@ -84,9 +84,11 @@ def _filter(slices: Float32, guide: Float32, mean: Float32, inverse: Float32, ra
 
 @kernel(fastmath=True)
 def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
-    """Filter row by row: the window sums of cost and guide * cost give the model of the row `radius` above;
-    the window sums of cost and guide * cost give the model of the row `radius` above; the window sums of the
-    models give the filtered row `radius` above that, which the ring remembers as long as it is needed.
+    """Filter one slice (H, W) row by row, in place; guide, mean, inverse: (H, W), see `GuidedFilter`.
+
+    The window sums of cost and guide * cost give the model of the row `radius` above; the window sums of the
+    models give the filtered row `radius` above that. Rings keep each row's costs and models as long as a
+    window holds them.
     """
     height, width = cost.shape
     ring = 2 * radius + 1
