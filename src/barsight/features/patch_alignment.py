@@ -128,6 +128,10 @@ def _weights(t: float, weights: Float32) -> None:
 
 @kernel(fastmath=True)
 def _inside(image: Float32, x: float, y: float, reach: float) -> bool:
+    """Check that the spline can be read from x - reach to x + reach and likewise in y, px.
+
+    image: (H, W) coefficients, of which one more is read before a place and two after it.
+    """
     return (
         x - reach >= 1
         and y - reach >= 1
@@ -266,6 +270,13 @@ def _locate(
     source: Float32, target: Float32, places: Float64, pixels: Float64, grown: Float64, sigma: Float64,
     likeness: Float64, reach: float,
 ) -> None:  # fmt: skip
+    """Align each patch by inverse-compositional Gauss-Newton [Baker 2004].
+
+    source, target: (H, W) spline coefficients. places: (N, 2) x, y px in the source. pixels: (N, 2) guesses
+    in the target, replaced where the patch is found within `reach` px of them in x and y. grown: (N,), see
+    `align_patches`. sigma: (N,) px, likeness: (N,); filled where it is found, otherwise they stay as they
+    were (NaN and 0).
+    """
     wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
     room = np.empty((2, _SIZE + 2, 4), np.float32)
     rows = np.empty((MAX_ROWS, _SIZE + 2), np.float32)

@@ -71,6 +71,14 @@ def _vote(
     gate_sigma: float,
     min_gate: float,
 ) -> None:
+    """Fuse a view's heights into a tile's slots, in place.
+
+    tile: (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS). members: (M,) indices of the heights that lie in the tile;
+    first_column, first_row: number of its first cell. x, y, z (m), variance (m^2), shared (m), intensity,
+    central: (N,), see `CellObservations`. gate_sigma, min_gate (m): a height joins the nearest slot within
+    the larger of both. One that joins none takes an empty slot, else replaces a height of a single view, else
+    is dropped.
+    """
     for m in members:
         slots = tile[y[m] - first_row, x[m] - first_column]
         best, best_gap = -1, np.inf

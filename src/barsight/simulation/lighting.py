@@ -102,6 +102,12 @@ def _bake(
     shape: Float64, cylinders: int, grid: Grid, lamps: Lamps, lightmap: Lightmap, rows: Int32, places: Int64,
     ceiling: Float64, diffuse: Float32, seen: UInt8,
 ) -> None:  # fmt: skip
+    """Bake the irradiance of each texel by shadow rays to the lamps and the hall's ceiling.
+
+    shape: (P, 15) primitives, the first `cylinders` of them bars. rows, places: (R,) each row of texels'
+    primitive and place along it. ceiling: (16, 3) unit directions. Fills diffuse (T,) and seen (T, SLOTS, 255
+    for all of a lamp), see `Lightmap`; texels at or below the floor's z = 0 stay 0.
+    """
     # Writes go to plain arrays: Numba 0.68 loses what a prange writes to a named tuple's field.
     for r in numba.prange(rows.shape[0]):
         p, s = rows[r], places[r]

@@ -150,6 +150,11 @@ def _cast(
     shape: Float64, cylinders: int, grid: Grid, origins: Float64, directions: Float64, distance: Float64,
     primitive: Int32,
 ) -> None:  # fmt: skip
+    """Trace each ray to its first hit.
+
+    origins: (N, 3) or (1, 3) m, directions: (N, 3), both in `yard`. Fills distance (N,), the ray parameter,
+    inf where nothing is hit, and primitive (N,), -1 for nothing and the number of primitives for the floor.
+    """
     step = 0 if origins.shape[0] == 1 else 1
     for r in numba.prange(directions.shape[0]):
         o, d = origins[r * step], directions[r]

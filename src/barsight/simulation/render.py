@@ -51,6 +51,11 @@ def _render(
     primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, tile: Float32, rays: Float32,
     side: int, R: Float64, centre: Float64, image: Float32,
 ) -> None:  # fmt: skip
+    """Render the radiance image (H, W) by ray casting, 1 about white paper under the lamps.
+
+    tile: (TILE, TILE, 4), see `surface_tile`. rays: (side H, side W, 2) directions with z = 1. R: (3, 3) and
+    centre: (3,) m, yard_from_cam. Fills image; a ray that hits nothing adds 0.
+    """
     shape, cylinders = primitives.shape, primitives.cylinders
     ox, oy, oz = centre[0], centre[1], centre[2]
     for v in numba.prange(image.shape[0]):
@@ -163,6 +168,10 @@ def _shine(
 
 @kernel()
 def _shade_floor(lightmap: Lightmap, tile: Float32, p: int, x: float, y: float) -> float:
+    """Shade the floor at (x, y) m: its diffuse radiance, lightmap and texture interpolated.
+
+    p: the floor's id, the number of primitives. tile: (TILE, TILE, 4).
+    """
     _, _, _, fine = _texels(tile, x / ALONG_M, y / ALONG_M)
     _, _, _, coarse = _texels(tile, (x + 0.31 * y) / (7.3 * ALONG_M), (y - 0.31 * x) / (7.3 * ALONG_M))
     floor = lightmap.floor
@@ -183,6 +192,10 @@ def _shade_floor(lightmap: Lightmap, tile: Float32, p: int, x: float, y: float) 
 def _shade_box(
     primitives: Primitives, lightmap: Lightmap, tile: Float32, p: int, x: float, y: float, z: float
 ) -> float:
+    """Shade box `p` at (x, y, z) m in `yard`: its diffuse radiance, lit per face and along its longest axis.
+
+    The face is that which the point lies nearest to, by the box's half sizes. tile: (TILE, TILE, 4).
+    """
     shape, material = primitives.shape, primitives.material
     cx, cy, cz = x - shape[p, 0], y - shape[p, 1], z - shape[p, 2]
     longest = longest_axis(shape, p)

@@ -226,6 +226,11 @@ def _cauchy(
     found: Float64,
     weight: Float64,
 ) -> float:
+    """Compute the mean Cauchy loss of the pixels' disparities.
+
+    centre: (3,) m; axis: (3,) unit vector; radius: m. rays: (N, 2) x, y with z = 1. behind: (N,) the floor's
+    disparity, px. scale: focal length times baseline, px m; doffs: px. found: (N,) px; weight: (N,) 1 / px.
+    """
     total, product = 0.0, 1.0
     for index in range(rays.shape[0]):
         predicted = _disparity_of_ray(
@@ -251,6 +256,11 @@ def _disparities(
     doffs: float,
     predicted: Float64,
 ) -> None:
+    """Predict the disparity of each ray, the cylinder's or the floor's behind it.
+
+    centre: (3,) m; axis: (3,) unit vector; radius: m. rays: (N, 2) x, y with z = 1. behind: (N,) px. scale:
+    focal length times baseline, px m; doffs: px. Fills predicted (N,) px.
+    """
     for index in range(rays.shape[0]):
         predicted[index] = _disparity_of_ray(
             centre, axis, radius, rays[index, 0], rays[index, 1], behind[index], scale, doffs

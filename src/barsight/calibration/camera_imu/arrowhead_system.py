@@ -152,6 +152,12 @@ def _add(
     first: Int64, residual: Float64, by_chain: Float64, by_common: Float64, chain: Float64, border: Float64,
     gradient: Float64, common: Float64, common_gradient: Float64,
 ) -> None:  # fmt: skip
+    """Accumulate the normal equations of all samples, in place.
+
+    first: (K,), residual: (K, ROWS), by_chain: (K, ROWS, LOCAL), by_common: (K, ROWS, P), see `Samples`.
+    chain: (N, LOCAL) lower band, border: (N, P), gradient: (N,), common: (P, P), common_gradient: (P,), see
+    `ArrowheadSystem`. Columns that are all zero are skipped.
+    """
     width = by_common.shape[2]
     live = np.empty(LOCAL, np.int64)
     columns = np.empty((LOCAL, ROWS))
@@ -193,6 +199,10 @@ def _add(
 
 @kernel(fastmath=True)
 def _project(first: Int64, by_chain: Float64, through: Float64, out: Float64) -> None:
+    """Subtract by_chain @ through from out (K, ROWS, P), in place: the Jacobian projected off the chain.
+
+    first: (K,) control points; by_chain: (K, ROWS, LOCAL); through: (N, P), see `EliminatedChain`.
+    """
     for k in range(first.size):
         base = first[k] * STATE
         for r in range(ROWS):
@@ -205,6 +215,10 @@ def _project(first: Int64, by_chain: Float64, through: Float64, out: Float64) ->
 
 @kernel(fastmath=True)
 def _predict(first: Int64, by_chain: Float64, chain: Float64, out: Float64) -> None:
+    """Add the Jacobian times a step of the chain (N,) to out (K, ROWS), in place.
+
+    first: (K,) control points; by_chain: (K, ROWS, LOCAL).
+    """
     for k in range(first.size):
         base = first[k] * STATE
         for r in range(ROWS):
@@ -216,6 +230,10 @@ def _predict(first: Int64, by_chain: Float64, chain: Float64, out: Float64) -> N
 
 @kernel(fastmath=True)
 def _pull(first: Int64, by_chain: Float64, residual: Float64, gradient: Float64) -> None:
+    """Add the transposed Jacobian times residual (K, ROWS) to the chain's gradient (N,), in place.
+
+    first: (K,) control points; by_chain: (K, ROWS, LOCAL).
+    """
     for k in range(first.size):
         base = first[k] * STATE
         for r in range(ROWS):

@@ -136,6 +136,13 @@ def _evaluate(
     segment: Int64, u: Float64, step_s: float, rotations: Float64, places: Float64, steps: Float64,
     inverse: Float64,
 ) -> tuple[Float64, Float64, Float64]:  # fmt: skip
+    """Evaluate the pose spline and its time derivatives at K times [Furgale 2013].
+
+    segment: (K,); u: (K,) place within it, 0...1. rotations: (M, 3, 3) and places: (M, 3) m of the control
+    points; steps: (M - 1, 3) rad between them, inverse: (M - 1, 3, 3) their inverse right Jacobians. Returns
+    rotation (K, 3, 3), turn rate (K, 3) rad/s in body axes, and (K, 3, 3) place, velocity, acceleration, m
+    and s.
+    """
     count = segment.size
     rotation, rate, place = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3, 3))
     weight, share = np.empty((3, ORDER)), np.empty((3, ORDER))

@@ -51,6 +51,7 @@ def sum_corners(
 
 @kernel()
 def _cross(v: Float64, out: Float64) -> None:
+    """Fill out (3, 3) with the skew-symmetric matrix of v (3,): out @ w is the cross product of v and w."""
     out[:] = 0.0
     out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
     out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]

@@ -49,6 +49,11 @@ class Warp:
 
 @kernel(fastmath=True)
 def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> None:
+    """Resample a picture by cubic convolution, down the columns and then along the rows [Keys 1981].
+
+    image: (h, w). crossing: (H, w) raw y; map_x: (H, W) raw x, px, see `Warp`. Fills warped (H, W), rounded
+    and held within 0...255; border pixels are replicated.
+    """
     height, width = image.shape
     row = np.empty(width + 4, np.float32)  # two more on each side
     for i in range(warped.shape[0]):

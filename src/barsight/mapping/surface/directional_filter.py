@@ -123,6 +123,12 @@ def _across() -> Float64:
 
 @kernel()
 def _sharpened(z: Float32, direction: Int8, share: Float32, rows: Int64, columns: Int64) -> Float32:
+    """Deblur heights across the bar by one step of van Cittert's iteration [1931]; returns a new array.
+
+    z: (H, W) m, NaN where there is none. direction: (H, W), -1 where there is none. share: (H, W) the blur's
+    variance, cells^2. rows, columns: (16,) one cell across each direction. A cell without direction, on the
+    border, beside a missing height or a step stays as it is.
+    """
     height, width = z.shape
     out = z.copy()
     for i in range(1, height - 1):
@@ -138,6 +144,11 @@ def _sharpened(z: Float32, direction: Int8, share: Float32, rows: Int64, columns
 
 @kernel()
 def _valleys(z: Float32, direction: Int8, rows: Int64, columns: Int64) -> Bool:
+    """Mark valleys (H, W): cells with a higher one on both sides across the bar, before any step.
+
+    z: (H, W) m; a missing height (NaN) on the way is passed over. direction: (H, W), -1 where there is none,
+    and then no valley. rows, columns: (_VALLEY_CELLS, 16) cells across each direction.
+    """
     height, width = z.shape
     out = np.zeros(z.shape, np.bool_)
     for i in range(height):

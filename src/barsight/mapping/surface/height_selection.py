@@ -229,6 +229,12 @@ def _elected(
     own_ratio: float,
     along_ratio: float,
 ) -> Int8:
+    """Select the highest supported height of each cell: its slot (rows, columns), -1 where there is none.
+
+    tile: (rows, columns, SLOTS, FIELDS). share, expected: (rows, columns, SLOTS) of `_supported`, share -1
+    where a height can't be the surface. It needs own_ratio of its votes (along_ratio where fewer than
+    min_views are expected), or along_ratio averaged along a bar or an edge.
+    """
     rows, columns = tile.shape[:2]
     winner = np.full((rows, columns), -1, np.int8)
     for i in range(rows):

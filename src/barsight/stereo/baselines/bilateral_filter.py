@@ -104,6 +104,12 @@ def _add_neighbours(
     weights: Float32,
     totals: Float32,
 ) -> None:
+    """Accumulate a row's bilateral sums over the neighbours at one offset, in place.
+
+    near: the offset's weight. alike: (256,) weights by gray difference. middle, grays: (W,) gray values of
+    the pixels and of their neighbours. present: (W,) 1, or 0 where the neighbour has no disparity; values:
+    (W,) px, 0 there. weights, totals: (W,) sums of the weights and of weight times value (px).
+    """
     for x in range(weights.shape[0]):
         step = np.uint8(max(middle[x], grays[x]) - min(middle[x], grays[x]))
         weight = near * alike[step]

@@ -56,6 +56,12 @@ def _ones(word: np.uint64) -> np.uint64:
 
 @kernel(parallel=True)
 def _encode(padded: Float32, reference: Float32, tolerance: np.float32, codes: UInt64) -> None:
+    """Compute the ternary Census transform of each pixel [Peng et al. 2017].
+
+    padded: (H + 6, W + 8) gray levels, replicated at the border; reference: (H, W) weighted means to compare
+    with; tolerance: gray levels. codes: (2, H, W), zero at the start, filled with the bits `brighter`,
+    `darker`.
+    """
     height, width = reference.shape
     for row in numba.prange(height):
         brighter, darker, middle = codes[0, row], codes[1, row], reference[row]
@@ -80,6 +86,11 @@ def _distances(
     unknown: np.float32,
     slices: Float32,
 ) -> None:
+    """Compute Hamming distances, 0...124, of the candidates from `lowest` px on.
+
+    left, right: (2, H, W) codes; left_valid, right_valid: (H, W). Fills slices (K, H, W): left pixel x
+    against right pixel x - d, `unknown` where either is invalid or outside.
+    """
     count, height, width = slices.shape
     for row in numba.prange(height):
         for index in range(count):
@@ -110,6 +121,10 @@ def _differences(
     unknown: np.float32,
     costs: Float32,
 ) -> None:
+    """Compute a row's Hamming distances at one candidate.
+
+    All (W,), right pixel i being the match of left pixel i. Fills costs; `unknown` where either is invalid.
+    """
     for x in range(costs.shape[0]):
         bits = _ones(left_brighter[x] ^ right_brighter[x]) + _ones(left_darker[x] ^ right_darker[x])
         costs[x] = np.float32(bits) if left_valid[x] & right_valid[x] else unknown

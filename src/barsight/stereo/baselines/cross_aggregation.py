@@ -67,6 +67,11 @@ def cross_regions(
 
 @kernel(parallel=True)
 def _grow(guide: UInt8, long: int, short: int, loose: int, tight: int, arms: Arms) -> None:
+    """Grow the four arms of each pixel's cross [Mei 2011, section 3.2].
+
+    guide: (H, W). long, short: px; loose, tight: gray levels, see `cross_regions`. Fills arms (4, H, W), px
+    to the left, right, up, down.
+    """
     height, width = guide.shape
     for row in numba.prange(height):
         for column in range(width):
@@ -90,6 +95,11 @@ def _grow(guide: UInt8, long: int, short: int, loose: int, tight: int, arms: Arm
 
 @kernel(parallel=True, fastmath=True)
 def _aggregate(slices: Float32, arms: Arms, shares: Float32, rounds: int) -> None:
+    """Average costs over the cross-shaped regions, in place [Zhang 2009].
+
+    slices: (K, H, W). arms: (4, H, W) px. shares: (2, H, W), one over the regions' sizes. Rounds 0, 2, ...
+    sum over the horizontal arms first, the others over the vertical ones.
+    """
     for index in numba.prange(slices.shape[0]):
         total = np.empty((slices.shape[1] + 1, slices.shape[2]), dtype=np.float32)
         for turn in range(rounds):
@@ -132,6 +142,7 @@ def _along_columns(cost: Float32, arms: Arms, total: Float32) -> None:
 
 @kernel(fastmath=True)
 def _scale(cost: Float32, share: Float32) -> None:
+    """Scale cost (H, W) by share (H, W), in place."""
     for row in range(cost.shape[0]):
         costs, shares = cost[row], share[row]
         for x in range(cost.shape[1]):

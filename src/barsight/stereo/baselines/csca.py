@@ -200,6 +200,11 @@ def _tie(slices: Float32, weight: float, lowest_px: int, coarser: _Scale | None)
 def _tie_slices(
     slices: Float32, weight: np.float32, lowest: int, coarse: Float32, coarse_lowest: int
 ) -> None:
+    """Combine the costs of two neighbouring scales, in place [Zhang, CVPR 2014].
+
+    slices: (K, H, W) aggregated costs of the candidates from `lowest` px on, multiplied by `weight`. coarse:
+    (K', ceil(H / 2), ceil(W / 2)) tied costs of the coarser scale from coarse_lowest on, in its own px.
+    """
     count, height, width = slices.shape
     half = np.float32(0.5)
     for row in numba.prange(height):

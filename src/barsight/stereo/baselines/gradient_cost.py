@@ -98,6 +98,12 @@ def _fill(
     gradient_limit: np.float32,
     slices: Float32,
 ) -> None:
+    """Compute truncated gray and gradient costs of the candidates from `lowest` px on [Hosni 2013].
+
+    left, right, their gradients and masks: (H, W), gray levels. share: weight of the gray difference. Fills
+    slices (K, H, W): left pixel x against right pixel x - d, the worst cost where either is invalid or
+    outside.
+    """
     count, height, width = slices.shape
     rest = np.float32(1) - share
     worst = share * gray_limit + rest * gradient_limit
@@ -134,6 +140,11 @@ def _compare(
     gradient_limit: np.float32,
     costs: Float32,
 ) -> None:
+    """Compute a row's truncated gray and gradient costs at one candidate.
+
+    All (W,), right pixel i being the match of left pixel i. Limits in gray levels. Fills costs; the worst
+    cost where either pixel is invalid.
+    """
     rest = np.float32(1) - share
     worst = share * gray_limit + rest * gradient_limit
     for x in range(costs.shape[0]):

@@ -74,15 +74,21 @@ def box_mean(image: Float32, radius_px: int) -> Float64:
 
 @kernel(parallel=True, fastmath=True)
 def _filter(slices: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
+    """Filter slices (K, H, W) by the guided filter, in place [He 2010].
+
+    guide, its window means, inverse = 1 / (window variance + epsilon): (H, W). radius: px.
+    """
     for index in numba.prange(slices.shape[0]):
         _filter_slice(slices[index], guide, mean, inverse, radius)
 
 
 @kernel(fastmath=True)
 def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
-    """Filter row by row: the window sums of cost and guide * cost give the model of the row `radius` above;
-    the window sums of cost and guide * cost give the model of the row `radius` above; the window sums of the
-    models give the filtered row `radius` above that, which the ring remembers as long as it is needed.
+    """Filter one slice (H, W) row by row, in place; guide, mean, inverse: (H, W), see `GuidedFilter`.
+
+    The window sums of cost and guide * cost give the model of the row `radius` above; the window sums of the
+    models give the filtered row `radius` above that. Rings keep each row's costs and models as long as a
+    window holds them.
     """
     height, width = cost.shape
     ring = 2 * radius + 1
@@ -123,6 +129,10 @@ def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32
 
 @kernel(fastmath=True)
 def _enter(sum_cost: Float32, sum_product: Float32, cost: Float32, kept: Float32, guide: Float32) -> None:
+    """Add a row of costs to the columns' sums. All (W,).
+
+    sum_cost, sum_product: sums of cost and of cost * guide, in place. kept: filled with cost, for `_leave`.
+    """
     for x in range(cost.shape[0]):
         kept[x] = cost[x]
         sum_cost[x] += cost[x]
@@ -131,6 +141,7 @@ def _enter(sum_cost: Float32, sum_product: Float32, cost: Float32, kept: Float32
 
 @kernel(fastmath=True)
 def _leave(sum_cost: Float32, sum_product: Float32, cost: Float32, guide: Float32) -> None:
+    """Subtract a row of costs, which `_enter` has added, from the columns' sums. All (W,); sums in place."""
     for x in range(cost.shape[0]):
         sum_cost[x] -= cost[x]
         sum_product[x] -= cost[x] * guide[x]
@@ -146,6 +157,11 @@ def _models(
     slope: Float32,
     offset: Float32,
 ) -> None:
+    """Fit the linear model cost = slope * guide + offset of each window in a row [He 2010].
+
+    windows: (2, W) window sums of cost and of guide * cost. share: (W,) one over the window's columns; rows:
+    its rows. mean, inverse: (W,) of the guide, see `GuidedFilter`. Fills slope and offset (W,).
+    """
     costs, products = windows[0], windows[1]
     per_row = np.float32(1) / rows
     for x in range(share.shape[0]):
@@ -158,6 +174,11 @@ def _models(
 
 @kernel(fastmath=True)
 def _apply(windows: Float32, share: Float32, rows: np.float32, guide: Float32, out: Float32) -> None:
+    """Evaluate the mean linear model of a row: the filtered costs, out (W,) [He 2010].
+
+    windows: (2, W) window sums of slope and offset. share: (W,) one over the window's columns; rows: its
+    rows.
+    """
     slopes, offsets = windows[0], windows[1]
     per_row = np.float32(1) / rows
     for x in range(share.shape[0]):
@@ -166,24 +187,31 @@ def _apply(windows: Float32, share: Float32, rows: np.float32, guide: Float32, o
 
 @kernel(fastmath=True)
 def _add(total: Float32, row: Float32) -> None:
+    """Add row (W,) to total (W,), in place."""
     for x in range(row.shape[0]):
         total[x] += row[x]
 
 
 @kernel(fastmath=True)
 def _subtract(total: Float32, row: Float32) -> None:
+    """Subtract row (W,) from total (W,), in place."""
     for x in range(row.shape[0]):
         total[x] -= row[x]
 
 
 @kernel(fastmath=True)
 def _copy(values: Float32, out: Float32) -> None:
+    """Copy the first W values to out (W,)."""
     for x in range(out.shape[0]):
         out[x] = values[x]
 
 
 @kernel(fastmath=True)
 def _pairs(values: Float32, size: int, sums: Float32) -> None:
+    """Sum pairs `size` places apart: sums[x] = values[x] + values[x + size], N - size of them.
+
+    values: (N,). sums: N - size long at least.
+    """
     shifted = values[size:]
     for x in range(shifted.shape[0]):
         sums[x] = values[x] + shifted[x]

@@ -46,6 +46,10 @@ def weighted_median(
 
 @kernel(parallel=True)
 def _compare(left: Int32, right: Int32, tolerance: int, agrees: Bool) -> None:
+    """Check left-right consistency of whole disparities.
+
+    left, right: (H, W) px; tolerance: px. Fills agrees (H, W); False where the match lies outside.
+    """
     height, width = left.shape
     for row in numba.prange(height):
         for column in range(width):
@@ -56,6 +60,11 @@ def _compare(left: Int32, right: Int32, tolerance: int, agrees: Bool) -> None:
 
 @kernel(parallel=True)
 def _fill_rows(values: Int32, usable: Bool, filled: Int32) -> None:
+    """Fill each row's unusable runs by the lower of the values beside them, the background's [Hosni 2013].
+
+    values: (H, W) px; usable: (H, W). filled: a copy of values at the start. A row without any usable value
+    stays as it is.
+    """
     height, width = values.shape
     for row in numba.prange(height):
         start = 0
@@ -86,6 +95,12 @@ def _median(
     count: int,
     result: Int32,
 ) -> None:
+    """Compute weighted medians by histogram at the pixels in `where` [Hosni 2013].
+
+    values: (H, W) px, from `lowest` on, `count` different ones at most. guide: (H, W) gray levels. near: (2 r
+    + 1, 2 r + 1) weights by place; alike: (256,) by gray difference. result: (H, W), a copy of values at the
+    start. Windows are cut off at the border.
+    """
     height, width = values.shape
     radius = near.shape[0] // 2
     for row in numba.prange(height):

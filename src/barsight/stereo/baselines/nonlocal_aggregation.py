@@ -114,6 +114,10 @@ def _median(values: Int32) -> Int32:
 
 @kernel(parallel=True)
 def _distance(values: Int32, matched: Bool, lowest: int, slices: Float32) -> None:
+    """Compute the refinement's costs |d - D| of the candidates from `lowest` px on [Yang, CVPR 2012].
+
+    values: (H, W) disparities D, px. Fills slices (K, H, W); 0 where a pixel isn't matched.
+    """
     count, height, width = slices.shape
     for row in numba.prange(height):
         for index in range(count):

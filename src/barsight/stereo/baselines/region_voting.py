@@ -37,6 +37,12 @@ def _vote(
     voted: Int32,
     joined: Bool,
 ) -> None:
+    """Vote once for each unreliable pixel among its region's reliable values [Mei 2011].
+
+    values: (H, W) px, from `lowest` on, `count` different ones at most; reliable: (H, W); arms: (4, H, W) px.
+    More than `fewest` votes are needed, the winner's share over `share`. voted, joined: (H, W), copies of
+    values and reliable at the start; what wins is written to them.
+    """
     height, width = values.shape
     for row in numba.prange(height):
         votes = np.zeros(count, dtype=np.int32)

@@ -112,6 +112,10 @@ def _kept_edges(guide: UInt8) -> UInt8:
 
 @kernel()
 def _chief_of(chief: Int32, member: int) -> int:
+    """Find the root of a pixel's set, halving the path to it [Tarjan & van Leeuwen 1984].
+
+    chief: (N,) flat pixel index of another member, a root's own; shortened in place.
+    """
     here = member
     while chief[here] != here:
         chief[here] = chief[chief[here]]
@@ -155,6 +159,11 @@ def _walk(guide: UInt8, kept: UInt8, node: Int32, parent: Int32, weight: UInt8) 
 
 @kernel(parallel=True)
 def _aggregate(slices: Float32, node: Int32, parent: Int32, similarity: Float32, lanes: Float32) -> None:
+    """Aggregate costs over the spanning tree, `_LANES` slices at a time [Yang, CVPR 2012].
+
+    slices: (K, H, W), in place. node, parent, similarity: (N,), see `SpanningTree` and `TreeFilter`. lanes:
+    (ceil(K / _LANES), N, _LANES) scratch.
+    """
     for group in numba.prange(lanes.shape[0]):
         first = group * _LANES
         used = min(_LANES, slices.shape[0] - first)
@@ -165,6 +174,11 @@ def _aggregate(slices: Float32, node: Int32, parent: Int32, similarity: Float32,
 
 @kernel()
 def _two_passes(node: Int32, parent: Int32, similarity: Float32, costs: Float32, used: int) -> None:
+    """Aggregate costs from the leaves to the root and back, in place [Yang, CVPR 2012].
+
+    node, parent: (N,) flat pixel indices, parents first; similarity: (N,) of a node and its parent. costs:
+    (N, _LANES) by pixel, of which `used` lanes are filled.
+    """
     size = node.shape[0]
     for place in range(size - 1, 0, -1):
         share = similarity[place]
@@ -195,6 +209,7 @@ def _to_lanes(slices: Float32, costs: Float32) -> None:
 
 @kernel()
 def _from_lanes(costs: Float32, slices: Float32) -> None:
+    """Transpose (H * W, lanes) back to slices (K, H, W), in the order of `_to_lanes`."""
     count, height, width = slices.shape
     for y in range(height):
         for start in range(0, width, _TILE):

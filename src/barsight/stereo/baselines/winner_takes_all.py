@@ -94,6 +94,11 @@ def _compete(
     above: Float32,
     last: Float32,
 ) -> None:
+    """Update the winners by slices (K, H, W) of the candidates from `lowest` px on.
+
+    Of equal costs the first wins. candidate: px; cost, below, above, last: costs; all (H, W), in place, see
+    `Winners`. above is inf until the winner's next candidate has been seen.
+    """
     count, height, width = slices.shape
     for row in numba.prange(height):
         for index in range(count):

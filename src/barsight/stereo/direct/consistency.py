@@ -31,6 +31,11 @@ def hits_valid(valid: Bool, disparity: Float32) -> Bool:
 
 @kernel()
 def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Bool) -> None:
+    """Check left-right consistency at the nearest whole column.
+
+    left_px (no NaN), right_px: (H, W) px; tolerance: px. Fills same (H, W); False where the match lies
+    outside or the right image's disparity is NaN.
+    """
     height, width = left_px.shape
     for y in range(height):
         for x in range(width):
@@ -41,6 +46,10 @@ def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Boo
 
 @kernel()
 def _land(valid: Bool, disparity: Float32, landed: Bool) -> None:
+    """Look up the right image's mask (H, W) at each match, its column clamped to the image.
+
+    disparity: (H, W) px, no NaN. Fills landed (H, W).
+    """
     height, width = valid.shape
     for y in range(height):
         for x in range(width):

@@ -41,5 +41,10 @@ def curvature_row(disparity: Float32, axes: Float32, y: int, curvature: Float32)
 
 @kernel(inline=True)
 def _bend(forth: np.float32, back: np.float32) -> np.float32:
+    """Compute the second derivative (1 / px) from the differences to both sides.
+
+    forth, back: disparity 5 px ahead and 5 px behind minus that here, px. 0 beside a jump: from 2.5 px in
+    either or 0.75 px in their sum on.
+    """
     smooth = (max(abs(forth), abs(back)) < _STEEPEST_PX) & (abs(forth + back) < _ROUNDEST_PX)
     return _SCALE * (forth + back) if smooth else np.float32(0)

@@ -53,6 +53,11 @@ def blend_fits(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[
 
 @kernel()
 def _excess(long: Float32, short: Float32, power: Float32, information: Float32, excess: Float32) -> None:
+    """Compute the excess (W,) px^2 of the supports' squared difference over half the short fit's variance.
+
+    long, short: (W,) fitted disparities, px. power: (W,), see `noise_power`; information: (W,) of the short
+    fit. Negative where they agree better than that.
+    """
     for x in range(len(excess)):
         gap = long[x] - short[x]
         excess[x] = gap * gap - _SLACK * (_SUPPORT * power[x] / max(information[x], _MIN_INFORMATION))
@@ -63,6 +68,12 @@ def _blend(
     long: Float32, long_information: Float32, short: Float32, short_information: Float32, power: Float32,
     usable: Float32, reach: int, fitted: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
+    """Blend the long and short supports' fits in rows first...end, see `blend_fits`.
+
+    Fits: (H, W) px with their information. power: (H, W), see `noise_power`; usable: (H, W) 0...1. The mean
+    excess over a window of 2 reach + 1 px shares between them. Fills fitted (H, W) px and variance (H, W)
+    px^2.
+    """
     height, width = power.shape
     columns = allocate_columns(2, width, reach)
     rows = np.zeros((5, width), dtype=np.float32)
@@ -116,6 +127,11 @@ def update_disparity(fitted: Float32, axes: Float32, disparity: Float32, varianc
 def _settle(
     fitted: Float32, axes: Float32, reach: int, disparity: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
+    """Update the disparity in rows first...end by what was fitted, corrected for curvature, in place.
+
+    fitted: (H, W) px. axes: (tile rows, tile columns, 2). reach: px, of the window over which the curvature
+    is averaged. disparity: a frame, px, moved by 1.5 px at most; variance: (H, W) px^2, added to.
+    """
     height, width = fitted.shape
     column = allocate_columns(1, width, reach)[0]
     rows = np.zeros((4, width), dtype=np.float32)

@@ -163,6 +163,7 @@ def _slopes_beside_holes(
 
 @kernel()
 def _sort_by_value(values: Float64, weights: Float64, count: int) -> None:
+    """Sort the first `count` values, ascending, with their weights, in place (insertion sort)."""
     for i in range(1, count):
         value, weight = values[i], weights[i]
         j = i - 1
@@ -188,6 +189,12 @@ def _fill(
     first: int,
     end: int,
 ) -> None:
+    """Fill the holes (NaN) of rows first...end by planes, see `fill_occlusions_by_planes`.
+
+    disparity, right_px: (H, W) px. grey: (H, W) smoothed grey levels. leaps: (H, W) px to the nearest match,
+    0 at one. slope_x, slope_y: (H, W) px per px. rays: (_RAYS, 2) x, y, the larger of them 1. Fills filled
+    and sigma (H, W) px in the holes; a hole whose rays find nothing keeps NaN in both.
+    """
     height, width = disparity.shape
     values, weights, pixels = np.empty(_RAYS), np.empty(_RAYS), np.hypot(rays[:, 0], rays[:, 1])
     for y in range(first, end):

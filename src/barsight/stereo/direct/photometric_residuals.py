@@ -47,6 +47,11 @@ def _compare(
     left: Float32, right: Float32, usable: Float32, reach: int, outlier: np.float32, residual: Float32,
     trust: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
+    """Compute photometric residuals and Cauchy weights in rows first...end, see `photometric_residual`.
+
+    left, right: (H, W) grey levels; usable: (H, W) 0...1. Mean and contrast are those of windows of 2 reach +
+    1 px; outlier: grey levels. Fills the frames residual (grey levels) and trust (0...1).
+    """
     height, width = left.shape
     columns = allocate_columns(5, width, reach)
     means = np.empty((5, width), dtype=np.float32)
@@ -108,6 +113,12 @@ def _weigh(
     reach: int, samples: np.float32, gloss_trust: np.float32, weight: Float32, pull: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
+    """Compute the Gauss-Newton weights and pulls of rows first...end, see `robust_weights`.
+
+    residual (grey levels), slope (grey levels per px), trust (0...1): frames. residual_mean, slope_mean: (H,
+    W) along the axis. samples: independent pixels behind a mean; windows are 2 reach + 1 px. Fills the frames
+    weight ((grey levels / px)^2) and pull (grey levels^2 / px).
+    """
     height, width = residual_mean.shape
     columns = allocate_columns(2, width, reach)
     powers = np.empty((2, width), dtype=np.float32)
@@ -184,6 +195,12 @@ def _lengthen(
     weight: Float32, trust: Float32, slope_noise: np.float32, reach: int, is_last: bool, pull: Float32,
     mean_weight: Float32, short_of: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
+    """Compute the step's gain in rows first...end, see `step_gain`.
+
+    weight, trust, pull: frames; pull is multiplied by the gain unless the step is the last. slope_noise:
+    variance of a slope, (grey levels / px)^2. Windows are 2 reach + 1 px. Fills mean_weight and short_of (the
+    gain, 3 at most), (H, W).
+    """
     height, width = mean_weight.shape
     columns = allocate_columns(2, width, reach)
     rows = np.zeros((2, width), dtype=np.float32)
@@ -243,6 +260,11 @@ def _noise_power(
     pull: Float32, usable: Float32, mean_usable: Float32, mean_weight: Float32, hold: np.float32, reach: int,
     power: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
+    """Estimate the noise power in rows first...end, see `noise_power`.
+
+    pull: a frame. usable (0...1), mean_usable, mean_weight: (H, W), the means over windows of 2 reach + 1 px.
+    hold: the plain hold's weight. Fills power (H, W), grey levels^2.
+    """
     height, width = usable.shape
     column = allocate_columns(1, width, reach)[0]
     rows = np.zeros((3, width), dtype=np.float32)

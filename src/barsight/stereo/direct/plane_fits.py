@@ -211,6 +211,12 @@ def _gather(
     disparity: Float32, weight: Float32, pull: Float32, axes: Float32, alongs: Int64, acrosses: Int64,
     factors: Float32, step: int, fitted: Float32, information: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
+    """Fit each pixel's plane in tile rows first_tile...end_tile, see `fit_planes`.
+
+    disparity, weight, pull: frames, disparity and pull in units of same_surface_px. axes: (tile rows, tile
+    columns, 2). alongs, acrosses: (K,) px and factors (6, K), see `_pairs`. step: the support's, in which
+    rows are taken too. Fills fitted (in the same units) and information, (H, W).
+    """
     height, width = fitted.shape
     framed_width = disparity.shape[1]
     theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)

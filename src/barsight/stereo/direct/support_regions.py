@@ -143,6 +143,11 @@ def _axis_means(
     first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, steps: Int64,
     shares: Float32, first_mean: Float32, second_mean: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
+    """Average two images along the axes in tile rows first_tile...end_tile, see `axis_means`.
+
+    first, second, weight, alike: frames, no NaN. axes: (tile rows, tile columns, 2). steps: (K,) px to one
+    side, shares: (K,) their Gaussian weights. Fills first_mean and second_mean (H, W).
+    """
     height, width = first_mean.shape
     framed_width = first.shape[1]
     firsts, seconds, weights, theres = (

@@ -76,7 +76,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the magnet may be asked; docs/how-to/describe-a-magnet.md explains each."""
+    """Limits of a lift with the magnet; docs/how-to/describe-a-magnet.md explains each."""
 
     pitch_deg: float
     roll_deg: float

@@ -119,6 +119,14 @@ def _profile(
     z: Float32, sigma: Float32, source: UInt8, x0: float, y0: float, cell: float, x: float, y: float,
     cos: float, sin: float, pole: Float64, parts: int, step: float, out: Float64,
 ) -> None:  # fmt: skip
+    """Sample the map's median heights under one pole.
+
+    z, sigma: maps (rows, columns), m; source: `HeightSource`, of which unknown and filled cells aren't seen.
+    x0, y0: the first cell's centre, m; cell: m. x, y, cos, sin: the magnet's place (m) and yaw. pole: (4,)
+    along, across, length, width, m. parts: along the pole, sampled every `step` m. Fills out (columns *
+    parts, COLUMNS) but for POLE; height and scatter are NaN where fewer than half of a part's samples are
+    seen.
+    """
     along, across, length, width = pole[0], pole[1], pole[2], pole[3]
     columns = out.shape[0] // parts
     samples = max(int(length / parts / step), 1)
@@ -172,6 +180,11 @@ def rest_plane(u: Float64, v: Float64, z: Float64, max_roll: float) -> tuple[flo
 
 @kernel()
 def _rest_along(u: Float64, v: Float64, z: Float64, roll: float) -> tuple[float, float]:
+    """Rest the plane with a given slope along u: height (m) at the origin and slope along v.
+
+    u, v, z: (N,) m. roll: slope along u. Golden-section search over slopes within `_STEEPEST` for the lowest
+    height, which is convex in the slope [Kiefer 1953].
+    """
     low, high = -_STEEPEST, _STEEPEST
     for _ in range(26):
         a, b = low + (high - low) * 0.382, low + (high - low) * 0.618

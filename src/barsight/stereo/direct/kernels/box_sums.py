@@ -133,6 +133,11 @@ def slide_window(column: Float64, reach: int, mean: Float32) -> None:
 def _window_means(
     images: Float32, weight: Float32, reach: int, every: int, sums: Float32, first: int, end: int
 ) -> None:
+    """Average weighted images over square windows, rows first...end of the result.
+
+    images: (K, H, W); weight: (H, W). Windows are 2 reach + 1 px wide, mirrored at the border, their middles
+    `every` px apart. Fills sums (K, ceil(H / every), ceil(W / every)).
+    """
     count, height, width = images.shape
     scale = np.float32(1.0 / (2 * reach + 1) ** 2)
     columns = np.empty((count, width), dtype=np.float32)

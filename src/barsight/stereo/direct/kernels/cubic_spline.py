@@ -73,6 +73,11 @@ def _read(
     coefficients: Float32, disparity: Float32, margin: int, value: Float32, slope: Float32, first_row: int,
     end_row: int,
 ) -> None:  # fmt: skip
+    """Evaluate the cubic B-spline and its x derivative at column x - disparity [Thevenaz 2000].
+
+    coefficients: (H, W + 3), see `row_coefficients`. disparity: px, no NaN, its pixel (0, 0) `margin` rows
+    and columns inside. Fills value and slope (per px), (H, W), in rows first_row...end_row.
+    """
     width = value.shape[1]
     one, two, three = np.float32(1), np.float32(2), np.float32(3)
     four, six, half, sixth = np.float32(4), np.float32(6), np.float32(0.5), np.float32(1 / 6)

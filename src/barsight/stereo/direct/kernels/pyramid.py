@@ -45,6 +45,12 @@ def _carry_up(
     started: Float32, moved: Float32, disparity: Float32, nearness: np.float32, result: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
+    """Upsample the update by bilinear weights that fall with the difference of disparity, rows first...end.
+
+    started, moved: (ceil(H / 2) + 2, ceil(W / 2) + 2), half size with a border of one, but in full px.
+    disparity: (H, W) px. nearness: one over the difference (px) at which a place no longer counts. Fills
+    result (H, W) px.
+    """
     width = disparity.shape[1]
     zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
     shares = np.array([9, 3, 3, 1], dtype=np.float32)

@@ -128,6 +128,10 @@ def trace_with_changes(packing: Float64, diameter: float, roll: float, sigma: fl
 
 @kernel()
 def _turned(packing: Float64, diameter: float, roll: float) -> Float64:
+    """Rotate the packing (bars, 2), in diameters, by roll (rad, sideways towards up) and scale it to m.
+
+    diameter: m. Returns the axes (bars, 2), sideways and up.
+    """
     turned = np.empty_like(packing)
     c, s = np.cos(roll), np.sin(roll)
     for b in range(packing.shape[0]):
