@@ -62,7 +62,7 @@ PROBES = 2
 
 
 @dataclass(frozen=True, eq=False)
-class _Iterate:
+class _CameraImuIterate:
     """A state and, made on use, what is linear there."""
 
     problem: CameraImuProblem
@@ -81,7 +81,7 @@ class _Iterate:
     def cost(self) -> float:
         return self.here.cost
 
-    def step(self, damping: float) -> _Iterate:
+    def step(self, damping: float) -> _CameraImuIterate:
         chain, common = step(self.system, eliminate(self.system, damping))
         return replace(self, state=retract_state(self.state, chain.reshape(-1, STATE), common))
 
@@ -91,7 +91,7 @@ def solve_camera_imu(problem: CameraImuProblem, start: CameraImuState, huber: fl
 
     Raises LinAlgError where the way of the body is not determined.
     """
-    found = minimise(_Iterate(problem, huber, start), OPTIONS)
+    found = minimise(_CameraImuIterate(problem, huber, start), OPTIONS)
     state, here = found.best.state, found.best.here
     if huber is not None:
         here = linearise_camera_imu(problem, state, None)

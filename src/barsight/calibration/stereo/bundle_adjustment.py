@@ -94,7 +94,7 @@ class _Normal:
 
 
 @dataclass(frozen=True, eq=False)
-class _Iterate:
+class _BoardIterate:
     """A state and, made on use, its normal equations."""
 
     lens: Lens
@@ -110,7 +110,7 @@ class _Iterate:
     def cost(self) -> float:
         return self.normal.cost
 
-    def step(self, damping: float) -> _Iterate:
+    def step(self, damping: float) -> _BoardIterate:
         return replace(self, state=_move(self.state, self.normal, damping))
 
 
@@ -140,7 +140,7 @@ def adjust(
     One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one.
     `converged` is False where the steps ran out.
     """
-    found = minimise(_Iterate(lens, seen, huber_px, start), OPTIONS)
+    found = minimise(_BoardIterate(lens, seen, huber_px, start), OPTIONS)
     state = found.best.state
     plain = _linearise(lens, seen, state, None)
     inverse = np.linalg.pinv(plain.boards, hermitian=True)

@@ -95,7 +95,7 @@ def sighting_residuals(problem: Problem, state: GraphState, used: Bool) -> Float
 
 
 @dataclass(frozen=True, eq=False)
-class _Iterate:
+class _PoseIterate:
     """A state, its cost and, made on use and let go with it, its system: never are two held."""
 
     problem: Problem
@@ -111,7 +111,7 @@ class _Iterate:
     def system(self) -> System:
         return linearise_graph(self.problem, self.graph, self.state, self.used)
 
-    def step(self, damping: float) -> _Iterate:
+    def step(self, damping: float) -> _PoseIterate:
         step = self.system.step(self.problem.free, damping)
         return replace(self, state=retract(self.problem, self.state, self.used, *step))
 
@@ -130,7 +130,7 @@ def optimise_graph(
     the cost that a step must save for another to follow. Raises LinAlgError where the measurements leave an
     unknown undetermined.
     """
-    found = minimise(_Iterate(problem, graph, used, state), Options(most, min_gain, 0.0, 1e-5, 1e6))
+    found = minimise(_PoseIterate(problem, graph, used, state), Options(most, min_gain, 0.0, 1e-5, 1e6))
     if found.termination is Termination.SINGULAR:
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
     return found.best.state, found.best.system
