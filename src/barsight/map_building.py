@@ -51,7 +51,7 @@ _TIDIED_EVERY = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class ProbedRecording:
     """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
     inputs: SHA-256 of the files. kept: folder of checkpoints, if any. watch: times the stages.
     """
@@ -98,7 +98,7 @@ class BuiltMap:
     preview: Preview | None
 
 
-def probe(recording: Recording, settings: MeasureSettings, resume: Path | None) -> Scene:
+def probe(recording: Recording, settings: MeasureSettings, resume: Path | None) -> ProbedRecording:
     """Look at a recording: how far the scene is, how large the cells, how sure the calibration."""
     source, watch = SelectedSensors(recording, settings.use), Stopwatch()
     with watch("look"):
@@ -113,57 +113,59 @@ def probe(recording: Recording, settings: MeasureSettings, resume: Path | None) 
     if resume is not None:
         kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
     calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
-    return Scene(
+    return ProbedRecording(
         source, rectifier, first, cell_m, calibration_px, tuple(hints), configuration, inputs, kept, watch
     )
 
 
 @contextmanager
-def follow(scene: Scene, settings: MeasureSettings, advance: Advance) -> Iterator[Way]:
+def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance) -> Iterator[Way]:
     """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
-    source, rectifier, watch = scene.source, scene.rectifier, scene.watch
+    source, rectifier, watch = probed.source, probed.rectifier, probed.watch
     total = len(source.index.stamps_ns)
     matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), rectifier, watch)
-    early = _known_early(source, settings, rectifier, scene.first.range_m)
+    early = _known_early(source, settings, rectifier, probed.first.range_m)
     begun = islice(source.frames(early), len(early))
     with ExitStack() as pools:
-        ahead = pools.enter_context(prefetched_map(matching(matcher, scene.kept), begun, _MATCHED_AHEAD))
+        ahead = pools.enter_context(prefetched_map(matching(matcher, probed.kept), begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = _counter("trajectory", total, advance)
-            trajectory = checkpointed(scene.kept, "trajectory", lambda: estimate(source, rectifier, count))
+            trajectory = checkpointed(probed.kept, "trajectory", lambda: estimate(source, rectifier, count))
             trim_heap()
             calibrated = self_calibrate(
-                source.rig, rectifier, trajectory.drift, scene.calibration_px,
+                source.rig, rectifier, trajectory.drift, probed.calibration_px,
                 correct=settings.self_calibrate == "yaw",
             )  # fmt: skip
         rectifier = calibrated.rectifier
         stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
-        taken = select_keyframes(trajectory.frames, rectifier, scene.first.range_m, settings.map.min_shift)
+        taken = select_keyframes(trajectory.frames, rectifier, probed.first.range_m, settings.map.min_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
         late = min((stamp for stamp in poses if stamp not in early), default=None)
         matched: Iterator[MatchedFrame | Refusal] = ahead
         if late is not None:
             rest = source.frames({stamp for stamp in poses if stamp >= late})
-            match = matching(replace(matcher, rectifier=rectifier), scene.kept)
+            match = matching(replace(matcher, rectifier=rectifier), probed.kept)
             after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
         yield Way(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
 
 
-def build_map(scene: Scene, way: Way, settings: MeasureSettings, scratch: Path, advance: Advance) -> BuiltMap:
+def build_map(
+    probed: ProbedRecording, way: Way, settings: MeasureSettings, scratch: Path, advance: Advance
+) -> BuiltMap:
     """Fuse each matched pair into the map's tiles, and carve its lines of sight.
 
     Raises MeasurementError where no frame could be measured.
     """
-    source, watch = scene.source, scene.watch
+    source, watch = probed.source, probed.watch
     body_from_rect0, camera = way.rectifier.body_from_rect0, way.rectifier.camera
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in way.trajectory.refused]
     placer = PointBinner(
-        way.stereo, body_from_rect0, scene.cell_m, scene.per_pixel, settings.map.max_sigma_m, watch
+        way.stereo, body_from_rect0, probed.cell_m, probed.per_pixel, settings.map.max_sigma_m, watch
     )
-    store, free = TileStore(scratch, settings.map.resident_tiles), FreeSpace(scene.cell_m)
+    store, free = TileStore(scratch, settings.map.resident_tiles), FreeSpace(probed.cell_m)
     preview = None
     placed: list[Pose] = []
     for done, (frame, posed, neighbours) in enumerate(_placed(way.matched, way.poses), start=1):

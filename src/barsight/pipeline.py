@@ -20,7 +20,7 @@ from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.parallel import in_background
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import Agreement, Contour, LaserProfile, Trajectory
-from barsight.map_building import Advance, BuiltMap, Scene, Way, build_map, follow, probe
+from barsight.map_building import Advance, BuiltMap, ProbedRecording, Way, build_map, follow, probe
 from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.surface.contours import cut_contours
@@ -64,36 +64,36 @@ def measure(
     """
     began, settings = time.perf_counter(), settings.chosen()
     expected = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
-    scene = probe(recording, settings, resume)
-    with follow(scene, settings, advance) as way:
-        built = build_map(scene, way, settings, scratch, advance)
-    watch, trajectory = scene.watch, way.trajectory
+    probed = probe(recording, settings, resume)
+    with follow(probed, settings, advance) as way:
+        built = build_map(probed, way, settings, scratch, advance)
+    watch, trajectory = probed.watch, way.trajectory
     with watch("surface"):
-        surface = _elect(scene, way, built, settings, scratch)
+        surface = _elect(probed, way, built, settings, scratch)
     with watch("contours"):
-        profiles = _compare_with_laser(scene, trajectory, surface, settings)
+        profiles = _compare_with_laser(probed, trajectory, surface, settings)
     with watch("bundles"), in_background(lambda: write(surface, built.free)):
         heights = surface_map(surface, built.free)
         bundles = find_bundles(heights, settings.bundles)
         placed_in_yard = expected is not None and trajectory.reference == "yard"
         stock = match_stock(expected, bundles) if placed_in_yard and expected is not None else None
-    warnings = _warnings(scene, way, built, profiles)
+    warnings = _warnings(probed, way, built, profiles)
     if expected is not None:
         warnings += [Notice("stock-list", text) for text in stock_warnings(expected, stock)]
     with watch("lifts"):
-        travel = _travel(scene, way, settings)
+        travel = _travel(probed, way, settings)
         lifts = _lifts(heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at)
-    source = scene.source
+    source = probed.source
     return Measurement(
         recording_path=source.path,
         recording_format=source.format,
         is_simulated=source.is_simulated,
         calibration_hash=json_digest(to_json(asdict(source.rig))),
-        configuration_hash=json_digest(scene.configuration),
-        input_hashes=scene.inputs,
-        configuration=scene.configuration,
+        configuration_hash=json_digest(probed.configuration),
+        input_hashes=probed.inputs,
+        configuration=probed.configuration,
         trajectory=trajectory,
-        frames_total=_frames_total(scene),
+        frames_total=_frames_total(probed),
         frames_used=len(built.placed),
         refusals=built.refusals,
         sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors))),
@@ -123,28 +123,30 @@ class Profiles:
     left_out: bool
 
 
-def _elect(scene: Scene, way: Way, built: BuiltMap, settings: MeasureSettings, scratch: Path) -> Surface:
+def _elect(
+    probed: ProbedRecording, way: Way, built: BuiltMap, settings: MeasureSettings, scratch: Path
+) -> Surface:
     """Elect the surface of all views. Raises MeasurementError where no place was seen often enough."""
     min_views = settings.map.min_views if len(built.placed) > 1 else 1
-    frusta = ViewFrusta.of(built.placed, way.rectifier.camera, scene.per_pixel)
-    election = SurfaceElection(built.store, scratch, scene.cell_m, settings.map)
+    frusta = ViewFrusta.of(built.placed, way.rectifier.camera, probed.per_pixel)
+    election = SurfaceElection(built.store, scratch, probed.cell_m, settings.map)
     surface = election.finish(min_views, frusta)
     trim_heap()
     if surface.seen == 0:
         raise MeasurementError(
-            f"{scene.source.path}: no place was seen by {min_views} frames; lower map.min_views"
+            f"{probed.source.path}: no place was seen by {min_views} frames; lower map.min_views"
         )
     return surface
 
 
 def _compare_with_laser(
-    scene: Scene, trajectory: Trajectory, surface: Surface, settings: MeasureSettings
+    probed: ProbedRecording, trajectory: Trajectory, surface: Surface, settings: MeasureSettings
 ) -> Profiles:
     """Cut contours and hold them against the laser's profiles.
 
     Profiles are places in the yard: a map in a frame of its own can't be held against them.
     """
-    whole = scene.source.laser()
+    whole = probed.source.laser()
     laser = whole if trajectory.reference == "yard" else ()
     contours = cut_contours(surface, laser, settings.map.profile_y_m, settings.map.contours)
     by_number = {contour.profile: contour for contour in contours}
@@ -155,10 +157,10 @@ def _compare_with_laser(
     return Profiles(contours, laser, agreed, len(laser) < len(whole))
 
 
-def _warnings(scene: Scene, way: Way, built: BuiltMap, profiles: Profiles) -> list[Notice]:
+def _warnings(probed: ProbedRecording, way: Way, built: BuiltMap, profiles: Profiles) -> list[Notice]:
     """Gather what every stage had to assume or leave out."""
     told = (
-        ("assumed", scene.source.notes), ("imu", scene.imu_hints), ("calibration", scene.first.warnings),
+        ("assumed", probed.source.notes), ("imu", probed.imu_hints), ("calibration", probed.first.warnings),
         ("calibration-drift", way.drift_warnings), ("trajectory", way.trajectory.warnings),
     )  # fmt: skip
     warnings = [Notice(code, text) for code, texts in told for text in texts]
@@ -169,21 +171,21 @@ def _warnings(scene: Scene, way: Way, built: BuiltMap, profiles: Profiles) -> li
     if len(built.placed) == 1:
         warnings.append(Notice("one-view", "one frame made the map: no height is confirmed by another"))
     if built.refusals:
-        reason = f"{len(built.refusals)} of {_frames_total(scene)} frames were refused"
+        reason = f"{len(built.refusals)} of {_frames_total(probed)} frames were refused"
         warnings.append(Notice("frames-refused", reason))
     return warnings
 
 
-def _frames_total(scene: Scene) -> int:
-    return len(scene.source.index.stamps_ns) + len(scene.source.index.unpaired)
+def _frames_total(probed: ProbedRecording) -> int:
+    return len(probed.source.index.stamps_ns) + len(probed.source.index.unpaired)
 
 
-def _travel(scene: Scene, way: Way, settings: MeasureSettings) -> Travel:
+def _travel(probed: ProbedRecording, way: Way, settings: MeasureSettings) -> Travel:
     """Tell how sure the frames' way is, and how far off the encoders."""
-    source = scene.source
+    source = probed.source
     shift_ns, window_ns = source.rig.timeshift_cam_imu_ns, seconds_to_ns(settings.motion.crane.window_s)
     camera = way.rectifier.camera
-    return Travel.of(way.trajectory, source.crane(), shift_ns, window_ns, scene.first.range_m, camera)
+    return Travel.of(way.trajectory, source.crane(), shift_ns, window_ns, probed.first.range_m, camera)
 
 
 def _lifts(
