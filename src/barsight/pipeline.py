@@ -27,7 +27,7 @@ from barsight.core.parallel import in_background, prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.settings.numbers import expect_numbers
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.timing import Stopwatch
+from barsight.core.timing import Stopwatch, count_frames
 from barsight.core.types import Agreement, PosedFrame, RefusedFrame, StereoFrame, Trajectory
 from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.free_space import FreeSpace
@@ -154,7 +154,7 @@ def measure(
         ahead = pools.enter_context(prefetched_map(match, begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
-            count = _counter("trajectory", total, advance)
+            count = count_frames("trajectory", total, advance)
             trajectory = checkpointed(kept, "trajectory", lambda: estimate(source, rectifier, count))
             trim_heap()
             calibrated = self_calibrate(
@@ -360,17 +360,6 @@ def _speed_along_x(trajectory: Trajectory) -> float:
     if seconds.size == 0:
         return float("nan")
     return float(np.median(np.diff(trajectory.positions_m[:, 0]) / seconds))
-
-
-def _counter(stage: str, total: int, advance: Advance) -> Callable[[], None]:
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        advance(stage, done, total)
-
-    return count
 
 
 def _first_reason(refusals: list[Refusal]) -> str:
