@@ -29,12 +29,18 @@ def test_no_setting_has_an_old_name() -> None:
 def test_an_old_key_is_told_its_new_name() -> None:
     with pytest.raises(ConfigError, match=r"^map\.least_shift is called map\.min_shift now$"):
         refuse_old_keys({"stereo": {"method": "sgbm"}, "map": {"least_shift": 0.1}})
-    refuse_old_keys({"map": {"min_shift": 0.1}, "preset": "fast"})
+    with pytest.raises(ConfigError, match=r"motion\.odometry\.offset_sigma_px now$"):
+        refuse_old_keys({"motion": {"odometry": {"calibration_sigma_px": 0.1}}})
+    refuse_old_keys({"map": {"min_shift": 0.1}, "stereo": {"calibration_sigma_px": 0.1}, "preset": "fast"})
 
 
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
+        (
+            ("--motion.fusion.calibration-sigma-px", "0.2"),
+            "--motion.fusion.calibration-sigma-px is called --motion.fusion.offset-prior-px now",
+        ),
         (("--map.least-shift", "0.2"), "--map.least-shift is called --map.min-shift now"),
         (
             ("--lift.max-unknown-share=0.2",),

@@ -64,7 +64,7 @@ def simulated(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTr
     points = np.column_stack([rng.uniform(-4, 12, 1500), rng.uniform(-4, 4, 1500), rng.uniform(0, 1.5, 1500)])
     rectifier = Rectifier(rig)
     sightings = []
-    offset_px = rng.normal(0, FusionSettings().calibration_sigma_px)
+    offset_px = rng.normal(0, FusionSettings().offset_prior_px)
     for stamp, pose in zip(stamps.tolist(), poses, strict=True):
         stereo = project_stereo((pose @ rectifier.body_from_rect0).inverse().apply(points), rectifier.camera)
         shown = (stereo[:, [0, 2]] > 0).all(1) & (stereo[:, [0, 2]] < 1280).all(1)

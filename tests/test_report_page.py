@@ -166,6 +166,9 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
         (folder / "height.tif").write_bytes(torn)
         with pytest.raises(InputError, match=r"height\.tif: is torn"):
             write_report(folder, tmp_path / "report.html")
+    write_height(folder / "height.tif", bands()[:3])
+    with pytest.raises(InputError, match=r"height\.tif: has the shape .*, not 4 planar bands in tiles"):
+        write_report(folder, tmp_path / "report.html")
     (folder / "height.tif").unlink()
     preview = (folder / "preview.png").read_bytes()
     for cut in (b"", preview[:30]):

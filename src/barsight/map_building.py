@@ -17,7 +17,7 @@ from barsight.core.errors import Failed, MeasurementError
 from barsight.core.memory import trim_heap
 from barsight.core.parallel import prefetched_map
 from barsight.core.pose import Pose
-from barsight.core.timing import Stopwatch
+from barsight.core.timing import Stopwatch, count_frames
 from barsight.core.types import PosedFrame, RefusedFrame, StereoFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
@@ -130,7 +130,7 @@ def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance)
         ahead = pools.enter_context(prefetched_map(matching(matcher, probed.kept), begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
-            count = _counter("trajectory", total, advance)
+            count = count_frames("trajectory", total, advance)
             trajectory = checkpointed(probed.kept, "trajectory", lambda: estimate(source, rectifier, count))
             trim_heap()
             calibrated = self_calibrate(
@@ -243,17 +243,6 @@ def _placed(
         both = (other for other in (before, after) if other is not None)
         yield *here, [(frame, pose) for frame, pose in both if not isinstance(frame, Refusal)]
         before = here
-
-
-def _counter(stage: str, total: int, advance: Advance) -> Callable[[], None]:
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        advance(stage, done, total)
-
-    return count
 
 
 def _first_reason(refusals: list[Refusal]) -> str:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import struct
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
+from barsight.core.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
 from barsight.core.ply import read_vertices
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
@@ -24,19 +20,6 @@ from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap
 
 PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")
-_BANDS = 4
-TORN_TIFF = (
-    tifffile.TiffFileError,
-    zlib.error,
-    struct.error,
-    OSError,
-    ValueError,
-    KeyError,
-    IndexError,
-    RuntimeError,
-)
-"""What tifffile raises on a file that is cut short or is something else."""
-_REMEDY = "measure the recording again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +53,9 @@ def read_summary(folder: Path) -> dict[str, Any]:
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise InputError(path, f"is not JSON ({error})", _REMEDY) from error
+        raise InputError(path, f"is not JSON ({error})", REMEDY) from error
     if not isinstance(summary, dict):
-        raise InputError(path, "is not a JSON object", _REMEDY)
+        raise InputError(path, "is not a JSON object", REMEDY)
     return summary
 
 
@@ -83,74 +66,31 @@ def read_heights(folder: Path) -> PartedMap:
     """
     path, photo, free = (folder / name for name in ("height.tif", "ortho.tif", "free.tif"))
     if not path.is_file():
-        raise InputError(folder, "has no height.tif", _REMEDY)
-    with _first_page(path) as page:
-        size = page.shape[-2:]
-        cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
-        tie = page.tags["ModelTiepointTag"].value
-        if page.planarconfig != 2 or not page.is_tiled or page.shape[0] < _BANDS:
-            raise InputError(path, f"is not {_BANDS} planar bands in tiles", _REMEDY)
-    x0_m, y0_m = float(tie[3]) + cell_m / 2, float(tie[4]) - (size[0] - 0.5) * cell_m
-    for file, dtype in ((photo, np.uint8), (free, np.float32)):
-        if file.is_file():
-            with _first_page(file) as page:
-                if page.shape != size or page.dtype != dtype or not page.is_tiled:
-                    raise InputError(file, "doesn't fit height.tif", _REMEDY)
+        raise InputError(folder, "has no height.tif", REMEDY)
+    with open_geotiff(path, HEIGHT_BANDS) as file:
+        size, cell_m = file.size, file.cell_m
+        x0_m, y0_m = file.left_m + cell_m / 2, file.top_m - (size[0] - 0.5) * cell_m
+    for other, dtype in ((photo, np.uint8), (free, np.float32)):
+        if other.is_file():
+            with open_geotiff(other) as file:
+                if file.size != size or file.page.dtype != dtype:
+                    raise InputError(other, "doesn't fit height.tif", REMEDY)
 
-    def layer(file: Path, rows: slice, columns: slice) -> NDArray[Any] | None:
-        if not file.is_file():
+    def layer(path: Path, rows: slice, columns: slice) -> NDArray[Any] | None:
+        if not path.is_file():
             return None
-        with _first_page(file) as page:
-            found: NDArray[Any] = _rectangle(page, 1, rows, columns)[0]
+        with open_geotiff(path) as file:
+            found: NDArray[Any] = file.rectangle(1, rows, columns)[0]
         return found
 
     def read(rows: slice, columns: slice) -> HeightMap:
-        with _first_page(path) as page:
-            z, sigma, views, source = _rectangle(page, _BANDS, rows, columns)
-        grey, bounds = (layer(file, rows, columns) for file in (photo, free))
+        with open_geotiff(path, HEIGHT_BANDS) as file:
+            z, sigma, views, source = file.rectangle(HEIGHT_BANDS, rows, columns)
+        grey, bounds = (layer(other, rows, columns) for other in (photo, free))
         x, y = x0_m + cell_m * columns.start, y0_m + cell_m * rows.start
         return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), grey, bounds)
 
-    return PartedMap(x0_m, y0_m, cell_m, (size[0], size[1]), read)
-
-
-@contextmanager
-def _first_page(path: Path) -> Iterator[tifffile.TiffPage]:
-    """Open the picture in a TIFF; what goes wrong while it is open says that the file is torn."""
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages.first
-            assert isinstance(page, tifffile.TiffPage)
-            yield page
-    except TORN_TIFF as error:
-        raise InputError(path, f"is torn ({error})", _REMEDY) from error
-
-
-def _rectangle(page: tifffile.TiffPage, bands: int, rows: slice, columns: slice) -> NDArray[Any]:
-    """Read (bands, R, C) of a tiled picture whose first row lies at the highest y; rows count from the
-    lowest.
-    """
-    height = page.shape[-2]
-    top, left = height - rows.stop, columns.start
-    out = np.empty((bands, rows.stop - rows.start, columns.stop - left), page.dtype)
-    down, across = -(-height // page.tilelength), -(-page.shape[-1] // page.tilewidth)
-    wanted = [
-        (band * down + i) * across + j
-        for band in range(bands)
-        for i in range(top // page.tilelength, -(-(height - rows.start) // page.tilelength))
-        for j in range(left // page.tilewidth, -(-columns.stop // page.tilewidth))
-    ]
-    file = page.parent.filehandle
-    for number in wanted:
-        file.seek(page.dataoffsets[number])
-        data, index, _ = page.decode(file.read(page.databytecounts[number]), number)
-        if data is None:
-            raise ValueError(f"tile {number} is empty")
-        i, j = index[2] - top, index[3] - left
-        target = out[index[0], max(i, 0) : i + page.tilelength, max(j, 0) : j + page.tilewidth]
-        shown = data[0, max(-i, 0) :, max(-j, 0) :, 0]
-        target[:] = shown[: target.shape[0], : target.shape[1]]
-    return np.ascontiguousarray(out[:, ::-1])
+    return PartedMap(x0_m, y0_m, cell_m, size, read)
 
 
 def read_path(folder: Path) -> CameraPath | None:
@@ -168,9 +108,9 @@ def read_path(folder: Path) -> CameraPath | None:
             stamps.append(parse_seconds(fields[0]))
             numbers.append([float(field) for field in fields[1:]])
         except ValueError as error:
-            raise InputError(path, f"line {count} is not TUM ({error})", _REMEDY) from error
+            raise InputError(path, f"line {count} is not TUM ({error})", REMEDY) from error
         if len(numbers[-1]) != 7:
-            raise InputError(path, f"line {count} has {len(fields)} numbers instead of 8", _REMEDY)
+            raise InputError(path, f"line {count} has {len(fields)} numbers instead of 8", REMEDY)
     table = np.array(numbers, dtype=np.float64).reshape(-1, 7)
     return CameraPath(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
 
@@ -181,16 +121,16 @@ def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
     Raises InputError where the file is missing, torn, empty or has other properties than formats.md says.
     """
     if not path.is_file():
-        raise InputError(path, "no such file", _REMEDY)
+        raise InputError(path, "no such file", REMEDY)
     try:
         data = read_vertices(path)
     except (ValueError, OSError) as error:
-        raise InputError(path, f"is torn ({error})", _REMEDY) from error
+        raise InputError(path, f"is torn ({error})", REMEDY) from error
     missing = [name for name in PROPERTIES if name not in (data.dtype.names or ())]
     if missing:
-        raise InputError(path, f"has no property {missing[0]}", _REMEDY)
+        raise InputError(path, f"has no property {missing[0]}", REMEDY)
     if data.size == 0:
-        raise InputError(path, "has no points", _REMEDY)
+        raise InputError(path, "has no points", REMEDY)
     count = int(data.size) if max_points is None else min(int(data.size), max_points)
     drawn = data[np.arange(count) * data.size // count]
     column = {name: np.asarray(drawn[name], dtype=np.float32) for name in PROPERTIES}
@@ -238,7 +178,7 @@ def _read_table(path: Path, columns: int) -> Float64:
     try:
         table = np.loadtxt(filled, dtype=np.float64, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise InputError(path, f"is torn ({str(error).split(';')[0]})", _REMEDY) from error
+        raise InputError(path, f"is torn ({str(error).split(';')[0]})", REMEDY) from error
     if table.shape[1] != columns:
-        raise InputError(path, f"has {table.shape[1]} columns instead of {columns}", _REMEDY)
+        raise InputError(path, f"has {table.shape[1]} columns instead of {columns}", REMEDY)
     return table

@@ -1,11 +1,11 @@
-"""Time the stages of a run."""
+"""Time and count the stages of a run."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 
 class Stopwatch:
@@ -30,3 +30,15 @@ class Stopwatch:
     def entries(self) -> tuple[tuple[str, float, int], ...]:
         """Return (stage, seconds, frames) in the order in which the stages first ended."""
         return tuple((stage, seconds, self._frames[stage]) for stage, seconds in self._seconds.items())
+
+
+def count_frames(stage: str, total: int, advance: Callable[[str, int, int], None]) -> Callable[[], None]:
+    """Count a stage's frames: each call reports one more of `total` to `advance(stage, done, total)`."""
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        advance(stage, done, total)
+
+    return count

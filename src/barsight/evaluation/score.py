@@ -8,10 +8,10 @@ import csv
 from pathlib import Path
 
 import numpy as np
-import tifffile
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
+from barsight.core.geotiff import HEIGHT_BANDS, open_geotiff
 from barsight.core.types import HeightSource
 from barsight.mapping.agreement import smooth_places
 
@@ -68,14 +68,14 @@ def _score_contours(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
 
 
 def _score_height(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
-    with tifffile.TiffFile(out / "height.tif") as file:
-        z, sigma, _, source = file.asarray()
-        tags = file.pages[0].tags  # type: ignore[union-attr]
-        cell = tags["ModelPixelScaleTag"].value[0]
-        left, top = tags["ModelTiepointTag"].value[3:5]
+    with open_geotiff(out / "height.tif", HEIGHT_BANDS) as file:
+        z, sigma, _, source = file.page.asarray()
     z_true = truth["z"].astype(np.float64)
     x, y = np.meshgrid(truth["x"], truth["y"], indexing="ij")
-    column, row = np.floor((x - left) / cell).astype(int), np.floor((top - y) / cell).astype(int)
+    column, row = (
+        np.floor((x - file.left_m) / file.cell_m).astype(int),
+        np.floor((file.top_m - y) / file.cell_m).astype(int),
+    )
     inside = (column >= 0) & (row >= 0) & (column < z.shape[1]) & (row < z.shape[0])
     column, row = column * inside, row * inside
     seen = inside & (source[row, column] == HeightSource.VISION)

@@ -8,17 +8,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError
+from barsight.core.geotiff import HEIGHT_BANDS, REMEDY, GeoTiff, open_geotiff
 from barsight.core.types import HeightSource
-from barsight.result_folder import TORN_TIFF
 
-BANDS = 4
-READ_BYTES = 1 << 22
-"""tifffile would read ahead 256 MiB."""
 LONGEST_PX = 2400
 MAX_PIXELS = 3_000_000
 MAX_STRIPS = 12
@@ -70,36 +66,22 @@ def strip_count(width: int, height: int) -> int:
 
 
 def read_raster(path: Path) -> Raster:
-    """Read height.tif segment by segment: memory holds the small map and a few tiles, whatever its size.
+    """Read height.tif tile by tile: memory holds the small map and a few tiles, whatever its size.
 
-    Raises InputError where the file is torn or is not four planar bands with a scale and a tie point.
+    Raises InputError where the file is torn or is not a map of four bands.
     """
-    try:
-        with tifffile.TiffFile(path) as file:
-            return _reduce(path, file.pages.first)
-    except InputError:
-        raise
-    except TORN_TIFF as error:
-        raise InputError(path, f"is torn ({error})", "measure the recording again") from error
+    with open_geotiff(path, HEIGHT_BANDS) as file:
+        return _reduce(file)
 
 
-def _reduce(path: Path, page: tifffile.TiffPage) -> Raster:
-    shape = page.shape
-    if len(shape) != 3 or shape[0] != BANDS or min(shape) < 1 or page.planarconfig != 2:
-        raise InputError(
-            path, f"has the shape {shape}, not {BANDS} planar bands", "measure the recording again"
-        )
-    height, width = shape[1:]
+def _reduce(file: GeoTiff) -> Raster:
+    height, width = file.size
     step = _choose_step(width, height)
     small = (-(-height // step), -(-width // step))
     sums = np.zeros((3, *small))
     counts = np.zeros((3, *small), np.int32)
-    codes = np.zeros((BANDS, *small), np.int32)
-    for data, index, _ in page.segments(maxworkers=1, buffersize=READ_BYTES):
-        if data is None:
-            continue
-        band, row, column = int(index[0]), int(index[2]), int(index[3])
-        values = data[0, : height - row, : width - column, 0]
+    codes = np.zeros((HEIGHT_BANDS, *small), np.int32)
+    for band, row, column, values in file.tiles():
         if band < 3:
             known = np.isfinite(values)
             _pool(np.where(known, values, 0), sums[band], row, column, step)
@@ -113,9 +95,7 @@ def _reduce(path: Path, page: tifffile.TiffPage) -> Raster:
     source[codes.sum(axis=0) == 0] = HeightSource.UNKNOWN
     views[(source == HeightSource.UNKNOWN) | (views <= 0)] = np.nan
     z[source == HeightSource.UNKNOWN] = np.nan
-    scale = page.tags["ModelPixelScaleTag"].value
-    tie = page.tags["ModelTiepointTag"].value
-    return Raster(z, sigma, views, source, float(scale[0]) * step, float(tie[3]), float(tie[4]), step)
+    return Raster(z, sigma, views, source, file.cell_m * step, file.left_m, file.top_m, step)
 
 
 def _choose_step(width: int, height: int) -> int:
@@ -235,7 +215,7 @@ def preview_uri(path: Path) -> str:
     stored = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     picture = cv2.imdecode(stored, cv2.IMREAD_COLOR) if stored.size else None
     if picture is None:
-        raise InputError(path, "is torn", "measure the recording again")
+        raise InputError(path, "is torn", REMEDY)
     opaque = np.full(picture.shape[:2], 255, np.uint8)
     return data_uri(np.dstack([picture[..., ::-1], opaque]).astype(np.uint8), lossless=False)
 

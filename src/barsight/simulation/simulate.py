@@ -100,14 +100,8 @@ def frame_stamps(settings: SimulationSettings, trajectory: SimulatedTrajectory) 
 def _write_slow_sensors(mav0: Path, world: World, surface: SurfaceTruth) -> ImuRecord:
     settings, trajectory, rig = world.settings, world.trajectory, world.mounted.rig
     sensors, lever = settings.sensors, np.array(CRANE_TO_BODY_M)
+    euroc_files.write_cameras(mav0, rig, world.frame_stamp_ns)
     euroc_files.write_body(mav0)
-    for name, camera, mounting in (
-        ("cam0", rig.cam0, rig.body_from_cam0),
-        ("cam1", rig.cam1, rig.body_from_cam1),
-    ):
-        euroc_files.write_camera(
-            mav0 / name, camera, mounting, world.frame_stamp_ns, sensors.timeshift_cam_imu_s
-        )
     imu = record_imu(trajectory, sensors, _stream(settings, 4))
     euroc_files.write_imu(mav0 / "imu0", imu, sensors)
     stamp_ns, place = record_encoders(trajectory, sensors, lever, _stream(settings, 5))

@@ -116,9 +116,13 @@ def read_document(path: Path) -> Document:
     return Document(path, {str(key): value for key, value in values.items()})
 
 
-def write_document(path: Path, values: dict[str, Any]) -> None:
-    """Write a YAML mapping; floats as Python's `repr`, so that they read back bit for bit."""
-    path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding="utf-8")
+def write_document(path: Path, values: dict[str, Any], *, block_lists: bool = False) -> None:
+    """Write a YAML mapping; floats as Python's `repr`, so that they read back bit for bit.
+
+    block_lists: a line per number instead of `[a, b, ...]`.
+    """
+    style = False if block_lists else None
+    path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=style), encoding="utf-8")
 
 
 def canonical_pose(target: str, source: str, matrix: Float64, *, inverted: bool = False) -> Pose:

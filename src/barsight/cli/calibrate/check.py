@@ -14,6 +14,7 @@ from rich.table import Table
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.core.files import expect_output
+from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, RigCheck, check_rig
 from barsight.recording.base import RecordingSettings
@@ -54,14 +55,8 @@ def run(arguments: Sequence[str]) -> None:
         if out is not None:
             expect_output(out, ".json")
         source = open_recording(recording, reading)
-        total, done = len(source.index.stamps_ns), 0
         with stages(Console(stderr=True)) as advance:
-
-            def count() -> None:
-                nonlocal done
-                done += 1
-                advance("travel", done, total)
-
+            count = count_frames("travel", len(source.index.stamps_ns), advance)
             check = check_rig(source, fusion, settings, count)
         if out is not None:
             write_rig_check_report(check, str(recording), out.with_suffix(".html"), out)

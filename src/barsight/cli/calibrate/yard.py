@@ -18,6 +18,7 @@ from barsight.cli.progress import stages
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.files import atomic_path, expect_output
+from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.crane_moves import MovedYard, yard_from_moves
 from barsight.motion.crane.encoder_trajectory import CraneSettings
@@ -88,14 +89,8 @@ def _from_moves(path: Path, reading: RecordingSettings, console: Console) -> Mov
     crane = recording.crane()
     if crane is None:
         raise MeasurementError(f"{path}: no crane encoders; give surveyed targets (.csv) instead")
-    total, done = len(recording.index.stamps_ns), 0
     with stages(console) as advance:
-
-        def count() -> None:
-            nonlocal done
-            done += 1
-            advance("travel", done, total)
-
+        count = count_frames("travel", len(recording.index.stamps_ns), advance)
         estimator = BatchFusion(FusionSettings(use="stereo,imu"), CraneSettings())
         trajectory = estimator(recording, Rectifier(recording.rig), count)
     moved = yard_from_moves(trajectory, crane, recording.rig.timeshift_cam_imu_ns)

@@ -15,6 +15,7 @@ RENAMED = {
     "farthest_baselines": "max_range_baselines",
     "fewest_votes": "min_votes",
     "first_share": "first_ratio",
+    "fusion.calibration_sigma_px": "offset_prior_px",
     "gray_share": "gray_weight",
     "highest_disparity_px": "max_disparity_px",
     "large_jump": "p2",
@@ -45,10 +46,12 @@ RENAMED = {
     "most_views": "max_views",
     "narrowest_m": "min_width_m",
     "nearest_m": "min_range_m",
+    "odometry.calibration_sigma_px": "offset_sigma_px",
     "other_side_share": "other_side_error_ratio",
     "own_share": "own_ratio",
     "packing_share": "packing_error_ratio",
     "ribbed_share": "ribbed_ratio",
+    "rough.calibration_sigma_px": "offset_sigma_px",
     "single_share": "single_error_ratio",
     "small_jump": "p1",
     "start_share": "start_error_ratio",
@@ -58,14 +61,14 @@ RENAMED = {
     "widest_edge_px": "max_edge_px",
     "widest_m": "max_width_m",
 }
-"""New names of settings by their old ones, whatever the section."""
+"""New names of settings by their old ones: of one section, or whatever the section."""
 
 
 def refuse_old_keys(content: Mapping[str, Any], section: str = "") -> None:
     """Raise ConfigError naming the new name of the first old key of nested settings."""
     for key, value in content.items():
-        if key in RENAMED:
-            raise ConfigError(f"{section}{key} is called {section}{RENAMED[key]} now")
+        if (new := _new_name(section, key)) is not None:
+            raise ConfigError(f"{section}{key} is called {section}{new} now")
         if isinstance(value, Mapping):
             refuse_old_keys(value, f"{section}{key}.")
 
@@ -74,7 +77,11 @@ def refuse_old_flags(arguments: Sequence[str]) -> None:
     """Raise ConfigError naming the new name of the first old flag of a command line."""
     for argument in arguments:
         section, dot, name = argument.partition("=")[0].removeprefix("--").rpartition(".")
-        new = RENAMED.get(name.replace("-", "_"))
+        new = _new_name(section, name.replace("-", "_"))
         if argument.startswith("--") and new is not None:
             section = f"--{section}{dot}"
             raise ConfigError(f"{section}{name} is called {section}{new.replace('_', '-')} now")
+
+
+def _new_name(section: str, key: str) -> str | None:
+    return RENAMED.get(f"{section.rstrip('.').rpartition('.')[2]}.{key}", RENAMED.get(key))

@@ -45,7 +45,7 @@ class FusionSettings:
     use: str = "stereo,imu,crane"
     """Sensors to use where the recording has them: any of stereo, imu, crane, with commas."""
     front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
-    calibration_sigma_px: float = 0.1
+    offset_prior_px: float = 0.1
     """How far a yaw between the cameras may move the disparity (1 sigma); the yaw is estimated too. 0 takes
     the calibration as exact."""
     scale_sigma: float = 5e-4
@@ -55,8 +55,8 @@ class FusionSettings:
         unknown = [name for name in self.sensors if name not in SENSORS]
         if unknown or not ({"stereo", "crane"} & set(self.sensors)):
             raise ConfigError(f"use is {self.use!r}; name stereo or crane, and imu if wanted, with commas")
-        if self.calibration_sigma_px < 0:
-            raise ConfigError("calibration_sigma_px can't be negative")
+        if self.offset_prior_px < 0:
+            raise ConfigError("offset_prior_px can't be negative")
         if not 0 < self.scale_sigma <= 0.1:
             raise ConfigError(f"scale_sigma must lie over 0 and up to 0.1, not {self.scale_sigma}")
 
@@ -225,7 +225,7 @@ class BatchFusion:
         problem = Problem(
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, placed,
             tuple(attitudes), ties.still, ties.bias,
-            offset_prior_px=self.settings.calibration_sigma_px, scale_prior=self.settings.scale_sigma,
+            offset_prior_px=self.settings.offset_prior_px, scale_prior=self.settings.scale_sigma,
             crane=inputs.crane, has_latency=bool(placed),
             has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip

@@ -134,7 +134,7 @@ class FixedLagEstimator:
         settings = self._settings
         problem = Problem(
             start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
-            offset_prior_px=settings.calibration_sigma_px, scale_prior=settings.scale_sigma,
+            offset_prior_px=settings.offset_prior_px, scale_prior=settings.scale_sigma,
             has_latency=now.crane is not None, has_imu=now.imu is not None,
         )  # fmt: skip
         state = GraphState(initial_values(problem), np.empty((0, 4)), np.zeros(2))

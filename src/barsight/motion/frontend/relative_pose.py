@@ -120,7 +120,7 @@ def refine_pose(
         if np.abs(update).max() < 1e-9:
             break
     depth = float(np.median(points[kept, 2]))
-    scale_sigma = settings.calibration_sigma_px * depth / base
+    scale_sigma = settings.offset_sigma_px * depth / base
     return RelativePose(rotation, translation, np.linalg.inv(normal).astype(np.float64), scale_sigma, kept)
 
 

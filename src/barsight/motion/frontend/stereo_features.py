@@ -32,8 +32,9 @@ class OdometrySettings:
     """A frame with fewer agreeing points is refused."""
     pixel_sigma_px: float = 0.3
     """The noise of a feature's place (1 sigma)."""
-    calibration_sigma_px: float = 0.1
-    """Disparity error common to all features: it makes every step too long or too short alike (1 sigma)."""
+    offset_sigma_px: float = 0.1
+    """Disparity error common to all features (1 sigma), not estimated: it makes every step too long or too
+    short alike."""
     ransac_px: float = 1.0
     """Points further off than this are outliers."""
 

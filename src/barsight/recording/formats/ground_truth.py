@@ -14,6 +14,7 @@ from barsight.core.stamps import expect_increasing, parse_seconds
 from barsight.recording.formats.euroc_tables import read_table, require_file
 
 EUROC_FOLDER = "state_groundtruth_estimate0"
+EUROC_HEADER = "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 EUROC_COLUMNS = ("timestamp", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z")
 
 
@@ -67,7 +68,7 @@ def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: s
 def truth_as_euroc(path: Path, stamp_ns: Int64) -> str:
     """Format a trajectory as EuRoC's `data.csv`, one pose per stamp for KITTI's."""
     truth = read_ground_truth(path, stamp_ns)
-    lines = ["#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"]
+    lines = [EUROC_HEADER]
     for stamp, pose in zip(truth.stamp_ns.tolist(), truth.poses, strict=True):
         x, y, z, w = pose.quaternion_xyzw.tolist()
         lines.append(",".join([str(stamp), *map(repr, [*pose.translation.tolist(), w, x, y, z])]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from barsight.core.types import CraneSamples, LaserProfile
 from barsight.recording.formats.ground_truth import EUROC_FOLDER, find_ground_truth, truth_as_euroc
 from barsight.recording.stored_images import StoredPictures
 
+IMAGE_HEADER = "#timestamp [ns],filename"
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -33,14 +34,14 @@ def write_euroc(recording: StoredPictures, folder: Path, progress: Callable[[int
     write_document(mav0 / "body.yaml", {"comment": "body", "is_simulated": recording.is_simulated})
     if (imu := recording.imu()) is not None:
         values = np.hstack([imu.gyro_radps, imu.accel_mps2])
-        _write_table(mav0 / "imu0" / "data.csv", IMU_HEADER, imu.stamp_ns, values)
+        write_table(mav0 / "imu0" / "data.csv", IMU_HEADER, table_rows(imu.stamp_ns, values))
         write_imu(mav0 / "imu0" / "sensor.yaml", recording.imu_noise(), median_rate(imu.stamp_ns))
     if (crane := recording.crane()) is not None:
-        _write_table(mav0 / "crane0" / "data.csv", CRANE_HEADER, crane.stamp_ns, crane.position_m)
+        rows = table_rows(crane.stamp_ns, crane.position_m)
+        write_table(mav0 / "crane0" / "data.csv", CRANE_HEADER, rows)
         write_crane_description(mav0 / "crane0" / "sensor.yaml", crane)
     if laser := recording.laser():
-        profile, xyz = laser_table(laser)
-        _write_table(mav0 / "laser0" / "data.csv", LASER_HEADER, profile, xyz)
+        write_table(mav0 / "laser0" / "data.csv", LASER_HEADER, table_rows(*laser_table(laser)))
         write_laser_description(mav0 / "laser0" / "sensor.yaml", laser)
     copy_truth(recording, mav0)
     return written
@@ -104,7 +105,7 @@ def _write_images(recording: StoredPictures, mav0: Path, progress: Callable[[int
         for camera in ("cam0", "cam1"):
             (mav0 / camera / "data").mkdir(parents=True, exist_ok=True)
             file = stack.enter_context((mav0 / camera / "data.csv").open("w", encoding="utf-8", newline="\n"))
-            file.write("#timestamp [ns],filename\n")
+            file.write(f"{IMAGE_HEADER}\n")
             lists.append(file)
         for image in recording.stored_images():
             name = f"{image.stamp_ns}.{image.kind}"
@@ -115,9 +116,15 @@ def _write_images(recording: StoredPictures, mav0: Path, progress: Callable[[int
     return done
 
 
-def _write_table(path: Path, header: str, first: Int64, rest: Float64) -> None:
+def write_table(path: Path, header: str, rows: Iterable[str]) -> None:
+    """Write one of EuRoC's CSV files, with its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(header + "\n")
-        for stamp, row in zip(first.tolist(), rest, strict=True):
-            file.write(f"{stamp},{','.join(map(repr, row.tolist()))}\n")
+        file.write(f"{header}\n")
+        file.writelines(f"{row}\n" for row in rows)
+
+
+def table_rows(first: Int64, rest: Float64, number: Callable[[float], str] = repr) -> Iterator[str]:
+    """Format rows of stamps or profile numbers (N,) and values (N, K)."""
+    for stamp, row in zip(first.tolist(), rest, strict=True):
+        yield f"{stamp},{','.join(map(number, row.tolist()))}"

@@ -24,13 +24,13 @@ from barsight.stereo.baselines.left_right_check import (
 from barsight.stereo.baselines.postprocessing import (
     OutputSettings,
     assemble_disparity,
+    is_matchable,
     mirror_pair,
     no_match,
-    overlaps_image,
 )
 from barsight.stereo.baselines.region_voting import region_vote
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
-from barsight.stereo.noise import has_texture, image_noise
+from barsight.stereo.noise import image_noise
 
 _SUPPORT_RADIUS_PX = 4
 _MEDIAN_RADIUS_PX = 9
@@ -84,7 +84,7 @@ class Census:
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """Match; see `StereoMethod`."""
         settings = self.settings
-        if not has_texture(pair) or not overlaps_image(candidates, pair.left.shape[1]):
+        if not is_matchable(pair, candidates):
             return no_match(pair)
         tolerance = settings.tolerance_sigmas * image_noise(pair.left)
         regions = _regions(pair, settings)

@@ -38,13 +38,12 @@ from barsight.stereo.baselines.left_right_check import (
 from barsight.stereo.baselines.postprocessing import (
     OutputSettings,
     assemble_disparity,
+    is_matchable,
     mirror_pair,
     no_match,
-    overlaps_image,
 )
 from barsight.stereo.baselines.spanning_tree import spanning_tree, tree_filter
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
-from barsight.stereo.noise import has_texture
 
 _FEWEST_CANDIDATES = 5
 _SUPPORT_RADIUS_PX = 4
@@ -95,7 +94,7 @@ class Csca:
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """Match; see `StereoMethod`."""
         settings = self.settings
-        if not has_texture(pair) or not overlaps_image(candidates, pair.left.shape[1]):
+        if not is_matchable(pair, candidates):
             return no_match(pair)
         winners = cross_scale_winners(pair, candidates, settings)
         mirrored = cross_scale_winners(mirror_pair(pair), candidates, settings)

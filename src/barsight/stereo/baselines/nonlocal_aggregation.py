@@ -22,13 +22,12 @@ from barsight.stereo.baselines.left_right_check import left_right_agreement
 from barsight.stereo.baselines.postprocessing import (
     OutputSettings,
     assemble_disparity,
+    is_matchable,
     mirror_pair,
     no_match,
-    overlaps_image,
 )
 from barsight.stereo.baselines.spanning_tree import SpanningTree, spanning_tree, tree_filter
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
-from barsight.stereo.noise import has_texture
 
 _SUPPORT_RADIUS_PX = 4
 _MEDIAN_PX = 5
@@ -62,7 +61,7 @@ class Nonlocal:
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """Match; see `StereoMethod`."""
         settings = self.settings
-        if not has_texture(pair) or not overlaps_image(candidates, pair.left.shape[1]):
+        if not is_matchable(pair, candidates):
             return no_match(pair)
         tree = spanning_tree(pair.left)
         winners = tree_winners(pair, tree, candidates, settings)

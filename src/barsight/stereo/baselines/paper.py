@@ -18,8 +18,7 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.bilateral_filter import bilateral_update
 from barsight.stereo.baselines.census import Census, CensusSettings
-from barsight.stereo.baselines.postprocessing import OutputSettings, no_match, overlaps_image
-from barsight.stereo.noise import has_texture, noise_sigma
+from barsight.stereo.baselines.postprocessing import OutputSettings, is_matchable, no_match, with_sigma
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 _SUPPORT_RADIUS_PX = 4
@@ -68,23 +67,14 @@ class Paper:
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """Match; see `StereoMethod`. Without `output.fill`, NaN where the initial disparity has none."""
         settings = self.settings
-        width = pair.left.shape[1]
-        too_narrow = width + min(candidates.lowest_px, 0) <= _NARROWEST_PX
-        if not has_texture(pair) or not overlaps_image(candidates, width) or too_narrow:
+        too_narrow = pair.left.shape[1] + min(candidates.lowest_px, 0) <= _NARROWEST_PX
+        if too_narrow or not is_matchable(pair, candidates):
             return no_match(pair)
         start: Sgbm | Census = Sgbm(settings.sgbm) if settings.initial == "sgbm" else Census(settings.census)
         initial = start(pair, candidates)
         values = iterate_bilateral(pair, initial.disparity_px, candidates, settings)
         matched = np.isfinite(initial.disparity_px)
-        output = settings.output
-        sigma = np.hypot(noise_sigma(pair.left, _SUPPORT_RADIUS_PX), np.float32(output.subpixel_sigma_px))
-        sigma = np.where(matched, sigma, np.float32(output.filled_sigma_px)).astype(np.float32)
-        missing = ~pair.left_valid | np.isnan(values)
-        if not output.fill:
-            missing |= ~matched
-        values[missing] = np.nan
-        sigma[missing] = np.nan
-        return Disparity(values, sigma)
+        return with_sigma(pair, values, matched, _SUPPORT_RADIUS_PX, settings.output)
 
 
 def iterate_bilateral(

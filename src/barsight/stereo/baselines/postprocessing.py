@@ -10,7 +10,7 @@ from barsight.core.arrays import Bool, Float32, Int32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.winner_takes_all import Winners, subpixel_winners
-from barsight.stereo.noise import noise_sigma
+from barsight.stereo.noise import has_texture, noise_sigma
 
 _MIN_RELIABLE = 0.01
 
@@ -54,12 +54,21 @@ def assemble_disparity(
         return no_match(pair)
     kept = matched & (chosen_px == winners.candidate_px)
     disparity = np.where(kept, subpixel_winners(winners), chosen_px.astype(np.float32))
+    return with_sigma(pair, disparity.astype(np.float32), matched, radius_px, settings)
+
+
+def with_sigma(
+    pair: RectifiedPair, disparity_px: Float32, matched: Bool, radius_px: int, settings: OutputSettings
+) -> Disparity:
+    """Propagate the noise's bound over a window of radius_px together with the settings' constants."""
     sigma = np.hypot(noise_sigma(pair.left, radius_px), np.float32(settings.subpixel_sigma_px))
     sigma = np.where(matched, sigma, np.float32(settings.filled_sigma_px)).astype(np.float32)
-    missing = ~pair.left_valid if settings.fill else ~(pair.left_valid & matched)
-    disparity[missing] = np.nan
-    sigma[missing] = np.nan
-    return Disparity(disparity.astype(np.float32), sigma)
+    known = pair.left_valid & ~np.isnan(disparity_px)
+    if not settings.fill:
+        known &= matched
+    return Disparity(
+        np.where(known, disparity_px, np.float32(np.nan)), np.where(known, sigma, np.float32(np.nan))
+    )
 
 
 def no_match(pair: RectifiedPair) -> Disparity:
@@ -95,6 +104,7 @@ def mirror_pair(pair: RectifiedPair) -> RectifiedPair:
     )
 
 
-def overlaps_image(candidates: DisparityRange, width: int) -> bool:
-    """Check whether any candidate leaves an overlap of the two images."""
-    return candidates.lowest_px < width and candidates.highest_px > -width
+def is_matchable(pair: RectifiedPair, candidates: DisparityRange) -> bool:
+    """Check that both images have texture and that a candidate leaves them an overlap."""
+    width = pair.left.shape[1]
+    return has_texture(pair) and candidates.lowest_px < width and candidates.highest_px > -width

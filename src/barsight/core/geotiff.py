@@ -1,0 +1,99 @@
+"""Read the GeoTIFFs of a result folder: tiled maps whose row 0 lies at the highest y."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from barsight.core.errors import InputError
+
+HEIGHT_BANDS = 4
+"""Bands of height.tif: z, sigma, views, source."""
+REMEDY = "measure the recording again"
+_READ_BYTES = 1 << 22
+"""tifffile would read ahead 256 MiB."""
+_TORN = (
+    tifffile.TiffFileError, zlib.error, struct.error, OSError, ValueError, KeyError, IndexError, RuntimeError,
+)  # fmt: skip
+"""What tifffile raises on a file that is cut short or is something else."""
+
+
+@dataclass(frozen=True, eq=False)
+class GeoTiff:
+    """An open map of (bands, H, W) or (H, W) cells. left_m, top_m: the outer corner of cell (0, 0)."""
+
+    page: tifffile.TiffPage
+    cell_m: float
+    left_m: float
+    top_m: float
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return the cells down and across."""
+        height, width = self.page.shape[-2:]
+        return height, width
+
+    def tiles(self) -> Iterator[tuple[int, int, int, NDArray[Any]]]:
+        """Yield each tile's band, first row and first column, and its cells within the map."""
+        height, width = self.size
+        for data, index, _ in self.page.segments(maxworkers=1, buffersize=_READ_BYTES):
+            if data is not None:
+                row, column = int(index[2]), int(index[3])
+                yield int(index[0]), row, column, data[0, : height - row, : width - column, 0]
+
+    def rectangle(self, bands: int, rows: slice, columns: slice) -> NDArray[Any]:
+        """Read (bands, R, C), the rows counted and stored from the lowest y."""
+        page, (height, width) = self.page, self.size
+        top, left = height - rows.stop, columns.start
+        out = np.empty((bands, rows.stop - rows.start, columns.stop - left), page.dtype)
+        down, across = -(-height // page.tilelength), -(-width // page.tilewidth)
+        wanted = [
+            (band * down + i) * across + j
+            for band in range(bands)
+            for i in range(top // page.tilelength, -(-(height - rows.start) // page.tilelength))
+            for j in range(left // page.tilewidth, -(-columns.stop // page.tilewidth))
+        ]
+        file = page.parent.filehandle
+        for number in wanted:
+            file.seek(page.dataoffsets[number])
+            data, index, _ = page.decode(file.read(page.databytecounts[number]), number)
+            if data is None:
+                raise ValueError(f"tile {number} is empty")
+            i, j = index[2] - top, index[3] - left
+            target = out[index[0], max(i, 0) : i + page.tilelength, max(j, 0) : j + page.tilewidth]
+            shown = data[0, max(-i, 0) :, max(-j, 0) :, 0]
+            target[:] = shown[: target.shape[0], : target.shape[1]]
+        return np.ascontiguousarray(out[:, ::-1])
+
+
+@contextmanager
+def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
+    """Open a tiled map of so many planar bands.
+
+    Raises InputError where it is something else, or where it proves torn while it is open.
+    """
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages.first
+            assert isinstance(page, tifffile.TiffPage)
+            planar = (
+                len(page.shape) == 2 if bands == 1 else page.shape[:-2] == (bands,) and page.planarconfig == 2
+            )
+            if not planar or not page.is_tiled or min(page.shape) < 1:
+                raise InputError(
+                    path, f"has the shape {page.shape}, not {bands} planar bands in tiles", REMEDY
+                )
+            cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
+            left_m, top_m = (float(v) for v in page.tags["ModelTiepointTag"].value[3:5])
+            yield GeoTiff(page, cell_m, left_m, top_m)
+    except _TORN as error:
+        raise InputError(path, f"is torn ({error})", REMEDY) from error
