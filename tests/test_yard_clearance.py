@@ -81,3 +81,30 @@ def test_an_unseen_face_needs_free_space_down_to_its_plane() -> None:
 def test_a_map_that_ends_beside_the_magnet_is_unseen_there() -> None:
     heights = map_of([laid(0.3)], x_m=(-1.5, 0.4))
     assert "unknown-under-footprint" in found(heights)
+
+
+WALL = ((0.42, 0.55), (-3.0, 3.0))
+
+
+def seen_in_part(every: int, top_m: float) -> HeightMap:
+    """An unseen wall of which single cells are seen, one in every so many rows and columns."""
+    heights = with_block(*WALL, None)
+    cells = np.zeros(heights.shape, np.bool_)
+    cells[::every, ::every] = True
+    cells &= np.isnan(heights.z_m)
+    heights.z_m[cells], heights.source[cells] = top_m, HeightSource.VISION
+    return heights
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_a_wall_that_is_seen_in_part_is_an_obstacle(every: int) -> None:
+    assert "obstructed" in found(seen_in_part(every, TOP_M + 0.7))
+
+
+@pytest.mark.parametrize("every", [2, 4, 7])
+def test_single_low_cells_do_not_prove_an_unseen_place_free(every: int) -> None:
+    assert found(seen_in_part(every, 0.2)) == {"unknown-under-footprint"}
+
+
+def test_a_bound_that_is_no_number_proves_nothing() -> None:
+    assert found(with_block(*WALL, None, np.nan)) == {"unknown-under-footprint"}

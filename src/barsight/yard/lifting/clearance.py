@@ -46,8 +46,16 @@ def clearance_vetoes(place: Placement, heights: HeightMap, magnet: Magnet, conta
     rise = lookup_heights(heights, xy[..., 0], xy[..., 1]) - plane
     unseen = np.isnan(rise)
     allowed = np.where(region.faces, MAX_RISE_M, max(magnet.beam.above_faces_m / 2, MAX_RISE_M))
-    unproven = unseen & (_free_up_to(heights, xy) - plane > allowed)
-    return [*_obstructed(np.where(unseen, -np.inf, rise), region), *_unseen(unproven, region)]
+    most = _free_up_to(heights, xy) - plane
+    blocked = np.where(unseen, ~(most <= allowed), rise > allowed)
+    return _obstructed(_filled(rise, most), region) or _unseen(blocked, region)
+
+
+def _filled(rise: Float64, most: Float64) -> Float64:
+    """Fill unseen cells (V, U) with the highest seen one two cells about, up to what lines of sight allow."""
+    seen = np.maximum(np.nan_to_num(rise, nan=-1.0), -1.0)
+    highest = cv2.dilate(seen, np.ones((5, 5), np.uint8))
+    return np.where(np.isnan(rise), np.fmin(highest, most), seen)
 
 
 def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
@@ -59,8 +67,8 @@ def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
 
 
 def _obstructed(rise: Float64, region: Region) -> list[Veto]:
-    """Report the highest connected patch over the plane. rise: (V, U), -inf where unseen."""
-    known = np.maximum(rise, -1.0).astype(np.float32)
+    """Report the highest connected patch over the plane. rise: (V, U)."""
+    known = rise.astype(np.float32)
     for side, allowed_m in ((5, MAX_RISE_M), (3, MAX_NARROW_RISE_M)):
         smooth = cv2.medianBlur(known, side)
         over = (region.faces | region.beam) & (smooth > allowed_m)
@@ -78,8 +86,12 @@ def _obstructed(rise: Float64, region: Region) -> list[Veto]:
     return []
 
 
-def _unseen(unproven: Bool, region: Region) -> list[Veto]:
-    """Report unproven places that are wide enough to hide what stands."""
+def _unseen(blocked: Bool, region: Region) -> list[Veto]:
+    """Report places, unproven or standing, that are wide enough to hide what stands. blocked: (V, U); a few
+    cells free among them, as wrong matches are, prove nothing.
+    """
+    _, patch, boxes, _ = cv2.connectedComponentsWithStats((~blocked).astype(np.uint8), connectivity=4)
+    unproven = blocked | (boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS)[patch]
     side = round(MAX_HOLE_M / STEP_M)
     wide = cv2.morphologyEx(unproven.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
     hidden = wide & (region.faces | region.beam)
