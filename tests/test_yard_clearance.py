@@ -10,7 +10,7 @@ import pytest
 from barsight.core.types import HeightSource
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.types import HeightMap
-from lift_yards import codes, judged, laid, map_of, record
+from lift_yards import MAGNET, codes, judged, laid, map_of, record
 
 TOP_M = laid(0.3).top_z_m
 
@@ -108,3 +108,20 @@ def test_single_low_cells_do_not_prove_an_unseen_place_free(every: int) -> None:
 
 def test_a_bound_that_is_no_number_proves_nothing() -> None:
     assert found(with_block(*WALL, None, np.nan)) == {"unknown-under-footprint"}
+
+
+def test_the_box_that_a_lift_states_is_clear_too() -> None:
+    open_yard, beside_wall = (
+        judged([laid(0.3)], place=Placement(0.3, 0.0, 0.0), heights=heights)
+        for heights in (None, with_block((0.51, 1.2), (-3.0, 3.0), TOP_M + 0.7))
+    )
+    assert not beside_wall.vetoes
+    assert beside_wall.tolerance.x_m == MAGNET.tolerance.x_m < open_yard.tolerance.x_m
+
+
+def test_faces_must_rest_on_the_load_itself() -> None:
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    for pole in MAGNET.poles:
+        rows = np.abs(heights.y_m - pole.along_m) < 0.25
+        heights.z_m[np.ix_(rows, np.abs(heights.x_m - 0.3) < 0.3)] = TOP_M + 0.018
+    assert found(heights) == {"obstructed"}

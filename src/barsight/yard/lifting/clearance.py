@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, frozen
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.contact import Contact
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.stability.stability import lookup_heights, nearest_cells
-from barsight.yard.types import HeightMap
+from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
 STEP_M = 0.01
@@ -56,6 +57,28 @@ def _filled(rise: Float64, most: Float64) -> Float64:
     seen = np.maximum(np.nan_to_num(rise, nan=-1.0), -1.0)
     highest = cv2.dilate(seen, np.ones((5, 5), np.uint8))
     return np.where(np.isnan(rise), np.fmin(highest, most), seen)
+
+
+def resting_vetoes(
+    place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
+) -> list[Veto]:
+    """Find what lies between the faces and the load: faces that rest above its top."""
+    if not load:
+        return []
+    poles = magnet.pole_table[:, :2] @ np.stack([place.along, place.across]) + (place.x_m, place.y_m)
+    above = []
+    for bundle in load:
+        axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
+        top = bundle.top_z_m + (poles - bundle.centre_m[:2]) @ axis * math.tan(bundle.pitch_rad)
+        above.append(contact.z_m - top - UPPER * np.nan_to_num(bundle.sigma.top_z_m, nan=math.inf))
+    highest = float(np.min(above, axis=0).max())
+    if not highest > MAX_RISE_M:
+        return []
+    reason = (
+        f"a face rests at least {1e3 * highest:.0f} mm above the load's top, {1e3 * MAX_RISE_M:.0f} mm are "
+        "allowed: something lies between"
+    )
+    return [Veto("obstructed", reason)]
 
 
 def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
