@@ -46,6 +46,7 @@ def found(heights: HeightMap) -> set[str]:
         ((0.36, 0.40), (-0.8, -0.4), 0.02),  # beside a face, within the stray field
         ((0.0, 0.6), (-0.05, 0.05), 0.10),  # between two poles, under the beam
         ((0.48, 0.52), (-3.0, 3.0), 0.70),  # a wall
+        ((0.0, 0.6), (-0.004, 0.004), 0.30),  # a plate on edge, one cell wide
     ],
 )
 def test_what_stands_above_the_faces_obstructs(

@@ -29,6 +29,8 @@ MAX_RISE_M = 0.012
 """A patch that the map shows this much above the faces' plane obstructs, by medians over 50 mm squares."""
 MAX_NARROW_RISE_M = 0.020
 """The same for what is too narrow for those: by medians over 30 mm squares."""
+MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
+"""The same for a connected patch of so many cells that may be a single one wide, as plates on edge are."""
 MIN_PATCH_CELLS = 4
 """Cells of STEP_M of the smallest patch that counts."""
 MAX_HOLE_M = 0.08
@@ -92,11 +94,15 @@ def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
 def _obstructed(rise: Float64, region: Region) -> list[Veto]:
     """Report the highest connected patch over the plane. rise: (V, U)."""
     known = rise.astype(np.float32)
-    for side, allowed_m in ((5, MAX_RISE_M), (3, MAX_NARROW_RISE_M)):
+    for side, allowed_m, cells in (
+        (5, MAX_RISE_M, MIN_PATCH_CELLS),
+        (3, MAX_NARROW_RISE_M, MIN_PATCH_CELLS),
+        (1, MAX_THIN_RISE_M, MIN_THIN_CELLS),
+    ):
         smooth = cv2.medianBlur(known, side)
         over = (region.faces | region.beam) & (smooth > allowed_m)
         _, patch, boxes, _ = cv2.connectedComponentsWithStats(over.astype(np.uint8), connectivity=8)
-        large = np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= MIN_PATCH_CELLS) + 1
+        large = np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= cells) + 1
         if large.size:
             highest = np.where(np.isin(patch, large), smooth, -np.inf)
             at = np.unravel_index(int(np.argmax(highest)), highest.shape)
