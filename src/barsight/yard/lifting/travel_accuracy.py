@@ -77,10 +77,11 @@ class Travel:
         """Read from result.json; None where it doesn't say, or not the same number of each."""
         content: Any = summary.get("travel")
         try:
-            place, sigma, off, refused, stamps = (
-                np.array(content[name], dtype=np.int64 if name == "stamp_ns" else np.float64)
-                for name in ("place_m", "sigma_m", "off_m", "refused_m", "stamp_ns")
+            place, sigma, off, refused = (
+                np.array(content[name], dtype=np.float64)
+                for name in ("place_m", "sigma_m", "off_m", "refused_m")
             )
+            stamps = np.array(content["stamp_ns"], dtype=np.int64)
             place, sigma, refused = place.reshape(-1, 2), sigma.reshape(-1, 3), refused.reshape(-1, 2)
             reach_m = float(content["reach_m"])
         except (KeyError, TypeError, ValueError, OverflowError):
