@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,16 @@ def test_a_gully_that_nobody_saw_is_proven_free_by_what_was_seen_beyond() -> Non
 
 def test_one_view_proves_nothing() -> None:
     assert np.isinf(carved(-1.0)).all()
+
+
+def test_matches_that_mix_front_and_back_at_an_edge_prove_nothing() -> None:
+    free, rng = FreeSpace(CELL_M), np.random.default_rng(3)
+    for eye_x_m in (-1.0, -0.6, 2.0, 2.4):
+        cells = seen_from(eye_x_m)
+        edge = np.isin(cells.x, [40, 41, 58, 59]) & (rng.random(cells.x.size) < 0.5)
+        z_m = np.where(edge, np.float32(0.1), cells.z_m)
+        free.carve(replace(cells, z_m=z_m), np.array([[eye_x_m, 0.2, 7.0]]))
+    assert (free.window(int(X[0]), 10, X.size, 20) >= HEIGHT[None]).all()
 
 
 def test_the_kernel_agrees_with_a_slow_reference() -> None:

@@ -10,7 +10,7 @@ import pytest
 from barsight.core.types import HeightSource
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.types import HeightMap
-from lift_yards import codes, judged, laid, map_of, record
+from lift_yards import MAGNET, codes, judged, laid, map_of, record
 
 TOP_M = laid(0.3).top_z_m
 
@@ -46,6 +46,7 @@ def found(heights: HeightMap) -> set[str]:
         ((0.36, 0.40), (-0.8, -0.4), 0.02),  # beside a face, within the stray field
         ((0.0, 0.6), (-0.05, 0.05), 0.10),  # between two poles, under the beam
         ((0.48, 0.52), (-3.0, 3.0), 0.70),  # a wall
+        ((0.0, 0.6), (-0.004, 0.004), 0.30),  # a plate on edge, one cell wide
     ],
 )
 def test_what_stands_above_the_faces_obstructs(
@@ -81,3 +82,47 @@ def test_an_unseen_face_needs_free_space_down_to_its_plane() -> None:
 def test_a_map_that_ends_beside_the_magnet_is_unseen_there() -> None:
     heights = map_of([laid(0.3)], x_m=(-1.5, 0.4))
     assert "unknown-under-footprint" in found(heights)
+
+
+WALL = ((0.42, 0.55), (-3.0, 3.0))
+
+
+def seen_in_part(every: int, top_m: float) -> HeightMap:
+    """An unseen wall of which single cells are seen, one in every so many rows and columns."""
+    heights = with_block(*WALL, None)
+    cells = np.zeros(heights.shape, np.bool_)
+    cells[::every, ::every] = True
+    cells &= np.isnan(heights.z_m)
+    heights.z_m[cells], heights.source[cells] = top_m, HeightSource.VISION
+    return heights
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_a_wall_that_is_seen_in_part_is_an_obstacle(every: int) -> None:
+    assert "obstructed" in found(seen_in_part(every, TOP_M + 0.7))
+
+
+@pytest.mark.parametrize("every", [2, 4, 7])
+def test_single_low_cells_do_not_prove_an_unseen_place_free(every: int) -> None:
+    assert found(seen_in_part(every, 0.2)) == {"unknown-under-footprint"}
+
+
+def test_a_bound_that_is_no_number_proves_nothing() -> None:
+    assert found(with_block(*WALL, None, np.nan)) == {"unknown-under-footprint"}
+
+
+def test_the_box_that_a_lift_states_is_clear_too() -> None:
+    open_yard, beside_wall = (
+        judged([laid(0.3)], place=Placement(0.3, 0.0, 0.0), heights=heights)
+        for heights in (None, with_block((0.51, 1.2), (-3.0, 3.0), TOP_M + 0.7))
+    )
+    assert not beside_wall.vetoes
+    assert beside_wall.tolerance.x_m == MAGNET.tolerance.x_m < open_yard.tolerance.x_m
+
+
+def test_faces_must_rest_on_the_load_itself() -> None:
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    for pole in MAGNET.poles:
+        rows = np.abs(heights.y_m - pole.along_m) < 0.25
+        heights.z_m[np.ix_(rows, np.abs(heights.x_m - 0.3) < 0.3)] = TOP_M + 0.018
+    assert found(heights) == {"obstructed"}

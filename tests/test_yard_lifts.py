@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -417,3 +418,13 @@ def test_the_accidents_are_vetoed_with_bundles_as_they_are_found(
     sound = map_of([laid(0.3)], sigma_m=0.005)
     found = find_bundles(sound, BundleSettings())
     assert codes(judged([laid(0.3)], found, Placement(0.3, 0.0, 0.0), heights=sound)) == set()
+
+
+@pytest.mark.parametrize("damage", [{"sigma_m": None}, {"stamp_ns": [2, 1]}, {"place_m": [[0, 0]]}])
+def test_a_damaged_travel_says_nothing(damage: dict[str, Any]) -> None:
+    whole = {
+        "place_m": [[0, 0], [1, 0]], "sigma_m": [[1, 1, 1]] * 2, "off_m": [None, None], "refused_m": [],
+        "reach_m": 4.0, "stamp_ns": [1, 2],
+    }  # fmt: skip
+    assert Travel.read({"travel": whole}) is not None
+    assert Travel.read({"travel": whole | damage}) is None

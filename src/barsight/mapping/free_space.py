@@ -6,9 +6,10 @@ higher, whether or not the cell itself was seen.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, Int32, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int32, kernel
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.tiles import TileKey
 
@@ -19,6 +20,9 @@ OVER_END_M = 0.02
 """A line of sight counts from this far above the height that it ends on."""
 REACH_M = 1.5
 """It counts up to this far above its end: free space matters beside what is to be lifted."""
+LEVEL_CELLS, LEVEL_M = 5, 0.05
+"""A line of sight counts if its view sees only heights so close within a square of so many cells about its
+end: at edges, matches mix what is in front with what is behind."""
 UNPROVEN = np.float32(np.inf)
 
 
@@ -35,7 +39,9 @@ class FreeSpace:
 
     def carve(self, cells: CellObservations, eyes_m: Float64) -> None:
         """Carve what one view has seen. eyes_m: (E, 3) places of its cameras, reference frame."""
-        chosen = (cells.x % COARSE_CELLS == 0) & (cells.y % COARSE_CELLS == 0)
+        if cells.x.size == 0:
+            return
+        chosen = (cells.x % COARSE_CELLS == 0) & (cells.y % COARSE_CELLS == 0) & _level(cells)
         x, y, z = (np.ascontiguousarray(part[chosen]) for part in (cells.x, cells.y, cells.z_m))
         if x.size == 0:
             return
@@ -90,6 +96,19 @@ class FreeSpace:
         first, second = tile[0][ours], tile[1][ours]
         tile[1][ours] = np.minimum(second, np.maximum(first, new))
         tile[0][ours] = np.minimum(first, new)
+
+
+def _level(cells: CellObservations) -> Bool:
+    """Find the heights (N,) that differ little from all that the view sees about them."""
+    column, row = cells.x - cells.x.min(), cells.y - cells.y.min()
+    shape = int(row.max()) + 1, int(column.max()) + 1
+    highest, lowest = np.full(shape, -np.inf, np.float32), np.full(shape, np.inf, np.float32)
+    np.maximum.at(highest, (row, column), cells.z_m)
+    np.minimum.at(lowest, (row, column), cells.z_m)
+    about = np.ones((LEVEL_CELLS, LEVEL_CELLS), np.uint8)
+    highest, lowest = cv2.dilate(highest, about), cv2.erode(lowest, about)
+    over, under = highest[row, column] - cells.z_m, cells.z_m - lowest[row, column]
+    return np.asarray(np.maximum(over, under) < LEVEL_M)
 
 
 def _overlap(

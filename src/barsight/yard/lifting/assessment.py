@@ -11,7 +11,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.checks import count_vetoes, face_vetoes, load_vetoes
-from barsight.yard.lifting.clearance import clearance_vetoes
+from barsight.yard.lifting.clearance import clearance_vetoes, resting_vetoes
 from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
 from barsight.yard.lifting.magnet import Magnet, Tolerance
@@ -98,6 +98,7 @@ def assess_placement(
         *count_vetoes(place, yard.heights, magnet, near, contact, held, settings),
         *face_vetoes(contact, needed, magnet, settings),
         *clearance_vetoes(place, yard.heights, magnet, contact),
+        *resting_vetoes(place, magnet, contact, load),
         *load_vetoes(load, mass, along, across, overhang, magnet, settings),
         *(v for b in load for v in footing_vetoes(b, near.bundles, yard.footings, settings)),
     ]
@@ -179,6 +180,8 @@ def _tolerance(
         changed = _change(place, box, yard, magnet, near, held, needed_n, settings)
         if changed:
             return found, changed
+        for veto in clearance_vetoes(place, yard.heights, replace(magnet, tolerance=box), contact):
+            return found, veto.reason
         found = scale
     return found, ""
 

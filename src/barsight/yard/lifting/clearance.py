@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, frozen
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.contact import Contact
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.stability.stability import lookup_heights, nearest_cells
-from barsight.yard.types import HeightMap
+from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
 STEP_M = 0.01
@@ -28,6 +29,8 @@ MAX_RISE_M = 0.012
 """A patch that the map shows this much above the faces' plane obstructs, by medians over 50 mm squares."""
 MAX_NARROW_RISE_M = 0.020
 """The same for what is too narrow for those: by medians over 30 mm squares."""
+MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
+"""The same for a connected patch of so many cells that may be a single one wide, as plates on edge are."""
 MIN_PATCH_CELLS = 4
 """Cells of STEP_M of the smallest patch that counts."""
 MAX_HOLE_M = 0.08
@@ -46,8 +49,38 @@ def clearance_vetoes(place: Placement, heights: HeightMap, magnet: Magnet, conta
     rise = lookup_heights(heights, xy[..., 0], xy[..., 1]) - plane
     unseen = np.isnan(rise)
     allowed = np.where(region.faces, MAX_RISE_M, max(magnet.beam.above_faces_m / 2, MAX_RISE_M))
-    unproven = unseen & (_free_up_to(heights, xy) - plane > allowed)
-    return [*_obstructed(np.where(unseen, -np.inf, rise), region), *_unseen(unproven, region)]
+    most = _free_up_to(heights, xy) - plane
+    blocked = np.where(unseen, ~(most <= allowed), rise > allowed)
+    return _obstructed(_filled(rise, most), region) or _unseen(blocked, region)
+
+
+def _filled(rise: Float64, most: Float64) -> Float64:
+    """Fill unseen cells (V, U) with the highest seen one two cells about, up to what lines of sight allow."""
+    seen = np.maximum(np.nan_to_num(rise, nan=-1.0), -1.0)
+    highest = cv2.dilate(seen, np.ones((5, 5), np.uint8))
+    return np.where(np.isnan(rise), np.fmin(highest, most), seen)
+
+
+def resting_vetoes(
+    place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
+) -> list[Veto]:
+    """Find what lies between the faces and the load: faces that rest above its top."""
+    if not load:
+        return []
+    poles = magnet.pole_table[:, :2] @ np.stack([place.along, place.across]) + (place.x_m, place.y_m)
+    above = []
+    for bundle in load:
+        axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
+        top = bundle.top_z_m + (poles - bundle.centre_m[:2]) @ axis * math.tan(bundle.pitch_rad)
+        above.append(contact.z_m - top - UPPER * np.nan_to_num(bundle.sigma.top_z_m, nan=math.inf))
+    highest = float(np.min(above, axis=0).max())
+    if not highest > MAX_RISE_M:
+        return []
+    reason = (
+        f"a face rests at least {1e3 * highest:.0f} mm above the load's top, {1e3 * MAX_RISE_M:.0f} mm are "
+        "allowed: something lies between"
+    )
+    return [Veto("obstructed", reason)]
 
 
 def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
@@ -59,13 +92,17 @@ def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
 
 
 def _obstructed(rise: Float64, region: Region) -> list[Veto]:
-    """Report the highest connected patch over the plane. rise: (V, U), -inf where unseen."""
-    known = np.maximum(rise, -1.0).astype(np.float32)
-    for side, allowed_m in ((5, MAX_RISE_M), (3, MAX_NARROW_RISE_M)):
+    """Report the highest connected patch over the plane. rise: (V, U)."""
+    known = rise.astype(np.float32)
+    for side, allowed_m, cells in (
+        (5, MAX_RISE_M, MIN_PATCH_CELLS),
+        (3, MAX_NARROW_RISE_M, MIN_PATCH_CELLS),
+        (1, MAX_THIN_RISE_M, MIN_THIN_CELLS),
+    ):
         smooth = cv2.medianBlur(known, side)
         over = (region.faces | region.beam) & (smooth > allowed_m)
         _, patch, boxes, _ = cv2.connectedComponentsWithStats(over.astype(np.uint8), connectivity=8)
-        large = np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= MIN_PATCH_CELLS) + 1
+        large = np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= cells) + 1
         if large.size:
             highest = np.where(np.isin(patch, large), smooth, -np.inf)
             at = np.unravel_index(int(np.argmax(highest)), highest.shape)
@@ -78,8 +115,12 @@ def _obstructed(rise: Float64, region: Region) -> list[Veto]:
     return []
 
 
-def _unseen(unproven: Bool, region: Region) -> list[Veto]:
-    """Report unproven places that are wide enough to hide what stands."""
+def _unseen(blocked: Bool, region: Region) -> list[Veto]:
+    """Report places, unproven or standing, that are wide enough to hide what stands. blocked: (V, U); a few
+    cells free among them, as wrong matches are, prove nothing.
+    """
+    _, patch, boxes, _ = cv2.connectedComponentsWithStats((~blocked).astype(np.uint8), connectivity=4)
+    unproven = blocked | (boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS)[patch]
     side = round(MAX_HOLE_M / STEP_M)
     wide = cv2.morphologyEx(unproven.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
     hidden = wide & (region.faces | region.beam)

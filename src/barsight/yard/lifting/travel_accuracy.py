@@ -74,19 +74,22 @@ class Travel:
 
     @classmethod
     def read(cls, summary: dict[str, Any]) -> Travel | None:
-        """Read from result.json; None where it doesn't say."""
-        content = summary.get("travel")
-        if not isinstance(content, dict) or content.get("stamp_ns") is None:
+        """Read from result.json; None where it doesn't say, or not the same number of each."""
+        content: Any = summary.get("travel")
+        try:
+            place, sigma, off, refused = (
+                np.array(content[name], dtype=np.float64)
+                for name in ("place_m", "sigma_m", "off_m", "refused_m")
+            )
+            stamps = np.array(content["stamp_ns"], dtype=np.int64)
+            place, sigma, refused = place.reshape(-1, 2), sigma.reshape(-1, 3), refused.reshape(-1, 2)
+            reach_m = float(content["reach_m"])
+        except (KeyError, TypeError, ValueError, OverflowError):
             return None
-        arrays = {
-            name: np.array(content[name], dtype=np.float64)
-            for name in ("place_m", "sigma_m", "off_m", "refused_m")
-        }
-        return cls(
-            arrays["place_m"].reshape(-1, 2), arrays["sigma_m"].reshape(-1, 3), arrays["off_m"].ravel(),
-            arrays["refused_m"].reshape(-1, 2), float(content["reach_m"]),
-            np.array(content["stamp_ns"], dtype=np.int64),
-        )  # fmt: skip
+        whole = len({len(place), len(sigma), off.size, stamps.size}) == 1 and off.ndim == stamps.ndim == 1
+        if not whole or (np.diff(stamps) <= 0).any():
+            return None
+        return cls(place, sigma, off, refused, reach_m, stamps)
 
     def content(self) -> dict[str, Any]:
         """Convert to what result.json says; NaN is left to the writer."""
