@@ -55,7 +55,16 @@ def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **ch
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
     write_bundles(bundles, None, "yard", folder / "bundles.json")
     stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)
-    way = Travel(np.zeros((3, 2)), np.full((3, 3), 0.001), np.zeros(3), np.empty((0, 2)), 5.0, stamps)
+    way = Travel(
+        np.zeros((3, 2)),
+        np.full((3, 3), 0.001),
+        np.zeros(3),
+        np.empty((0, 2)),
+        5.0,
+        stamps,
+        np.ones(len(stamps), bool),
+        3.0,
+    )
     content = summary() | {"agreement": [], "travel": way.content()} | changes
     (folder / "result.json").write_text(json.dumps(content), encoding="utf-8")
     return folder

@@ -310,7 +310,9 @@ def travel(place_m: list[tuple[float, float]], ages_s: list[float]) -> Travel:
     stamps = np.array([NOW_NS - round(age * NS_PER_S) for age in ages_s], np.int64)
     count = len(place_m)
     sure, off = np.full((count, 3), 0.001), np.zeros(count)
-    return Travel(np.array(place_m), sure, off, np.empty((0, 2)), 5.0, stamps)
+    return Travel(
+        np.array(place_m), sure, off, np.empty((0, 2)), 5.0, stamps, np.ones(len(stamps), bool), 3.0
+    )
 
 
 def test_a_trajectory_less_sure_than_the_magnet_needs() -> None:
@@ -339,6 +341,19 @@ def test_a_place_is_as_old_as_the_last_frame_that_saw_it() -> None:
     ahead = travel([(0, 0), (0, 0)], [1.0, -60.0])
     plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), ahead, NOW_NS)
     assert codes(plan.refused[0]) == {"map-from-the-future"}
+
+
+def test_a_place_out_of_the_picture_or_not_measured_again_grows_old() -> None:
+    stock = [laid(0.3)]
+    bundles = (record(stock[0]),)
+    beside = travel([(0, 0), (3.5, 0), (3.5, 0)], [900.0, 300.0, 1.0])
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), beside, NOW_NS)
+    assert "map-too-old" in codes(plan.refused[0])
+    parked = travel([(0, 0)] * 3, [900.0, 300.0, 1.0])
+    parked = replace(parked, measured=np.array([True, False, False]))
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), parked, NOW_NS)
+    assert codes(plan.refused[0]) == {"map-too-old"}
+    assert parked.captured_ns == (NOW_NS - 900 * NS_PER_S,) * 2
 
 
 def test_an_empty_yard_and_one_without_a_free_bundle_offer_nothing() -> None:
@@ -424,7 +439,7 @@ def test_the_accidents_are_vetoed_with_bundles_as_they_are_found(
 def test_a_damaged_travel_says_nothing(damage: dict[str, Any]) -> None:
     whole = {
         "place_m": [[0, 0], [1, 0]], "sigma_m": [[1, 1, 1]] * 2, "off_m": [None, None], "refused_m": [],
-        "reach_m": 4.0, "stamp_ns": [1, 2],
+        "reach_m": 4.0, "stamp_ns": [1, 2], "measured": [True, True], "sure_reach_m": 2.0,
     }  # fmt: skip
     assert Travel.read({"travel": whole}) is not None
     assert Travel.read({"travel": whole | damage}) is None

@@ -30,7 +30,7 @@ def travel(
         frames.append(PosedFrame(int(STAMPS[k]), pose, covariance))
     gone = tuple(RefusedFrame(int(STAMPS[k]), "blurred") for k in refused)
     trajectory = Trajectory("yard", tuple(frames), gone, ("crane", "stereo"))
-    return Travel.of(trajectory, encoders, 0, int(0.35e9), RANGE_M, CAMERA)  # type: ignore[arg-type]
+    return Travel.of(trajectory, encoders, 0, int(0.35e9), RANGE_M, CAMERA, STAMPS.tolist())  # type: ignore[arg-type]
 
 
 def encoders(

@@ -89,11 +89,14 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class BuiltMap:
-    """All views' votes. placed: reference_from_rect0 of the views used. preview: of a view in the middle."""
+    """All views' votes. placed: reference_from_rect0 of the views used, stamps_ns theirs. preview: of a view
+    in the middle.
+    """
 
     store: TileStore
     free: FreeSpace
     placed: tuple[Pose, ...]
+    stamps_ns: tuple[int, ...]
     refusals: tuple[Refusal, ...]
     preview: Preview | None
 
@@ -168,6 +171,7 @@ def build_map(
     store, free = TileStore(scratch, settings.map.resident_tiles), FreeSpace(probed.cell_m)
     preview = None
     placed: list[Pose] = []
+    stamps: list[int] = []
     for done, (frame, posed, neighbours) in enumerate(_placed(way.matched, way.poses), start=1):
         view = frame if isinstance(frame, Refusal) else placer(frame, posed, neighbours)
         if isinstance(view, Failed):
@@ -178,6 +182,7 @@ def build_map(
             with watch("fuse", 1):
                 fuse_view(store, view.cells, settings.map)
             placed.append(posed.reference_from_body @ body_from_rect0)
+            stamps.append(posed.stamp_ns)
             with watch("free space", 1):
                 free.carve(view.cells, ViewFrusta.of([placed[-1]], camera).eyes[0])
             if preview is None or abs(done - len(way.poses) / 2) < 1:
@@ -187,7 +192,7 @@ def build_map(
         advance("map", done, len(way.poses))
     if not placed:
         raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
-    return BuiltMap(store, free, tuple(placed), tuple(refusals), preview)
+    return BuiltMap(store, free, tuple(placed), tuple(stamps), tuple(refusals), preview)
 
 
 def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:

@@ -81,7 +81,7 @@ def measure(
     if expected is not None:
         warnings += [Notice("stock-list", text) for text in stock_warnings(expected, stock)]
     with watch("lifts"):
-        travel = _travel(probed, way, settings)
+        travel = _travel(probed, way, built, settings)
         lifts = _lifts(heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at)
     source = probed.source
     return Measurement(
@@ -159,11 +159,11 @@ def _compare_with_laser(
 
 def _warnings(probed: ProbedRecording, way: Way, built: BuiltMap, profiles: Profiles) -> list[Notice]:
     """Gather what every stage had to assume or leave out."""
-    told = (
-        ("assumed", probed.source.notes), ("imu", probed.imu_hints), ("calibration", probed.first.warnings),
-        ("calibration-drift", way.drift_warnings), ("trajectory", way.trajectory.warnings),
-    )  # fmt: skip
-    warnings = [Notice(code, text) for code, texts in told for text in texts]
+    warnings = [Notice("assumed", text) for text in probed.source.notes]
+    warnings += [Notice("imu", text) for text in probed.imu_hints]
+    warnings += [Notice("calibration", text) for text in probed.first.warnings]
+    warnings += [Notice("calibration-drift", text) for text in way.drift_warnings]
+    warnings += [Notice("trajectory", text) for text in way.trajectory.warnings]
     warnings += [Notice(a.code, a.reason) for a in profiles.agreed if isinstance(a, Failed)]
     if profiles.left_out:
         reason = "without a crane the map isn't in the laser's yard: no agreement"
@@ -180,12 +180,13 @@ def _frames_total(probed: ProbedRecording) -> int:
     return len(probed.source.index.stamps_ns) + len(probed.source.index.unpaired)
 
 
-def _travel(probed: ProbedRecording, way: Way, settings: MeasureSettings) -> Travel:
+def _travel(probed: ProbedRecording, way: Way, built: BuiltMap, settings: MeasureSettings) -> Travel:
     """Tell how sure the frames' way is, and how far off the encoders."""
     source = probed.source
     shift_ns, window_ns = source.rig.timeshift_cam_imu_ns, seconds_to_ns(settings.motion.crane.window_s)
     camera = way.rectifier.camera
-    return Travel.of(way.trajectory, source.crane(), shift_ns, window_ns, probed.first.range_m, camera)
+    range_m = probed.first.range_m
+    return Travel.of(way.trajectory, source.crane(), shift_ns, window_ns, range_m, camera, built.stamps_ns)
 
 
 def _lifts(
@@ -194,7 +195,7 @@ def _lifts(
 ) -> LiftPlan:  # fmt: skip
     """Choose lifts, judged now or at the last frame."""
     told = [(notice.code, notice.message) for notice in warnings]
-    captured_to_ns = int(trajectory.stamp_ns[-1])
+    captured_to_ns = int(travel.stamp_ns[travel.measured][-1])
     now_ns = time.time_ns() if judged_at == "now" else captured_to_ns
     forbidden = map_vetoes(
         told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=magnet is not None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -102,6 +103,13 @@ class Yard:
         """Return the lifts, and what forbids them."""
         content = read_lifts(self.folder / "lifts.json")
         offered, refused = (tuple(map(_target, content[name])) for name in ("lifts", "refused"))
+        if not content.get("looks_back"):
+            now_ns = time.time_ns()
+            fresh = tuple(lift for lift in offered if (lift.valid_until_ns or 0) >= now_ns)
+            aged = (lift for lift in offered if lift not in fresh)
+            late = (("map-too-old", "the lift was valid once, it isn't any more"),)
+            refused += tuple(replace(lift, rank=None, vetoes=(*lift.vetoes, *late)) for lift in aged)
+            offered = fresh
         return Lifts(offered, refused, _vetoes(content))
 
     @property

@@ -237,15 +237,15 @@ def write_summary(content: dict[str, Any], target: Path) -> None:
 def summary(measurement: Measurement) -> dict[str, Any]:
     """Build the content of result.json; rounded for people, NaN as null."""
     trajectory, surface = measurement.trajectory, measurement.surface
-    stamps = trajectory.stamp_ns
+    stamps, captured = trajectory.stamp_ns, measurement.travel.captured_ns
     rows, columns = surface.shape
     cell = surface.cell_m
     content = {
         "schema_version": SCHEMA_VERSION,
         "software": {"name": "barsight", "version": barsight.__version__},
         "measured_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "captured_from_ns": int(stamps[0]),
-        "captured_to_ns": int(stamps[-1]),
+        "captured_from_ns": captured[0] if captured else None,
+        "captured_to_ns": captured[1] if captured else None,
         "is_simulated": measurement.is_simulated,
         "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
         "reference": trajectory.reference,

@@ -59,6 +59,7 @@ def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
             "captured_from_ns": plan.captured_ns[0] if plan.captured_ns else None,
             "captured_to_ns": plan.captured_ns[1] if plan.captured_ns else None,
             "judged_at_ns": plan.judged_at_ns,
+            "looks_back": plan.looks_back,
             "rule": RULE,
             "magnet": asdict(plan.magnet),
             "settings": asdict(plan.settings),

@@ -60,6 +60,11 @@ class LiftPlan:
     judged_at_ns: int
     captured_ns: tuple[int, int] | None
 
+    @property
+    def looks_back(self) -> bool:
+        """Whether the lifts were judged at the last frame, not at a clock's time: never for a crane."""
+        return self.captured_ns is not None and self.judged_at_ns == self.captured_ns[1]
+
 
 def map_vetoes(
     warnings: Iterable[tuple[str, str]], reference: str, captured_to_ns: int | None, now_ns: int,

@@ -4,13 +4,14 @@ lift there.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import interp1d
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.pose import skew
 from barsight.core.types import CraneSamples, RectifiedCamera, Trajectory
@@ -34,7 +35,8 @@ class Travel:
     place_m: (N, 2) the body, x and y. sigma_m: (N, 3) of the ground below it in x, y, z. off_m: (N,) by how
     much the encoders are off the trajectory, NaN where there are none; what a constant latency explains is
     taken off. refused_m: (R, 2) where the refused frames must have been. reach_m: how far from the body a
-    frame sees. stamp_ns: (N,) of the frames, rising.
+    frame may see. stamp_ns: (N,) of the frames, rising. measured: (N,) whether a frame's heights are in the
+    map. sure_reach_m: what is nearer to the body than this is in the picture.
     """
 
     place_m: Float64
@@ -43,20 +45,23 @@ class Travel:
     refused_m: Float64
     reach_m: float
     stamp_ns: Int64
+    measured: Bool
+    sure_reach_m: float
 
     @property
     def captured_ns(self) -> tuple[int, int] | None:
-        """Stamps of the first and the last placed frame; None without any."""
-        return (int(self.stamp_ns[0]), int(self.stamp_ns[-1])) if self.stamp_ns.size else None
+        """Stamps of the first and the last measured frame; None without any."""
+        stamps = self.stamp_ns[self.measured]
+        return (int(stamps[0]), int(stamps[-1])) if stamps.size else None
 
     @classmethod
     def of(
         cls, trajectory: Trajectory, crane: CraneSamples | None, shift_ns: int, window_ns: int,
-        range_m: float, camera: RectifiedCamera,
+        range_m: float, camera: RectifiedCamera, measured_ns: Collection[int],
     ) -> Travel:  # fmt: skip
         """Build from a trajectory. shift_ns: from the camera's clock to the encoders'. window_ns: of readings
         that make one place.
-        range_m: the surface's depth below the body.
+        range_m: the surface's depth below the body. measured_ns: stamps of the frames in the map.
         """
         stamps, places = trajectory.stamp_ns, trajectory.positions_m
         lever = np.array([0.0, 0.0, -range_m])
@@ -70,6 +75,8 @@ class Travel:
             _places_at(refused, stamps, places),
             range_m * float(np.hypot(camera.width, camera.height)) / 2 / camera.focal_px,
             stamps,
+            np.isin(stamps, list(measured_ns)),
+            range_m * min(camera.width, camera.height) / 2 / camera.focal_px,
         )  # fmt: skip
 
     @classmethod
@@ -83,13 +90,17 @@ class Travel:
             )
             stamps = np.array(content["stamp_ns"], dtype=np.int64)
             place, sigma, refused = place.reshape(-1, 2), sigma.reshape(-1, 3), refused.reshape(-1, 2)
-            reach_m = float(content["reach_m"])
+            measured = np.array(content["measured"], dtype=np.bool_)
+            reach_m, sure_reach_m = float(content["reach_m"]), float(content["sure_reach_m"])
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
-        whole = len({len(place), len(sigma), off.size, stamps.size}) == 1 and off.ndim == stamps.ndim == 1
+        whole = (
+            len({len(place), len(sigma), off.size, stamps.size, measured.size}) == 1
+            and off.ndim == stamps.ndim == 1
+        )
         if not whole or (np.diff(stamps) <= 0).any():
             return None
-        return cls(place, sigma, off, refused, reach_m, stamps)
+        return cls(place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m)
 
     def content(self) -> dict[str, Any]:
         """Convert to what result.json says; NaN is left to the writer."""

@@ -26,7 +26,8 @@ class Validity:
 
 def validity(travel: Travel, place: Placement, settings: LiftSettings) -> Validity | None:
     """Find the validity of a place: from the last frame that saw it, for `max_age_s`. None if none did."""
-    near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.reach_m
+    near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.sure_reach_m
+    near &= travel.measured
     if not near.any():
         return None
     seen_ns = int(travel.stamp_ns[near].max())
