@@ -62,7 +62,7 @@ class LiftPlan:
 
     @property
     def looks_back(self) -> bool:
-        """Whether the lifts were judged at the last frame, not at a clock's time: never for a crane."""
+        """Tell lifts judged as of the last frame, to look back, from those for a crane."""
         return self.captured_ns is not None and self.judged_at_ns == self.captured_ns[1]
 
 
