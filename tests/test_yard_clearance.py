@@ -10,7 +10,7 @@ import pytest
 from barsight.core.types import HeightSource
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.types import HeightMap
-from lift_yards import MAGNET, codes, judged, laid, map_of, record
+from lift_yards import MAGNET, SIGMA, codes, judged, laid, map_of, record
 
 TOP_M = laid(0.3).top_z_m
 
@@ -126,3 +126,5 @@ def test_faces_must_rest_on_the_load_itself() -> None:
         rows = np.abs(heights.y_m - pole.along_m) < 0.25
         heights.z_m[np.ix_(rows, np.abs(heights.x_m - 0.3) < 0.3)] = TOP_M + 0.018
     assert found(heights) == {"obstructed"}
+    unsure = record(laid(0.3), sigma=replace(SIGMA, top_z_m=float("nan")))
+    assert "obstructed" in codes(judged([laid(0.3)], (unsure,), Placement(0.3, 0.0, 0.0), heights=heights))

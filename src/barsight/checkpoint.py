@@ -52,7 +52,7 @@ _KEPT: dict[str, Any] = {
     )
 }
 _TORN = (OSError, EOFError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile)
-"""What reading raises on a file that is cut short or is something else."""
+"""Exceptions of reading a file that is cut short or is something else."""
 
 
 def checkpoint_folder(root: Path, key: str) -> Path:

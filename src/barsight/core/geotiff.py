@@ -24,7 +24,7 @@ _READ_BYTES = 1 << 22
 _TORN = (
     tifffile.TiffFileError, zlib.error, struct.error, OSError, ValueError, KeyError, IndexError, RuntimeError,
 )  # fmt: skip
-"""What tifffile raises on a file that is cut short or is something else."""
+"""Exceptions of tifffile on a file that is cut short or is something else."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
 MIN_PATCH_CELLS = 4
 """Cells of STEP_M of the smallest patch that counts."""
 MAX_HOLE_M = 0.08
-"""An unseen place narrower than this, with its rim seen below the plane, hides nothing that stands."""
+"""An unseen place narrower than this is taken to hide nothing that stands."""
 
 
 def clearance_vetoes(place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact) -> list[Veto]:
@@ -72,7 +72,7 @@ def resting_vetoes(
     for bundle in load:
         axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
         top = bundle.top_z_m + (poles - bundle.centre_m[:2]) @ axis * math.tan(bundle.pitch_rad)
-        above.append(contact.z_m - top - UPPER * np.nan_to_num(bundle.sigma.top_z_m, nan=math.inf))
+        above.append(contact.z_m - top - UPPER * np.nan_to_num(bundle.sigma.top_z_m))
     highest = float(np.min(above, axis=0).max())
     if not highest > MAX_RISE_M:
         return []
