@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
+from barsight.core.types import (
+    CraneSamples,
+    ImuSamples,
+    LaserProfile,
+    RectifiedCamera,
+    RectifiedPair,
+    RefusedFrame,
+    StereoFrame,
+)
+from barsight.motion import estimator
+from barsight.motion.frontend.tracking import Sighting
 from barsight.recording.base import FrameIndex
 
 BODY_FROM_CAM0 = Pose("body", "cam0", np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([0.2, -0.1, 0.3]))
@@ -60,3 +72,21 @@ class MemoryRecording:
 
     def digests(self) -> dict[str, str]:
         return {}
+
+
+def tell_sightings(patch: pytest.MonkeyPatch, room: Any, seen: Iterable[Sighting | RefusedFrame]) -> None:
+    """Let the estimator of `room` track what is told, frame by frame, whatever the pictures show."""
+    told = {one.stamp_ns: one for one in seen}
+    dark, seen_of_all = np.zeros((1, 1), np.uint8), np.ones((1, 1), np.bool_)
+    camera = RectifiedCamera(1, 0, 0, 1, 0, 1, 1)
+
+    class Told:
+        def __init__(self, *_: Any) -> None:
+            pass
+
+        def push(self, pair: RectifiedPair) -> Sighting | RefusedFrame:
+            return told[pair.stamp_ns]
+
+    patch.setattr(room, "Tracker", Told)
+    pairs = [RectifiedPair(stamp, dark, dark, seen_of_all, seen_of_all, camera) for stamp in told]
+    patch.setattr(estimator, "_frames", lambda *_: iter(pairs))

@@ -15,7 +15,7 @@ FLOORS = {
     "mapping": 4,
     "yard": 5,
     "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "simulation": 6, "board_views": 6,
-    "measure_settings": 6, "map_building": 6.5,
+    "measure_settings": 6, "map_building": 6.5, "live_map": 6.7,
     "report": 7, "pipeline": 7, "benchmarks": 7, "plant": 7, "viewer": 7,
     "result": 8, "pair_matching": 8, "measure_folder": 8,
     "api": 9, "session": 9,

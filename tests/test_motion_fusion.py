@@ -24,7 +24,7 @@ from barsight.recording.open import open_recording
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
 from barsight.simulation.settings import CameraSettings, SensorSettings, TravelSettings
 from barsight.simulation.trajectory import SimulatedTrajectory
-from motion_recordings import MemoryRecording, ideal_rig
+from motion_recordings import MemoryRecording, ideal_rig, tell_sightings
 
 SIGMA_PX = 0.1
 LEVER = np.array([0.35, -0.2, -0.55])
@@ -84,7 +84,7 @@ def simulated(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTr
 def fused(
     recording: Recording, monkeypatch: pytest.MonkeyPatch, sightings: tuple[Sighting, ...]
 ) -> Trajectory:
-    monkeypatch.setattr(fusion, "track_recording", lambda *_: (sightings, ()))
+    tell_sightings(monkeypatch, fusion, sightings)
     return BatchFusion(FusionSettings(), CraneSettings())(recording, Rectifier(recording.rig), lambda: None)
 
 

@@ -23,7 +23,7 @@ from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.recording.open import open_recording
-from motion_recordings import MemoryRecording, ideal_rig
+from motion_recordings import MemoryRecording, ideal_rig, tell_sightings
 from simulated_ways import steady
 from test_motion_fusion import simulated
 
@@ -45,10 +45,7 @@ def off_in_sigmas(found: Trajectory, batch: Trajectory) -> float:
 def estimated(
     name: str, use: str, recording: Recording, seen: tuple, patch: pytest.MonkeyPatch
 ) -> Trajectory:
-    patch.setattr(
-        fusion, "track_recording", lambda *_: (tuple(s for s in seen if not isinstance(s, RefusedFrame)), ())
-    )
-    patch.setattr(live, "track_incrementally", lambda *_: iter(seen))
+    tell_sightings(patch, {"fused": fusion, "live": live}[name], seen)
     return ESTIMATORS[name](use)(recording, Rectifier(recording.rig), lambda: None)
 
 

@@ -23,7 +23,7 @@ from barsight.motion.rig_check.self_calibration import (
     self_calibrate,
     turn_right_camera,
 )
-from motion_recordings import MemoryRecording, ideal_rig
+from motion_recordings import MemoryRecording, ideal_rig, tell_sightings
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 RIG = ideal_rig(1280, 1024)
@@ -73,7 +73,7 @@ def travel(seed: int, yaw_rad: float, scale: float, bias_px: float) -> tuple[Mem
 
 
 def drift_of(recording: MemoryRecording, sightings: list[Sighting], patch: pytest.MonkeyPatch) -> RigDrift:
-    patch.setattr(fusion, "track_recording", lambda *_: (tuple(sightings), ()))
+    tell_sightings(patch, fusion, sightings)
     estimator = BatchFusion(FusionSettings(), CraneSettings())
     found = estimator(recording, Rectifier(RIG), lambda: None).drift
     assert found is not None

@@ -18,7 +18,7 @@ from barsight.core.memory import trim_heap
 from barsight.core.parallel import prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch, count_frames
-from barsight.core.types import PosedFrame, RefusedFrame, StereoFrame, Trajectory
+from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.scene_extent import (
@@ -37,6 +37,7 @@ from barsight.measurement import Preview, Refusal, json_digest, to_json
 from barsight.motion.rig_check.self_calibration import self_calibrate
 from barsight.motion.settings import make_estimator
 from barsight.recording.base import Recording
+from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_samples import imu_hints
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.settings import StereoSettings, make_method
@@ -57,7 +58,7 @@ class ProbedRecording:
     """
 
     source: Recording
-    rectifier: Rectifier
+    pairs: RectifiedPairs
     first: RecordingProbe
     cell_m: float
     calibration_px: float
@@ -101,54 +102,60 @@ class BuiltMap:
     preview: Preview | None
 
 
-def probe(recording: Recording, settings: MeasureSettings, resume: Path | None) -> ProbedRecording:
+def probe(
+    recording: Recording, settings: MeasureSettings, scratch: Path, resume: Path | None
+) -> ProbedRecording:
     """Look at a recording: how far the scene is, how large the cells, how sure the calibration."""
     source, watch = SelectedSensors(recording, settings.use), Stopwatch()
-    with watch("look"):
-        rectifier = Rectifier(source.rig)
-        first = probe_recording(source, rectifier)
-        imu = source.imu()
-        hints = imu_hints(imu) if imu is not None else ()
-        cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
-    known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
     configuration, inputs = to_json(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
         kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
+    with watch("look"):
+        pairs = RectifiedPairs(source, Rectifier(source.rig), kept or scratch, watch)
+        first = probe_recording(pairs)
+        imu = source.imu()
+        hints = imu_hints(imu) if imu is not None else ()
+        cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
+    known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
     calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
     return ProbedRecording(
-        source, rectifier, first, cell_m, calibration_px, tuple(hints), configuration, inputs, kept, watch
+        source, pairs, first, cell_m, calibration_px, tuple(hints), configuration, inputs, kept, watch
     )
 
 
 @contextmanager
 def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance) -> Iterator[Way]:
     """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
-    source, rectifier, watch = probed.source, probed.rectifier, probed.watch
-    total = len(source.index.stamps_ns)
-    matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), rectifier, watch)
+    source, pairs, watch = probed.source, probed.pairs, probed.watch
+    rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
+    matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), watch)
+    match = matching(matcher, probed.kept)
     early = _known_early(source, settings, rectifier, probed.first.range_m)
-    begun = islice(source.frames(early), len(early))
+    begun = islice(pairs(early), len(early))
     with ExitStack() as pools:
-        ahead = pools.enter_context(prefetched_map(matching(matcher, probed.kept), begun, _MATCHED_AHEAD))
+        ahead = pools.enter_context(prefetched_map(match, begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = count_frames("trajectory", total, advance)
-            trajectory = checkpointed(probed.kept, "trajectory", lambda: estimate(source, rectifier, count))
+            trajectory = checkpointed(
+                probed.kept, "trajectory", lambda: estimate(source, rectifier, count, pairs)
+            )
             trim_heap()
             calibrated = self_calibrate(
                 source.rig, rectifier, trajectory.drift, probed.calibration_px,
                 correct=settings.self_calibrate == "yaw",
             )  # fmt: skip
-        rectifier = calibrated.rectifier
+        if calibrated.rectifier is not rectifier:
+            rectifier = calibrated.rectifier
+            pairs = RectifiedPairs(source, rectifier, watch=watch)
         stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
         taken = select_keyframes(trajectory.frames, rectifier, probed.first.range_m, settings.map.min_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
         late = min((stamp for stamp in poses if stamp not in early), default=None)
         matched: Iterator[MatchedFrame | Refusal] = ahead
         if late is not None:
-            rest = source.frames({stamp for stamp in poses if stamp >= late})
-            match = matching(replace(matcher, rectifier=rectifier), probed.kept)
+            rest = pairs({stamp for stamp in poses if stamp >= late})
             after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
         yield Way(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
@@ -223,16 +230,13 @@ def _known_early(
 
 def matching(
     matcher: Matcher, kept: Path | None
-) -> Callable[[StereoFrame | RefusedFrame], MatchedFrame | Refusal]:
-    """Match frames, each once for all runs that keep checkpoints in `kept`."""
+) -> Callable[[RectifiedPair | RefusedFrame], MatchedFrame | Refusal]:
+    """Match pairs, each once for all runs that keep checkpoints in `kept`."""
 
-    def match(frame: StereoFrame | RefusedFrame) -> MatchedFrame | Refusal:
-        if isinstance(frame, RefusedFrame):
-            return Refusal("recording", frame)
-        matched = checkpointed(kept, f"matched_{frame.stamp_ns}", lambda: matcher(frame))
-        if isinstance(matched, Failed):
-            return Refusal("stereo", RefusedFrame(frame.stamp_ns, matched.reason))
-        return matched
+    def match(pair: RectifiedPair | RefusedFrame) -> MatchedFrame | Refusal:
+        if isinstance(pair, RefusedFrame):
+            return Refusal("recording", pair)
+        return checkpointed(kept, f"matched_{pair.stamp_ns}", lambda: matcher(pair))
 
     return match
 

@@ -8,10 +8,11 @@ from typing import Any, Literal
 
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
+from barsight.core.parallel import in_background
 from barsight.evaluation.score import score_folder
 from barsight.map_building import Advance
 from barsight.measure_settings import MeasureSettings
-from barsight.pipeline import measure
+from barsight.pipeline import find_lifts, map_yard
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report
@@ -40,7 +41,7 @@ def measure_into(
 
     resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
     truth_of: a recording with truth to score against; only after the measuring is done. judged_at: when
-    lifts are judged, see `barsight.pipeline.measure`.
+    lifts are judged, see `barsight.pipeline.find_lifts`.
     """
     if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
@@ -72,10 +73,9 @@ def write_measured(
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
-        measured = measure(
-            recording, settings, scratch, advance, keep, described,
-            lambda surface, free: write_surface(surface, free, staging), judged_at,
-        )  # fmt: skip
+        mapped = map_yard(recording, settings, scratch, advance, keep)
+        with in_background(lambda: write_surface(mapped.surface, mapped.built.free, staging)):
+            measured = find_lifts(mapped, described, judged_at)
         content = summary(measured)
         write_results(measured, staging)
         shutil.rmtree(scratch)

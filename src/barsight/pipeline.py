@@ -8,7 +8,6 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,12 +16,10 @@ import numpy as np
 
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.memory import peak_memory_mib, trim_heap
-from barsight.core.parallel import in_background
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import Agreement, Contour, LaserProfile, Trajectory
 from barsight.map_building import Advance, BuiltMap, ProbedRecording, Way, build_map, follow, probe
 from barsight.mapping.agreement import compute_agreement
-from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.surface.contours import cut_contours
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
@@ -31,7 +28,7 @@ from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Measurement, Notice, StageTime, json_digest, to_json
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.inventory.stock_list import match_stock, read_stock, stock_warnings
+from barsight.yard.inventory.stock_list import ListedBundle, match_stock, read_stock, stock_warnings
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.magnet import Magnet, load_magnet
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
@@ -40,46 +37,73 @@ from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
 
 
-def measure(
-    recording: Recording,
-    settings: MeasureSettings,
-    scratch: Path,
-    advance: Advance,
-    resume: Path | None = None,
-    magnet: Magnet | None = None,
-    write: Callable[[Surface, FreeSpace], None] = lambda _surface, _free: None,
-    judged_at: Literal["now", "end"] = "now",
-) -> Measurement:
-    """Measure a recording. `scratch` is an empty folder for the map's tiles; the caller removes it.
+@dataclass(frozen=True, eq=False)
+class Profiles:
+    """Contours, the laser's profiles in the map's frame, their agreement or why there is none."""
 
-    resume: a folder that keeps the trajectory and each frame's disparity (about 16 MB for 1.3 megapixels), so
+    contours: tuple[Contour, ...]
+    laser: tuple[LaserProfile, ...]
+    agreed: tuple[Agreement | Failed, ...]
+    left_out: bool
+
+
+@dataclass(frozen=True, eq=False)
+class MappedYard:
+    """The first half's results: trajectory, map and contours. began_s: the clock when it was begun."""
+
+    settings: MeasureSettings
+    probed: ProbedRecording
+    way: Way
+    built: BuiltMap
+    surface: Surface
+    profiles: Profiles
+    stock: tuple[ListedBundle, ...] | None
+    began_s: float
+
+
+def map_yard(
+    recording: Recording, settings: MeasureSettings, scratch: Path, advance: Advance,
+    resume: Path | None = None,
+) -> MappedYard:  # fmt: skip
+    """Measure the surface. `scratch` is an empty folder for tiles and pictures; the caller removes it.
+
+    resume: a folder that keeps the trajectory and each frame's disparity (about 19 MB for 1.3 megapixels), so
     that a killed run goes on where it was; the caller removes it when all is written.
-    magnet: what lifts are chosen for; where there is none, they are judged for the package's example and
-    all forbidden (`no-magnet`).
-    write: given surface and free space as soon as they are finished, beside the search for bundles.
-    judged_at: when lifts are judged: now, or at the recording's last frame, to look back.
 
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
     """
-    began, settings = time.perf_counter(), settings.chosen()
-    expected = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
-    probed = probe(recording, settings, resume)
+    began_s, settings = time.perf_counter(), settings.chosen()
+    stock = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
+    probed = probe(recording, settings, scratch, resume)
     with follow(probed, settings, advance) as way:
         built = build_map(probed, way, settings, scratch, advance)
-    watch, trajectory = probed.watch, way.trajectory
-    with watch("surface"):
+    with probed.watch("surface"):
         surface = _elect(probed, way, built, settings, scratch)
-    with watch("contours"):
-        profiles = _compare_with_laser(probed, trajectory, surface, settings)
-    with watch("bundles"), in_background(lambda: write(surface, built.free)):
+    with probed.watch("contours"):
+        profiles = _compare_with_laser(probed, way.trajectory, surface, settings)
+    return MappedYard(settings, probed, way, built, surface, profiles, stock, began_s)
+
+
+def find_lifts(
+    mapped: MappedYard, magnet: Magnet | None = None, judged_at: Literal["now", "end"] = "now"
+) -> Measurement:
+    """Find the bundles of a mapped yard and choose lifts.
+
+    magnet: what lifts are chosen for; where there is none, they are judged for the package's example and all
+    forbidden (`no-magnet`). judged_at: when lifts are judged: now, or at the recording's last frame, to look
+    back.
+    """
+    settings, probed, way, built = mapped.settings, mapped.probed, mapped.way, mapped.built
+    watch, trajectory, surface, profiles = probed.watch, way.trajectory, mapped.surface, mapped.profiles
+    with watch("bundles"):
         heights = surface_map(surface, built.free)
         bundles = find_bundles(heights, settings.bundles)
-        placed_in_yard = expected is not None and trajectory.reference == "yard"
-        stock = match_stock(expected, bundles) if placed_in_yard and expected is not None else None
+        placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
+        stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None
     warnings = _warnings(probed, way, built, profiles)
-    if expected is not None:
-        warnings += [Notice("stock-list", text) for text in stock_warnings(expected, stock)]
+    if mapped.stock is not None:
+        warnings += [Notice("stock-list", text) for text in stock_warnings(mapped.stock, stock)]
     with watch("lifts"):
         travel = _travel(probed, way, built, settings)
         lifts = _lifts(heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at)
@@ -103,7 +127,7 @@ def measure(
         agreements=tuple(a for a in profiles.agreed if isinstance(a, Agreement)),
         stages=tuple(StageTime(*entry) for entry in watch.entries()),
         warnings=tuple(warnings),
-        seconds=time.perf_counter() - began,
+        seconds=time.perf_counter() - mapped.began_s,
         peak_memory_mib=peak_memory_mib(),
         preview=built.preview,
         bundles=bundles,
@@ -111,16 +135,6 @@ def measure(
         stock=stock,
         travel=travel,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Profiles:
-    """Contours, the laser's profiles in the map's frame, their agreement or why there is none."""
-
-    contours: tuple[Contour, ...]
-    laser: tuple[LaserProfile, ...]
-    agreed: tuple[Agreement | Failed, ...]
-    left_out: bool
 
 
 def _elect(

@@ -16,10 +16,9 @@ from barsight.core.types import (
     DisparityRange,
     PosedFrame,
     RectifiedCamera,
-    RectifiedPair,
     RefusedFrame,
 )
-from barsight.recording.base import Recording
+from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.stereo.search_range import find_disparity_range
 from barsight.stereo.vertical_offset import MAX_OFFSET_PX, vertical_offset
 
@@ -51,40 +50,34 @@ class RecordingProbe:
         )
 
 
-def probe_recording(source: Recording, rectifier: Rectifier) -> RecordingProbe:
-    """Match the first usable frame.
+def probe_recording(pairs: RectifiedPairs) -> RecordingProbe:
+    """Match the first usable pair.
 
     Raises InputError where left and right are swapped, MeasurementError where no frame can be used.
     """
     reasons: list[str] = []
-    swapped = 0
-    for frame in source.frames():
-        if isinstance(frame, RefusedFrame):
-            reasons.append(frame.reason)
+    swapped, path = 0, pairs.recording.path
+    for pair in pairs():
+        if isinstance(pair, RefusedFrame):
+            reasons.append(pair.reason)
             continue
-        pair = rectifier(frame)
-        found = pair if isinstance(pair, Failed) else find_disparity_range(pair)
-        if isinstance(pair, RectifiedPair) and isinstance(found, DisparityRange):
-            camera = rectifier.camera
+        found = find_disparity_range(pair)
+        if isinstance(found, DisparityRange):
+            camera = pair.camera
             middle = (found.lowest_px + found.highest_px) / 2 + camera.doffs_px
             offset = vertical_offset(pair.left, pair.right)
             off_rows = math.nan if isinstance(offset, Failed) else offset
             pixel_m = camera.baseline_m / max(middle, 1.0)
             return RecordingProbe(found, pixel_m, off_rows, camera.focal_px * pixel_m)
-        assert isinstance(found, Failed)
         reasons.append(found.reason)
         swapped += found.code == "swapped"
         if swapped >= 2:
             break
     if swapped:
-        raise InputError(
-            source.path, reasons[-1], "exchange the folders or topics of cam0 (left) and cam1 (right)"
-        )
+        raise InputError(path, reasons[-1], "exchange the folders or topics of cam0 (left) and cam1 (right)")
     if not reasons:
-        raise InputError(source.path, "no stereo pair at all", "check the cameras' time stamps")
-    raise MeasurementError(
-        f"{source.path}: none of the {len(reasons)} frames can be used; first: {reasons[0]}"
-    )
+        raise InputError(path, "no stereo pair at all", "check the cameras' time stamps")
+    raise MeasurementError(f"{path}: none of the {len(reasons)} frames can be used; first: {reasons[0]}")
 
 
 def choose_cell_size(first: RecordingProbe, *, has_crane: bool) -> float:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
-from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair, StereoFrame
+from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair
 from barsight.mapping.ego_mask import mask_carried
 from barsight.mapping.observation import CellObservations, bin_points
 from barsight.stereo.masking import mask_disparity, mask_gaps, mask_unsure
@@ -50,20 +49,15 @@ Neighbour = tuple[MatchedFrame, PosedFrame]
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """Rectify and match a frame: without state, so that frames run side by side."""
+    """Match a rectified pair: without state, so that pairs run side by side."""
 
     stereo: StereoSettings
     method: StereoMethod
-    rectifier: Rectifier
     watch: Stopwatch
 
-    def __call__(self, frame: StereoFrame) -> MatchedFrame | Failed:
-        """Rectify and match. Failed where the images have the wrong size; the disparity Failed where they are
-        swapped or have no texture.
-        """
-        with self.watch("rectify", 1):
-            pair = self.rectifier(frame)
-        return pair if isinstance(pair, Failed) else MatchedFrame(pair, self._disparity(pair))
+    def __call__(self, pair: RectifiedPair) -> MatchedFrame:
+        """Match; the disparity is Failed where the pictures are swapped or have no texture."""
+        return MatchedFrame(pair, self._disparity(pair))
 
     def _disparity(self, pair: RectifiedPair) -> Disparity | Failed:
         candidates = disparity_range(pair, self.stereo)

@@ -1,21 +1,81 @@
-"""Define the protocol of every trajectory estimator."""
+"""Define the protocol of every pose estimator, and run one over a finished recording."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from typing import ClassVar, Protocol
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.types import Trajectory
+from barsight.core.parallel import prefetch
+from barsight.core.types import NamedPoints, PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.recording.base import Recording
+from barsight.recording.formats.board_corners import CornerRecording
+from barsight.recording.rectified_pairs import RectifiedPairs
+
+Seen = RectifiedPair | NamedPoints | RefusedFrame
+"""A frame as an estimator takes it: its pictures, its named points, or only its stamp."""
+
+UNPLACED = "no sensor places it"
+"""Reason of a frame whose picture isn't read, where nothing else places it."""
 
 
-class TrajectoryEstimator(Protocol):
-    """Protocol: estimate the body's pose at every frame of a recording."""
+class PoseEstimator(Protocol):
+    """Protocol: estimate the body's pose frame by frame; estimators differ in when a pose is final.
 
-    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Estimate; `advance` is called once a frame.
+    reads_pictures: whether `push` wants the pictures; else frames come as `UNPLACED`.
+    delay_ns: the readings that a frame needs come this much later than itself; None where it needs all.
+    """
 
-        Frames that can't be placed are refused with a reason.
+    @property
+    def reads_pictures(self) -> bool: ...
+
+    @property
+    def delay_ns(self) -> int | None: ...
+
+    def push(self, seen: Seen) -> PosedFrame | RefusedFrame | None:
+        """Take the next frame in time's order; return its final pose or why it has none, None where only
+        `finish` can tell.
         """
         ...
+
+    def finish(self) -> Trajectory:
+        """Return all frames' poses. Raises MeasurementError where nothing places the body."""
+        ...
+
+
+class TrajectoryEstimator(ABC):
+    """Settings of an estimator; `begin` makes one for a recording.
+
+    begins_early: whether each pose depends on no reading beyond the estimator's `delay_ns`, so that a
+    recording that still grows ends with the same poses.
+    """
+
+    begins_early: ClassVar[bool] = False
+
+    @abstractmethod
+    def begin(self, recording: Recording, rectifier: Rectifier) -> PoseEstimator:
+        """Begin at the recording's first frame. recording: its sensors' readings may still grow."""
+
+    def __call__(
+        self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None],
+        pairs: RectifiedPairs | None = None,
+    ) -> Trajectory:  # fmt: skip
+        """Estimate a finished recording; `advance` is called once a frame.
+
+        pairs: of the recording, where others read them too.
+        """
+        poses = self.begin(recording, rectifier)
+        for seen in _frames(recording, pairs or RectifiedPairs(recording, rectifier), poses.reads_pictures):
+            advance()
+            poses.push(seen)
+        return poses.finish()
+
+
+def _frames(recording: Recording, pairs: RectifiedPairs, reads_pictures: bool) -> Iterator[Seen]:
+    if not reads_pictures:
+        yield from (RefusedFrame(stamp, UNPLACED) for stamp in recording.index.stamps_ns)
+    elif isinstance(recording, CornerRecording):
+        yield from recording.points()
+    else:
+        yield from prefetch(pairs())

@@ -42,3 +42,15 @@ def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
             return StereoOdometry(settings.odometry)
         case "paper":
             return PaperStitching(settings.stitching, settings.odometry, settings.crane)
+
+
+def make_early_estimator(settings: MotionSettings, *, has_crane: bool) -> TrajectoryEstimator:
+    """Make the estimator for poses before the end: the one that the settings name, if it can, else one of the
+    same sensors.
+    """
+    named = make_estimator(settings)
+    if named.begins_early:
+        return named
+    if has_crane:
+        return EncoderOdometry(settings.crane)
+    return FixedLagFusion(settings.fusion, settings.live, settings.crane)

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.arrays import Int64
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 from barsight.recording.base import FrameIndex, Recording
 
+Samples = TypeVar("Samples", ImuSamples, CraneSamples)
 Packet = StereoFrame | RefusedFrame | ImuSamples | CraneSamples | LaserProfile
 """A pair, or samples that came since the last packet of their kind, or a reference profile."""
 
@@ -46,31 +48,33 @@ class PacketRecording:
     ) -> None:
         self.rig, self._folder, self._noise, self.is_simulated = rig, folder, noise, is_simulated
         self._frames: dict[int, RefusedFrame | None] = {}
-        self._imu: list[ImuSamples] = []
-        self._crane: list[CraneSamples] = []
+        self._imu: _Grown[ImuSamples] = _Grown()
+        self._crane: _Grown[CraneSamples] = _Grown()
         self._laser: list[LaserProfile] = []
+        self.last_frame_ns: int | None = None
 
     def add(self, packet: Packet) -> None:
         """Take a packet."""
         if isinstance(packet, LaserProfile):
             self._laser.append(packet)
         elif isinstance(packet, ImuSamples):
-            self._expect_later(packet.stamp_ns[:1], [part.stamp_ns[-1:] for part in self._imu[-1:]])
-            self._imu.append(packet)
+            self._expect_later(packet.stamp_ns, self._imu.last_ns)
+            self._imu.add(packet)
         elif isinstance(packet, CraneSamples):
-            self._expect_later(packet.stamp_ns[:1], [part.stamp_ns[-1:] for part in self._crane[-1:]])
-            self._crane.append(packet)
+            self._expect_later(packet.stamp_ns, self._crane.last_ns)
+            self._crane.add(packet)
         else:
-            self._expect_later([packet.stamp_ns], [list(self._frames)[-1:]])
+            self._expect_later([packet.stamp_ns], self.last_frame_ns)
+            self.last_frame_ns = packet.stamp_ns
             if isinstance(packet, StereoFrame):
                 np.savez(self._file(packet.stamp_ns), left=packet.left, right=packet.right)
             self._frames[packet.stamp_ns] = packet if isinstance(packet, RefusedFrame) else None
 
-    def _expect_later(self, first: object, last: list[object]) -> None:
-        new = np.asarray(first, np.int64)
-        old = np.asarray(last, np.int64)
-        if new.size and old.size and new[0] <= old.max():
-            raise InputError(self.path, f"a packet of {new[0]} ns comes late", "push packets in time's order")
+    def _expect_later(self, stamps_ns: Sequence[int] | Int64, last_ns: int | None) -> None:
+        if len(stamps_ns) and last_ns is not None and stamps_ns[0] <= last_ns:
+            raise InputError(
+                self.path, f"a packet of {stamps_ns[0]} ns comes late", "push packets in time's order"
+            )
 
     @property
     def index(self) -> FrameIndex:
@@ -85,9 +89,7 @@ class PacketRecording:
 
     def imu(self) -> ImuSamples | None:
         """Read the IMU; see `Recording.imu`."""
-        if len(self._imu) > 1:
-            self._imu = [ImuSamples(*(_joined(self._imu, name) for name in _IMU))]
-        return self._imu[0] if self._imu else None
+        return self._imu.samples
 
     def imu_noise(self) -> ImuNoise | None:
         """Read the IMU's noise; see `Recording.imu_noise`."""
@@ -95,10 +97,7 @@ class PacketRecording:
 
     def crane(self) -> CraneSamples | None:
         """Read the encoders; see `Recording.crane`."""
-        if len(self._crane) > 1:
-            joined = {name: _joined(self._crane, name) for name in ("stamp_ns", "position_m")}
-            self._crane = [replace(self._crane[0], **joined)]
-        return self._crane[0] if self._crane else None
+        return self._crane.samples
 
     def laser(self) -> tuple[LaserProfile, ...]:
         """Read the laser; see `Recording.laser`."""
@@ -116,21 +115,54 @@ class PacketRecording:
         return self._folder / f"pair_{stamp_ns}.npz"
 
 
-_IMU = ("stamp_ns", "gyro_radps", "accel_mps2")
+_ARRAYS = {
+    ImuSamples: ("stamp_ns", "gyro_radps", "accel_mps2"),
+    CraneSamples: ("stamp_ns", "position_m"),
+}  # fmt: skip
 
 
-def _joined(parts: Sequence[ImuSamples | CraneSamples], name: str) -> Any:
-    return np.concatenate([getattr(part, name) for part in parts])
+class _Grown(Generic[Samples]):
+    """Samples that grow; adding costs the same however many there are."""
+
+    def __init__(self) -> None:
+        self._first: Samples | None = None
+        self._arrays: dict[str, Any] = {}
+        self._count = 0
+
+    def add(self, part: Samples) -> None:
+        if self._first is None:
+            self._first = part
+            self._arrays = {name: getattr(part, name).copy() for name in _ARRAYS[type(part)]}
+            self._count = len(part.stamp_ns)
+            return
+        end = self._count + len(part.stamp_ns)
+        held: Any
+        for name, held in self._arrays.items():
+            if end > len(held):
+                self._arrays[name] = np.resize(held, (2 * end, *held.shape[1:]))
+            self._arrays[name][self._count : end] = getattr(part, name)
+        self._count = end
+
+    @property
+    def last_ns(self) -> int | None:
+        return int(self._arrays["stamp_ns"][self._count - 1]) if self._count else None
+
+    @property
+    def samples(self) -> Samples | None:
+        if self._first is None:
+            return None
+        return replace(self._first, **{name: held[: self._count] for name, held in self._arrays.items()})
 
 
 def _between(
     imu: ImuSamples | None, crane: CraneSamples | None, after_ns: int | None, last_ns: int | None
 ) -> Iterator[ImuSamples | CraneSamples]:
     """Return the samples after one stamp up to another; None has no bound."""
-    for samples, names in ((imu, _IMU), (crane, ("stamp_ns", "position_m"))):
+    for samples in (imu, crane):
         if samples is not None:
             stamps = samples.stamp_ns
             first = 0 if after_ns is None else int(np.searchsorted(stamps, after_ns, side="right"))
             end = stamps.size if last_ns is None else int(np.searchsorted(stamps, last_ns, side="right"))
             if end > first:
+                names = _ARRAYS[type(samples)]
                 yield replace(samples, **{name: getattr(samples, name)[first:end] for name in names})

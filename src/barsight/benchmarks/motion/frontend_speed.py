@@ -11,10 +11,12 @@ from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance, Timing, provenance, summarise_times
 from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.types import RefusedFrame
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, track_recording
+from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
+from barsight.recording.rectified_pairs import RectifiedPairs
 
 
 @dataclass(frozen=True)
@@ -65,13 +67,19 @@ def _row(recording: Recording, name: str, predictor: Predictor, repeats: int) ->
     walls, cpus = [], []
     for _ in range(repeats + 1):
         wall, cpu = time.perf_counter(), time.process_time()
-        seen, refused = track_recording(recording, rectifier, predictor, FrontEndSettings(), lambda: None)
+        tracker = Tracker(predictor, FrontEndSettings())
+        tracked = [
+            pair if isinstance(pair, RefusedFrame) else tracker.push(pair)
+            for pair in RectifiedPairs(recording, rectifier)()
+        ]
         walls.append((time.perf_counter() - wall) / pairs)
         cpus.append((time.process_time() - cpu) / pairs)
     camera = rectifier.camera
+    seen = [one for one in tracked if isinstance(one, Sighting)]
     points = float(np.mean([len(s.track) for s in seen])) if seen else 0.0
+    refused = len(tracked) - len(seen)
     return FrontEndRow(
-        recording.path.resolve().name, (camera.width, camera.height), name, pairs, len(refused), points,
+        recording.path.resolve().name, (camera.width, camera.height), name, pairs, refused, points,
         summarise_times(walls[1:]), 1e3 * float(np.median(cpus[1:])),
     )  # fmt: skip
 

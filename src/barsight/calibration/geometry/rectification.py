@@ -65,8 +65,11 @@ class Rectifier:
                     f"the calibration is for {size[1]}x{size[0]}",
                 )
         right = frame.right if self._warps is None else self._warps[1](frame.right)
-        left = self.left(frame.left)
-        return RectifiedPair(frame.stamp_ns, left, right, self._left_valid, self._right_valid, self.camera)
+        return self.pair(frame.stamp_ns, self.left(frame.left), right)
+
+    def pair(self, stamp_ns: int, left: UInt8, right: UInt8) -> RectifiedPair:
+        """Name the geometry of two pictures that this rectifier has rectified."""
+        return RectifiedPair(stamp_ns, left, right, self._left_valid, self._right_valid, self.camera)
 
     def left(self, image: UInt8) -> UInt8:
         """Rectify the left image alone, of the calibration's size."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,14 @@ from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import CraneSamples, ImuSamples, PosedFrame, RefusedFrame, Trajectory
+from barsight.core.types import (
+    CraneSamples,
+    ImuSamples,
+    NamedPoints,
+    PosedFrame,
+    RefusedFrame,
+    Trajectory,
+)
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
 from barsight.motion.batch.fault_detection import check_crane, frames_off, gyro_in_degrees
 from barsight.motion.crane.encoder_trajectory import (
@@ -22,10 +28,11 @@ from barsight.motion.crane.encoder_trajectory import (
     fit_position,
     reestimate_noise,
 )
+from barsight.motion.estimator import Seen, TrajectoryEstimator
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
-from barsight.motion.frontend.board_corners import track_named_points
+from barsight.motion.frontend.board_corners import PointTracker, split_tracks
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.tracking import FrontEndSettings, Sighting, innovations, track_recording
+from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker, innovations
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
 from barsight.recording.base import Recording
@@ -66,6 +73,20 @@ class FusionSettings:
         return tuple(name.strip() for name in self.use.split(",") if name.strip())
 
 
+@dataclass(frozen=True)
+class BatchFusion(TrajectoryEstimator):
+    """Estimates any recording as a whole; the reference is `yard` with encoders, else `world`."""
+
+    settings: FusionSettings
+    crane: CraneSettings
+
+    def begin(self, recording: Recording, rectifier: Rectifier) -> BatchPoses:
+        """Begin; the recording's readings must be complete. Raises MeasurementError where no sensor that
+        places the body is left to use.
+        """
+        return BatchPoses(self.settings, self.crane, recording, rectifier)
+
+
 @dataclass(frozen=True, eq=False)
 class _Inputs:
     crane: CraneSamples | None
@@ -76,18 +97,58 @@ class _Inputs:
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class BatchFusion:
-    """`TrajectoryEstimator` for any recording; the reference is `yard` with encoders, else `world`."""
+class BatchPoses:
+    """`PoseEstimator` whose poses are final at the end: `push` tracks, `finish` solves for all frames."""
 
-    settings: FusionSettings
-    crane: CraneSettings
+    delay_ns = None
 
-    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Estimate; frames that neither pictures nor encoders place are refused. Raises MeasurementError
-        where no sensor that places the body is left to use.
-        """
-        inputs = self._gather(recording, rectifier, advance)
+    def __init__(
+        self, settings: FusionSettings, crane: CraneSettings, recording: Recording, rectifier: Rectifier
+    ) -> None:
+        use = settings.sensors
+        self._settings, self._crane_settings = settings, crane
+        self._recording, self._rectifier = recording, rectifier
+        self.reads_pictures = "stereo" in use
+        stated = recording.crane() if "crane" in use else None
+        self._checked = None if stated is None else check_crane(reestimate_noise(stated))
+        self._crane = None if self._checked is None else self._checked.samples
+        self._imu, self._spoiled = recording.imu() if "imu" in use else None, 0
+        if self._imu is not None:
+            self._imu, self._spoiled = without_saturation(self._imu)
+        if self._crane is None and not self.reads_pictures:
+            raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
+        self._tracker = Tracker(self._predictor(), settings.front_end)
+        self._points = PointTracker(rectifier, settings.front_end.rough)
+        self._sightings: list[Sighting] = []
+        self._refused: list[RefusedFrame] = []
+
+    def _predictor(self) -> Predictor:
+        crane, imu, shift = self._crane, self._imu, self._recording.rig.timeshift_cam_imu_ns
+        if crane is None:
+            return lambda old_ns, new_ns: None
+        bias = np.zeros(3) if imu is None else imu.gyro_radps.mean(axis=0)
+        return CranePredictor(crane, imu, bias, self._rectifier, shift)
+
+    def push(self, seen: Seen) -> None:
+        """Track the next frame."""
+        if not self.reads_pictures:
+            return
+        tracked: Sighting | RefusedFrame
+        match seen:
+            case RefusedFrame():
+                tracked = seen
+            case NamedPoints():
+                tracked = self._points.push(seen)
+            case _:
+                tracked = self._tracker.push(seen)
+        if isinstance(tracked, Sighting):
+            self._sightings.append(tracked)
+        else:
+            self._refused.append(tracked)
+
+    def finish(self) -> Trajectory:
+        """Estimate; frames that neither pictures nor encoders place are refused."""
+        recording, rectifier, inputs = self._recording, self._rectifier, self._inputs()
         shift = recording.rig.timeshift_cam_imu_ns
         frames = np.array([s.stamp_ns for s in inputs.sightings], np.int64)
         refused = list(inputs.refused)
@@ -97,12 +158,12 @@ class BatchFusion:
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())
         if len(frames) < 2:
-            return self._simple(recording, rectifier, inputs)
+            return self._simple(inputs)
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
             estimate, seen, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
         except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
-            simple = self._simple(recording, rectifier, inputs)
+            simple = self._simple(inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             told = dict.fromkeys((*simple.warnings, *inputs.warnings, f"{reason}: estimated one by one"))
             return replace(simple, warnings=tuple(told))
@@ -113,51 +174,30 @@ class BatchFusion:
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
         return Trajectory(
-            self._reference(inputs), placed, tuple(refused), sensors, inputs.warnings + seen, estimate.drift,
+            "world" if inputs.crane is None else "yard", placed, tuple(refused), sensors,
+            inputs.warnings + seen, estimate.drift,
             _detail(estimate, inputs.sightings, nodes, encoders, shift),
         )  # fmt: skip
 
-    def _simple(self, recording: Recording, rectifier: Rectifier, inputs: _Inputs) -> Trajectory:
+    def _simple(self, inputs: _Inputs) -> Trajectory:
         """Estimate without a graph: the encoders' trajectory, or frame to frame."""
+        simple: TrajectoryEstimator = StereoOdometry(self._settings.front_end.rough)
         if inputs.crane is not None:
-            return EncoderOdometry(self.crane)(recording, rectifier, _silent)
-        return StereoOdometry(self.settings.front_end.rough)(recording, rectifier, _silent)
+            simple = EncoderOdometry(self._crane_settings)
+        return simple(self._recording, self._rectifier, lambda: None)
 
-    def _reference(self, inputs: _Inputs) -> str:
-        return "world" if inputs.crane is None else "yard"
-
-    def _gather(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> _Inputs:
-        use = self.settings.sensors
-        stated = recording.crane() if "crane" in use else None
-        checked = None if stated is None else check_crane(reestimate_noise(stated))
-        crane = None if checked is None else checked.samples
-        imu, spoiled = recording.imu() if "imu" in use else None, 0
-        if imu is not None:
-            imu, spoiled = without_saturation(imu)
-        if crane is None and "stereo" not in use:
-            raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
-        sightings: tuple[Sighting, ...] = ()
-        refused: tuple[RefusedFrame, ...] = ()
-        if "stereo" in use:
-            shift = recording.rig.timeshift_cam_imu_ns
-            bias = np.zeros(3) if imu is None else imu.gyro_radps.mean(axis=0)
-            predictor = CranePredictor(crane, imu, bias, rectifier, shift) if crane else lambda a, b: None
-            if isinstance(recording, CornerRecording):
-                rough = self.settings.front_end.rough
-                sightings, refused = track_named_points(recording, rectifier, rough, advance)
-            else:
-                sightings, refused = track_recording(
-                    recording, rectifier, predictor, self.settings.front_end, advance
-                )
-        else:
-            for _ in recording.index.stamps_ns:
-                advance()
-        self._refuse_wrong_sensors(recording, rectifier, sightings, imu, crane)
+    def _inputs(self) -> _Inputs:
+        """Gather what was tracked and the checked sensors. Raises InputError where they contradict."""
+        recording, crane, imu = self._recording, self._crane, self._imu
+        sightings, refused = tuple(self._sightings), tuple(self._refused)
+        if isinstance(recording, CornerRecording):
+            sightings = split_tracks(sightings)
+        self._refuse_wrong_sensors(recording, self._rectifier, sightings, imu, crane)
         level = None if crane else align_with_gravity(recording)
-        warnings = (level.warnings if level else ()) + (checked.warnings if checked else ())
-        if spoiled:
-            warnings += (f"{spoiled} IMU samples are at the end of their scale and were left out",)
-        if "stereo" in use and crane is not None:
+        warnings = (level.warnings if level else ()) + (self._checked.warnings if self._checked else ())
+        if self._spoiled:
+            warnings += (f"{self._spoiled} IMU samples are at the end of their scale and were left out",)
+        if self.reads_pictures and crane is not None:
             warnings += _untied(sightings, refused)
         return _Inputs(crane, imu, sightings, refused, level, warnings)
 
@@ -211,9 +251,9 @@ class BatchFusion:
             still = [k for k in chosen if k in ties.still]
             for k in chosen:
                 # Sway turns round within a second or so: nodes nearer than that aren't independent.
-                sigma = self.crane.attitude_std_deg * 1.6
+                sigma = self._crane_settings.attitude_std_deg * 1.6
                 if k in still:
-                    sigma = self.crane.sway_std_deg * len(still) ** 0.5
+                    sigma = self._crane_settings.sway_std_deg * len(still) ** 0.5
                 attitudes.append(AttitudePrior(k, nominal, np.full(3, np.deg2rad(sigma))))
         seen = None
         if inputs.sightings:
@@ -225,7 +265,7 @@ class BatchFusion:
         problem = Problem(
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, placed,
             tuple(attitudes), ties.still, ties.bias,
-            offset_prior_px=self.settings.offset_prior_px, scale_prior=self.settings.scale_sigma,
+            offset_prior_px=self._settings.offset_prior_px, scale_prior=self._settings.scale_sigma,
             crane=inputs.crane, has_latency=bool(placed),
             has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
@@ -261,10 +301,6 @@ def _detail(
         inertial, by_frames[0], by_frames[1], by_frames[2], points, RelativePoses(estimate.relative),
         innovations(sightings),
     )  # fmt: skip
-
-
-def _silent() -> None:
-    """Swallow progress: the frames were told already."""
 
 
 def _untied(sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]) -> tuple[str, ...]:

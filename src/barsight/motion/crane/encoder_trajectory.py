@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +14,8 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame, RefusedFrame, Trajectory
 from barsight.motion.crane.robust_parabola import fit_parabola
-from barsight.motion.crane.sway import sway_at, turned_angle
+from barsight.motion.crane.sway import sway_at
+from barsight.motion.estimator import Seen, TrajectoryEstimator
 from barsight.recording.base import Recording
 
 CAUCHY_SIGMAS = 3.0
@@ -43,50 +43,63 @@ class CraneSettings:
 
 
 @dataclass(frozen=True)
-class EncoderOdometry:
-    """`TrajectoryEstimator` for recordings with encoders; the reference is `yard`."""
+class EncoderOdometry(TrajectoryEstimator):
+    """Estimates recordings with encoders; the reference is `yard`. No image is read."""
 
     settings: CraneSettings
 
-    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Estimate the poses.
-
-        Raises MeasurementError where the recording has no encoders. No image is read.
-        """
-        crane = recording.crane()
-        if crane is None:
+    def begin(self, recording: Recording, rectifier: Rectifier) -> EncoderPoses:
+        """Begin. Raises MeasurementError where the recording has no encoders."""
+        if recording.crane() is None:
             raise MeasurementError(
                 f"{recording.path}: no crane encoders; measure without them (--use stereo)"
             )
-        settings = self.settings
-        shift = recording.rig.timeshift_cam_imu_ns
-        imu = recording.imu()
-        angle = turned_angle(imu) if imu is not None else np.empty((0, 3))
-        placed: list[PosedFrame] = []
-        refused: list[RefusedFrame] = []
-        without_sway = 0
-        for stamp in recording.index.stamps_ns:
-            advance()
-            fit = fit_position(crane, stamp + shift, seconds_to_ns(settings.window_s))
-            if isinstance(fit, Failed):
-                refused.append(RefusedFrame(stamp, fit.reason))
-                continue
-            attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
-            if imu is not None:
-                sway = sway_at(imu, angle, stamp + shift, settings.sway_window_s)
-                if isinstance(sway, Failed):
-                    without_sway += 1
-                else:
-                    attitude = attitude @ Rotation.from_rotvec(sway).as_matrix()
-                    attitude_std_deg = settings.sway_std_deg
-            covariance = np.zeros((6, 6))
-            covariance[:3, :3] = np.eye(3) * np.deg2rad(attitude_std_deg) ** 2
-            covariance[3:, 3:] = fit.covariance
-            pose = Pose("yard", "body", attitude, fit.position_m + crane.crane_to_body_m)
-            placed.append(PosedFrame(stamp, pose, covariance))
-        sensors = ("crane",) if imu is None or without_sway == len(placed) else ("crane", "imu")
-        warnings = (f"the IMU doesn't cover {without_sway} frames: nominal attitude",) if without_sway else ()
-        return Trajectory("yard", tuple(placed), tuple(refused), sensors, warnings)
+        return EncoderPoses(self.settings, recording)
+
+
+class EncoderPoses:
+    """`PoseEstimator` from readings on both sides of a frame: each pose is final at once."""
+
+    reads_pictures = False
+
+    def __init__(self, settings: CraneSettings, recording: Recording) -> None:
+        self._settings, self._recording = settings, recording
+        self.delay_ns = seconds_to_ns(settings.window_s)
+        self._placed: list[PosedFrame] = []
+        self._refused: list[RefusedFrame] = []
+        self._without_sway = 0
+
+    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
+        """Place the frame by the readings around it."""
+        settings, stamp = self._settings, seen.stamp_ns
+        crane, imu = self._recording.crane(), self._recording.imu()
+        assert crane is not None
+        at_ns = stamp + self._recording.rig.timeshift_cam_imu_ns
+        fit = fit_position(crane, at_ns, seconds_to_ns(settings.window_s))
+        if isinstance(fit, Failed):
+            self._refused.append(RefusedFrame(stamp, fit.reason))
+            return self._refused[-1]
+        attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
+        if imu is not None:
+            sway = sway_at(imu, at_ns, settings.sway_window_s)
+            if isinstance(sway, Failed):
+                self._without_sway += 1
+            else:
+                attitude = attitude @ Rotation.from_rotvec(sway).as_matrix()
+                attitude_std_deg = settings.sway_std_deg
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = np.eye(3) * np.deg2rad(attitude_std_deg) ** 2
+        covariance[3:, 3:] = fit.covariance
+        pose = Pose("yard", "body", attitude, fit.position_m + crane.crane_to_body_m)
+        self._placed.append(PosedFrame(stamp, pose, covariance))
+        return self._placed[-1]
+
+    def finish(self) -> Trajectory:
+        """Return all poses."""
+        missed, placed = self._without_sway, tuple(self._placed)
+        sensors = ("crane",) if self._recording.imu() is None or missed == len(placed) else ("crane", "imu")
+        warnings = (f"the IMU doesn't cover {missed} frames: nominal attitude",) if missed else ()
+        return Trajectory("yard", placed, tuple(self._refused), sensors, warnings)
 
 
 @dataclass(frozen=True, eq=False)

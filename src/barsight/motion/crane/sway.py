@@ -24,11 +24,11 @@ def turned_angle(imu: ImuSamples) -> Float64:
     return np.vstack([np.zeros((1, 3)), np.cumsum(between, axis=0)])
 
 
-def sway_at(imu: ImuSamples, angle: Float64, stamp_ns: int, half_window_s: float) -> Float64 | Failed:
+def sway_at(imu: ImuSamples, stamp_ns: int, half_window_s: float) -> Float64 | Failed:
     """Compute the rotation vector (3,) `nominal body from body` at a stamp, rad.
 
-    angle: from `turned_angle`. The trend is fitted over half_window_s before and after. Failed `no-imu` where
-    the samples don't enclose the stamp, leave a gap there or span less than 4 s.
+    The trend is fitted over half_window_s before and after. Failed `no-imu` where the samples don't enclose
+    the stamp, leave a gap there or span less than 4 s.
     """
     window = seconds_to_ns(half_window_s)
     first, last = np.searchsorted(imu.stamp_ns, (stamp_ns - window, stamp_ns + window))
@@ -39,7 +39,8 @@ def sway_at(imu: ImuSamples, angle: Float64, stamp_ns: int, half_window_s: float
         return Failed("no-imu", "the IMU has a gap around the frame or is too short")
     time = (stamps - stamp_ns) / NS_PER_S
     design = np.column_stack([np.ones(time.size), time])
-    trend, *_ = np.linalg.lstsq(design, angle[first:last], rcond=None)
-    here = interpolate_at(np.array([stamp_ns]), stamps, angle[first:last])[0]
+    angle = turned_angle(ImuSamples(stamps, imu.gyro_radps[first:last], imu.accel_mps2[first:last]))
+    trend, *_ = np.linalg.lstsq(design, angle, rcond=None)
+    here = interpolate_at(np.array([stamp_ns]), stamps, angle)[0]
     sway: Float64 = here - trend[0]
     return sway

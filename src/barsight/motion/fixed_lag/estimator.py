@@ -6,23 +6,20 @@ memory don't grow with the way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, MeasurementError
-from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
+from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
-from barsight.motion.frontend.tracking import Sighting, track_incrementally
+from barsight.motion.estimator import Seen, TrajectoryEstimator
+from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, ReadingsSoFar
+from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
-
-if TYPE_CHECKING:
-    from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 
 
 @dataclass(frozen=True)
@@ -38,56 +35,75 @@ class FixedLagSettings:
 
 
 @dataclass(frozen=True)
-class FixedLagFusion:
-    """`TrajectoryEstimator` that never looks ahead: `yard` with encoders, else `world`, whose upright is the
-    first second's.
+class FixedLagFusion(TrajectoryEstimator):
+    """Estimates without looking ahead: `yard` with encoders, else `world`, whose upright is the first
+    second's.
     """
 
+    begins_early = True
     settings: FusionSettings
     live: FixedLagSettings
     crane: CraneSettings
 
-    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Estimate; frames that neither pictures nor encoders place are refused."""
+    def begin(self, recording: Recording, rectifier: Rectifier) -> FixedLagPoses:
+        """Begin; without encoders the IMU's first second must be there. Raises MeasurementError where no
+        sensor that places the body is left to use.
+        """
+        return FixedLagPoses(self, recording, rectifier)
+
+
+class FixedLagPoses:
+    """`PoseEstimator` whose poses are final at once."""
+
+    delay_ns = seconds_to_ns(SENSOR_DELAY_S)
+
+    def __init__(self, estimator: FixedLagFusion, recording: Recording, rectifier: Rectifier) -> None:
         from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 
-        use = self.settings.sensors
-        crane, imu = recording.crane(), recording.imu()
-        readings = ReadingsSoFar(
-            crane if "crane" in use else None, imu if "imu" in use else None,
-            recording.imu_noise() or ORDINARY_NOISE,
-        )  # fmt: skip
-        if readings.crane is None and "stereo" not in use:
+        settings = estimator.settings
+        self._use, self._recording = settings.sensors, recording
+        self._noise = recording.imu_noise() or ORDINARY_NOISE
+        self.reads_pictures = "stereo" in self._use
+        readings = self._readings()
+        if readings.crane is None and not self.reads_pictures:
             raise MeasurementError(f"{recording.path}: no crane encoders; estimate with --use stereo")
-        shift = recording.rig.timeshift_cam_imu_ns
-        level = None if readings.crane is not None else align_with_gravity(recording)
-        estimator = FixedLagEstimator(
-            self.settings, self.crane, self.live.frames, rectifier, shift, readings, level
-        )
-        placed: list[PosedFrame] = []
-        refused: list[RefusedFrame] = []
-        for seen in self._frames(recording, rectifier, estimator, advance):
-            frame = estimator.take(seen)
-            if isinstance(frame, PosedFrame):
-                placed.append(frame)
-            else:
-                refused.append(frame)
-        names = {"crane": readings.crane, "imu": readings.imu, "stereo": "stereo" in use or None}
-        sensors = tuple(name for name, used in names.items() if used is not None)
-        warnings = () if level is None else level.warnings
-        return Trajectory(
-            "world" if readings.crane is None else "yard", tuple(placed), tuple(refused), sensors, warnings
-        )
+        self._level = None if readings.crane is not None else align_with_gravity(recording)
+        self._estimator = FixedLagEstimator(
+            settings, estimator.crane, estimator.live.frames, rectifier,
+            recording.rig.timeshift_cam_imu_ns, readings, self._level,
+        )  # fmt: skip
+        self._tracker = Tracker(self._estimator.predict, settings.front_end)
+        self._placed: list[PosedFrame] = []
+        self._refused: list[RefusedFrame] = []
 
-    def _frames(
-        self, recording: Recording, rectifier: Rectifier, estimator: FixedLagEstimator,
-        advance: Callable[[], None],
-    ) -> Iterator[Sighting | RefusedFrame]:  # fmt: skip
-        if "stereo" in self.settings.sensors:
-            yield from track_incrementally(
-                recording, rectifier, estimator.predict, self.settings.front_end, advance
-            )
-            return
-        for stamp in recording.index.stamps_ns:
-            advance()
-            yield RefusedFrame(stamp, "no sensor places it")
+    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
+        """Track the next frame and estimate its pose."""
+        self._estimator.readings = self._readings()
+        if isinstance(seen, RectifiedPair):
+            tracked = self._tracker.push(seen)
+        else:
+            tracked = RefusedFrame(seen.stamp_ns, getattr(seen, "reason", "points without pictures"))
+        frame = self._estimator.take(tracked)
+        if isinstance(frame, PosedFrame):
+            self._placed.append(frame)
+        else:
+            self._refused.append(frame)
+        return frame
+
+    def finish(self) -> Trajectory:
+        """Return all poses."""
+        readings = self._estimator.readings
+        names = {"crane": readings.crane, "imu": readings.imu, "stereo": self.reads_pictures or None}
+        sensors = tuple(name for name, used in names.items() if used is not None)
+        return Trajectory(
+            "world" if readings.crane is None else "yard", tuple(self._placed), tuple(self._refused), sensors,
+            () if self._level is None else self._level.warnings,
+        )  # fmt: skip
+
+    def _readings(self) -> ReadingsSoFar:
+        """Read the sensors as they stand."""
+        recording, use = self._recording, self._use
+        return ReadingsSoFar(
+            recording.crane() if "crane" in use else None, recording.imu() if "imu" in use else None,
+            self._noise,
+        )  # fmt: skip

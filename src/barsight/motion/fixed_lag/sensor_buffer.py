@@ -9,6 +9,9 @@ import numpy as np
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.types import CraneSamples, ImuSamples
 
+SENSOR_DELAY_S = 0.06
+"""A frame is computed once readings this much later are there."""
+
 
 @dataclass(frozen=True, eq=False)
 class ReadingsSoFar:

@@ -20,7 +20,7 @@ from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
-from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, ReadingsSoFar
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
 from barsight.motion.frontend.motion_prediction import CranePredictor, predict_by_imu
@@ -39,15 +39,13 @@ from barsight.motion.problem.nodes import (
 )
 from barsight.motion.problem.problem import AttitudePrior, EncoderPosition, Problem
 
-SENSOR_DELAY_S = 0.06
-"""A frame is computed once readings this much later are there."""
 LOOK_BACK_S = 6.0
 """What is held of IMU and encoders before the first node held."""
 FIT_S = PLACE_SPACING_S / 2 + 0.01
 
 
 class FixedLagEstimator:
-    """Fixed-lag estimator that holds `held` frames; `window` is all that it knows."""
+    """Fixed-lag estimator that holds `held` frames; `window` is all that it knows, beside the `readings`."""
 
     def __init__(
         self, settings: FusionSettings, crane: CraneSettings, held: int, rectifier: Rectifier, shift_ns: int,
@@ -55,7 +53,7 @@ class FixedLagEstimator:
     ) -> None:  # fmt: skip
         self._settings, self._crane, self._held = settings, crane, held
         self._rectifier, self._shift_ns = rectifier, shift_ns
-        self._readings, self._level = readings, level
+        self.readings, self._level = readings, level
         self.window: Window | None = None
         self._failed = False
 
@@ -118,7 +116,7 @@ class FixedLagEstimator:
         """
         last = stamp_ns + self._shift_ns + seconds_to_ns(SENSOR_DELAY_S)
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
-        return self._readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
+        return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
 
     def _begun(self, stamp: int, sighting: Sighting | None, now: ReadingsSoFar) -> Window | Failed:
         # Without encoders the first frame is the origin: a node before it would be, and move against it.

@@ -7,7 +7,6 @@ estimate does neither.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -17,12 +16,13 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose
-from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
+from barsight.core.types import PosedFrame, RectifiedCamera, RectifiedPair, RefusedFrame, Trajectory
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import match_mutual
 from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry
+from barsight.motion.estimator import Seen, TrajectoryEstimator
 from barsight.motion.frontend.relative_pose import rotate_covariance, transport_covariance
-from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_views
+from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_view
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
 from barsight.registration.rigid import Alignment, align_rigid
@@ -45,9 +45,9 @@ class StitchingSettings:
 
 
 @dataclass(frozen=True)
-class PaperStitching:
-    """`TrajectoryEstimator`: mutual ORB matches by Hamming distance [paper Eq. 6], filtered by one homography
-    [paper Eq. 7] and by the predicted motion where the crane tells it, chained by SVD [paper Eq. 13-20].
+class PaperStitching(TrajectoryEstimator):
+    """Mutual ORB matches by Hamming distance [paper Eq. 6], filtered by one homography [paper Eq. 7] and by
+    the predicted motion where the crane tells it, chained by SVD [paper Eq. 13-20].
 
     The first frame stands where the crane says (`yard`), else levelled at the origin (`world`).
     """
@@ -56,60 +56,93 @@ class PaperStitching:
     features: OdometrySettings
     crane: CraneSettings
 
-    def __call__(self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None]) -> Trajectory:
-        """Estimate; frames without enough matches are refused, the next one is tied to the last good one."""
-        predicted = self._predicted(recording, rectifier)
-        placed: list[PosedFrame] = []
-        refused: list[RefusedFrame] = []
-        last: FeatureView | None = None
-        noise = np.diag([1e-12] * 6)
-        for view in feature_views(recording, rectifier, self.features, advance):
-            if isinstance(view, RefusedFrame):
-                refused.append(view)
-                continue
-            if last is None:
-                first = predicted.get(view.stamp_ns)
-                if predicted and first is None:
-                    refused.append(RefusedFrame(view.stamp_ns, "the encoders don't cover the first frame"))
-                    continue
-                pose = align_with_gravity(recording).world_from_body if first is None else first
-            else:
-                trend = _between(predicted.get(last.stamp_ns), predicted.get(view.stamp_ns), rectifier)
-                step = self._step(last, view, rectifier.camera, trend)
-                if isinstance(step, Failed):
-                    refused.append(RefusedFrame(view.stamp_ns, step.reason))
-                    continue
-                old = placed[-1].reference_from_body
-                old_rect0 = old @ rectifier.body_from_rect0
-                new_rect0 = old_rect0 @ step.target_from_source
-                pose = new_rect0 @ rectifier.body_from_rect0.inverse()
-                added = rotate_covariance(step.covariance, old_rect0.rotation)
-                lever = pose.translation - new_rect0.translation
-                noise = transport_covariance(
-                    noise, pose.translation - old.translation
-                ) + transport_covariance(added, lever)
-            placed.append(PosedFrame(view.stamp_ns, pose, noise))
-            last = view
-        reference = "yard" if predicted else "world"
-        sensors = ("stereo", "crane") if predicted else ("stereo",)
-        return Trajectory(reference, tuple(placed), tuple(refused), sensors)
+    def begin(self, recording: Recording, rectifier: Rectifier) -> StitchedPoses:
+        """Begin at the first frame."""
+        return StitchedPoses(self, recording, rectifier)
 
-    def _predicted(self, recording: Recording, rectifier: Rectifier) -> dict[int, Pose]:
-        if recording.crane() is None:
-            return {}
-        trajectory = EncoderOdometry(self.crane)(recording, rectifier, lambda: None)
-        return {frame.stamp_ns: frame.reference_from_body for frame in trajectory.frames}
+
+class StitchedPoses:
+    """`PoseEstimator` that ties each frame to the last good one; each pose is final at once."""
+
+    reads_pictures = True
+
+    def __init__(self, estimator: PaperStitching, recording: Recording, rectifier: Rectifier) -> None:
+        self._settings, self._features = estimator.settings, estimator.features
+        self._recording, self._rectifier = recording, rectifier
+        self._crane = None
+        if recording.crane() is not None:
+            self._crane = EncoderOdometry(estimator.crane).begin(recording, rectifier)
+        self.delay_ns = self._crane.delay_ns if self._crane else 0
+        self._placed: list[PosedFrame] = []
+        self._refused: list[RefusedFrame] = []
+        self._last: tuple[FeatureView, Pose | None] | None = None
+        self._noise = np.diag([1e-12] * 6)
+
+    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
+        """Place the frame, or refuse it where too few matches agree."""
+        found = self._place(seen)
+        if isinstance(found, Failed):
+            self._refused.append(RefusedFrame(seen.stamp_ns, found.reason))
+            return self._refused[-1]
+        self._placed.append(found)
+        return found
+
+    def _place(self, seen: Seen) -> PosedFrame | Failed:
+        if not isinstance(seen, RectifiedPair):
+            return Failed("no-pictures", getattr(seen, "reason", "points without pictures"))
+        view = feature_view(seen, self._features)
+        if isinstance(view, Failed):
+            return view
+        by_crane = self._crane.push(seen) if self._crane else None
+        predicted = by_crane.reference_from_body if isinstance(by_crane, PosedFrame) else None
+        if self._last is not None:
+            pose = self._chained(self._last, view, predicted)
+            if isinstance(pose, Failed):
+                return pose
+        elif predicted is not None:
+            pose = predicted
+        elif self._crane is not None:
+            return Failed("no-encoder", "the encoders don't cover the first frame")
+        else:
+            pose = align_with_gravity(self._recording).world_from_body
+        self._last = view, predicted
+        return PosedFrame(seen.stamp_ns, pose, self._noise)
+
+    def _chained(
+        self, last: tuple[FeatureView, Pose | None], view: FeatureView, predicted: Pose | None
+    ) -> Pose | Failed:
+        """Chain the step since the last good frame to its pose, and its covariance."""
+        rectifier = self._rectifier
+        trend = _between(last[1], predicted, rectifier)
+        step = self._step(last[0], view, rectifier.camera, trend)
+        if isinstance(step, Failed):
+            return step
+        old = self._placed[-1].reference_from_body
+        old_rect0 = old @ rectifier.body_from_rect0
+        new_rect0 = old_rect0 @ step.target_from_source
+        pose = new_rect0 @ rectifier.body_from_rect0.inverse()
+        added = rotate_covariance(step.covariance, old_rect0.rotation)
+        lever = pose.translation - new_rect0.translation
+        noise = transport_covariance(self._noise, pose.translation - old.translation)
+        self._noise = noise + transport_covariance(added, lever)
+        return pose
+
+    def finish(self) -> Trajectory:
+        """Return all poses."""
+        by_crane = self._crane is not None
+        sensors = ("stereo", "crane") if by_crane else ("stereo",)
+        return Trajectory("yard" if by_crane else "world", tuple(self._placed), tuple(self._refused), sensors)
 
     def _step(
         self, old: FeatureView, new: FeatureView, camera: RectifiedCamera, trend: Pose | None
     ) -> Alignment | Failed:
         pairs = match_mutual(old.features, new.features)
-        first, second = old.points(pairs[:, 0], self.features), new.points(pairs[:, 1], self.features)
+        first, second = old.points(pairs[:, 0], self._features), new.points(pairs[:, 1], self._features)
         kept = np.isfinite(first[:, 2]) & np.isfinite(second[:, 2])
-        if kept.sum() >= self.settings.min_matches:
+        if kept.sum() >= self._settings.min_matches:
             kept[kept] = self._on_plane(old, new, pairs[kept])
             kept &= self._on_trend(first, new.features.pixels[pairs[:, 1]], camera, trend)
-        if kept.sum() < self.settings.min_matches:
+        if kept.sum() < self._settings.min_matches:
             return Failed("no-matches", f"only {int(kept.sum())} matches with the frame before agree")
         return align_rigid(second[kept], first[kept], ("rect0", "rect0"))
 
@@ -117,7 +150,7 @@ class PaperStitching:
         cv2.setRNGSeed(1)
         _, inliers = cv2.findHomography(
             old.features.pixels[pairs[:, 0]], new.features.pixels[pairs[:, 1]], cv2.RANSAC,
-            self.settings.homography_px,
+            self._settings.homography_px,
         )  # fmt: skip
         if inliers is None:
             return np.zeros(len(pairs), np.bool_)
@@ -129,7 +162,7 @@ class PaperStitching:
             return np.ones(len(points), np.bool_)
         with np.errstate(invalid="ignore"):
             off = np.linalg.norm(project_stereo(trend.apply(points), camera)[:, :2] - seen, axis=1)
-            near: Bool = off <= self.settings.trend_px
+            near: Bool = off <= self._settings.trend_px
         return near
 
 

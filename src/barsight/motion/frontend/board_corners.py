@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -17,7 +17,6 @@ from barsight.features.guided_matching import PredictedMotion, triangulate_stere
 from barsight.motion.frontend.relative_pose import ransac, refine_pose
 from barsight.motion.frontend.stereo_features import OdometrySettings
 from barsight.motion.frontend.tracking import Sighting
-from barsight.recording.formats.board_corners import CornerRecording
 
 TURN = 7
 SIGMA_PX = 0.3
@@ -29,26 +28,26 @@ MAX_FRAMES = 20
 square. Points change their names by turns: neighbouring frames always share most of them."""
 
 
-def track_named_points(
-    recording: CornerRecording, rectifier: Rectifier, rough: OdometrySettings, advance: Callable[[], None]
-) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:
-    """Track points of all frames that share enough of them with the one before; the others are refused."""
-    settings = replace(rough, min_inliers=MIN_POINTS)
-    sightings: list[Sighting] = []
-    refused: list[RefusedFrame] = []
-    for points in recording.points():
-        advance()
-        seen = _sighting(points, rectifier)
-        if sightings and isinstance(seen, Sighting):
-            seen = _tied(sightings[-1], seen, rectifier, settings)
+class PointTracker:
+    """Tracks named points: a frame must share enough of them with the one before."""
+
+    def __init__(self, rectifier: Rectifier, rough: OdometrySettings) -> None:
+        self._rectifier, self._settings = rectifier, replace(rough, min_inliers=MIN_POINTS)
+        self._last: Sighting | None = None
+
+    def push(self, points: NamedPoints) -> Sighting | RefusedFrame:
+        """Track the next frame's points, or refuse it."""
+        seen = _sighting(points, self._rectifier)
+        if self._last is not None and isinstance(seen, Sighting):
+            seen = _tied(self._last, seen, self._rectifier, self._settings)
         if isinstance(seen, Failed):
-            refused.append(RefusedFrame(points.stamp_ns, seen.reason))
-        else:
-            sightings.append(seen)
-    return _renamed(sightings), tuple(refused)
+            return RefusedFrame(points.stamp_ns, seen.reason)
+        self._last = seen
+        return seen
 
 
-def _renamed(sightings: list[Sighting]) -> tuple[Sighting, ...]:
+def split_tracks(sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
+    """Give points new names every `MAX_FRAMES` frames."""
     most = len(sightings) // MAX_FRAMES + 2
     return tuple(
         replace(seen, track=seen.track * most + (k + seen.track * TURN % MAX_FRAMES) // MAX_FRAMES)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import ConfigError, Failed
-from barsight.core.types import RefusedFrame
+from barsight.core.types import RectifiedPair
 from barsight.features.guided_matching import match_across, triangulate_stereo
 from barsight.features.orb import Features, detect_orb
 from barsight.features.patch_alignment import PatchPair, patch_pair
-from barsight.recording.base import Recording
 from barsight.stereo.search_range import coarse_disparity
 
 
@@ -75,21 +72,9 @@ class FeatureView:
         return np.where(kept[:, None], points, np.nan)
 
 
-def feature_views(
-    recording: Recording, rectifier: Rectifier, settings: OdometrySettings, advance: Callable[[], None]
-) -> Iterator[FeatureView | RefusedFrame]:
-    """Yield each frame's ORB features, or why it shows none. `advance` is called once a frame."""
-    for frame in recording.frames():
-        advance()
-        if isinstance(frame, RefusedFrame):
-            yield frame
-            continue
-        pair = rectifier(frame)
-        if isinstance(pair, Failed):
-            yield RefusedFrame(frame.stamp_ns, pair.reason)
-            continue
-        view = match_coarsely(patch_pair(pair), detect_orb(pair.left, settings.features), settings)
-        yield RefusedFrame(frame.stamp_ns, view.reason) if isinstance(view, Failed) else view
+def feature_view(pair: RectifiedPair, settings: OdometrySettings) -> FeatureView | Failed:
+    """Detect a pair's ORB features; Failed `no-features` where too few have a disparity."""
+    return match_coarsely(patch_pair(pair), detect_orb(pair.left, settings.features), settings)
 
 
 def match_coarsely(

@@ -1,19 +1,17 @@
-"""Track points through a recording's pairs, each frame's motion checked by consensus."""
+"""Track points from pair to pair, each frame's motion checked by consensus."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.motion_detail import NormalisedResiduals
-from barsight.core.parallel import ordered_map, prefetch
-from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame
+from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
 from barsight.features.guided_matching import (
     GuidedMatches,
     PredictedMotion,
@@ -26,11 +24,8 @@ from barsight.features.self_similarity import texture_period_px
 from barsight.features.tracks import Tracks, TrackSettings, detect_corners, match_tracks, update_tracks
 from barsight.motion.frontend.relative_pose import RelativePose, estimate_step, ransac, refine_pose
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, match_coarsely
-from barsight.recording.base import Recording
 from barsight.stereo.search_range import coarse_disparity
 
-PREPARED = 1
-"""Pairs that are rectified ahead while the one before is followed."""
 MIN_RATIO = 0.45
 """One bar off, a twentieth of the points find one alike and agree, on dull bars a third; at the true place
 most do (six in ten from a car, eight over a yard)."""
@@ -80,51 +75,28 @@ class _State:
     view: FeatureView | None
 
 
-def track_recording(
-    recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
-    advance: Callable[[], None],
-) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:  # fmt: skip
-    """Track all frames that show enough; the others are refused with a reason."""
-    seen = list(track_incrementally(recording, rectifier, predictor, settings, advance))
-    return (
-        tuple(s for s in seen if isinstance(s, Sighting)),
-        tuple(s for s in seen if isinstance(s, RefusedFrame)),
-    )
+class Tracker:
+    """Tracks points from pair to pair; only the last few views are held.
 
-
-def track_incrementally(
-    recording: Recording, rectifier: Rectifier, predictor: Predictor, settings: FrontEndSettings,
-    advance: Callable[[], None],
-) -> Iterator[Sighting | RefusedFrame]:  # fmt: skip
-    """Track frame by frame; only the last few views are held. `predictor` is asked when a frame's turn comes,
-    so it may know what was made of the frames before.
+    `predictor` is asked when a frame's turn comes, so it may know what was made of the frames before.
     """
-    state: _State | None = None
 
-    def prepare(frame: StereoFrame | RefusedFrame) -> PatchPair | RefusedFrame:
-        if isinstance(frame, RefusedFrame):
-            return frame
-        rectified = rectifier(frame)
-        if isinstance(rectified, Failed):
-            return RefusedFrame(frame.stamp_ns, rectified.reason)
-        return patch_pair(rectified)
+    def __init__(self, predictor: Predictor, settings: FrontEndSettings) -> None:
+        self._predictor, self._settings = predictor, settings
+        self._state: _State | None = None
 
-    for pair in ordered_map(prepare, prefetch(recording.frames()), PREPARED):
-        advance()
-        if isinstance(pair, RefusedFrame):
-            yield pair
-            continue
-        stamp_ns = pair.pair.stamp_ns
-        prediction = predictor(state.stamp_ns, stamp_ns) if state else None
-        result = _see(state, pair, prediction, settings)
+    def push(self, pair: RectifiedPair) -> Sighting | RefusedFrame:
+        """Track the next pair, or refuse it where it shows too little."""
+        state, settings, patches = self._state, self._settings, patch_pair(pair)
+        prediction = self._predictor(state.stamp_ns, pair.stamp_ns) if state else None
+        result = _see(state, patches, prediction, settings)
         if isinstance(result, Failed) and state is not None and prediction is not None:
             # The other sensors tie the frame to the ones before; pictures begin anew.
-            result = _see(replace(state, tracks=None), pair, prediction, settings)
+            result = _see(replace(state, tracks=None), patches, prediction, settings)
         if isinstance(result, Failed):
-            yield RefusedFrame(stamp_ns, result.reason)
-            continue
-        state, sighting = result
-        yield sighting
+            return RefusedFrame(pair.stamp_ns, result.reason)
+        self._state, sighting = result
+        return sighting
 
 
 def _see(

@@ -180,6 +180,10 @@ class BagRecording:
 
     def crane(self) -> CraneSamples | None:
         """Read the encoders; see `Recording.crane`."""
+        return self._crane
+
+    @cached_property
+    def _crane(self) -> CraneSamples | None:
         name = self._topics.crane
         if name is None:
             return None

@@ -81,6 +81,10 @@ class EurocRecording(PictureFiles):
 
     def crane(self) -> CraneSamples | None:
         """Read the encoders; see `Recording.crane`."""
+        return self._crane
+
+    @cached_property
+    def _crane(self) -> CraneSamples | None:
         folder = self._root / "crane0"
         if not folder.is_dir():
             return None

@@ -1,0 +1,92 @@
+"""The rectified pairs of a recording, each picture decoded and rectified once."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.errors import Failed
+from barsight.core.files import atomic_path
+from barsight.core.timing import Stopwatch
+from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
+from barsight.recording.base import Recording
+
+MAX_STORED_BYTES = 8 << 30
+"""What may lie in the folder; pairs beyond are decoded again where they are asked for again."""
+
+
+class RectifiedPairs:
+    """Reads rectified pairs; `folder` takes their pixels, so that a second reader gets them from there.
+
+    Without a folder a pair that is asked for again is decoded again. Several threads may read at once.
+    """
+
+    def __init__(
+        self, recording: Recording, rectifier: Rectifier, folder: Path | None = None,
+        watch: Stopwatch | None = None,
+    ) -> None:  # fmt: skip
+        self.recording, self.rectifier = recording, rectifier
+        self._folder, self._watch, self._bytes = folder, watch or Stopwatch(), 0
+        self._lock = Lock()
+
+    def __call__(self, wanted: Container[int] | None = None) -> Iterator[RectifiedPair | RefusedFrame]:
+        """Yield the pairs in time's order; a frame that can't be decoded or rectified is refused.
+
+        wanted: the stamps of those to read; all, if None.
+        """
+        fresh = self.recording.frames(_Missing(self, wanted))
+        ahead: StereoFrame | RefusedFrame | None = None
+        for stamp in self.recording.index.stamps_ns:
+            if wanted is not None and stamp not in wanted:
+                continue
+            if ahead is None and not self.has(stamp):
+                ahead = next(fresh, None)
+            if ahead is None or ahead.stamp_ns != stamp:
+                # Another reader was quicker.
+                yield self._read(stamp)
+                continue
+            frame, ahead = ahead, None
+            yield frame if isinstance(frame, RefusedFrame) else self.rectify(frame)
+
+    def rectify(self, frame: StereoFrame) -> RectifiedPair | RefusedFrame:
+        """Rectify a frame, and store it for who asks later."""
+        with self._watch("rectify", 1):
+            pair = self.rectifier(frame)
+        if isinstance(pair, Failed):
+            return RefusedFrame(frame.stamp_ns, pair.reason)
+        with self._lock:
+            if self._folder is not None and self._bytes < MAX_STORED_BYTES and not self.has(frame.stamp_ns):
+                self._bytes += pair.left.nbytes + pair.right.nbytes
+                with atomic_path(self._file(frame.stamp_ns)) as path, path.open("wb") as stream:
+                    np.save(stream, np.stack([pair.left, pair.right]))
+        return pair
+
+    def has(self, stamp_ns: int) -> bool:
+        """Check whether a pair lies in the folder."""
+        return self._folder is not None and self._file(stamp_ns).is_file()
+
+    def _read(self, stamp_ns: int) -> RectifiedPair:
+        left, right = np.load(self._file(stamp_ns))
+        return self.rectifier.pair(stamp_ns, left, right)
+
+    def _file(self, stamp_ns: int) -> Path:
+        assert self._folder is not None
+        return self._folder / f"rectified_{stamp_ns}.npy"
+
+
+@dataclass(frozen=True)
+class _Missing:
+    """The wanted stamps that aren't stored, as of when they are asked for."""
+
+    pairs: RectifiedPairs
+    wanted: Container[int] | None
+
+    def __contains__(self, stamp_ns: object) -> bool:
+        return (self.wanted is None or stamp_ns in self.wanted) and not (
+            isinstance(stamp_ns, int) and self.pairs.has(stamp_ns)
+        )
