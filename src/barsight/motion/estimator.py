@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import ClassVar, Protocol
 
 from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.errors import Failed
 from barsight.core.parallel import prefetch
 from barsight.core.types import NamedPoints, PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.recording.base import Recording
@@ -42,6 +43,44 @@ class PoseEstimator(Protocol):
     def finish(self) -> Trajectory:
         """Return all frames' poses. Raises MeasurementError where nothing places the body."""
         ...
+
+
+class ImmediatePoses(ABC):
+    """`PoseEstimator` whose poses are final at once; a subclass places one frame.
+
+    placed, refused: the frames so far.
+    """
+
+    reads_pictures: bool = True
+    delay_ns: int | None = 0
+
+    def __init__(self) -> None:
+        self.placed: list[PosedFrame] = []
+        self.refused: list[RefusedFrame] = []
+
+    @abstractmethod
+    def place(self, seen: Seen) -> PosedFrame | RefusedFrame | Failed:
+        """Estimate the next frame's pose, or say why it has none."""
+
+    @abstractmethod
+    def finish(self) -> Trajectory:
+        """Return all frames' poses."""
+
+    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
+        """Place the next frame; see `PoseEstimator.push`."""
+        frame = self.place(seen)
+        if isinstance(frame, PosedFrame):
+            self.placed.append(frame)
+            return frame
+        self.refused.append(RefusedFrame(seen.stamp_ns, frame.reason))
+        return self.refused[-1]
+
+
+def pictures_of(seen: Seen) -> RectifiedPair | Failed:
+    """Return a frame's pictures; Failed `no-pictures` where it has none."""
+    if isinstance(seen, RectifiedPair):
+        return seen
+    return Failed("no-pictures", seen.reason if isinstance(seen, RefusedFrame) else "points without pictures")
 
 
 class TrajectoryEstimator(ABC):

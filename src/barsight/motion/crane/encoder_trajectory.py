@@ -12,10 +12,10 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, PosedFrame, RefusedFrame, Trajectory
+from barsight.core.types import CraneSamples, PosedFrame, Trajectory
 from barsight.motion.crane.robust_parabola import fit_parabola
 from barsight.motion.crane.sway import sway_at
-from barsight.motion.estimator import Seen, TrajectoryEstimator
+from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator
 from barsight.recording.base import Recording
 
 CAUCHY_SIGMAS = 3.0
@@ -57,19 +57,18 @@ class EncoderOdometry(TrajectoryEstimator):
         return EncoderPoses(self.settings, recording)
 
 
-class EncoderPoses:
-    """`PoseEstimator` from readings on both sides of a frame: each pose is final at once."""
+class EncoderPoses(ImmediatePoses):
+    """`PoseEstimator` from the readings on both sides of a frame."""
 
     reads_pictures = False
 
     def __init__(self, settings: CraneSettings, recording: Recording) -> None:
+        super().__init__()
         self._settings, self._recording = settings, recording
         self.delay_ns = seconds_to_ns(settings.window_s)
-        self._placed: list[PosedFrame] = []
-        self._refused: list[RefusedFrame] = []
         self._without_sway = 0
 
-    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
+    def place(self, seen: Seen) -> PosedFrame | Failed:
         """Place the frame by the readings around it."""
         settings, stamp = self._settings, seen.stamp_ns
         crane, imu = self._recording.crane(), self._recording.imu()
@@ -77,8 +76,7 @@ class EncoderPoses:
         at_ns = stamp + self._recording.rig.timeshift_cam_imu_ns
         fit = fit_position(crane, at_ns, seconds_to_ns(settings.window_s))
         if isinstance(fit, Failed):
-            self._refused.append(RefusedFrame(stamp, fit.reason))
-            return self._refused[-1]
+            return fit
         attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
         if imu is not None:
             sway = sway_at(imu, at_ns, settings.sway_window_s)
@@ -91,15 +89,14 @@ class EncoderPoses:
         covariance[:3, :3] = np.eye(3) * np.deg2rad(attitude_std_deg) ** 2
         covariance[3:, 3:] = fit.covariance
         pose = Pose("yard", "body", attitude, fit.position_m + crane.crane_to_body_m)
-        self._placed.append(PosedFrame(stamp, pose, covariance))
-        return self._placed[-1]
+        return PosedFrame(stamp, pose, covariance)
 
     def finish(self) -> Trajectory:
         """Return all poses."""
-        missed, placed = self._without_sway, tuple(self._placed)
+        missed, placed = self._without_sway, tuple(self.placed)
         sensors = ("crane",) if self._recording.imu() is None or missed == len(placed) else ("crane", "imu")
         warnings = (f"the IMU doesn't cover {missed} frames: nominal attitude",) if missed else ()
-        return Trajectory("yard", placed, tuple(self._refused), sensors, warnings)
+        return Trajectory("yard", placed, tuple(self.refused), sensors, warnings)
 
 
 @dataclass(frozen=True, eq=False)

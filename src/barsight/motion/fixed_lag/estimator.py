@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
+from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.estimator import Seen, TrajectoryEstimator
+from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator, pictures_of
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, ReadingsSoFar
 from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
@@ -52,14 +52,15 @@ class FixedLagFusion(TrajectoryEstimator):
         return FixedLagPoses(self, recording, rectifier)
 
 
-class FixedLagPoses:
-    """`PoseEstimator` whose poses are final at once."""
+class FixedLagPoses(ImmediatePoses):
+    """`PoseEstimator` over a window of the last frames."""
 
     delay_ns = seconds_to_ns(SENSOR_DELAY_S)
 
     def __init__(self, estimator: FixedLagFusion, recording: Recording, rectifier: Rectifier) -> None:
         from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 
+        super().__init__()
         settings = estimator.settings
         self._use, self._recording = settings.sensors, recording
         self._noise = recording.imu_noise() or ORDINARY_NOISE
@@ -73,22 +74,14 @@ class FixedLagPoses:
             recording.rig.timeshift_cam_imu_ns, readings, self._level,
         )  # fmt: skip
         self._tracker = Tracker(self._estimator.predict, settings.front_end)
-        self._placed: list[PosedFrame] = []
-        self._refused: list[RefusedFrame] = []
 
-    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
-        """Track the next frame and estimate its pose."""
+    def place(self, seen: Seen) -> PosedFrame | RefusedFrame:
+        """Track the frame and estimate its pose."""
         self._estimator.readings = self._readings()
-        if isinstance(seen, RectifiedPair):
-            tracked = self._tracker.push(seen)
-        else:
-            tracked = RefusedFrame(seen.stamp_ns, getattr(seen, "reason", "points without pictures"))
-        frame = self._estimator.take(tracked)
-        if isinstance(frame, PosedFrame):
-            self._placed.append(frame)
-        else:
-            self._refused.append(frame)
-        return frame
+        pair = pictures_of(seen)
+        if isinstance(pair, Failed):
+            return self._estimator.take(RefusedFrame(seen.stamp_ns, pair.reason))
+        return self._estimator.take(self._tracker.push(pair))
 
     def finish(self) -> Trajectory:
         """Return all poses."""
@@ -96,7 +89,7 @@ class FixedLagPoses:
         names = {"crane": readings.crane, "imu": readings.imu, "stereo": self.reads_pictures or None}
         sensors = tuple(name for name, used in names.items() if used is not None)
         return Trajectory(
-            "world" if readings.crane is None else "yard", tuple(self._placed), tuple(self._refused), sensors,
+            "world" if readings.crane is None else "yard", tuple(self.placed), tuple(self.refused), sensors,
             () if self._level is None else self._level.warnings,
         )  # fmt: skip
 

@@ -16,11 +16,11 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose
-from barsight.core.types import PosedFrame, RectifiedCamera, RectifiedPair, RefusedFrame, Trajectory
+from barsight.core.types import PosedFrame, RectifiedCamera, Trajectory
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import match_mutual
 from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry
-from barsight.motion.estimator import Seen, TrajectoryEstimator
+from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator, pictures_of
 from barsight.motion.frontend.relative_pose import rotate_covariance, transport_covariance
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_view
 from barsight.motion.gravity import align_with_gravity
@@ -61,36 +61,24 @@ class PaperStitching(TrajectoryEstimator):
         return StitchedPoses(self, recording, rectifier)
 
 
-class StitchedPoses:
-    """`PoseEstimator` that ties each frame to the last good one; each pose is final at once."""
-
-    reads_pictures = True
+class StitchedPoses(ImmediatePoses):
+    """`PoseEstimator` that ties each frame to the last good one."""
 
     def __init__(self, estimator: PaperStitching, recording: Recording, rectifier: Rectifier) -> None:
+        super().__init__()
         self._settings, self._features = estimator.settings, estimator.features
         self._recording, self._rectifier = recording, rectifier
         self._crane = None
         if recording.crane() is not None:
             self._crane = EncoderOdometry(estimator.crane).begin(recording, rectifier)
         self.delay_ns = self._crane.delay_ns if self._crane else 0
-        self._placed: list[PosedFrame] = []
-        self._refused: list[RefusedFrame] = []
         self._last: tuple[FeatureView, Pose | None] | None = None
         self._noise = np.diag([1e-12] * 6)
 
-    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
-        """Place the frame, or refuse it where too few matches agree."""
-        found = self._place(seen)
-        if isinstance(found, Failed):
-            self._refused.append(RefusedFrame(seen.stamp_ns, found.reason))
-            return self._refused[-1]
-        self._placed.append(found)
-        return found
-
-    def _place(self, seen: Seen) -> PosedFrame | Failed:
-        if not isinstance(seen, RectifiedPair):
-            return Failed("no-pictures", getattr(seen, "reason", "points without pictures"))
-        view = feature_view(seen, self._features)
+    def place(self, seen: Seen) -> PosedFrame | Failed:
+        """Chain the frame; Failed where too few matches agree."""
+        pair = pictures_of(seen)
+        view = pair if isinstance(pair, Failed) else feature_view(pair, self._features)
         if isinstance(view, Failed):
             return view
         by_crane = self._crane.push(seen) if self._crane else None
@@ -117,7 +105,7 @@ class StitchedPoses:
         step = self._step(last[0], view, rectifier.camera, trend)
         if isinstance(step, Failed):
             return step
-        old = self._placed[-1].reference_from_body
+        old = self.placed[-1].reference_from_body
         old_rect0 = old @ rectifier.body_from_rect0
         new_rect0 = old_rect0 @ step.target_from_source
         pose = new_rect0 @ rectifier.body_from_rect0.inverse()
@@ -131,7 +119,7 @@ class StitchedPoses:
         """Return all poses."""
         by_crane = self._crane is not None
         sensors = ("stereo", "crane") if by_crane else ("stereo",)
-        return Trajectory("yard" if by_crane else "world", tuple(self._placed), tuple(self._refused), sensors)
+        return Trajectory("yard" if by_crane else "world", tuple(self.placed), tuple(self.refused), sensors)
 
     def _step(
         self, old: FeatureView, new: FeatureView, camera: RectifiedCamera, trend: Pose | None

@@ -11,8 +11,8 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
-from barsight.motion.estimator import Seen, TrajectoryEstimator
+from barsight.core.types import PosedFrame, Trajectory
+from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator, pictures_of
 from barsight.motion.frontend.relative_pose import estimate_step, rotate_covariance, transport_covariance
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_view
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
@@ -33,31 +33,19 @@ class StereoOdometry(TrajectoryEstimator):
         return ChainedPoses(self.settings, align_with_gravity(recording), rectifier)
 
 
-class ChainedPoses:
-    """`PoseEstimator` that ties each frame to the last good one; each pose is final at once."""
-
-    reads_pictures, delay_ns = True, 0
+class ChainedPoses(ImmediatePoses):
+    """`PoseEstimator` that ties each frame to the last good one."""
 
     def __init__(self, settings: OdometrySettings, level: GravityAlignment, rectifier: Rectifier) -> None:
         self._settings, self._level, self._body_from_rect0 = settings, level, rectifier.body_from_rect0
-        self._placed: list[PosedFrame] = []
-        self._refused: list[RefusedFrame] = []
+        super().__init__()
         self._last: FeatureView | None = None
         self._noise, self._stretch = np.diag([1e-12] * 6), np.zeros(3)
 
-    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
-        """Place the frame, or refuse it where too few features agree."""
-        found = self._place(seen)
-        if isinstance(found, Failed):
-            self._refused.append(RefusedFrame(seen.stamp_ns, found.reason))
-            return self._refused[-1]
-        self._placed.append(found)
-        return found
-
-    def _place(self, seen: Seen) -> PosedFrame | Failed:
-        if not isinstance(seen, RectifiedPair):
-            return Failed("no-pictures", getattr(seen, "reason", "points without pictures"))
-        view = feature_view(seen, self._settings)
+    def place(self, seen: Seen) -> PosedFrame | Failed:
+        """Chain the frame; Failed where too few features agree."""
+        pair = pictures_of(seen)
+        view = pair if isinstance(pair, Failed) else feature_view(pair, self._settings)
         if isinstance(view, Failed):
             return view
         if self._last is None:
@@ -67,7 +55,7 @@ class ChainedPoses:
         if isinstance(step, Failed):
             return step
         old_from_new = Pose("rect0", "rect0", step.rotation, step.translation).inverse()
-        old = self._placed[-1].reference_from_body
+        old = self.placed[-1].reference_from_body
         world_from_new = old @ self._body_from_rect0 @ old_from_new
         pose = world_from_new @ self._body_from_rect0.inverse()
         way = pose.translation - old.translation
@@ -84,4 +72,4 @@ class ChainedPoses:
     def finish(self) -> Trajectory:
         """Return all poses."""
         sensors = ("stereo", "imu") if self._level.from_imu else ("stereo",)
-        return Trajectory("world", tuple(self._placed), tuple(self._refused), sensors, self._level.warnings)
+        return Trajectory("world", tuple(self.placed), tuple(self.refused), sensors, self._level.warnings)
