@@ -13,8 +13,9 @@ import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
 from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
-from barsight.core.errors import Failed, MeasurementError
+from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.memory import trim_heap
+from barsight.core.notices import Notice
 from barsight.core.parallel import prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch, count_frames
@@ -37,7 +38,7 @@ from barsight.measurement import Preview, Refusal, json_digest, to_json
 from barsight.motion.rig_check.self_calibration import self_calibrate
 from barsight.motion.settings import make_estimator
 from barsight.recording.base import Recording
-from barsight.recording.sensor_samples import imu_hints
+from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.settings import StereoSettings, make_method
 
@@ -53,7 +54,8 @@ _TIDIED_EVERY = 8
 @dataclass(frozen=True, eq=False)
 class ProbedRecording:
     """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
-    inputs: SHA-256 of the files. kept: folder of checkpoints, if any. watch: times the stages.
+    doubts: what can't be right in the samples. inputs: SHA-256 of the files. kept: folder of checkpoints, if
+    any. watch: times the stages.
     """
 
     source: Recording
@@ -61,7 +63,7 @@ class ProbedRecording:
     first: RecordingProbe
     cell_m: float
     calibration_px: float
-    imu_hints: tuple[str, ...]
+    doubts: tuple[Notice, ...]
     configuration: dict[str, Any]
     inputs: dict[str, str]
     kept: Path | None
@@ -102,13 +104,16 @@ class BuiltMap:
 
 
 def probe(recording: Recording, settings: MeasureSettings, resume: Path | None) -> ProbedRecording:
-    """Look at a recording: how far the scene is, how large the cells, how sure the calibration."""
+    """Look at a recording: how far the scene is, how large the cells, how sure the calibration.
+
+    Raises InputError where the sensors' clocks differ.
+    """
     source, watch = SelectedSensors(recording, settings.use), Stopwatch()
+    if faults := clock_faults(source):
+        raise InputError(source.path, "; ".join(faults), "or leave the sensor out with --use")
     with watch("look"):
         rectifier = Rectifier(source.rig)
         first = probe_recording(source, rectifier)
-        imu = source.imu()
-        hints = imu_hints(imu) if imu is not None else ()
         cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
     known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
     configuration, inputs = to_json(asdict(settings)), source.digests()
@@ -117,7 +122,7 @@ def probe(recording: Recording, settings: MeasureSettings, resume: Path | None) 
         kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
     calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
     return ProbedRecording(
-        source, rectifier, first, cell_m, calibration_px, tuple(hints), configuration, inputs, kept, watch
+        source, rectifier, first, cell_m, calibration_px, doubts(source), configuration, inputs, kept, watch
     )
 
 
@@ -134,7 +139,10 @@ def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance)
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = count_frames("trajectory", total, advance)
-            trajectory = checkpointed(probed.kept, "trajectory", lambda: estimate(source, rectifier, count))
+            with _naming(probed):
+                trajectory = checkpointed(
+                    probed.kept, "trajectory", lambda: estimate(source, rectifier, count)
+                )
             trim_heap()
             calibrated = self_calibrate(
                 source.rig, rectifier, trajectory.drift, probed.calibration_px,
@@ -152,6 +160,17 @@ def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance)
             after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
         yield Way(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
+
+
+@contextmanager
+def _naming(probed: ProbedRecording) -> Iterator[None]:
+    """Name what can't be right in the samples as the cause, where nothing can be estimated from them."""
+    try:
+        yield
+    except (InputError, MeasurementError) as error:
+        if not probed.doubts:
+            raise
+        raise InputError(probed.source.path, "; ".join(doubt.message for doubt in probed.doubts)) from error
 
 
 def build_map(

@@ -7,7 +7,7 @@ memory don't grow with the way.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from barsight.calibration.geometry.rectification import Rectifier
@@ -15,6 +15,7 @@ from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
+from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
 from barsight.motion.frontend.tracking import Sighting, track_incrementally
@@ -66,12 +67,19 @@ class FixedLagFusion:
         )
         placed: list[PosedFrame] = []
         refused: list[RefusedFrame] = []
+        motions: list[Sighting] = []
         for seen in self._frames(recording, rectifier, estimator, advance):
+            if isinstance(seen, Sighting):  # without its points: memory doesn't grow with them
+                none = slice(0, 0)
+                motions.append(replace(
+                    seen, track=seen.track[none], stereo=seen.stereo[none], sigma_px=seen.sigma_px[none]
+                ))  # fmt: skip
             frame = estimator.take(seen)
             if isinstance(frame, PosedFrame):
                 placed.append(frame)
             else:
                 refused.append(frame)
+        refuse_contradictions(recording.path, motions, readings.imu, readings.crane, rectifier, shift)
         names = {"crane": readings.crane, "imu": readings.imu, "stereo": "stereo" in use or None}
         sensors = tuple(name for name, used in names.items() if used is not None)
         warnings = () if level is None else level.warnings
