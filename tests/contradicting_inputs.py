@@ -109,6 +109,16 @@ def shifted(seconds: float) -> Spoil:
     return both(*(stated(cam, "timeshift_cam_imu", lambda _: seconds) for cam in ("cam0", "cam1")))
 
 
+def zoomed(ratio: float) -> Spoil:
+    """State other focal lengths."""
+
+    def change(numbers: object) -> object:
+        fx, fy, *middle = numbers  # type: ignore[misc]
+        return [ratio * fx, ratio * fy, *middle]
+
+    return both(*(stated(cam, "intrinsics", change) for cam in ("cam0", "cam1")))
+
+
 def scaled(*factors: float) -> Callable[[np.ndarray], np.ndarray]:
     """Multiply the columns."""
     return lambda values: values * np.array(factors)
@@ -182,7 +192,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "cameras turned 90 about z": (turned("z", 90, "cam0", "cam1"), "wrong mounting"),
     "cameras turned 180 about z": (turned("z", 180, "cam0", "cam1"), "wrong mounting"),
     "cameras turned 180 about x": (turned("x", 180, "cam0", "cam1"), "wrong mounting"),
-    "IMU turned 90 about x": (turned("x", 90, "imu0"), "wrong mounting"),
+    "IMU turned 90 about x": (turned("x", 90, "imu0"), "gravity lies 90 degrees off"),
     "IMU turned 90 about z": (turned("z", 90, "imu0"), "wrong mounting"),
     "IMU turned 180 about z": (turned("z", 180, "imu0"), "wrong mounting"),
     "rig's attitude turned 90 about yard x": (crane_turned("x", 90), "mounting-doubtful"),
@@ -192,7 +202,18 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "rig's attitude turned 10 about yard z": (crane_turned("z", 10), "wrong mounting"),
     "pictures of the cameras exchanged": (swapped_pictures, "cam0 (left) and cam1 (right)"),
     "calibrations of the cameras exchanged": (exchanged_calibrations, "left and right are swapped"),
+    "calibration of a rig knocked in pitch": (turned("y", 0.5, "cam1"), "calibration-drift"),
+    "calibration of a rig knocked in yaw": (turned("x", 0.3, "cam1"), "calibration-drift"),
+    "calibration of cameras zoomed by 1.3": (zoomed(1.3), "check the baseline"),
     "no cam1 calibration": (without("cam1/sensor.yaml"), "cam1"),
     "no crane": (without("crane0"), "no-yard-frame"),
 }
 """What is spoiled -> how, and the code (or words) that must name it."""
+
+YEARS_S = 20 * 365.25 * 86_400
+AGES: dict[str, tuple[Spoil, bool, str]] = {
+    "recorded years ago": (both(), True, "map-too-old"),
+    "recorded in the future": (clock(late(YEARS_S), *SENSORS), True, "map-from-the-future"),
+    "no magnet": (both(), False, "no-magnet"),
+}
+"""Stale, future or missing, judged now -> how, whether a magnet is given, the code that must name it."""

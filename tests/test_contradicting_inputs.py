@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
 from barsight.yard.lifting.magnet import example_magnet
 from barsight.yard.vetoes import VETOES
-from contradicting_inputs import CONTRADICTIONS
+from contradicting_inputs import AGES, CONTRADICTIONS
 from drawn_steps import DrawnSteps, drawn_steps
 
 
@@ -118,14 +119,17 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def outcome(recording: Path) -> tuple[str, int]:
+def outcome(
+    recording: Path, judged_at: Literal["now", "end"] = "end", *, has_magnet: bool = True
+) -> tuple[str, int]:
     """The refusal or the map's vetoes, and how many lifts are offered."""
     magnet = recording.parent / "magnet.toml"
     magnet.write_text(example_magnet())
     out = recording.parent / "out"
+    given = magnet if has_magnet else None
     try:
         measure_into(
-            recording, out, MeasureSettings(), advance=lambda *_: None, magnet=magnet, judged_at="end"
+            recording, out, MeasureSettings(), advance=lambda *_: None, magnet=given, judged_at=judged_at
         )
     except BarsightError as error:
         return str(error), 0
@@ -145,3 +149,13 @@ def test_a_spoiled_recording_offers_nothing_and_says_why(name: str, sound: Path,
     spoil(recording / "mav0")
     told, offered = outcome(recording)
     assert offered == 0 and words in told and "\n" not in told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", AGES)
+def test_what_is_stale_future_or_missing_offers_nothing(name: str, sound: Path, tmp_path: Path) -> None:
+    recording = Path(shutil.copytree(sound, tmp_path / "recording"))
+    spoil, has_magnet, code = AGES[name]
+    spoil(recording / "mav0")
+    told, offered = outcome(recording, "now", has_magnet=has_magnet)
+    assert offered == 0 and code in told

@@ -170,7 +170,8 @@ def _naming(probed: ProbedRecording) -> Iterator[None]:
     except (InputError, MeasurementError) as error:
         if not probed.doubts:
             raise
-        raise InputError(probed.source.path, "; ".join(doubt.message for doubt in probed.doubts)) from error
+        told = "; ".join(doubt.message for doubt in probed.doubts)
+        raise InputError(probed.source.path, told, str(error)) from error
 
 
 def build_map(

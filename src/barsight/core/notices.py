@@ -39,8 +39,3 @@ class Notice:
 
     code: str
     message: str
-
-    @property
-    def veto(self) -> str | None:
-        """The veto by which it forbids every lift; None for one that forbids nothing."""
-        return FORBIDS.get(self.code)
