@@ -92,7 +92,8 @@ class PaperStitching:
             last = view
         reference = "yard" if predicted else "world"
         sensors = ("stereo", "crane") if predicted else ("stereo",)
-        return Trajectory(reference, tuple(placed), tuple(refused), sensors)
+        doubt = "the paper's stitching is for comparison: nothing holds the sensors against each other"
+        return Trajectory(reference, tuple(placed), tuple(refused), sensors, doubts=(doubt,))
 
     def _predicted(self, recording: Recording, rectifier: Rectifier) -> dict[int, Pose]:
         if recording.crane() is None:
