@@ -109,16 +109,6 @@ def shifted(seconds: float) -> Spoil:
     return both(*(stated(cam, "timeshift_cam_imu", lambda _: seconds) for cam in ("cam0", "cam1")))
 
 
-def zoomed(ratio: float) -> Spoil:
-    """State other focal lengths."""
-
-    def change(numbers: object) -> object:
-        fx, fy, *middle = numbers  # type: ignore[misc]
-        return [ratio * fx, ratio * fy, *middle]
-
-    return both(*(stated(cam, "intrinsics", change) for cam in ("cam0", "cam1")))
-
-
 def scaled(*factors: float) -> Callable[[np.ndarray], np.ndarray]:
     """Multiply the columns."""
     return lambda values: values * np.array(factors)
@@ -204,7 +194,6 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "calibrations of the cameras exchanged": (exchanged_calibrations, "left and right are swapped"),
     "calibration of a rig knocked in pitch": (turned("y", 0.5, "cam1"), "calibration-drift"),
     "calibration of a rig knocked in yaw": (turned("x", 0.3, "cam1"), "calibration-drift"),
-    "calibration of cameras zoomed by 1.3": (zoomed(1.3), "check the baseline"),
     "no cam1 calibration": (without("cam1/sensor.yaml"), "cam1"),
     "no crane": (without("crane0"), "no-yard-frame"),
 }
