@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from barsight.core.notices import FORBIDS, WARNINGS
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.detection import find_bundles
@@ -274,6 +275,10 @@ NOW_NS = 1_700_000_000 * NS_PER_S
         ("calibration", "yard", 1.0, "calibration-drift"),
         ("calibration-drift", "yard", 1.0, "calibration-drift"),
         ("one-view", "yard", 1.0, "one-view"),
+        ("units-doubtful", "yard", 1.0, "units-doubtful"),
+        ("mounting-doubtful", "yard", 1.0, "mounting-doubtful"),
+        ("trajectory-degraded", "yard", 1.0, "trajectory-degraded"),
+        ("stock-contradicts", "yard", 1.0, "stock-list"),
         ("assumed", "world", 1.0, "no-yard-frame"),
         ("assumed", "yard", 601.0, "map-too-old"),
         ("assumed", "yard", 3e7, "map-too-old"),
@@ -299,10 +304,21 @@ def test_an_assumed_magnet_forbids_every_lift() -> None:
 
 
 def test_a_sound_map_forbids_nothing() -> None:
-    harmless = [("frames-refused", "1 of 9"), ("trajectory", "the encoders are 20 ms late")]
+    harmless = [(code, "as the result says") for code in WARNINGS if code not in FORBIDS]
+    assert {"assumed", "frames-refused", "stock-list", "trajectory"} <= {code for code, _ in harmless}
     for age_s in (599, 10, -0.9):
         captured_ns = NOW_NS - round(age_s * NS_PER_S)
         assert map_vetoes(harmless, "yard", captured_ns, NOW_NS, SETTINGS, has_magnet=True) == ()
+
+
+def test_a_bundle_that_the_stock_list_contradicts_is_not_offered() -> None:
+    stock = [laid(0.3), laid(1.5)]
+    bundles = (record(stock[0], 0), record(stock[1], 1))
+    assert len(plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, ()).offered) == 2
+    told = {1: "the stock list doesn't name it"}
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), contradicted=told)
+    assert [lift.bundles for lift in plan.offered] == [(0,)]
+    assert [(v.code, v.reason) for v in plan.refused[0].vetoes] == [("stock-list", told[1])]
 
 
 def travel(place_m: list[tuple[float, float]], ages_s: list[float]) -> Travel:

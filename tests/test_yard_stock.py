@@ -12,8 +12,15 @@ import pytest
 from barsight.core.errors import InputError
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.inventory.bundle_file import read_bundles, schema, write_bundles
-from barsight.yard.inventory.stock_list import ListedBundle, match_stock, read_stock, stock_warnings
+from barsight.yard.inventory.bundle_file import read_bundles, read_match, schema, write_bundles
+from barsight.yard.inventory.stock_list import (
+    ListedBundle,
+    contradicted_bundles,
+    list_contradiction,
+    match_stock,
+    read_stock,
+    stock_warnings,
+)
 from barsight.yard.types import Bundle
 from yard_maps import Laid, draw
 
@@ -37,6 +44,9 @@ def test_a_list_that_fits_has_nothing_missing_moved_or_extra(bundles: tuple[Bund
         ("B2", 2, ()),
     ]
     assert (match.moved, match.missing, match.hidden, match.extra) == ((), (), (), ())
+    assert contradicted_bundles(match) == {} and list_contradiction(listed, match) is None
+    one_more = (*listed, ListedBundle("gone", 4.0, 0.0))
+    assert list_contradiction(one_more, match_stock(one_more, bundles)) is None
 
 
 def test_a_list_that_contradicts_the_map_is_told_so(bundles: tuple[Bundle, ...]) -> None:
@@ -54,6 +64,9 @@ def test_a_list_that_contradicts_the_map_is_told_so(bundles: tuple[Bundle, ...])
     assert len(by_name["thinner"].disagrees) == 2
     assert match.hidden == ("under",)
     assert match.extra == (2,)
+    told = contradicted_bundles(match)
+    assert set(told) == {0, 1, 2} and "119 mm" in told[0] and "bars' diameter" in told[1]
+    assert "3 of 3 listed bundles" in (list_contradiction(listed, match) or "")
     said = stock_warnings(listed, match)
     assert said[0] == "stock list: 1 of 4 listed bundles weren't found: gone"
     assert said[1] == "stock list: 1 of 4 lie elsewhere than listed: shifted"
@@ -117,6 +130,7 @@ def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ..
     jsonschema.Draft202012Validator.check_schema(schema())
     jsonschema.validate(content, schema())
     assert content["stock"]["missing"] == ["gone"]
+    assert read_match(path) == match
     for one, back in zip(bundles, read_bundles(path), strict=True):
         assert np.allclose(one.centre_m, back.centre_m, atol=1e-6)
         assert np.allclose(one.ends_m, back.ends_m, atol=1e-6)
@@ -131,6 +145,7 @@ def test_no_bundles_make_a_valid_file(tmp_path: Path) -> None:
     content = json.loads((tmp_path / "bundles.json").read_text(encoding="utf-8"))
     jsonschema.validate(content, schema())
     assert read_bundles(tmp_path / "bundles.json") == ()
+    assert read_match(tmp_path / "bundles.json") is None
 
 
 def test_a_torn_or_other_version_is_refused(tmp_path: Path) -> None:

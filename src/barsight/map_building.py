@@ -13,8 +13,9 @@ import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
 from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
-from barsight.core.errors import Failed, MeasurementError
+from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.memory import trim_heap
+from barsight.core.notices import Notice
 from barsight.core.parallel import prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch, count_frames
@@ -37,8 +38,8 @@ from barsight.measurement import Preview, Refusal, json_digest, to_json
 from barsight.motion.rig_check.self_calibration import self_calibrate
 from barsight.motion.settings import make_estimator
 from barsight.recording.base import Recording
+from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.recording.sensor_samples import imu_hints
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.settings import StereoSettings, make_method
 
@@ -54,7 +55,8 @@ _TIDIED_EVERY = 8
 @dataclass(frozen=True, eq=False)
 class ProbedRecording:
     """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
-    inputs: SHA-256 of the files. kept: folder of checkpoints, if any. watch: times the stages.
+    doubts: what can't be right in the samples. inputs: SHA-256 of the files. kept: folder of checkpoints, if
+    any. watch: times the stages.
     """
 
     source: Recording
@@ -62,7 +64,7 @@ class ProbedRecording:
     first: RecordingProbe
     cell_m: float
     calibration_px: float
-    imu_hints: tuple[str, ...]
+    doubts: tuple[Notice, ...]
     configuration: dict[str, Any]
     inputs: dict[str, str]
     kept: Path | None
@@ -105,8 +107,13 @@ class BuiltMap:
 def probe(
     recording: Recording, settings: MeasureSettings, scratch: Path, resume: Path | None
 ) -> ProbedRecording:
-    """Look at a recording: how far the scene is, how large the cells, how sure the calibration."""
+    """Look at a recording: how far the scene is, how large the cells, how sure the calibration.
+
+    Raises InputError where the sensors' clocks differ.
+    """
     source, watch = SelectedSensors(recording, settings.use), Stopwatch()
+    if faults := clock_faults(source):
+        raise InputError(source.path, "; ".join(faults), "or leave the sensor out with --use")
     configuration, inputs = to_json(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
@@ -114,13 +121,11 @@ def probe(
     with watch("look"):
         pairs = RectifiedPairs(source, Rectifier(source.rig), kept or scratch, watch)
         first = probe_recording(pairs)
-        imu = source.imu()
-        hints = imu_hints(imu) if imu is not None else ()
         cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
     known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
     calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
     return ProbedRecording(
-        source, pairs, first, cell_m, calibration_px, tuple(hints), configuration, inputs, kept, watch
+        source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, kept, watch
     )
 
 
@@ -138,9 +143,10 @@ def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance)
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = count_frames("trajectory", total, advance)
-            trajectory = checkpointed(
-                probed.kept, "trajectory", lambda: estimate(source, rectifier, count, pairs)
-            )
+            with _naming(probed):
+                trajectory = checkpointed(
+                    probed.kept, "trajectory", lambda: estimate(source, rectifier, count, pairs)
+                )
             trim_heap()
             calibrated = self_calibrate(
                 source.rig, rectifier, trajectory.drift, probed.calibration_px,
@@ -159,6 +165,18 @@ def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance)
             after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
         yield Way(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
+
+
+@contextmanager
+def _naming(probed: ProbedRecording) -> Iterator[None]:
+    """Name what can't be right in the samples as the cause, where nothing can be estimated from them."""
+    try:
+        yield
+    except (InputError, MeasurementError) as error:
+        if not probed.doubts:
+            raise
+        told = "; ".join(doubt.message for doubt in probed.doubts)
+        raise InputError(probed.source.path, told, str(error)) from error
 
 
 def build_map(

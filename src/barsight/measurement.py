@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
+from barsight.core.notices import Notice
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
 from barsight.mapping.surface.surface import Surface
 from barsight.yard.inventory.stock_list import StockMatch
@@ -26,14 +27,6 @@ class StageTime:
     name: str
     seconds: float
     frames: int = 0
-
-
-@dataclass(frozen=True)
-class Notice:
-    """A warning or a veto: `code` is stable and short, `message` a sentence."""
-
-    code: str
-    message: str
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import numpy as np
 
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.memory import peak_memory_mib, trim_heap
+from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import Agreement, Contour, LaserProfile, Trajectory
 from barsight.map_building import Advance, BuiltMap, ProbedRecording, Way, build_map, follow, probe
@@ -25,16 +26,29 @@ from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Measurement, Notice, StageTime, json_digest, to_json
+from barsight.measurement import Measurement, StageTime, json_digest, to_json
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.inventory.stock_list import ListedBundle, match_stock, read_stock, stock_warnings
+from barsight.yard.inventory.stock_list import (
+    ListedBundle,
+    StockMatch,
+    contradicted_bundles,
+    list_contradiction,
+    match_stock,
+    read_stock,
+    stock_warnings,
+)
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.magnet import Magnet, load_magnet
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
+
+LEAST_DOWN = 0.5
+"""Cosine between the optical axis and straight down; a rig over a yard looks down."""
+MAX_BELOW_FLOOR_RATIO = 0.3
+"""What lies this share of the working distance under the floor isn't there; depths of one pair are rough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +118,13 @@ def find_lifts(
     warnings = _warnings(probed, way, built, profiles)
     if mapped.stock is not None:
         warnings += [Notice("stock-list", text) for text in stock_warnings(mapped.stock, stock)]
+        contradiction = None if stock is None else list_contradiction(mapped.stock, stock)
+        warnings += [Notice("stock-contradicts", contradiction)] if contradiction else []
     with watch("lifts"):
         travel = _travel(probed, way, built, settings)
-        lifts = _lifts(heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at)
+        lifts = _lifts(
+            heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at, stock
+        )
     source = probed.source
     return Measurement(
         recording_path=source.path,
@@ -174,10 +192,14 @@ def _compare_with_laser(
 def _warnings(probed: ProbedRecording, way: Way, built: BuiltMap, profiles: Profiles) -> list[Notice]:
     """Gather what every stage had to assume or leave out."""
     warnings = [Notice("assumed", text) for text in probed.source.notes]
-    warnings += [Notice("imu", text) for text in probed.imu_hints]
+    warnings += probed.doubts
     warnings += [Notice("calibration", text) for text in probed.first.warnings]
     warnings += [Notice("calibration-drift", text) for text in way.drift_warnings]
     warnings += [Notice("trajectory", text) for text in way.trajectory.warnings]
+    warnings += [Notice("trajectory-degraded", text) for text in way.trajectory.doubts]
+    if way.trajectory.reference == "yard" and "stereo" not in way.trajectory.sensors:
+        warnings.append(Notice("trajectory-degraded", "no picture was held against the encoders"))
+    warnings += _floor_doubts(probed, built, way.trajectory)
     warnings += [Notice(a.code, a.reason) for a in profiles.agreed if isinstance(a, Failed)]
     if profiles.left_out:
         reason = "without a crane the map isn't in the laser's yard: no agreement"
@@ -188,6 +210,23 @@ def _warnings(probed: ProbedRecording, way: Way, built: BuiltMap, profiles: Prof
         reason = f"{len(built.refusals)} of {_frames_total(probed)} frames were refused"
         warnings.append(Notice("frames-refused", reason))
     return warnings
+
+
+def _floor_doubts(probed: ProbedRecording, built: BuiltMap, trajectory: Trajectory) -> list[Notice]:
+    """Doubt a way on which the cameras look under the yard's floor, or not down."""
+    if trajectory.reference != "yard":
+        return []
+    ahead = np.array([0.0, 0.0, probed.first.range_m])
+    seen_z_m = float(np.median([pose.apply(ahead)[2] for pose in built.placed]))
+    eye_z_m = float(np.median([pose.translation[2] for pose in built.placed]))
+    if eye_z_m - seen_z_m < LEAST_DOWN * probed.first.range_m:
+        where = "not below them"
+    elif seen_z_m < -MAX_BELOW_FLOOR_RATIO * probed.first.range_m:
+        where = f"{-seen_z_m:.1f} m below the yard's floor (z = 0)"
+    else:
+        return []
+    remedy = "check the hoist's sign and unit, p_crane_body, R_yard_body and the cameras' T_BS"
+    return [Notice("mounting-doubtful", f"what the cameras see lies {where}: {remedy}")]
 
 
 def _frames_total(probed: ProbedRecording) -> int:
@@ -206,6 +245,7 @@ def _travel(probed: ProbedRecording, way: Way, built: BuiltMap, settings: Measur
 def _lifts(
     heights: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet | None, settings: LiftSettings,
     warnings: list[Notice], trajectory: Trajectory, travel: Travel, judged_at: Literal["now", "end"],
+    stock: StockMatch | None,
 ) -> LiftPlan:  # fmt: skip
     """Choose lifts, judged now or at the last frame."""
     told = [(notice.code, notice.message) for notice in warnings]
@@ -214,7 +254,10 @@ def _lifts(
     forbidden = map_vetoes(
         told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=magnet is not None
     )
-    return plan_lifts(heights, bundles, magnet or load_magnet(None), settings, forbidden, travel, now_ns)
+    listed = {} if stock is None else contradicted_bundles(stock)
+    return plan_lifts(
+        heights, bundles, magnet or load_magnet(None), settings, forbidden, travel, now_ns, listed
+    )
 
 
 def _speed_along_x(trajectory: Trajectory) -> float:

@@ -17,7 +17,8 @@ from rich.table import Table
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.report.page import write_report
 from barsight.result_folder import read_heights, read_summary
-from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.inventory.bundle_file import read_bundles, read_match
+from barsight.yard.inventory.stock_list import contradicted_bundles
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import write_lifts
 from barsight.yard.lifting.magnet import load_magnet
@@ -62,7 +63,9 @@ def run(arguments: Sequence[str]) -> None:
             unknown = "result.json doesn't say how sure the trajectory is: measure again"
             vetoes = (*vetoes, Veto("trajectory-degraded", unknown))
         bundles = read_bundles(out / "bundles.json")
-        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes, travel, now_ns)
+        stock = read_match(out / "bundles.json")
+        listed = {} if stock is None else contradicted_bundles(stock)
+        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes, travel, now_ns, listed)
         write_lifts(plan, reference, out / "lifts.json")
         write_report(out, out / "report.html")
         print_lifts(plan, Console(stderr=True))

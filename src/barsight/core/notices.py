@@ -1,17 +1,41 @@
-"""All warnings of a measurement: one table of codes."""
+"""All warnings of a measurement: one table of codes, and one of those that forbid every lift."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 WARNINGS = {
     "assumed": "The recording doesn't say something, or says it in part; the message names the assumption.",
     "calibration": "The calibration is doubtful: rows of the pictures don't match as it says.",
     "calibration-drift": "The crane's travel contradicts the calibration; no lift is offered.",
     "frames-refused": "Frames were refused; `frames.refused` gives each one's stamp, stage and reason.",
-    "imu": "The IMU's samples look odd: check the unit that the message names.",
     "laser-frame": "Without a crane the map isn't in the laser's yard, so there is no agreement.",
+    "mounting-doubtful": "Gravity or floor contradict the stated mounting; no lift is offered.",
     "no-overlap": "A laser profile and the map share fewer than two points, so there is no agreement for it.",
     "one-view": "One frame made the map, so no height is confirmed by another; no lift is offered.",
-    "stock-list": "Stock list and map disagree, or the map can't tell.",
-    "trajectory": "Sensors contradict each other, or readings were left out; the message says which.",
+    "stock-contradicts": "Half of the stock list or more contradicts the map; no lift is offered.",
+    "stock-list": "Stock list and map disagree, or the map can't tell; bundles that disagree aren't offered.",
+    "trajectory": "Sensors contradict each other here and there; the message says which.",
+    "trajectory-degraded": "Readings or sensors were left out of the trajectory; no lift is offered.",
+    "units-doubtful": "A sensor's numbers are of a size that can't be; no lift is offered.",
 }
 """Code to what it means."""
+
+FORBIDS = {
+    "calibration": "calibration-drift",
+    "calibration-drift": "calibration-drift",
+    "mounting-doubtful": "mounting-doubtful",
+    "one-view": "one-view",
+    "stock-contradicts": "stock-list",
+    "trajectory-degraded": "trajectory-degraded",
+    "units-doubtful": "units-doubtful",
+}
+"""Code of a warning that forbids every lift to the veto's code."""
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A warning: `code` of `WARNINGS`, `message` a sentence."""
+
+    code: str
+    message: str

@@ -239,6 +239,7 @@ class Trajectory:
 
     reference: `yard` or `world`. sensors: which were used. warnings: sentences for the result.
     drift: of the rig, where the estimate sees it. detail: what else it knows, where it is one of all sensors.
+    doubts: sentences on what makes all of it doubtful, so that no lift may be chosen by it.
     """
 
     reference: str
@@ -248,6 +249,7 @@ class Trajectory:
     warnings: tuple[str, ...] = ()
     drift: RigDrift | None = None
     detail: MotionDetail | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def stamp_ns(self) -> Int64:

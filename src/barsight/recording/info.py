@@ -13,12 +13,10 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Int64
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import CraneSamples, LaserProfile, RefusedFrame
-from barsight.recording.sensor_samples import imu_hints
+from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.stored_images import StoredPictures
 
 GAP_FACTOR = 1.5
-LARGE_SHIFT_S = 0.5
-LARGE_YARD_M = 3000.0
 
 
 @dataclass(frozen=True)
@@ -98,14 +96,14 @@ def describe_recording(recording: StoredPictures) -> RecordingInfo:
     """Describe a recording. Raises `InputError` where a sensor's file is wrong, as measuring would."""
     stamps = recording.camera_stamps
     streams = [stream_info("cam0", stamps.left_ns), stream_info("cam1", stamps.right_ns)]
-    notes = list(recording.notes)
     imu, crane, laser = recording.imu(), recording.crane(), recording.laser()
     if imu is not None:
         streams.append(stream_info("imu0", imu.stamp_ns))
-        notes += imu_hints(imu)
     if crane is not None:
         streams.append(stream_info("crane0", crane.stamp_ns))
     first = next(iter(recording.frames()), None)
+    told = (doubt.message for doubt in doubts(recording))
+    notes = (*recording.notes, *clock_faults(recording), *told, *_time_notes(streams))
     return RecordingInfo(
         path=recording.path,
         format=recording.format,
@@ -117,7 +115,7 @@ def describe_recording(recording: StoredPictures) -> RecordingInfo:
         calibration=_calibration(recording.rig),
         crane=_crane(crane) if crane is not None else None,
         laser=_laser(laser),
-        notes=(*notes, *_unit_notes(recording.rig, crane), *_time_notes(streams)),
+        notes=tuple(dict.fromkeys(notes)),
     )
 
 
@@ -153,24 +151,14 @@ def _laser(profiles: Iterable[LaserProfile]) -> tuple[ProfileInfo, ...]:
     )
 
 
-def _unit_notes(rig: StereoRig, crane: CraneSamples | None) -> Iterable[str]:
-    """Note milliseconds and millimetres where seconds and metres belong."""
-    shift_s = rig.timeshift_cam_imu_ns / NS_PER_S
-    if abs(shift_s) > LARGE_SHIFT_S:
-        yield f"timeshift_cam_imu is {shift_s:g} s: check that it is not in milliseconds"
-    if crane is not None and float(np.abs(crane.position_m).max()) > LARGE_YARD_M:
-        yield f"the crane is up to {np.abs(crane.position_m).max():.0f} m away: check that it is not in mm"
-
-
 def _time_notes(streams: Iterable[StreamInfo]) -> Iterable[str]:
-    """Note a sensor whose clock runs elsewhere: its samples don't span the pictures."""
+    """Note a sensor whose samples don't span the pictures."""
     cam0, *others = streams
     for stream in others:
         before = (stream.first_ns - cam0.first_ns) / NS_PER_S
         after = (cam0.last_ns - stream.last_ns) / NS_PER_S
-        if stream.first_ns > cam0.last_ns or stream.last_ns < cam0.first_ns:
-            yield f"{stream.name} and cam0 have no time in common: their clocks differ"
-        elif stream.name != "cam1" and max(before, after) > 0.1:
+        apart = stream.first_ns > cam0.last_ns or stream.last_ns < cam0.first_ns
+        if stream.name != "cam1" and not apart and max(before, after) > 0.1:
             yield (
                 f"{stream.name} does not span the pictures: {max(before, 0):.2f} s missing at the start, "
                 f"{max(after, 0):.2f} s at the end"

@@ -33,18 +33,6 @@ def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_fr
     return ImuSamples(stamp_ns, gyro, accel)
 
 
-def imu_hints(samples: ImuSamples) -> tuple[str, ...]:
-    """List what looks odd in an IMU's samples but may be right."""
-    hints = []
-    gravity = float(np.median(np.linalg.norm(samples.accel_mps2, axis=1)))
-    if not 8.0 < gravity < 12.0:
-        hints.append(f"the IMU's median acceleration is {gravity:.2f} m/s^2, gravity is 9.8: check the unit")
-    turn = float(np.percentile(np.linalg.norm(samples.gyro_radps, axis=1), 95))
-    if turn > 5.0:
-        hints.append(f"the IMU turns at {turn:.1f} rad/s: check that the gyroscope is not in degrees/s")
-    return tuple(hints)
-
-
 def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> CraneSamples:
     """Build the encoders' places with the mounting of the crane's `sensor.yaml`.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +33,6 @@ WINDOW_S = 0.35
 TURN_SIGMA_RAD = 5e-4
 WAY_SIGMA_M = 0.005
 CLEARLY_BETTER = 0.1
-DEGREES = 180 / np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def compare_steps(
     count, ends = len(sightings), max(abs(off) for off in offs)
     steps = [k for k in range(1 + ends, count - ends) if sightings[k].motion is not None]
     stamps = np.array([s.stamp_ns for s in sightings]) + shift_ns
-    turn, way = _seen(sightings, steps, rectifier)
+    turn, way = seen_steps(sightings, steps, rectifier)
     angle, place = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
     if imu is not None:
         angle = interpolate_at(stamps, imu.stamp_ns, turned_angle(imu))
@@ -110,7 +110,13 @@ def compare_steps(
         old, new = [k + off - 1 for k in steps], [k + off for k in steps]
         travel = np.linalg.norm(place[new] - place[old], axis=1)
         found.append(
-            StepComparison(turn, way, angle[new] - angle[old], travel, (stamps[new] - stamps[old]) / NS_PER_S)
+            StepComparison(
+                turn,
+                np.linalg.norm(way, axis=1),
+                angle[new] - angle[old],
+                travel,
+                (stamps[new] - stamps[old]) / NS_PER_S,
+            )
         )
     return tuple(found)
 
@@ -143,33 +149,21 @@ def frames_off(
     return -best if clear else 0
 
 
-def gyro_in_degrees(
-    sightings: tuple[Sighting, ...], imu: ImuSamples, rectifier: Rectifier, shift_ns: int
-) -> bool:
-    """Check whether the gyro turns some 57 times as far as the pictures, step by step."""
-    (steps,) = compare_steps(sightings, imu, None, rectifier, shift_ns)
-    radians, degrees = _gyro_residual(steps), _gyro_residual(steps, DEGREES)
-    if len(radians) < MIN_STEPS:
-        return False
-    spread = float((radians**2).mean())
-    return (
-        float((degrees**2).mean()) < CLEARLY_BETTER * spread and spread > TURN_SIGMA_RAD**2 / CLEARLY_BETTER
-    )
-
-
-def _gyro_residual(steps: StepComparison, per_turn: float = 1.0) -> Float64:
-    """Subtract `per_turn` times the pictures' turn from the gyro (K, 3), and the constant rate that fits
-    best.
-    """
+def _gyro_residual(steps: StepComparison) -> Float64:
+    """Subtract the pictures' turn from the gyro (K, 3), and the constant rate that fits best."""
     known = np.isfinite(steps.gyro).all(axis=1)
     time = steps.seconds[known, None]
-    off = steps.gyro[known] - per_turn * steps.turn[known]
+    off = steps.gyro[known] - steps.turn[known]
     residual: Float64 = off - time * (time * off).sum(axis=0) / max(float((time**2).sum()), 1e-12)
     return residual
 
 
-def _seen(sightings: tuple[Sighting, ...], steps: list[int], rectifier: Rectifier) -> tuple[Float64, Float64]:
-    """Measure by the pictures: turn old body from new body (K, 3) and length of the way (K,)."""
+def seen_steps(
+    sightings: Sequence[Sighting], steps: list[int], rectifier: Rectifier
+) -> tuple[Float64, Float64]:
+    """Measure by the pictures: turn old body from new body (K, 3), and the way in m (K, 3), both in the old
+    body's axes.
+    """
     mount = rectifier.body_from_rect0
     turns, ways = [], []
     for k in steps:
@@ -180,8 +174,8 @@ def _seen(sightings: tuple[Sighting, ...], steps: list[int], rectifier: Rectifie
         move = mount.rotation @ (-old_from_new @ motion.translation)
         move = move + mount.translation - rotation @ mount.translation
         turns.append(Rotation.from_matrix(rotation).as_rotvec())
-        ways.append(np.linalg.norm(move))
-    return np.array(turns).reshape(-1, 3), np.array(ways)
+        ways.append(move)
+    return np.array(turns).reshape(-1, 3), np.array(ways).reshape(-1, 3)
 
 
 def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:

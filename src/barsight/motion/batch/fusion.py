@@ -21,7 +21,8 @@ from barsight.core.types import (
     Trajectory,
 )
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
-from barsight.motion.batch.fault_detection import check_crane, frames_off, gyro_in_degrees
+from barsight.motion.batch.fault_detection import check_crane, frames_off
+from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import (
     CraneSettings,
     EncoderOdometry,
@@ -95,6 +96,7 @@ class _Inputs:
     refused: tuple[RefusedFrame, ...]
     level: GravityAlignment | None
     warnings: tuple[str, ...]
+    doubts: tuple[str, ...]
 
 
 class BatchPoses:
@@ -109,8 +111,8 @@ class BatchPoses:
         self._settings, self._crane_settings = settings, crane
         self._recording, self._rectifier = recording, rectifier
         self.reads_pictures = "stereo" in use
-        stated = recording.crane() if "crane" in use else None
-        self._checked = None if stated is None else check_crane(reestimate_noise(stated))
+        self._stated = recording.crane() if "crane" in use else None
+        self._checked = None if self._stated is None else check_crane(reestimate_noise(self._stated))
         self._crane = None if self._checked is None else self._checked.samples
         self._imu, self._spoiled = recording.imu() if "imu" in use else None, 0
         if self._imu is not None:
@@ -158,15 +160,15 @@ class BatchPoses:
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())
         if len(frames) < 2:
-            return self._simple(inputs)
+            return replace(self._simple(inputs), doubts=inputs.doubts)
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
             estimate, seen, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
         except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
             simple = self._simple(inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
-            told = dict.fromkeys((*simple.warnings, *inputs.warnings, f"{reason}: estimated one by one"))
-            return replace(simple, warnings=tuple(told))
+            told = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
+            return replace(simple, warnings=told, doubts=(*inputs.doubts, f"{reason}: estimated one by one"))
         placed = tuple(
             PosedFrame(int(stamp), estimate.poses[k], covariance)
             for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
@@ -176,7 +178,7 @@ class BatchPoses:
         return Trajectory(
             "world" if inputs.crane is None else "yard", placed, tuple(refused), sensors,
             inputs.warnings + seen, estimate.drift,
-            _detail(estimate, inputs.sightings, nodes, encoders, shift),
+            _detail(estimate, inputs.sightings, nodes, encoders, shift), inputs.doubts,
         )  # fmt: skip
 
     def _simple(self, inputs: _Inputs) -> Trajectory:
@@ -192,26 +194,23 @@ class BatchPoses:
         sightings, refused = tuple(self._sightings), tuple(self._refused)
         if isinstance(recording, CornerRecording):
             sightings = split_tracks(sightings)
-        self._refuse_wrong_sensors(recording, self._rectifier, sightings, imu, crane)
-        level = None if crane else align_with_gravity(recording)
-        warnings = (level.warnings if level else ()) + (self._checked.warnings if self._checked else ())
+        self._refuse_wrong_sensors(recording, self._rectifier, sightings, imu, self._stated, crane)
+        level, checked = None if crane else align_with_gravity(recording), self._checked
+        warnings, doubts = level.warnings if level else (), checked.warnings if checked else ()
         if self._spoiled:
             warnings += (f"{self._spoiled} IMU samples are at the end of their scale and were left out",)
         if self.reads_pictures and crane is not None:
-            warnings += _untied(sightings, refused)
-        return _Inputs(crane, imu, sightings, refused, level, warnings)
+            few, most = _untied(sightings, refused)
+            warnings, doubts = warnings + few, doubts + most
+        return _Inputs(crane, imu, sightings, refused, level, warnings, doubts)
 
     def _refuse_wrong_sensors(
         self, recording: Recording, rectifier: Rectifier, sightings: tuple[Sighting, ...],
-        imu: ImuSamples | None, crane: CraneSamples | None,
+        imu: ImuSamples | None, stated: CraneSamples | None, crane: CraneSamples | None,
     ) -> None:  # fmt: skip
-        """Raise InputError where the pictures show that a sensor's unit or the cameras' stamps are wrong."""
+        """Raise InputError where the pictures show that a sensor or the cameras' stamps are wrong."""
         shift = recording.rig.timeshift_cam_imu_ns
-        if imu is not None and gyro_in_degrees(sightings, imu, rectifier, shift):
-            raise InputError(
-                recording.path, "the gyro turns 57 times as far as the pictures, so it is in degrees/s",
-                "multiply it by pi / 180",
-            )  # fmt: skip
+        refuse_contradictions(recording.path, sightings, imu, stated, rectifier, shift)
         late = frames_off(sightings, imu, crane, rectifier, shift)
         if late:
             raise InputError(
@@ -303,14 +302,18 @@ def _detail(
     )  # fmt: skip
 
 
-def _untied(sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]) -> tuple[str, ...]:
+def _untied(
+    sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Warn that pictures don't follow from each other, though encoders place their frames."""
     count = len(refused) + sum(sighting.motion is None for sighting in sightings[1:])
     if count == 0:
-        return ()
+        return (), ()
     total = len(sightings) + len(refused)
-    why = ": too little texture, or left and right pictures of different times" if 2 * count > total else ""
-    return (f"the pictures of {count} of {total} frames can't be tied to those before{why}",)
+    told = f"the pictures of {count} of {total} frames can't be tied to those before"
+    if 2 * count <= total:
+        return (told,), ()
+    return (), (f"{told}: too little texture, or left and right pictures of different times",)
 
 
 def _placed_frames(

@@ -119,7 +119,9 @@ class StitchedPoses(ImmediatePoses):
         """Return all poses."""
         by_crane = self._crane is not None
         sensors = ("stereo", "crane") if by_crane else ("stereo",)
-        return Trajectory("yard" if by_crane else "world", tuple(self.placed), tuple(self.refused), sensors)
+        doubt = "the paper's stitching is for comparison: nothing holds the sensors against each other"
+        reference = "yard" if by_crane else "world"
+        return Trajectory(reference, tuple(self.placed), tuple(self.refused), sensors, doubts=(doubt,))
 
     def _step(
         self, old: FeatureView, new: FeatureView, camera: RectifiedCamera, trend: Pose | None

@@ -13,7 +13,7 @@ import numpy as np
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
-from barsight.yard.inventory.stock_list import StockMatch
+from barsight.yard.inventory.stock_list import MatchedEntry, StockMatch
 from barsight.yard.types import Bar, Bundle, BundleSigma
 
 SCHEMA_VERSION = 1
@@ -52,6 +52,22 @@ def read_bundles(path: Path) -> tuple[Bundle, ...]:
     except FileNotFoundError as error:
         raise InputError(path, "no such file", remedy) from error
     except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
+
+
+def read_match(path: Path) -> StockMatch | None:
+    """Read how bundles.json, as `read_bundles` takes it, and the stock list fit; None without a list."""
+    stock = json.loads(path.read_text(encoding="utf-8")).get("stock")
+    if stock is None:
+        return None
+    try:
+        matched = tuple(
+            MatchedEntry(one["name"], one["bundle"], tuple(one["moved_m"]), tuple(one["disagrees"]))
+            for one in stock["matched"]
+        )
+        return StockMatch(matched, *(tuple(stock[name]) for name in ("moved", "missing", "hidden", "extra")))
+    except (KeyError, TypeError) as error:
+        remedy = "measure the recording again"
         raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
 
 

@@ -157,6 +157,25 @@ def match_stock(listed: tuple[ListedBundle, ...], bundles: tuple[Bundle, ...]) -
     )
 
 
+def contradicted_bundles(match: StockMatch) -> dict[int, str]:
+    """Tell which found bundles (by id) the list contradicts, and how: moved, another kind, or not listed."""
+    told = dict.fromkeys(match.extra, "the stock list doesn't name it")
+    for one in match.matched:
+        moved = [f"lies {1e3 * np.linalg.norm(one.moved_m):.0f} mm from there"] * (one.name in match.moved)
+        if differs := [*one.disagrees, *moved]:
+            told[one.bundle] = f"the stock list has {one.name} there, which this isn't: {'; '.join(differs)}"
+    return told
+
+
+def list_contradiction(listed: tuple[ListedBundle, ...], match: StockMatch) -> str | None:
+    """Say so where half of the listed bundles or more, hidden ones aside, contradict the map."""
+    seen = len(listed) - len(match.hidden)
+    wrong = len(match.missing) + sum(bool(one.disagrees) or one.name in match.moved for one in match.matched)
+    if 2 * wrong < max(seen, 1):
+        return None
+    return f"{wrong} of {seen} listed bundles contradict the map: is it this yard's list, in its frame?"
+
+
 def stock_warnings(listed: tuple[ListedBundle, ...], match: StockMatch | None) -> tuple[str, ...]:
     """Warn where list and map differ. match: None where the map isn't in the yard's frame."""
     if match is None:

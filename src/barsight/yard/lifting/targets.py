@@ -4,11 +4,13 @@ vetoes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
+from barsight.core.notices import FORBIDS
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.footprint import BundleTable, Placement
@@ -31,12 +33,6 @@ RULE = (
     "Offered lifts come safest first: by the smallest of pull over needed pull, capacity over load, and "
     "tolerance over the crane's tolerance; the higher bundle first where two are equal."
 )
-FROM_WARNINGS = {
-    "calibration": "calibration-drift",
-    "calibration-drift": "calibration-drift",
-    "one-view": "one-view",
-}
-"""Which of a result's warnings forbid every lift."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +70,7 @@ def map_vetoes(
 
     captured_to_ns: stamp of its last frame, None where that isn't known; now_ns: on the same clock.
     """
-    vetoes = [Veto(FROM_WARNINGS[code], text) for code, text in warnings if code in FROM_WARNINGS]
+    vetoes = [Veto(FORBIDS[code], text) for code, text in warnings if code in FORBIDS]
     if reference != "yard":
         vetoes.append(Veto("no-yard-frame", f"the map is in the {reference} frame: no crane gave its place"))
     if not has_magnet:
@@ -86,9 +82,11 @@ def map_vetoes(
 def plan_lifts(
     yard: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
     vetoes: tuple[Veto, ...], travel: Travel | None = None, now_ns: int = 0,
+    contradicted: Mapping[int, str] = MappingProxyType({}),
 ) -> LiftPlan:  # fmt: skip
     """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames.
-    now_ns: when the lifts are judged, on the frames' clock.
+    now_ns: when the lifts are judged, on the frames' clock. contradicted: bundles, by id, of which the stock
+    list says something else, and what.
     """
     parts, stands = split_map(yard), dict[int, Footing]()
     for part in parts:
@@ -105,8 +103,9 @@ def plan_lifts(
                 lifts[number] = _best(group, here, magnet, settings)
     offered, refused = [], []
     for _, lift in sorted(lifts.items()):
-        if lift.vetoes or vetoes:
-            refused.append(_with(lift, vetoes))
+        listed = tuple(Veto("stock-list", contradicted[i]) for i in lift.bundles if i in contradicted)
+        if lift.vetoes or vetoes or listed:
+            refused.append(_with(lift, (*vetoes, *listed)))
         else:
             offered.append(lift)
     top = {b.id: b.top_z_m for b in bundles}

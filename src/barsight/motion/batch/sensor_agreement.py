@@ -1,0 +1,206 @@
+"""Hold gyro and encoders against the pictures' motion: units, axes and clocks that can't be right.
+
+Pictures of a calibrated pair measure turn and way of each step in rad and m, whatever the other sensors say.
+A wrong unit, axis or clock is off by far more than any noise, so every limit is a coarse one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import InputError
+from barsight.core.stamps import interpolate_at, seconds_to_ns
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.motion.batch.fault_detection import (
+    CLEARLY_BETTER,
+    TURN_SIGMA_RAD,
+    WAY_SIGMA_M,
+    seen_steps,
+)
+from barsight.motion.crane.sway import turned_angle
+from barsight.motion.frontend.tracking import Sighting
+
+MIN_STEPS, MAX_STEPS = 3, 200
+MIN_WAY_M = 0.1
+"""Steps shorter than this by pictures and encoders tell no scale and no direction."""
+MAX_WAY_RATIO, MAX_ANGLE_DEG = 1.15, 5.0
+"""Encoders' way over the pictures', and the angle between them."""
+TURNS_SIGMAS, MAX_TURN_RATIO, MIN_ALIKE = 4.0, 5.0, 0.7
+"""A turn this many sigma long is seen; gyro's over pictures' turns; cosine between them."""
+MAX_IMU_LATE_S, MAX_CRANE_LATE_S = 0.05, 0.2
+"""The encoders' latency is estimated, so theirs may be longer."""
+LATE_S = np.arange(-50, 51) * 0.02
+"""Delays that are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """K steps between frames: old_ns, new_ns (K,) by the other sensors' clock; turn (K, 3) rotation vector
+    old body from new body and way (K, 3) m in `body`, by the pictures."""
+
+    old_ns: Int64
+    new_ns: Int64
+    turn: Float64
+    way: Float64
+
+    def between(self, stamp_ns: Int64, values: Float64, late_s: float) -> Float64:
+        """Differences (K, 3) of a sensor's values over the steps, its stamps `late_s` late; NaN beyond."""
+        late_ns = seconds_to_ns(late_s)
+        old, new = (interpolate_at(at + late_ns, stamp_ns, values) for at in (self.old_ns, self.new_ns))
+        return np.asarray(new - old)
+
+
+def refuse_contradictions(
+    path: Path, sightings: Sequence[Sighting], imu: ImuSamples | None, crane: CraneSamples | None,
+    rectifier: Rectifier, shift_ns: int,
+) -> None:  # fmt: skip
+    """Raise InputError where the pictures show that a unit, an axis or a clock is wrong.
+
+    crane: as stated. Too few steps, or steps that are too short, tell nothing.
+    """
+    steps = _steps(sightings, rectifier, shift_ns)
+    if len(steps.old_ns) < MIN_STEPS:
+        return
+    if crane is not None and len(crane.stamp_ns) > 1:
+        _check_encoders(path, steps, crane)
+    if imu is not None and len(imu.stamp_ns) > 1:
+        _check_gyro(path, steps, imu)
+
+
+def _check_encoders(path: Path, steps: _Steps, crane: CraneSamples) -> None:
+    place = median_filter(crane.position_m, size=(5, 1), mode="nearest")  # single readings may be wild
+    seen_m = np.linalg.norm(steps.way, axis=1)
+
+    def travelled(late_s: float) -> Float64:
+        return steps.between(crane.stamp_ns, place, late_s) @ crane.yard_from_body_nominal
+
+    def compared(late_s: float) -> tuple[float, float] | None:
+        """Median of the ratio, third quartile of the angle (deg); None where too few steps are long."""
+        travel = travelled(late_s)
+        read_m = np.linalg.norm(travel, axis=1)
+        long = np.maximum(read_m, seen_m) > MIN_WAY_M
+        if long.sum() < MIN_STEPS:
+            return None
+        cosine = (travel * steps.way).sum(axis=1)[long] / np.maximum(read_m * seen_m, 1e-12)[long]
+        ratio = float(np.median(read_m[long] / np.maximum(seen_m[long], 1e-6)))
+        least = float(np.percentile(cosine, 25))  # diagonal steps hide exchanged axes
+        return ratio, float(np.degrees(np.arccos(np.clip(least, -1, 1))))
+
+    found = compared(0.0)
+    if found is None:
+        return
+    unlike = max(found[0], 1 / max(found[0], 1e-9)) > 2
+    if not unlike:
+
+        def cost(late_s: float) -> float:
+            off = np.linalg.norm(travelled(late_s), axis=1) - seen_m
+            return _mean_square(off[:, None])
+
+        late_s = _delay(cost, WAY_SIGMA_M)
+        if abs(late_s) > MAX_CRANE_LATE_S:
+            raise _wrong_clock(path, "encoders'", late_s)
+        found = compared(late_s) or found
+        unlike = max(found[0], 1 / found[0]) > MAX_WAY_RATIO
+    ratio, angle_deg = found
+    if unlike:
+        raise InputError(
+            path, f"the encoders travel {ratio:.3g} times as far as the pictures show: a wrong unit",
+            "give bridge, trolley and hoist in metres, or check the baseline",
+        )  # fmt: skip
+    if angle_deg > MAX_ANGLE_DEG:
+        raise InputError(
+            path,
+            f"the encoders travel {angle_deg:.0f} degrees off the pictures' way: a wrong mounting",
+            "check the encoders' axes and signs, R_yard_body and the cameras' T_BS",
+        )
+
+
+def _check_gyro(path: Path, steps: _Steps, imu: ImuSamples) -> None:
+    angle = turned_angle(imu)
+    seconds = (steps.new_ns - steps.old_ns)[:, None] / 1e9
+
+    def varying(turns: Float64) -> Float64:
+        """Take the constant rate off: the gyro's bias."""
+        known = np.isfinite(turns).all(axis=1)
+        time = seconds[known]
+        rate = (time * turns[known]).sum(axis=0) / max(float((time**2).sum()), 1e-12)
+        return np.asarray(turns - seconds * rate)
+
+    def turned(late_s: float) -> tuple[Float64, Float64]:
+        """Turns (K, 3) by gyro and pictures over the steps that both know."""
+        gyro = steps.between(imu.stamp_ns, angle, late_s)
+        known = np.asarray(np.isfinite(gyro).all(axis=1))
+        return varying(gyro)[known], varying(np.where(known[:, None], steps.turn, np.nan))[known]
+
+    gyro, seen = turned(0.0)
+    if len(gyro) < MIN_STEPS:
+        return
+    by_gyro, by_pictures = (float(np.sqrt((turns**2).sum(axis=1).mean())) for turns in (gyro, seen))
+    least = TURNS_SIGMAS * TURN_SIGMA_RAD
+    if by_gyro > MAX_TURN_RATIO * max(by_pictures, least) or (
+        by_pictures > max(MAX_TURN_RATIO * by_gyro, least)
+    ):
+        raise InputError(
+            path,
+            f"the gyro turns {by_gyro / max(by_pictures, 1e-9):.3g} times as far as the pictures: "
+            "a wrong unit",
+            "give it in rad/s (degrees/s times pi / 180)",
+        )
+
+    def cost(late_s: float) -> float:
+        gyro, seen = turned(late_s)
+        return _mean_square(gyro - seen)
+
+    alike = float((gyro * seen).sum()) / max(float(np.linalg.norm(gyro) * np.linalg.norm(seen)), 1e-12)
+    late_s = _delay(cost, TURN_SIGMA_RAD)
+    # Half a period of the sway late looks like a wrong sign; the sign is what people get wrong.
+    if abs(late_s) > MAX_IMU_LATE_S and alike > -MIN_ALIKE:
+        raise _wrong_clock(path, "gyro's", late_s)
+    if min(by_gyro, by_pictures) > least and alike < MIN_ALIKE:
+        raise InputError(
+            path,
+            f"the gyro turns about other axes than the pictures (cosine {alike:.2f}): a wrong mounting",
+            "check T_BS of IMU and cameras and the gyro's axes and signs, or the IMU's clock",
+        )
+
+
+def _delay(cost: Callable[[float], float], sigma: float) -> float:
+    """The delay (s) that explains the steps clearly better than none does; 0 where there is none."""
+    at_none = cost(0.0)
+    if not at_none > sigma**2 / CLEARLY_BETTER:
+        return 0.0
+    costs = [cost(float(late_s)) for late_s in LATE_S]
+    best = int(np.nanargmin(costs))
+    return float(LATE_S[best]) if costs[best] < CLEARLY_BETTER * at_none else 0.0
+
+
+def _mean_square(off: Float64) -> float:
+    """Mean over the known steps, per axis; NaN where too few are known."""
+    known = off[np.isfinite(off).all(axis=1)]
+    return float((known**2).mean()) if len(known) >= MIN_STEPS else float("nan")
+
+
+def _wrong_clock(path: Path, sensor: str, late_s: float) -> InputError:
+    return InputError(
+        path,
+        f"the {sensor} stamps are {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'} against the "
+        "pictures: a wrong clock",
+        "put all sensors on one clock, and check timeshift_cam_imu (seconds)",
+    )
+
+
+def _steps(sightings: Sequence[Sighting], rectifier: Rectifier, shift_ns: int) -> _Steps:
+    """Gather the steps that pictures measured, at most `MAX_STEPS`, evenly."""
+    known = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
+    known = known[:: -(-len(known) // MAX_STEPS) or 1]
+    stamps = np.array([s.stamp_ns for s in sightings], np.int64) + shift_ns
+    new = np.array(known, np.int64)
+    turn, way = seen_steps(sightings, known, rectifier)
+    return _Steps(stamps[new - 1], stamps[new], turn, way)
