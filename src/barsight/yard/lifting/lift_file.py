@@ -68,7 +68,7 @@ def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
             "refused": [_lift(lift, None) for lift in plan.refused],
             "footings": [_footing(footing) for footing in plan.footings],
             "sides": [asdict(side) for side in plan.sides],
-            "free_places": [asdict(place) for place in plan.free],
+            "blocked": [asdict(each) for each in plan.blocked],
         },
         DIGITS,
     )
@@ -117,6 +117,7 @@ def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
             }
             for pole in (contact.poles if contact else ())
         ],
+        "set_down": asdict(lift.set_down) if lift.set_down else None,
         "vetoes": _vetoes(lift.vetoes),
     }
 
