@@ -59,7 +59,13 @@ def test_a_hole_of_300_mm_refuses(length_m: float, beside_m: float, turned: bool
 
 
 def test_two_beams_about_the_middle_carry_and_two_on_one_side_do_not() -> None:
-    for ends, fits in (((-2.0, 2.0), True), ((-3.0, 3.0), False), ((0.5, 3.0), False), ((-0.8, 0.8), False), ((0.0, 0.0), False)):
+    for ends, fits in (
+        ((-2.0, 2.0), True),
+        ((-3.0, 3.0), False),
+        ((0.5, 3.0), False),
+        ((-0.8, 0.8), False),
+        ((0.0, 0.0), False),
+    ):
         heights = yard()
         for y in ends:
             heights.z_m[cells(heights, (1.0, 2.2), (y - 0.05, y + 0.05))] += 0.1
@@ -67,7 +73,9 @@ def test_two_beams_about_the_middle_carry_and_two_on_one_side_do_not() -> None:
 
 
 def test_gullies_between_bars_are_no_holes_and_a_ridge_is_no_support() -> None:
-    close = map_of([laid(1.0 + 0.091 * k, bars=1, diameter_m=0.09, z=0.045) for k in range(14)], x_m=(-0.5, 3.5))
+    close = map_of(
+        [laid(1.0 + 0.091 * k, bars=1, diameter_m=0.09, z=0.045) for k in range(14)], x_m=(-0.5, 3.5)
+    )
     far = map_of([laid(0.9 + 0.3 * k, bars=1, diameter_m=0.2, z=0.1) for k in range(6)], x_m=(-0.5, 3.5))
     dunnage = LiftSettings(dunnage_m=0.09)
     for heights, bare, bridged in ((close, False, True), (far, False, False)):

@@ -34,7 +34,7 @@ MAX_SPAN_RATIO = 0.65
 """Of the length between one support and the next."""
 MAX_ALONG_DEG, MAX_ACROSS_DEG = 2.0, 3.0
 MAX_HOLE_M, HOLE_DEPTH_M = 0.14, 0.15
-"""Gullies narrower than this between bars are no holes, and dunnage bridges them; nor is what is less deep."""
+"""Gullies narrower than this between bars are no holes, and dunnage bridges them; nor are shallow ones."""
 _HOLE_STEPS = round(MAX_HOLE_M / STEP_M) | 1
 MAX_UNSEEN_CELLS = 4
 """An unseen place narrower than so many steps hides nothing that stands."""
@@ -47,9 +47,9 @@ MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.1, 6
 
 @dataclass(frozen=True)
 class Bearing:
-    """A load's rest at a place. z_m: its underside at the middle, over its dunnage. slope_deg: of the underside. support_m: from
-    the first support to the last. margin_along_m, margin_across_m: from the middle to the nearer end and side
-    of what carries it, the least within the crane's tolerance.
+    """A load's rest at a place. z_m: its underside at the middle, over its dunnage. slope_deg: of the
+    underside. support_m: from the first support to the last. margin_along_m, margin_across_m: from the middle
+    to the nearer end and side of what carries it, the least within the crane's tolerance.
     """
 
     z_m: float
@@ -63,8 +63,8 @@ class Bearing:
 class Surroundings:
     """Heights (V, U) about a place on a grid along (v_m) and across (u_m) the load.
 
-    z_m: medians over 50 mm squares, which wrong matches don't move. thin_m: over 30 mm, for what is thin. Both
-    have the highest nearby where a few cells were not seen; unseen: those cells and all others.
+    z_m: medians over 50 mm squares, which wrong matches don't move. thin_m: over 30 mm, for what is thin.
+    Both have the highest nearby where a few cells were not seen; unseen: those cells and all others.
     """
 
     v_m: Float64
@@ -131,7 +131,9 @@ def _surroundings(
     lowest = np.where(seen, part.z_m, np.float32(-1e3))
     nearby = cv2.dilate(lowest, np.ones((UNSEEN_REACH_CELLS,) * 2, np.uint8))
     filled = np.where(seen, part.z_m, nearby).astype(np.float32)
-    z, thin = (np.where(inside, cv2.medianBlur(filled, side)[row, column], nearby[row, column]) for side in (5, 3))
+    z, thin = (
+        np.where(inside, cv2.medianBlur(filled, side)[row, column], nearby[row, column]) for side in (5, 3)
+    )
     return Surroundings(v, u, z, thin, ~(inside & seen[row, column]))
 
 
@@ -153,7 +155,10 @@ def _rest(around: Surroundings, carrying: Float32, load: Load, du: float, dv: fl
     u = around.u_m[columns] - du
     vv, uu = np.meshgrid(v, u, indexing="ij")
     height, roll, pitch = rest_plane(uu.ravel(), vv.ravel(), stations.ravel(), math.tan(math.radians(10)))
-    if abs(math.degrees(math.atan(pitch))) > MAX_ALONG_DEG or abs(math.degrees(math.atan(roll))) > MAX_ACROSS_DEG:
+    if (
+        abs(math.degrees(math.atan(pitch))) > MAX_ALONG_DEG
+        or abs(math.degrees(math.atan(roll))) > MAX_ACROSS_DEG
+    ):
         return None
     gap = height + roll * uu + pitch * vv - stations
     level = gap <= gap.min(axis=1, keepdims=True) + LEVEL_M
@@ -179,7 +184,9 @@ def _stands_in_the_way(
     if (clear & (z > low_m + MAX_RISE_M)).any():
         return True
     over = (clear & (around.thin_m > low_m + MAX_THIN_RISE_M)).astype(np.uint8)
-    if (cv2.connectedComponentsWithStats(over, connectivity=8)[2][1:, cv2.CC_STAT_AREA] >= MIN_THIN_CELLS).any():
+    if (
+        cv2.connectedComponentsWithStats(over, connectivity=8)[2][1:, cv2.CC_STAT_AREA] >= MIN_THIN_CELLS
+    ).any():
         return True
     top = low_m + load.height_m
     beside, beyond = np.abs(around.u_m)[None], np.abs(around.v_m)[:, None]
@@ -200,7 +207,12 @@ def _has_hole(z: Float32, outline: Bool, high_m: float) -> bool:
 
 
 def _stanchion_in_the_way(
-    load: Load, place: tuple[float, float], axes: Float64, slack: Float64, top_m: float, settings: LiftSettings
+    load: Load,
+    place: tuple[float, float],
+    axes: Float64,
+    slack: Float64,
+    top_m: float,
+    settings: LiftSettings,
 ) -> bool:
     """Check for a stanchion that would be touched, or doesn't stand over what it would hold."""
     for x, y, z in settings.stanchions:

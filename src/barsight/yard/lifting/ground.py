@@ -61,6 +61,22 @@ class Ground:
         nothing = np.zeros(shape, np.bool_)
         return cls(yard, yard.x0_m + offset, yard.y0_m + offset, step * yard.cell_m, top, unknown, nothing)
 
+    def about(self, x_m: float, y_m: float, reach_m: float) -> Ground:
+        """Cut out what lies this near to a place, along X and along Y."""
+        low, high = (
+            [
+                round((at + side * reach_m - first) / self.cell_m)
+                for at, first in ((y_m, self.y0_m), (x_m, self.x0_m))
+            ]
+            for side in (-1, 1)
+        )
+        top, left = max(low[0], 0), max(low[1], 0)
+        cut = np.s_[top : max(high[0], top) + 1, left : max(high[1], left) + 1]
+        return replace(
+            self, x0_m=self.x0_m + left * self.cell_m, y0_m=self.y0_m + top * self.cell_m,
+            top_m=self.top_m[cut], unknown=self.unknown[cut], barred=self.barred[cut],
+        )  # fmt: skip
+
     def inside(self, load: Load, x_m: float, y_m: float, yaw_rad: float, margin_m: float) -> Bool:
         """Mark the cells under a load of this outline at a place, and so far around it."""
         rows, columns = self.top_m.shape
@@ -90,7 +106,9 @@ class Ground:
         size = np.array([columns - 1, rows - 1]) * self.cell_m
         corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size + (self.x0_m, self.y0_m)
         low, high = (corners @ axes.T).min(axis=0), (corners @ axes.T).max(axis=0)
-        across, along = (np.arange(a, b + self.cell_m / 2, self.cell_m) for a, b in zip(low, high, strict=True))
+        across, along = (
+            np.arange(a, b + self.cell_m / 2, self.cell_m) for a, b in zip(low, high, strict=True)
+        )
         uu, vv = np.meshgrid(across, along)
         x, y = (uu * axes[0, k] + vv * axes[1, k] for k in (0, 1))
         column = np.rint((x - self.x0_m) / self.cell_m).astype(np.int64)
@@ -115,7 +133,7 @@ class Ground:
 
 
 def _coarse(heights: HeightMap, step: int) -> tuple[Float32, Float32]:
-    """Compute the highest that may stand in each block of step x step, and the fraction of it that was seen."""
+    """Compute the highest that may stand in each block of step x step, and which fraction was seen."""
     rows, columns = (n // step for n in heights.z_m.shape)
     seen = (heights.source != HeightSource.UNKNOWN) & (heights.source != HeightSource.FILLED)
     cut = np.s_[: rows * step, : columns * step]

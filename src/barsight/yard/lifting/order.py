@@ -1,7 +1,7 @@
 """Order the lifts that dig a bundle out: which lift uncovers which, and how each load travels.
 
-Only the first lift of an order is offered: where a load was lifted or set down nothing is known any more until
-the place is measured again.
+Only the first lift of an order is offered: where a load was lifted or set down nothing is known any more
+until the place is measured again.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from barsight.yard.types import Bundle, YardMap
 
 @dataclass(frozen=True)
 class LiftStep:
-    """One lift of an order. travel_z_m: of the load's underside on its way. is_offered: it is one of the plan's
-    lifts; otherwise it is to be confirmed by a measurement after the one before.
+    """One lift of an order. travel_z_m: of the load's underside on its way. is_offered: it is one of the
+    plan's lifts; otherwise it is to be confirmed by a measurement after the one before.
     """
 
     bundle: int
@@ -50,9 +50,9 @@ def order_lifts(
     """
     by_id = {bundle.id: bundle for bundle in bundles}
     if bundle_id not in by_id:
-        return Failed(f"there is no bundle {bundle_id}; bundles.json lists them")
+        return Failed("no-such-bundle", f"there is no bundle {bundle_id}; bundles.json lists them")
     if plan.vetoes:
-        return Failed(f"no lift is offered: {plan.vetoes[0].reason}")
+        return Failed("no-lift", f"no lift is offered: {plan.vetoes[0].reason}")
     blockers = {each.bundle: each.blockers for each in plan.blocked}
     queue = _sequence(bundle_id, by_id, blockers, _offered(plan))
     if isinstance(queue, Failed):
@@ -66,7 +66,7 @@ def order_lifts(
         load = Load.of((bundle,))
         place = find_set_down(ground, load, plan.magnet, plan.settings)
         if place is None:
-            return Failed(f"no place is known where bundle {bundle.id} can be set down")
+            return Failed("no-set-down", f"no place is known where bundle {bundle.id} can be set down")
         height = travel_height(ground, load, place, plan.settings)
         if isinstance(height, Failed):
             return height
@@ -88,8 +88,9 @@ def travel_height(ground: Ground, load: Load, place: SetDown, settings: LiftSett
     highest = ground.highest_m(ends.min(axis=0) - reach, ends.max(axis=0) + reach, unseen)
     if not math.isfinite(highest):
         return Failed(
-            f"the way of bundle {load.bundles[0]} passes over places that were not seen: measure them, or give "
-            "max_stack_m, the most that may stand there"
+            "unseen-way",
+            f"the way of bundle {load.bundles[0]} passes over places that were not seen: measure them, or "
+            "give max_stack_m, the most that may stand there",
         )
     return highest + settings.travel_clear_m
 
@@ -119,16 +120,18 @@ def _sequence(
         open_ += blockers[one]
         unexplained = by_id[one].on_top is not True and not blockers[one]
         if unexplained:
-            return Failed(f"what lies on bundle {one} is not known")
+            return Failed("covered", f"what lies on bundle {one} is not known")
     queue = list[Bundle]()
     while needed:
         free = [one for one in needed if not needed & set(blockers[one])]
         if not free:
-            return Failed(f"bundles {', '.join(map(str, sorted(needed)))} lie on each other in a ring")
+            return Failed(
+                "ring", f"bundles {', '.join(map(str, sorted(needed)))} lie on each other in a ring"
+            )
         if not queue:
             free = [one for one in free if one in offered]
         if not free:
-            return Failed(_why_not_first(needed, blockers))
+            return Failed("no-lift", _why_not_first(needed, blockers))
         highest = max(free, key=lambda one: (by_id[one].top_z_m, -one))
         queue.append(by_id[highest])
         needed.remove(highest)

@@ -18,6 +18,8 @@ from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
 
+REACH_M = 30.0
+"""Places further than this from the load, along X or Y, are not looked for."""
 MAX_TRIED = 40
 APART_M = 0.15
 SHADOW_M = 0.3
@@ -30,8 +32,8 @@ RULE = "The least turn first, then the lowest, then the nearest to where the loa
 class SetDown:
     """Place for a load, yard axes: the middle of its underside; yaw as a bundle's.
 
-    turn_deg: from where it lies. slope_deg: of what it lies on. support_m: from the first support to the last.
-    margin_along_m, margin_across_m: from the load's middle to the end and the side of what carries it.
+    turn_deg: from where it lies. slope_deg: of what it lies on. support_m: from the first support to the
+    last. margin_along_m, margin_across_m: from the load's middle to the end and the side of what carries it.
     """
 
     x_m: float
@@ -54,6 +56,7 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
     """Find the first place in `RULE`'s order; None where there is none, or where the load would roll."""
     if load.rolls:
         return None
+    ground = ground.about(load.x_m, load.y_m, REACH_M)
     free = ground.barring(ground.inside(load, load.x_m, load.y_m, load.yaw_rad, SHADOW_M))
     for turn in _turns(settings.max_turn_deg):
         yaw = load.yaw_rad + math.radians(turn)

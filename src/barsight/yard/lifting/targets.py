@@ -12,9 +12,9 @@ import numpy as np
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.footprint import BundleTable, Placement
-from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load
+from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.set_down import find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import age_vetoes
@@ -47,8 +47,8 @@ class LiftPlan:
     """offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
 
     vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
-    stands. sides: of the piles. blocked: what must go before each bundle. judged_at_ns: when, on the frames' clock; captured_ns: stamps of the first
-    and last frame, None where the map is given.
+    stands. sides: of the piles. blocked: what must go before each bundle. judged_at_ns: when, on the frames'
+    clock; captured_ns: stamps of the first and last frame, None where the map is given.
     """
 
     magnet: Magnet
