@@ -92,13 +92,15 @@ def find_bearing(
     carrying = around.z_m
     if settings.dunnage_m > 0:
         carrying = cv2.morphologyEx(carrying, cv2.MORPH_CLOSE, np.ones((1, _HOLE_STEPS), np.uint8))
-    found = [
-        _rest(around, carrying, load, float(du), float(dv))
-        for du, dv in {(0.0, 0.0), *itertools.product((-slack[0], slack[0]), (-slack[1], slack[1]))}
-    ]
-    rests = [one for one in found if one is not None]
-    if len(rests) < len(found):
+    middle = _rest(around, carrying, load, 0.0, 0.0)
+    if middle is None or _stands_in_the_way(around, clear, middle.z_m, load, slack, magnet):
         return None
+    rests = [middle]
+    for du, dv in itertools.product((-slack[0], slack[0]), (-slack[1], slack[1])):
+        shifted = _rest(around, carrying, load, float(du), float(dv))
+        if shifted is None:
+            return None
+        rests.append(shifted)
     low, high = min(one.z_m for one in rests), max(one.z_m for one in rests)
     outline = _within(around, load, slack)
     if _stands_in_the_way(around, clear, low, load, slack, magnet) or _has_hole(around.z_m, outline, high):

@@ -20,7 +20,7 @@ from barsight.yard.types import Bundle
 
 REACH_M = 30.0
 """Places further than this from the load, along X or Y, are not looked for."""
-MAX_TRIED = 40
+MAX_TRIED = 16
 APART_M = 0.15
 SHADOW_M = 0.3
 """What lies this near to a load was partly hidden by it and may move when it goes."""

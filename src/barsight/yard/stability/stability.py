@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
@@ -29,6 +29,7 @@ BESIDE_M = 0.3
 TOUCH_M = 0.02
 RAISED_RATIO = 0.25
 """Of the width by which a neighbour's underside lies higher where it rests against a bundle."""
+_UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
 @dataclass(frozen=True)
@@ -133,10 +134,26 @@ def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, In
 
 def lookup_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
     """Look up heights of the nearest cells; NaN where they were not seen."""
-    column, row, inside = nearest_cells(heights, x, y)
-    source = heights.source[row, column]
-    seen = inside & (source != HeightSource.UNKNOWN) & (source != HeightSource.FILLED)
-    return np.where(seen, heights.z_m[row, column], np.nan).astype(np.float64)
+    x, y = np.broadcast_arrays(x, y)
+    z = _lookup(
+        heights.z_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m,
+        np.ravel(x).astype(np.float64), np.ravel(y).astype(np.float64),
+    )  # fmt: skip
+    return z.reshape(x.shape)
+
+
+@kernel()
+def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Float64, y: Float64) -> Float64:
+    """Look up the heights (N,) of the cells nearest to places x and y (N,), m; NaN where none was seen."""
+    found = np.full(x.size, np.nan)
+    for k in range(x.size):
+        column = int(np.floor((x[k] - x0) / cell + 0.5))
+        row = int(np.floor((y[k] - y0) / cell + 0.5))
+        if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
+            continue
+        if source[row, column] != _UNKNOWN and source[row, column] != _FILLED:
+            found[k] = z[row, column]
+    return found
 
 
 def _side(profile: Float64, bundle: Bundle) -> Side:
