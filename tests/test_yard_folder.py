@@ -137,6 +137,21 @@ def test_an_old_yard_can_be_looked_back_at(tmp_path: Path) -> None:
     assert written["judged_at_ns"] == written["captured_to_ns"] < time.time_ns() - 2e7 * NS_PER_S
 
 
+def test_a_bundle_is_fetched_by_name_or_said_why_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "out")
+    assert lifts(folder, "--fetch", "1", "--max-stack-m", "3") == 0
+    told = capsys.readouterr().err
+    assert "Lifts that fetch bundle 1" in told and "Measure again after every lift" in told
+    (step,) = read_lifts(folder / "lifts.json")["fetch"]["steps"]
+    assert step["bundle"] == 1 and step["is_offered"] and step["travel_z_m"] == pytest.approx(3.5)
+    for flags, why in (("1",), "not seen"), (("7",), "no bundle 7"):
+        assert lifts(folder, "--fetch", *flags) != 0
+        assert why in capsys.readouterr().err
+        assert read_lifts(folder / "lifts.json")["fetch"] is None
+
+
 def test_an_empty_yard_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "out")
     write_bundles((), None, "yard", folder / "bundles.json")

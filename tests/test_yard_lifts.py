@@ -25,7 +25,6 @@ from barsight.yard.lifting.footprint import BundleTable, Placement, count_grippe
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
 from barsight.yard.lifting.magnet import Beam, Magnet, Tolerance
 from barsight.yard.lifting.resting_plane import rest_plane
-from barsight.yard.lifting.set_down import CLEARANCE_M, COARSE_M, free_places
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.vetoes import VETOES, Veto
@@ -408,26 +407,6 @@ def test_an_unknown_code_is_no_veto() -> None:
     with pytest.raises(ValueError, match="no veto"):
         Veto("because", "so")
     assert all(re.fullmatch(r"[a-z]+(-[a-z]+)*", code) for code in VETOES)
-
-
-def test_free_places_lie_beside_the_bundles_and_on_the_level() -> None:
-    stock = [laid(1.0), laid(1.32), laid(2.8, z=0.3)]
-    places = free_places(map_of(stock, x_m=(-0.5, 4.0)), stock[0].width_m, 6.0)
-    on_floor = [place for place in places if place.z_m < 0.05]
-    assert on_floor == list(places[: len(on_floor)]), "the floor comes first"
-    for place in on_floor:
-        clear = min(abs(place.x_m - one.x_m) - one.width_m for one in stock)
-        assert clear > CLEARANCE_M - COARSE_M
-    between = [abs(a.x_m - b.x_m) for a in places for b in places if a is not b]
-    assert len(on_floor) >= 2 and min(between) > stock[0].width_m
-
-
-def test_an_unseen_floor_is_no_free_place() -> None:
-    heights = map_of([])
-    assert free_places(heights, 0.3, 6.0)
-    heights.source[:] = HeightSource.FILLED
-    assert free_places(heights, 0.3, 6.0) == ()
-    assert free_places(heights, 30.0, 6.0) == ()
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from barsight.cli.arguments import call, config_path, load_settings
+from barsight.core.errors import Failed, InputError
 from barsight.report.page import write_report
 from barsight.result_folder import read_heights, read_summary
 from barsight.yard.inventory.bundle_file import read_bundles, read_match
@@ -22,9 +23,12 @@ from barsight.yard.inventory.stock_list import contradicted_bundles
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import write_lifts
 from barsight.yard.lifting.magnet import load_magnet
+from barsight.yard.lifting.order import LiftOrder, order_lifts
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.vetoes import Veto
+
+REMEDY = "fetch another one, or measure again once its cause is gone"
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -37,6 +41,7 @@ def run(arguments: Sequence[str]) -> None:
         settings: Annotated[LiftSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
         at: Literal["now", "end"] = "now",
+        fetch: int | None = None,
     ) -> None:
         """Choose lift targets anew from a measured yard, without measuring again.
 
@@ -48,6 +53,7 @@ def run(arguments: Sequence[str]) -> None:
             settings: What a lift must fulfil.
             config: TOML file with settings; flags go before it.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
+            fetch: Id of a bundle: also print the lifts that dig it out, in order.
         """
         described = load_magnet(magnet)
         summary = read_summary(out)
@@ -65,12 +71,34 @@ def run(arguments: Sequence[str]) -> None:
         bundles = read_bundles(out / "bundles.json")
         stock = read_match(out / "bundles.json")
         listed = {} if stock is None else contradicted_bundles(stock)
-        plan = plan_lifts(read_heights(out), bundles, described, settings, vetoes, travel, now_ns, listed)
-        write_lifts(plan, reference, out / "lifts.json")
+        heights, console = read_heights(out), Console(stderr=True)
+        plan = plan_lifts(heights, bundles, described, settings, vetoes, travel, now_ns, listed)
+        order = None if fetch is None else order_lifts(fetch, heights, bundles, plan)
+        found = None if isinstance(order, Failed) else order
+        write_lifts(plan, reference, out / "lifts.json", found)
         write_report(out, out / "report.html")
-        print_lifts(plan, Console(stderr=True))
+        print_lifts(plan, console)
+        if isinstance(order, Failed):
+            raise InputError(out, f"bundle {fetch} can't be fetched: {order.reason}", REMEDY)
+        if order is not None:
+            print_order(order, console)
 
     call(command, "lifts", arguments)
+
+
+def print_order(order: LiftOrder, console: Console) -> None:
+    """Print the lifts that dig a bundle out, and that only the first is offered."""
+    table = Table(title=f"Lifts that fetch bundle {order.bundle}", box=SIMPLE_HEAD)
+    for head in ("step", "bundle", "to x m", "y m", "z m", "yaw deg", "travel z m", ""):
+        table.add_column(head, justify="right", no_wrap=True)
+    for number, step in enumerate(order.steps, start=1):
+        to, state = step.set_down, "offered" if step.is_offered else "to be confirmed"
+        table.add_row(
+            str(number), str(step.bundle), f"{to.x_m:.3f}", f"{to.y_m:.3f}", f"{to.z_m:.3f}",
+            f"{to.yaw_deg:.2f}", f"{step.travel_z_m:.2f}", state,
+        )  # fmt: skip
+    console.print(table)
+    console.print("Measure again after every lift: the next one is a plan, not an offer.", highlight=False)
 
 
 def print_lifts(plan: LiftPlan, console: Console) -> None:

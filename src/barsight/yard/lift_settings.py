@@ -31,10 +31,18 @@ class LiftSettings:
     """Of its width that a bundle may stand over the edge of what carries it."""
     max_lean_deg: float = 5.0
     """How far a side of the pile may lean outwards."""
-    set_down_width_m: float = 0.3
-    """Width of the bundle that free places are looked for, where the map shows none to go by."""
-    set_down_length_m: float = 6.0
-    """Its length."""
+    max_turn_deg: float = 5.0
+    """How far the crane can turn a load before it sets it down; from 90 on places across count."""
+    set_down_clear_m: float = 0.1
+    """What stands higher must be this far from a load that is set down, beyond the crane's tolerance."""
+    dunnage_m: float = 0.0
+    """Thickness of what men lay across under every load that is set down; 0 where nothing is laid."""
+    travel_clear_m: float = 0.5
+    """Height of a travelling load's underside over all that stands on its way."""
+    swing_m: float = 0.5
+    """How far a travelling load may swing out to any side."""
+    max_stack_m: float | None = None
+    """The most that may stand where nothing was seen; without it no load travels over such a place."""
     stanchions: tuple[tuple[float, float, float], ...] = ()
     """x, y and height (m) of the stanchions, where there are any."""
     min_freeboard_m: float = 0.05
@@ -53,8 +61,14 @@ class LiftSettings:
             raise ConfigError("lift shares, min_confidence and min_count_probability lie in 0...1")
         if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
             raise ConfigError("lift contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
-        if min(self.set_down_width_m, self.set_down_length_m) <= 0:
-            raise ConfigError("lift set_down_width_m and set_down_length_m must be over 0")
+        if min(self.set_down_clear_m, self.travel_clear_m, self.swing_m) <= 0:
+            raise ConfigError("lift set_down_clear_m, travel_clear_m and swing_m must be over 0")
+        if not 0 <= self.dunnage_m <= 0.5:
+            raise ConfigError(f"lift dunnage_m must lie in 0...0.5, not {self.dunnage_m}")
+        if not 0 <= self.max_turn_deg <= 180:
+            raise ConfigError(f"lift max_turn_deg must lie in 0...180, not {self.max_turn_deg}")
+        if self.max_stack_m is not None and not 0 < self.max_stack_m <= 50:
+            raise ConfigError(f"lift max_stack_m must lie between 0 and 50, not {self.max_stack_m}")
         if not 0 < self.max_lean_deg <= 45:
             raise ConfigError(f"lift max_lean_deg must lie in 0...45, not {self.max_lean_deg}")
 

@@ -15,6 +15,7 @@ from barsight.yard.lifting.clearance import clearance_vetoes, resting_vetoes
 from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
 from barsight.yard.lifting.magnet import Magnet, Tolerance
+from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.travel_accuracy import Travel, travel_vetoes
 from barsight.yard.lifting.validity import Validity, age_vetoes, validity
 from barsight.yard.stability.stability import Footing, footing_vetoes
@@ -49,7 +50,8 @@ class Lift:
     bound times safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
     overhang_m: bars beyond the outermost pole. tolerance: half sides of the box within which all this holds.
     safety: the smallest of pull over needed, capacity over load and tolerance over the crane's; at least 1
-    where nothing is vetoed. validity: in time, None where no frame is known to have seen the place.
+    where nothing is vetoed. validity: in time, None where no frame is known to have seen the place. set_down:
+    where the load can be put, None where no place is known or none was looked for.
     """
 
     place: Placement
@@ -67,6 +69,7 @@ class Lift:
     safety: float
     vetoes: tuple[Veto, ...]
     validity: Validity | None = None
+    set_down: SetDown | None = None
 
 
 def assess_placement(

@@ -13,6 +13,7 @@ from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
 from barsight.yard.lifting.assessment import Lift
+from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
 from barsight.yard.stability.stability import Footing
 from barsight.yard.vetoes import Veto
@@ -27,10 +28,10 @@ def schema() -> dict[str, Any]:
     return content
 
 
-def write_lifts(plan: LiftPlan, reference: str, target: Path) -> None:
+def write_lifts(plan: LiftPlan, reference: str, target: Path, order: LiftOrder | None = None) -> None:
     """Write lifts.json whole or not at all. reference: the frame, `yard` or `world`."""
     with atomic_path(target) as path:
-        text = json.dumps(lifts_content(plan, reference), indent=1, allow_nan=False)
+        text = json.dumps(lifts_content(plan, reference, order), indent=1, allow_nan=False)
         path.write_text(text + "\n", encoding="utf-8")
 
 
@@ -50,8 +51,8 @@ def read_lifts(path: Path) -> dict[str, Any]:
     return lifts
 
 
-def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
-    """Build the content of lifts.json."""
+def lifts_content(plan: LiftPlan, reference: str, order: LiftOrder | None = None) -> dict[str, Any]:
+    """Build the content of lifts.json. order: that digs out the bundle that was asked for, if one was."""
     content: dict[str, Any] = json_value(
         {
             "schema_version": SCHEMA_VERSION,
@@ -68,7 +69,8 @@ def lifts_content(plan: LiftPlan, reference: str) -> dict[str, Any]:
             "refused": [_lift(lift, None) for lift in plan.refused],
             "footings": [_footing(footing) for footing in plan.footings],
             "sides": [asdict(side) for side in plan.sides],
-            "free_places": [asdict(place) for place in plan.free],
+            "blocked": [asdict(each) for each in plan.blocked],
+            "fetch": asdict(order) if order else None,
         },
         DIGITS,
     )
@@ -117,6 +119,7 @@ def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
             }
             for pole in (contact.poles if contact else ())
         ],
+        "set_down": asdict(lift.set_down) if lift.set_down else None,
         "vetoes": _vetoes(lift.vetoes),
     }
 

@@ -1,98 +1,128 @@
-"""Find free places to set a bundle down: known, level and wide enough, ranked."""
+"""Find where a load can be set down: its very outline, on what carries it, with nothing in its way."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64
-from barsight.core.types import HeightSource
-from barsight.yard.sections import patches
-from barsight.yard.types import HeightMap, YardMap
+from barsight.core.arrays import Float64
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing
+from barsight.yard.lifting.ground import Ground
+from barsight.yard.lifting.load import Load
+from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.stability.stability import Footing
+from barsight.yard.types import Bundle
 
-COARSE_M = 0.05
-LEVEL_M = 0.04
-CLEARANCE_M = 0.1
-MIN_KNOWN = 0.9
-GULLY_M = 0.4
-"""Gullies narrower than this between tops don't make a layer uneven: dunnage bridges them."""
-MAX_VALUE = 20
-_PATCH_CELLS = 256
-RULE = (
-    "The lowest first, then the most level; at least 90 % seen, level within 40 mm, 100 mm clear all round."
-)
+REACH_M = 30.0
+"""Places further than this from the load, along X or Y, are not looked for."""
+MAX_TRIED = 16
+APART_M = 0.15
+SHADOW_M = 0.3
+"""What lies this near to a load was partly hidden by it and may move when it goes."""
+SMALL_TURNS_DEG = (0.0, 2.5, -2.5, 5.0, -5.0)
+RULE = "The least turn first, then the lowest, then the nearest to where the load lies."
 
 
 @dataclass(frozen=True)
-class FreePlace:
-    """A rectangle along Y for a bundle: its middle. level_m: spread of its heights; known_share: seen."""
+class SetDown:
+    """Place for a load, yard axes: the middle of its underside; yaw as a bundle's.
+
+    turn_deg: from where it lies. slope_deg: of what it lies on. support_m: from the first support to the
+    last. margin_along_m, margin_across_m: from the load's middle to the end and the side of what carries it.
+    """
 
     x_m: float
     y_m: float
     z_m: float
-    level_m: float
-    known_share: float
+    yaw_deg: float
+    turn_deg: float
+    slope_deg: float
+    support_m: float
+    margin_along_m: float
+    margin_across_m: float
+
+    @property
+    def yaw_rad(self) -> float:
+        """Return the yaw as the rest of the yard has it."""
+        return math.radians(self.yaw_deg)
 
 
-def free_places(yard: YardMap, width_m: float, length_m: float) -> tuple[FreePlace, ...]:
-    """Find places along Y for a bundle of this size, in `RULE`'s order; at most 20, none over another.
-
-    On the floor or on a layer of bundles: what counts is the upper envelope, closed over gullies.
-    """
-    step = max(round(COARSE_M / yard.cell_m), 1)
-    top, known = np.empty((2, *(n // step for n in yard.shape)), np.float32)
-    for patch in patches(yard, _PATCH_CELLS * step):
-        blocks = tuple(slice(cut.start // step, cut.stop // step) for cut in patch)
-        top[blocks], known[blocks] = _coarse(yard.part(*patch), step)
-    cell = yard.cell_m * step
-    wide = round((width_m + 2 * CLEARANCE_M) / cell) | 1
-    long = round((length_m + 2 * CLEARANCE_M) / cell) | 1
-    if wide > top.shape[1] or long > top.shape[0]:
-        return ()
-    gully = np.ones((1, round(GULLY_M / cell) | 1), np.uint8)
-    envelope = cv2.morphologyEx(np.where(known > 0, top, -1.0).astype(np.float32), cv2.MORPH_CLOSE, gully)
-    window = np.ones((long, wide), np.uint8)
-    highest, lowest = cv2.dilate(envelope, window), cv2.erode(envelope, window)
-    share = cv2.boxFilter(known, -1, (wide, long))
-    level = highest - lowest
-    fits: Bool = (level < LEVEL_M) & (share > MIN_KNOWN)
-    rows, columns = long // 2, wide // 2
-    inner = np.zeros_like(fits)
-    inner[rows : fits.shape[0] - rows, columns : fits.shape[1] - columns] = True
-    return _ranked(fits & inner, highest, level, share, yard, cell, (wide, long))
+def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSettings) -> SetDown | None:
+    """Find the first place in `RULE`'s order; None where there is none, or where the load would roll."""
+    if load.rolls:
+        return None
+    ground = ground.about(load.x_m, load.y_m, REACH_M)
+    free = ground.barring(ground.inside(load, load.x_m, load.y_m, load.yaw_rad, SHADOW_M))
+    for turn in _turns(settings.max_turn_deg):
+        yaw = load.yaw_rad + math.radians(turn)
+        yaw -= math.pi * math.ceil(yaw / math.pi - 0.5)
+        for x, y in _candidates(free, load, yaw, settings):
+            bearing = find_bearing(ground.yard, load, x, y, yaw, magnet, settings)
+            if bearing is not None:
+                return _place(bearing, x, y, yaw, turn)
+    return None
 
 
-def _coarse(heights: HeightMap, step: int) -> tuple[Float32, Float32]:
-    """Compute the highest seen height and fraction of seen cells of each block of step x step."""
-    rows, columns = (n // step for n in heights.z_m.shape)
-    seen = (heights.source != HeightSource.UNKNOWN) & (heights.source != HeightSource.FILLED)
-    z = np.where(seen, heights.z_m, -np.inf)[: rows * step, : columns * step]
-    blocks = z.reshape(rows, step, columns, step)
-    share = np.isfinite(blocks).mean(axis=(1, 3)).astype(np.float32)
-    return np.where(share > 0, blocks.max(axis=(1, 3)), 0).astype(np.float32), share
+def sound_ground(
+    ground: Ground, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
+) -> Ground:
+    """Bar what should not be loaded: bundles that lean or stand over an edge, and doubtful ones."""
+    footings = {footing.bundle: footing for footing in standing}
+    for bundle in bundles:
+        footing = footings[bundle.id]
+        leans = footing.overhang_side and footing.overhang_m > 0
+        if leans or bundle.confidence < settings.min_confidence:
+            own = Load.of((bundle,))
+            ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))
+    return ground
 
 
-def _ranked(
-    fits: Bool, z: Float32, level: Float32, share: Float32, yard: YardMap, cell: float,
-    size: tuple[int, int],
-) -> tuple[FreePlace, ...]:  # fmt: skip
-    found: list[FreePlace] = []
+def _turns(most_deg: float) -> Iterator[float]:
+    yield from (turn for turn in SMALL_TURNS_DEG if abs(turn) <= most_deg)
+    if most_deg >= 90:
+        yield 90.0
+
+
+def _candidates(
+    ground: Ground, load: Load, yaw_rad: float, settings: LiftSettings
+) -> Iterator[tuple[float, float]]:
+    """Propose places (x, y) where coarse cells rule nothing out: the lowest, of these the nearest first."""
+    top, shut, low = ground.turned(yaw_rad)
+    cell, margin = ground.cell_m, settings.set_down_clear_m
+    size = tuple(
+        int((side + 2 * margin) / cell) | 1 for side in (load.width_m, load.length_m)
+    )  # odd, no wider than the clear outline by more than a cell
+    if size[0] > top.shape[1] or size[1] > top.shape[0]:
+        return
+    # A gully may be as wide as three cells between two that carry.
+    closed = cv2.morphologyEx(top, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    window = np.ones((max(size[1] - 2, 1), max(size[0] - 2, 1)), np.uint8)
+    highest = cv2.dilate(top, window)
+    lowest = cv2.erode(closed, window)
+    fits = highest - lowest < HOLE_DEPTH_M + 2 * MAX_RISE_M
+    fits &= cv2.dilate(shut.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=1) == 0
     row, column = np.nonzero(fits)
-    order = np.lexsort((level[row, column], np.round(z[row, column], 1)))
-    taken = np.zeros(fits.shape, np.bool_)
-    wide, long = size
-    offset: Float64 = np.array([yard.x0_m, yard.y0_m]) + (cell - yard.cell_m) / 2
-    for k in order:
-        i, j = int(row[k]), int(column[k])
-        if taken[i, j]:
-            continue
-        x, y = offset + np.array([j, i]) * cell
-        found.append(
-            FreePlace(float(x), float(y), float(z[i, j]), float(level[i, j]), float(min(share[i, j], 1.0)))
-        )
-        if len(found) == MAX_VALUE:
-            break
-        taken[max(i - long + 1, 0) : i + long, max(j - wide + 1, 0) : j + wide] = True
-    return tuple(found)
+    if not row.size:
+        return
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    u, v = low[0] + cell * column, low[1] + cell * row
+    places = np.stack([u * cos - v * sin, u * sin + v * cos], axis=1)
+    away = np.linalg.norm(places - (load.x_m, load.y_m), axis=1)
+    left: Float64 = places[np.lexsort((away, np.round(highest[row, column], 1)))]
+    for _ in range(MAX_TRIED):
+        if not len(left):
+            return
+        yield float(left[0, 0]), float(left[0, 1])
+        left = left[np.abs(left - left[0]).max(axis=1) >= APART_M]
+
+
+def _place(bearing: Bearing, x_m: float, y_m: float, yaw_rad: float, turn_deg: float) -> SetDown:
+    return SetDown(
+        x_m, y_m, bearing.z_m, math.degrees(yaw_rad), turn_deg, bearing.slope_deg, bearing.support_m,
+        bearing.margin_along_m, bearing.margin_across_m,
+    )  # fmt: skip

@@ -5,7 +5,7 @@ vetoes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -14,13 +14,16 @@ from barsight.core.notices import FORBIDS
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.footprint import BundleTable, Placement
+from barsight.yard.lifting.ground import Ground
+from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.lifting.set_down import FreePlace, free_places
+from barsight.yard.lifting.set_down import find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import age_vetoes
 from barsight.yard.sections import split_map
+from barsight.yard.stability.blockers import Blocked, find_blocked
 from barsight.yard.stability.pile_sides import PileSide, pile_sides
-from barsight.yard.stability.stability import Footing, footings
+from barsight.yard.stability.stability import Footing, footings, high_side, turn_between
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto
 
@@ -40,9 +43,8 @@ class LiftPlan:
     """offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
 
     vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
-    stands. sides: of the piles. judged_at_ns: when, on the frames' clock; captured_ns: stamps of the first
-    and last frame, None where the map is given. free: places to set down the longest and widest bundle, in
-    the order of `set_down.RULE`.
+    stands. sides: of the piles. blocked: what must go before each bundle. judged_at_ns: when, on the frames'
+    clock; captured_ns: stamps of the first and last frame, None where the map is given.
     """
 
     magnet: Magnet
@@ -52,7 +54,7 @@ class LiftPlan:
     vetoes: tuple[Veto, ...]
     footings: tuple[Footing, ...]
     sides: tuple[PileSide, ...]
-    free: tuple[FreePlace, ...]
+    blocked: tuple[Blocked, ...]
     judged_at_ns: int
     captured_ns: tuple[int, int] | None
 
@@ -110,10 +112,13 @@ def plan_lifts(
             offered.append(lift)
     top = {b.id: b.top_z_m for b in bundles}
     offered.sort(key=lambda lift: (-round(lift.safety, 2), -max(top[i] for i in lift.bundles)))
-    wide = max((b.width_m for b in bundles), default=settings.set_down_width_m)
-    long = max((b.length_m for b in bundles), default=settings.set_down_length_m)
-    free = free_places(yard, wide, long)
     standing = tuple(stands[bundle.id] for bundle in bundles)
+    if offered:
+        ground = sound_ground(Ground.of(yard), bundles, standing, settings)
+        by_id = {bundle.id: bundle for bundle in bundles}
+        loads = (Load.of(tuple(by_id[k] for k in lift.bundles)) for lift in offered)
+        places = (find_set_down(ground, load, magnet, settings) for load in loads)
+        offered = [replace(lift, set_down=place) for lift, place in zip(offered, places, strict=True)]
     return LiftPlan(
         magnet,
         settings,
@@ -122,7 +127,7 @@ def plan_lifts(
         vetoes,
         standing,
         pile_sides(bundles, standing),
-        free,
+        find_blocked(bundles, standing, settings),
         now_ns,
         travel.captured_ns if travel else None,
     )
@@ -135,19 +140,24 @@ def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
-    """Group bundles on which nothing lies (or may), each with its next count - 1 neighbours towards
-    high x.
+    """Group bundles on which nothing lies (or may), each with its next count - 1 neighbours towards its high
+    side.
     """
-    free = sorted((b for b in bundles if b.on_top is not False), key=lambda b: float(b.centre_m[0]))
-    for place, first in enumerate(free):
-        group = [first]
-        for other in free[place + 1 :]:
-            if len(group) == count:
-                break
-            level = abs(other.top_z_m - group[-1].top_z_m) < SAME_TOP_M
-            parallel = abs(other.yaw_rad - first.yaw_rad) < SAME_YAW_RAD
-            between = float(other.centre_m[0] - group[-1].centre_m[0])
-            if level and parallel and between < (other.width_m + group[-1].width_m) / 2 + 0.1:
+    free = [bundle for bundle in bundles if bundle.on_top is not False]
+    for first in free:
+        group, across = [first], high_side(first.yaw_rad)
+        beyond = sorted(
+            (float((b.centre_m - first.centre_m)[:2] @ across), n)
+            for n, b in enumerate(free) if abs(turn_between(first.yaw_rad, b.yaw_rad)) < SAME_YAW_RAD
+        ) if count > 1 else []  # fmt: skip
+        for away, number in beyond:
+            last, other = group[-1], free[number]
+            if away <= 0 or len(group) == count:
+                continue
+            level = abs(other.top_z_m - last.top_z_m) < SAME_TOP_M
+            between = away - float((last.centre_m - first.centre_m)[:2] @ across)
+            shift = abs(float((other.centre_m - first.centre_m)[:2] @ first.direction[:2]))
+            if level and between < (other.width_m + last.width_m) / 2 + 0.1 and shift < first.length_m / 2:
                 group.append(other)
         if len(group) == count:
             yield tuple(group)
@@ -183,7 +193,8 @@ def _worst_first(lift: Lift) -> tuple[int, float]:
 
 def _place(group: tuple[Bundle, ...], along: float, across: float) -> Placement:
     centre = np.mean([b.centre_m[:2] for b in group], axis=0)
-    yaw = float(np.mean([b.yaw_rad for b in group]))
+    first = group[0].yaw_rad
+    yaw = first + float(np.mean([turn_between(first, b.yaw_rad) for b in group]))
     place = Placement(float(centre[0]), float(centre[1]), yaw)
     moved = centre + along * place.along + across * place.across
     return Placement(float(moved[0]), float(moved[1]), yaw)

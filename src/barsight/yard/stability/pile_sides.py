@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from barsight.core.arrays import Float64
-from barsight.yard.stability.stability import MIN_LEDGE_M, STEP_M, Footing
+from barsight.yard.stability.stability import MIN_LEDGE_M, STEP_M, Footing, high_side, turn_between
 from barsight.yard.types import Bundle
 
 NEAR_M = 0.3
@@ -56,8 +56,8 @@ def pile_sides(bundles: tuple[Bundle, ...], standing: tuple[Footing, ...]) -> tu
     footings = {footing.bundle: footing for footing in standing}
     sides = []
     for pile in _piles(bundles):
-        yaw = float(np.median([b.yaw_rad for b in pile]))
-        across = np.array([np.cos(yaw), np.sin(yaw)])
+        turned = [turn_between(pile[0].yaw_rad, b.yaw_rad) for b in pile]
+        across = high_side(pile[0].yaw_rad + float(np.median(turned)))
         sides += [_side(pile, across, side, footings) for side in (-1, 1)]
     return tuple(sides)
 
@@ -73,8 +73,7 @@ def _piles(bundles: tuple[Bundle, ...]) -> list[list[Bundle]]:
 
 def _near(one: Bundle, other: Bundle) -> bool:
     """Check whether two parallel bundles come nearer than NEAR_M sideways and overlap along."""
-    turned = (one.yaw_rad - other.yaw_rad + np.pi / 2) % np.pi - np.pi / 2
-    if abs(turned) > PARALLEL_RAD:
+    if abs(turn_between(one.yaw_rad, other.yaw_rad)) > PARALLEL_RAD:
         return False
     away = other.centre_m[:2] - one.centre_m[:2]
     cos, sin = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
@@ -87,6 +86,10 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
     def edge(bundle: Bundle) -> float:
         return float(side * (bundle.centre_m[:2] @ across)) + bundle.width_m / 2
 
+    def own_side(bundle: Bundle) -> int:
+        """Return this side as the bundle's footing calls it."""
+        return side if high_side(bundle.yaw_rad) @ across > 0 else -side
+
     outer: list[Bundle] = []
     for layer in sorted({b.layer for b in pile}, reverse=True):
         widest = max((b for b in pile if b.layer == layer), key=edge)
@@ -97,7 +100,7 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
     overhangs = []
     for place, bundle in enumerate(outer):
         footing, own = footings[bundle.id], _edge_sigma(bundle)
-        if footing.overhang_side == side:
+        if footing.overhang_side == own_side(bundle):
             overhangs.append(LayerOverhang(bundle.id, footing.overhang_m, math.hypot(own, STEP_M)))
         elif place:
             lower = outer[place - 1]
@@ -106,10 +109,10 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
         else:
             overhangs.append(LayerOverhang(bundle.id, math.nan, math.nan))
     lean, sigma = _lean(lowest, highest, edge(highest) - edge(lowest))
-    if footings[highest.id].overhang_side == side:
+    if footings[highest.id].overhang_side == own_side(highest):
         lean = footings[highest.id].lean_deg
         sigma = math.degrees(overhangs[-1].sigma_m / highest.width_m)
-    beside = footings[highest.id].sides[0 if side < 0 else 1]
+    beside = footings[highest.id].sides[0 if own_side(highest) < 0 else 1]
     run, drop = beside.run_m, beside.drop_m
     reach = run**2 + drop**2
     slope_sigma = (

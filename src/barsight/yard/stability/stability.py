@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
@@ -26,6 +26,10 @@ DUNNAGE_M = 0.3
 MIN_LEDGE_M = 0.03
 MIN_KNOWN = 0.3
 BESIDE_M = 0.3
+TOUCH_M = 0.02
+RAISED_RATIO = 0.25
+"""Of the width by which a neighbour's underside lies higher where it rests against a bundle."""
+_UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,10 @@ class Side:
 
 @dataclass(frozen=True)
 class Footing:
-    """Support of a bundle. sides: towards low and high x. overhang_m: over the edge of what carries it,
-    towards low and high x. overhang_m: over the edge of what carries it, towards (overhang_side: -1 low x, 1
-    high x, 0 none), NaN where it can't be told; lean_deg: of the side below it. freeboard_m: lowest stanchion
-    beside it over its top, NaN where there is none.
+    """Support of a bundle. sides: towards low and high x (y, where it lies nearer to X; see `high_side`).
+    overhang_m: over the edge of what carries it, towards (overhang_side: -1 low, 1 high, 0 none), NaN where
+    it can't be told; lean_deg: of the side below it. freeboard_m: lowest stanchion beside it over its top,
+    NaN where there is none.
     """
 
     bundle: int
@@ -56,6 +60,18 @@ class Footing:
     overhang_side: int
     lean_deg: float
     freeboard_m: float
+
+
+def high_side(yaw_rad: float) -> Float64:
+    """Return the unit vector (2,) across an axis, towards high x, or high y where it lies nearer to X."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    turned = cos < 0 if abs(cos) > abs(sin) else sin < 0
+    return np.array([-cos, -sin] if turned else [cos, sin])
+
+
+def turn_between(yaw_rad: float, other_rad: float) -> float:
+    """Compute the turn in [-pi/2, pi/2) from one axis to another; an axis has no front."""
+    return (other_rad - yaw_rad + math.pi / 2) % math.pi - math.pi / 2
 
 
 def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> tuple[Footing, ...]:
@@ -95,8 +111,9 @@ def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
     out = bundle.width_m / 2 + np.arange(0, LOOK_M, STEP_M)
     along = np.linspace(-0.45, 0.45, STATIONS) * bundle.length_m
     cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
-    x = bundle.centre_m[0] + sign * out[:, None] * cos - along[None] * sin
-    y = bundle.centre_m[1] + sign * out[:, None] * sin + along[None] * cos
+    side = sign * high_side(bundle.yaw_rad)
+    x = bundle.centre_m[0] + out[:, None] * side[0] - along[None] * sin
+    y = bundle.centre_m[1] + out[:, None] * side[1] + along[None] * cos
     z = lookup_heights(heights, x, y) - along[None] * np.tan(bundle.pitch_rad)
     known = np.isfinite(z)
     filled = np.where(known, z, np.inf)
@@ -117,10 +134,26 @@ def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, In
 
 def lookup_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
     """Look up heights of the nearest cells; NaN where they were not seen."""
-    column, row, inside = nearest_cells(heights, x, y)
-    source = heights.source[row, column]
-    seen = inside & (source != HeightSource.UNKNOWN) & (source != HeightSource.FILLED)
-    return np.where(seen, heights.z_m[row, column], np.nan).astype(np.float64)
+    x, y = np.broadcast_arrays(x, y)
+    z = _lookup(
+        heights.z_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m,
+        np.ravel(x).astype(np.float64), np.ravel(y).astype(np.float64),
+    )  # fmt: skip
+    return z.reshape(x.shape)
+
+
+@kernel()
+def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Float64, y: Float64) -> Float64:
+    """Look up the heights (N,) of the cells nearest to places x and y (N,), m; NaN where none was seen."""
+    found = np.full(x.size, np.nan)
+    for k in range(x.size):
+        column = int(np.floor((x[k] - x0) / cell + 0.5))
+        row = int(np.floor((y[k] - y0) / cell + 0.5))
+        if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
+            continue
+        if source[row, column] != _UNKNOWN and source[row, column] != _FILLED:
+            found[k] = z[row, column]
+    return found
 
 
 def _side(profile: Float64, bundle: Bundle) -> Side:
@@ -180,17 +213,42 @@ def footing_vetoes(
                  f"top, {1e3 * settings.min_freeboard_m:.0f} mm are needed")
         )  # fmt: skip
     for other in bundles:
-        leaning = by_id[other.id]
-        if other.id == target.id or not leaning.overhang_side or not _beside(target, other):
-            continue
-        towards = np.sign(target.centre_m[0] - other.centre_m[0]) == leaning.overhang_side
-        over = leaning.overhang_m > settings.max_overhang_ratio * other.width_m
-        if towards and (over or leaning.lean_deg > settings.max_lean_deg):
+        if leans_on(other, target, by_id[other.id], settings):
             vetoes.append(
-                Veto("unstable-side", f"bundle {other.id} stands {1e3 * leaning.overhang_m:.0f} mm over the "
-                     f"edge on this side")
+                Veto("unstable-side", f"bundle {other.id} stands {1e3 * by_id[other.id].overhang_m:.0f} mm "
+                     f"over the edge on this side")
             )  # fmt: skip
+        elif rests_against(other, target):
+            vetoes.append(Veto("unstable-side", f"bundle {other.id} rests against it from above"))
     return tuple(vetoes)
+
+
+def leans_on(other: Bundle, target: Bundle, footing: Footing, settings: LiftSettings) -> bool:
+    """Check whether `other`, of this footing, stands or leans over the edge beside which `target` lies."""
+    if other.id == target.id or not footing.overhang_side or not _beside(target, other):
+        return False
+    away = target.centre_m[:2] - other.centre_m[:2]
+    over = footing.overhang_m > settings.max_overhang_ratio * other.width_m
+    leans = over or footing.lean_deg > settings.max_lean_deg
+    return bool(leans and footing.overhang_side * (away @ high_side(other.yaw_rad)) > 0)
+
+
+def rests_against(other: Bundle, target: Bundle) -> bool:
+    """Check whether `other`, one of the neighbours that touch `target`, has its underside well over
+    `target`'s and its axis no higher than touching bundles can have it.
+    """
+    if other.id not in target.neighbours:
+        return False
+    raised = underside_m(other) - underside_m(target)
+    sideways = abs(float((other.centre_m - target.centre_m)[:2] @ high_side(target.yaw_rad)))
+    reach = (other.width_m + target.width_m) / 2 + TOUCH_M
+    apart = math.hypot(sideways, float(other.centre_m[2] - target.centre_m[2]))
+    return raised > RAISED_RATIO * min(other.width_m, target.width_m) and apart < reach
+
+
+def underside_m(bundle: Bundle) -> float:
+    """Compute the underside's height: a hexagon is as deep below its axis as it rises above it."""
+    return float(2 * bundle.centre_m[2] - bundle.top_z_m)
 
 
 def _sure(sigma: float) -> float:

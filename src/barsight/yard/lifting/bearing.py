@@ -1,0 +1,228 @@
+"""Judge one place for a load: what carries it there, how level it lies, what stands around."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.types import HeightSource
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.lifting.resting_plane import rest_plane
+from barsight.yard.sections import part_about
+from barsight.yard.stability.stability import nearest_cells
+from barsight.yard.types import YardMap
+
+STEP_M = 0.02
+STATION_STEPS = 5
+"""Heights are the highest of so many steps along the load: what carries it is what stands highest."""
+NEAR_M = 0.02
+"""A station this little below the underside carries it."""
+LEVEL_M = 0.01
+"""So level a station must be across the load to hold it upright."""
+MIN_ACROSS_RATIO = 1 / 6
+"""Of the width, to either side of the middle, that a station must carry."""
+MIN_ALONG_RATIO = 0.2
+"""Of the length, to either side of the middle, that the supports must reach."""
+MAX_SPAN_RATIO = 0.65
+"""Of the length between one support and the next."""
+MAX_ALONG_DEG, MAX_ACROSS_DEG = 2.0, 3.0
+MAX_HOLE_M, HOLE_DEPTH_M = 0.14, 0.15
+"""Gullies narrower than this between bars are no holes, and dunnage bridges them; nor are shallow ones."""
+_HOLE_STEPS = round(MAX_HOLE_M / STEP_M) | 1
+MAX_UNSEEN_CELLS = 4
+"""An unseen place narrower than so many steps hides nothing that stands."""
+UNSEEN_REACH_CELLS = 9
+MAX_RISE_M = 0.03
+"""What stands this little over the underside beside the load doesn't touch it."""
+MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.1, 6
+"""The same for what is thin, as plates on edge are, in connected steps."""
+
+
+@dataclass(frozen=True)
+class Bearing:
+    """A load's rest at a place. z_m: its underside at the middle, over its dunnage. slope_deg: of the
+    underside. support_m: from the first support to the last. margin_along_m, margin_across_m: from the middle
+    to the nearer end and side of what carries it, the least within the crane's tolerance.
+    """
+
+    z_m: float
+    slope_deg: float
+    support_m: float
+    margin_along_m: float
+    margin_across_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Heights (V, U) about a place on a grid along (v_m) and across (u_m) the load.
+
+    z_m: medians over 50 mm squares, which wrong matches don't move. thin_m: over 30 mm, for what is thin.
+    Both have the highest nearby where a few cells were not seen; unseen: those cells and all others.
+    """
+
+    v_m: Float64
+    u_m: Float64
+    z_m: Float32
+    thin_m: Float32
+    unseen: Bool
+
+
+def find_bearing(
+    yard: YardMap, load: Load, x_m: float, y_m: float, yaw_rad: float, magnet: Magnet, settings: LiftSettings
+) -> Bearing | None:
+    """Find how the load rests at a place and all over the crane's tolerance; None where it doesn't, or where
+    something may stand in its way.
+    """
+    axes = axes_of(yaw_rad)
+    slack = np.abs(axes) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
+    slack[0] += load.length_m / 2 * math.radians(magnet.tolerance.yaw_deg)
+    around = _surroundings(yard, load, (x_m, y_m), yaw_rad, slack + settings.set_down_clear_m, magnet)
+    clear = _within(around, load, slack + settings.set_down_clear_m)
+    square = np.ones((MAX_UNSEEN_CELLS, MAX_UNSEEN_CELLS), np.uint8)
+    wide = cv2.morphologyEx(around.unseen.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+    if (wide & clear).any():
+        return None
+    carrying = around.z_m
+    if settings.dunnage_m > 0:
+        carrying = cv2.morphologyEx(carrying, cv2.MORPH_CLOSE, np.ones((1, _HOLE_STEPS), np.uint8))
+    middle = _rest(around, carrying, load, 0.0, 0.0)
+    if middle is None or _stands_in_the_way(around, clear, middle.z_m, load, slack, magnet):
+        return None
+    rests = [middle]
+    for du, dv in itertools.product((-slack[0], slack[0]), (-slack[1], slack[1])):
+        shifted = _rest(around, carrying, load, float(du), float(dv))
+        if shifted is None:
+            return None
+        rests.append(shifted)
+    low, high = min(one.z_m for one in rests), max(one.z_m for one in rests)
+    outline = _within(around, load, slack)
+    if _stands_in_the_way(around, clear, low, load, slack, magnet) or _has_hole(around.z_m, outline, high):
+        return None
+    high += settings.dunnage_m
+    if _stanchion_in_the_way(load, (x_m, y_m), axes, slack, high + load.height_m, settings):
+        return None
+    return Bearing(
+        high,
+        max(one.slope_deg for one in rests),
+        min(one.support_m for one in rests),
+        min(one.margin_along_m for one in rests),
+        min(one.margin_across_m for one in rests),
+    )
+
+
+def _surroundings(
+    yard: YardMap, load: Load, place: tuple[float, float], yaw_rad: float, margin: Float64, magnet: Magnet
+) -> Surroundings:
+    """Read the heights under the load, under the magnet over it, and in a margin (across, along) beside."""
+    beam = magnet.beam
+    long = max(load.length_m, beam.length_m) / 2 + margin[1]
+    wide = max(load.width_m, beam.width_m, max(p.width_m for p in magnet.poles)) / 2 + margin[0]
+    v, u = (STEP_M * np.arange(-math.ceil(a / STEP_M), math.ceil(a / STEP_M) + 1) for a in (long, wide))
+    across, along = axes_of(yaw_rad)
+    x, y = (place[k] + v[:, None] * along[k] + u[None] * across[k] for k in (0, 1))
+    part = part_about(yard, x, y)
+    column, row, inside = nearest_cells(part, x, y)
+    seen = (part.source != HeightSource.UNKNOWN) & (part.source != HeightSource.FILLED)
+    lowest = np.where(seen, part.z_m, np.float32(-1e3))
+    nearby = cv2.dilate(lowest, np.ones((UNSEEN_REACH_CELLS,) * 2, np.uint8))
+    filled = np.where(seen, part.z_m, nearby).astype(np.float32)
+    z, thin = (
+        np.where(inside, cv2.medianBlur(filled, side)[row, column], nearby[row, column]) for side in (5, 3)
+    )
+    return Surroundings(v, u, z, thin, ~(inside & seen[row, column]))
+
+
+def _within(around: Surroundings, load: Load, margin: Float64) -> Bool:
+    """Mark the cells (V, U) under the load and in a margin (across, along) around it."""
+    long = np.abs(around.v_m) <= load.length_m / 2 + margin[1]
+    return np.asarray(long[:, None] & (np.abs(around.u_m) <= load.width_m / 2 + margin[0]))
+
+
+def _rest(around: Surroundings, carrying: Float32, load: Load, du: float, dv: float) -> Bearing | None:
+    """Rest the load's underside, a level strip of half its width, this far beside the place."""
+    rows = np.abs(around.v_m - dv) <= load.length_m / 2
+    columns = np.abs(around.u_m - du) <= max(load.width_m / 4, STEP_M)
+    count = rows.sum() // STATION_STEPS
+    first = int(np.argmax(rows))
+    strip = carrying[first : first + count * STATION_STEPS][:, columns]
+    stations = strip.reshape(count, STATION_STEPS, -1).max(axis=1).astype(np.float64)
+    v = around.v_m[first : first + count * STATION_STEPS].reshape(count, -1).mean(axis=1) - dv
+    u = around.u_m[columns] - du
+    vv, uu = np.meshgrid(v, u, indexing="ij")
+    height, roll, pitch = rest_plane(uu.ravel(), vv.ravel(), stations.ravel(), math.tan(math.radians(10)))
+    if (
+        abs(math.degrees(math.atan(pitch))) > MAX_ALONG_DEG
+        or abs(math.degrees(math.atan(roll))) > MAX_ACROSS_DEG
+    ):
+        return None
+    gap = height + roll * uu + pitch * vv - stations
+    level = gap <= gap.min(axis=1, keepdims=True) + LEVEL_M
+    to_low, to_high = (np.where(level, side * uu, -np.inf).max(axis=1) for side in (-1, 1))
+    across = np.minimum(to_low, to_high)
+    carries = (gap.min(axis=1) <= NEAR_M) & (across >= MIN_ACROSS_RATIO * load.width_m)
+    if carries.sum() < 2:
+        return None
+    at = v[carries]
+    margin = min(-float(at[0]), float(at[-1]))
+    span = float(np.diff(at).max())
+    if margin < MIN_ALONG_RATIO * load.length_m or span > MAX_SPAN_RATIO * load.length_m:
+        return None
+    slope = math.degrees(math.atan(math.hypot(roll, pitch)))
+    return Bearing(height, slope, float(at[-1] - at[0]), margin, float(across[carries].min()))
+
+
+def _stands_in_the_way(
+    around: Surroundings, clear: Bool, low_m: float, load: Load, slack: Float64, magnet: Magnet
+) -> bool:
+    """Check for what stands over the underside beside the load, or under the magnet over the load's top."""
+    z = around.z_m
+    if (clear & (z > low_m + MAX_RISE_M)).any():
+        return True
+    over = (clear & (around.thin_m > low_m + MAX_THIN_RISE_M)).astype(np.uint8)
+    if (
+        cv2.connectedComponentsWithStats(over, connectivity=8)[2][1:, cv2.CC_STAT_AREA] >= MIN_THIN_CELLS
+    ).any():
+        return True
+    top = low_m + load.height_m
+    beside, beyond = np.abs(around.u_m)[None], np.abs(around.v_m)[:, None]
+    for width, length, height in (
+        *((p.width_m, 2 * magnet.half_span_m, top) for p in magnet.poles),
+        (magnet.beam.width_m, magnet.beam.length_m, top + magnet.beam.above_faces_m / 2),
+    ):
+        under = (beside <= width / 2 + slack[0]) & (beyond <= length / 2 + slack[1])
+        if (under & (z > height)).any():
+            return True
+    return False
+
+
+def _has_hole(z: Float32, outline: Bool, high_m: float) -> bool:
+    """Check for a place under the load that is deep, and too wide for what lies between bars."""
+    closed = cv2.morphologyEx(z, cv2.MORPH_CLOSE, np.ones((_HOLE_STEPS, _HOLE_STEPS), np.uint8))
+    return bool((outline & (closed < high_m - HOLE_DEPTH_M)).any())
+
+
+def _stanchion_in_the_way(
+    load: Load,
+    place: tuple[float, float],
+    axes: Float64,
+    slack: Float64,
+    top_m: float,
+    settings: LiftSettings,
+) -> bool:
+    """Check for a stanchion that would be touched, or doesn't stand over what it would hold."""
+    for x, y, z in settings.stanchions:
+        away = np.abs(axes @ (np.array([x, y]) - place)) - slack
+        beyond = away - (load.width_m / 2, load.length_m / 2)
+        apart = float(np.linalg.norm(np.maximum(beyond, 0)))
+        if apart < settings.set_down_clear_m:
+            return True
+        if apart < settings.beside_stanchion_m and z - top_m < settings.min_freeboard_m:
+            return True
+    return False

@@ -1,0 +1,60 @@
+"""Describe what hangs in the magnet as a box: the outline and height of one bundle or of several."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.yard.lift_settings import UPPER
+from barsight.yard.stability.stability import turn_between, underside_m
+from barsight.yard.types import Bundle
+
+UNKNOWN_SIGMA_M = 0.05
+
+
+@dataclass(frozen=True)
+class Load:
+    """Outline of the load as it lies, m and rad, upper 95 % bounds of its sizes.
+
+    x_m, y_m: its middle, which is taken for its centre of mass. yaw_rad: as a bundle's. height_m: from its
+    underside to its top. rolls: nothing but its roundness would hold it on level ground.
+    """
+
+    bundles: tuple[int, ...]
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    width_m: float
+    length_m: float
+    height_m: float
+    rolls: bool
+
+    @classmethod
+    def of(cls, bundles: tuple[Bundle, ...]) -> Load:
+        """Build from the bundles of one lift, which lie side by side."""
+        first = bundles[0].yaw_rad
+        yaw = first + float(np.mean([turn_between(first, b.yaw_rad) for b in bundles]))
+        axes = axes_of(yaw)
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for b in bundles:
+            half = [
+                size / 2 + UPPER * (sigma if math.isfinite(sigma) else UNKNOWN_SIGMA_M) / 2
+                for size, sigma in ((b.width_m, b.sigma.width_m), (b.length_m, b.sigma.length_m))
+            ]
+            low = np.minimum(low, axes @ b.centre_m[:2] - half)
+            high = np.maximum(high, axes @ b.centre_m[:2] + half)
+        x, y = (low + high) / 2 @ axes
+        height = max(b.top_z_m for b in bundles) - min(underside_m(b) for b in bundles)
+        rolls = len(bundles) == 1 and bundles[0].width_m < 1.5 * bundles[0].bar_diameter_m
+        size = high - low
+        ids = tuple(b.id for b in bundles)
+        return cls(ids, float(x), float(y), yaw, float(size[0]), float(size[1]), height, rolls)
+
+
+def axes_of(yaw_rad: float) -> Float64:
+    """Return unit vectors (2, 2): across an axis and along it."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[cos, sin], [-sin, cos]])

@@ -1,0 +1,143 @@
+"""Order the lifts that dig a bundle out: which lift uncovers which, and how each load travels.
+
+Only the first lift of an order is offered: where a load was lifted or set down nothing is known any more
+until the place is measured again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.ground import Ground
+from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.set_down import SHADOW_M, SetDown, find_set_down, sound_ground
+from barsight.yard.lifting.targets import LiftPlan
+from barsight.yard.types import Bundle, YardMap
+
+
+@dataclass(frozen=True)
+class LiftStep:
+    """One lift of an order. travel_z_m: of the load's underside on its way. is_offered: it is one of the
+    plan's lifts; otherwise it is to be confirmed by a measurement after the one before.
+    """
+
+    bundle: int
+    set_down: SetDown
+    travel_z_m: float
+    is_offered: bool
+
+
+@dataclass(frozen=True)
+class LiftOrder:
+    """Lifts that dig a bundle out, the first one first; the last is the bundle's own."""
+
+    bundle: int
+    steps: tuple[LiftStep, ...]
+
+
+def order_lifts(
+    bundle_id: int, yard: YardMap, bundles: tuple[Bundle, ...], plan: LiftPlan
+) -> LiftOrder | Failed:
+    """Find the order that digs a bundle out, or why there is none.
+
+    Of the lifts that nothing is in the way of the highest comes first; the first must be an offered one.
+    """
+    by_id = {bundle.id: bundle for bundle in bundles}
+    if bundle_id not in by_id:
+        return Failed("no-such-bundle", f"there is no bundle {bundle_id}; bundles.json lists them")
+    if plan.vetoes:
+        return Failed("no-lift", f"no lift is offered: {plan.vetoes[0].reason}")
+    blockers = {each.bundle: each.blockers for each in plan.blocked}
+    queue = _sequence(bundle_id, by_id, blockers, _offered(plan))
+    if isinstance(queue, Failed):
+        return queue
+    ground = sound_ground(Ground.of(yard), bundles, plan.footings, plan.settings)
+    for bundle in queue:
+        own = Load.of((bundle,))
+        ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))
+    steps = list[LiftStep]()
+    for bundle in queue:
+        load = Load.of((bundle,))
+        place = find_set_down(ground, load, plan.magnet, plan.settings)
+        if place is None:
+            return Failed("no-set-down", f"no place is known where bundle {bundle.id} can be set down")
+        height = travel_height(ground, load, place, plan.settings)
+        if isinstance(height, Failed):
+            return height
+        steps.append(LiftStep(bundle.id, place, height, not steps))
+        cells = ground.inside(load, place.x_m, place.y_m, place.yaw_rad, SHADOW_M)
+        ground = ground.with_load(cells, place.z_m + load.height_m)
+    return LiftOrder(bundle_id, tuple(steps))
+
+
+def travel_height(ground: Ground, load: Load, place: SetDown, settings: LiftSettings) -> float | Failed:
+    """Find the height (m) for the load's underside that clears all it may pass over, or why there is none.
+
+    Bridge and trolley may move one before the other and the load may turn and swing: all of the rectangle
+    between both places counts, wider by half the load's diagonal and the swing.
+    """
+    ends = np.array([[load.x_m, load.y_m], [place.x_m, place.y_m]])
+    reach = _reach(load, place, settings)
+    unseen = math.inf if settings.max_stack_m is None else settings.max_stack_m
+    highest = ground.highest_m(ends.min(axis=0) - reach, ends.max(axis=0) + reach, unseen)
+    if not math.isfinite(highest):
+        return Failed(
+            "unseen-way",
+            f"the way of bundle {load.bundles[0]} passes over places that were not seen: measure them, or "
+            "give max_stack_m, the most that may stand there",
+        )
+    return highest + settings.travel_clear_m
+
+
+def _reach(load: Load, place: SetDown, settings: LiftSettings) -> Float64:
+    """Return how far (x, y) the load reaches from its middle on the way, swing included."""
+    half = np.array([load.width_m, load.length_m]) / 2
+    yaws = load.yaw_rad + math.radians(place.turn_deg) * np.linspace(0, 1, 19)
+    reaches = [half @ np.abs(axes_of(float(yaw))) for yaw in yaws]
+    return np.asarray(np.max(reaches, axis=0) + settings.swing_m)
+
+
+def _offered(plan: LiftPlan) -> set[int]:
+    return {lift.bundles[0] for lift in plan.offered if len(lift.bundles) == 1}
+
+
+def _sequence(
+    bundle_id: int, by_id: dict[int, Bundle], blockers: dict[int, tuple[int, ...]], offered: set[int]
+) -> list[Bundle] | Failed:
+    """Sort all that must go, and the bundle itself last, so that nothing is lifted from under another."""
+    needed, open_ = set[int](), [bundle_id]
+    while open_:
+        one = open_.pop()
+        if one in needed:
+            continue
+        needed.add(one)
+        open_ += blockers[one]
+        unexplained = by_id[one].on_top is not True and not blockers[one]
+        if unexplained:
+            return Failed("covered", f"what lies on bundle {one} is not known")
+    queue = list[Bundle]()
+    while needed:
+        free = [one for one in needed if not needed & set(blockers[one])]
+        if not free:
+            return Failed(
+                "ring", f"bundles {', '.join(map(str, sorted(needed)))} lie on each other in a ring"
+            )
+        if not queue:
+            free = [one for one in free if one in offered]
+        if not free:
+            return Failed("no-lift", _why_not_first(needed, blockers))
+        highest = max(free, key=lambda one: (by_id[one].top_z_m, -one))
+        queue.append(by_id[highest])
+        needed.remove(highest)
+    return queue
+
+
+def _why_not_first(needed: set[int], blockers: dict[int, tuple[int, ...]]) -> str:
+    free = sorted(one for one in needed if not needed & set(blockers[one]))
+    return f"none of the bundles to begin with ({', '.join(map(str, free))}) may be lifted: see their vetoes"

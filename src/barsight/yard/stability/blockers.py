@@ -1,0 +1,62 @@
+"""Find which bundles must go before another can be lifted: the order in which a pile comes apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.stability.stability import Footing, leans_on, rests_against, underside_m
+from barsight.yard.types import Bundle
+
+HIGHER_RATIO = 0.25
+"""Of the smaller width by which the upper one's underside lies higher."""
+MEETS_RATIO = 0.05
+"""Of the smaller width by which outlines must overlap to meet."""
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """A bundle and the ids of those that must go before it: they lie on it, lean or rest against it."""
+
+    bundle: int
+    blockers: tuple[int, ...]
+
+
+def find_blocked(
+    bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
+) -> tuple[Blocked, ...]:
+    """Find for each bundle what must go before it, in the bundles' order."""
+    by_id = {footing.bundle: footing for footing in standing}
+    centres = np.array([b.centre_m[:2] for b in bundles]).reshape(-1, 2)
+    reach = np.array([(b.length_m + b.width_m) / 2 for b in bundles])
+    found = []
+    for number, target in enumerate(bundles):
+        away = np.linalg.norm(centres - centres[number], axis=1)
+        near = (bundles[k] for k in np.flatnonzero(away < reach + reach[number]) if k != number)
+        blockers = (
+            other.id for other in near
+            if lies_on(other, target) or rests_against(other, target)
+            or leans_on(other, target, by_id[other.id], settings)
+        )  # fmt: skip
+        found.append(Blocked(target.id, tuple(blockers)))
+    return tuple(found)
+
+
+def lies_on(upper: Bundle, lower: Bundle) -> bool:
+    """Check whether the outlines meet, seen from above, and `upper` has its underside well over `lower`'s."""
+    width = min(upper.width_m, lower.width_m)
+    if underside_m(upper) - underside_m(lower) <= HIGHER_RATIO * width:
+        return False
+    away = (upper.centre_m - lower.centre_m)[:2]
+    both = [
+        (np.array([[np.cos(b.yaw_rad), np.sin(b.yaw_rad)], [-np.sin(b.yaw_rad), np.cos(b.yaw_rad)]]),
+         np.array([b.width_m, b.length_m]) / 2)
+        for b in (upper, lower)
+    ]  # fmt: skip
+    for axis in (*both[0][0], *both[1][0]):
+        reach = sum(float(np.abs(own @ axis) @ half) for own, half in both)
+        if abs(float(away @ axis)) >= reach - MEETS_RATIO * width:
+            return False
+    return True

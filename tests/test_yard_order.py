@@ -1,0 +1,139 @@
+"""The order that digs a bundle out: which lift uncovers which, and how high a load travels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jsonschema
+import numpy as np
+import pytest
+
+from barsight.core.errors import Failed
+from barsight.core.types import HeightSource
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.lift_file import lifts_content, schema
+from barsight.yard.lifting.order import LiftOrder, order_lifts
+from barsight.yard.lifting.targets import plan_lifts
+from barsight.yard.stability.blockers import find_blocked
+from barsight.yard.stability.stability import footings
+from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.vetoes import Veto
+from lift_yards import LENGTH_M, MAGNET, SETTINGS, SIGMA, laid, map_of, record
+from yard_maps import Laid
+
+STOCK = [laid(0.3), laid(0.6), laid(0.9), laid(0.45, z=0.56), laid(0.75, z=0.56), laid(0.6, z=0.92)]
+"""A pile of three layers: 5 lies on 3 and 4, which lie on 0, 1 and 2."""
+
+
+def pile(settings: LiftSettings = SETTINGS, x_m: float = 6.0) -> tuple[HeightMap, tuple[Bundle, ...]]:
+    on_top = (False, False, False, False, False, True)
+    layers = (0, 0, 0, 1, 1, 2)
+    bundles = tuple(
+        record(one, k, layer=layers[k], on_top=on_top[k], ends_sigma_m=(0.02, 0.02))
+        for k, one in enumerate(STOCK)
+    )
+    return map_of(STOCK, x_m=(-1.5, x_m), y_m=(-5.0, 5.0)), bundles
+
+
+def fetch(bundle: int, settings: LiftSettings = SETTINGS) -> LiftOrder | Failed:
+    heights, bundles = pile()
+    return order_lifts(bundle, heights, bundles, plan_lifts(heights, bundles, MAGNET, settings, ()))
+
+
+def test_what_lies_on_leans_or_rests_against_a_bundle_must_go_first() -> None:
+    heights, bundles = pile()
+    blocked = find_blocked(bundles, footings(heights, bundles, SETTINGS), SETTINGS)
+    assert [set(each.blockers) for each in blocked] == [{3}, {3, 4, 5}, {4}, {5}, {5}, set()]
+    across = record(laid(0.6, z=1.3, yaw_deg=90.0, length_m=2.0), 6)
+    all_of = (*bundles, across)
+    blocked = find_blocked(all_of, footings(heights, all_of, SETTINGS), SETTINGS)
+    assert 6 in blocked[5].blockers and blocked[6].blockers == ()
+
+
+def test_the_order_takes_what_is_above_first_and_offers_only_the_first() -> None:
+    order = fetch(1)
+    assert isinstance(order, LiftOrder)
+    assert [step.bundle for step in order.steps] == [5, 3, 4, 1] or [s.bundle for s in order.steps] == [
+        5,
+        4,
+        3,
+        1,
+    ]
+    assert [step.is_offered for step in order.steps] == [True, False, False, False]
+    places = [step.set_down for step in order.steps]
+    for k, one in enumerate(places):
+        assert one.z_m < 0.02, "on the floor beside the pile"
+        assert min(abs(one.x_m - other.x_m) for other in STOCK) > 0.27 + SETTINGS.set_down_clear_m
+        assert all(abs(one.x_m - other.x_m) > 0.27 + SETTINGS.set_down_clear_m for other in places[:k])
+    top = STOCK[5].top_z_m
+    for step in order.steps:
+        assert step.travel_z_m == pytest.approx(top + SETTINGS.travel_clear_m, abs=0.02)
+
+
+def test_what_cannot_be_dug_out_says_why() -> None:
+    missing = fetch(9)
+    assert isinstance(missing, Failed) and "no bundle 9" in missing.reason
+    heights, bundles = pile()
+    plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, (Veto("one-view", "one frame"),))
+    refused = order_lifts(1, heights, bundles, plan)
+    assert isinstance(refused, Failed) and "one frame" in refused.reason
+    weak = plan_lifts(heights, bundles, replace(MAGNET, capacity_kg=1000.0), SETTINGS, ())
+    refused = order_lifts(1, heights, bundles, weak)
+    assert isinstance(refused, Failed) and "(5)" in refused.reason
+    doubted = (*bundles[:5], replace(bundles[5], on_top=None))
+    plan = plan_lifts(heights, doubted, MAGNET, SETTINGS, ())
+    refused = order_lifts(1, heights, doubted, plan)
+    assert isinstance(refused, Failed) and "what lies on bundle 5" in refused.reason
+    heights, bundles = pile(x_m=1.4)
+    refused = order_lifts(1, heights, bundles, plan_lifts(heights, bundles, MAGNET, SETTINGS, ()))
+    assert isinstance(refused, Failed) and "no place" in refused.reason
+
+
+def test_no_load_travels_over_what_was_not_seen_or_below_what_may_stand_there() -> None:
+    heights, bundles = pile()
+    spot = (
+        (np.abs(heights.y_m - LENGTH_M / 2 - 0.3) < 0.15)[:, None] & (heights.x_m < 0.5) & (heights.x_m > 0.2)
+    )
+    heights.source[spot] = HeightSource.UNKNOWN
+    plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, ())
+    refused = order_lifts(5, heights, bundles, plan)
+    assert isinstance(refused, Failed) and "not seen" in refused.reason
+    told = replace(plan, settings=LiftSettings(max_stack_m=3.0))
+    order = order_lifts(5, heights, bundles, told)
+    assert isinstance(order, LiftOrder) and order.steps[0].travel_z_m == pytest.approx(3.5)
+    free = np.full(heights.shape, 1.7, np.float32)
+    order = order_lifts(5, replace(heights, free_m=free), bundles, plan)
+    assert isinstance(order, LiftOrder) and order.steps[0].travel_z_m == pytest.approx(2.2)
+
+
+def test_lifts_json_says_the_order_and_what_is_in_the_way() -> None:
+    heights, bundles = pile()
+    plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, ())
+    order = order_lifts(3, heights, bundles, plan)
+    assert isinstance(order, LiftOrder)
+    content = json.loads(json.dumps(lifts_content(plan, "yard", order)))
+    jsonschema.validate(content, schema())
+    assert [step["bundle"] for step in content["fetch"]["steps"]] == [5, 3]
+    assert content["blocked"][1] == {"bundle": 1, "blockers": [3, 4, 5]}
+    assert content["lifts"][0]["set_down"]["z_m"] < 0.02
+    assert lifts_content(plan, "yard")["fetch"] is None
+
+
+def test_a_bundle_nested_against_another_vetoes_it() -> None:
+    from barsight.yard.stability.stability import footing_vetoes
+
+    low = record(laid(0.3), 0, neighbours=(1,))
+    high = record(laid(0.3 + 0.235, z=0.335), 1, neighbours=(0,))
+    stock = [laid(0.3), laid(0.535, z=0.335)]
+    standing = footings(map_of(stock), (low, high), SETTINGS)
+    codes = {veto.code for veto in footing_vetoes(low, (low, high), standing, SETTINGS)}
+    assert codes == {"unstable-side"}
+    level = replace(high, centre_m=np.array([0.3 + 0.28, 0.0, 0.2]), top_z_m=low.top_z_m, sigma=SIGMA)
+    assert "unstable-side" not in {
+        veto.code for veto in footing_vetoes(low, (low, level), standing, SETTINGS)
+    }
+
+
+def test_the_pile_is_laid_as_told() -> None:
+    assert isinstance(STOCK[0], Laid) and STOCK[5].z_m > STOCK[3].top_z_m

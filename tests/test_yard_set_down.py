@@ -1,0 +1,150 @@
+"""Set-down: a place for the very bundle, on what carries it, with nothing in its way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.core.types import HeightSource
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.bearing import find_bearing
+from barsight.yard.lifting.ground import Ground
+from barsight.yard.lifting.load import Load
+from barsight.yard.lifting.set_down import find_set_down
+from barsight.yard.types import HeightMap
+from lift_yards import LENGTH_M, MAGNET, SETTINGS, laid, map_of, record
+
+LOAD = Load.of((record(laid(0.3)),))
+FREE = (1.6, 0.0)
+"""A place on the bare floor of `yard`."""
+
+
+def yard() -> HeightMap:
+    return map_of([laid(0.3)], x_m=(-0.5, 3.0))
+
+
+def cells(heights: HeightMap, x: tuple[float, float], y: tuple[float, float]) -> tuple[slice, slice]:
+    """The cells between these places."""
+    columns = np.searchsorted(heights.x_m, x)
+    rows = np.searchsorted(heights.y_m, y)
+    return slice(*rows.tolist()), slice(*columns.tolist())
+
+
+def carried(heights: HeightMap, load: Load = LOAD, place: tuple[float, float] = FREE) -> bool:
+    return find_bearing(heights, load, *place, 0.0, MAGNET, SETTINGS) is not None
+
+
+def test_a_bare_level_floor_carries_all_of_it() -> None:
+    bearing = find_bearing(yard(), LOAD, *FREE, 0.0, MAGNET, SETTINGS)
+    assert bearing is not None
+    assert bearing.z_m == pytest.approx(0.0, abs=0.01) and bearing.slope_deg < 1
+    assert bearing.support_m > 0.9 * LENGTH_M
+    assert bearing.margin_along_m > 0.45 * LENGTH_M and bearing.margin_across_m > LOAD.width_m / 6
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("length_m", [0.3, 6.0])
+@pytest.mark.parametrize("beside_m", [0.0, 0.1])
+def test_a_hole_of_300_mm_refuses(length_m: float, beside_m: float, turned: bool) -> None:
+    heights = yard()
+    middle = FREE[0] + beside_m
+    x, y = (middle - 0.15, middle + 0.15), (1.0 - length_m / 2, 1.0 + length_m / 2)
+    if turned:
+        x, y = (FREE[0] - length_m / 2, FREE[0] + length_m / 2), (0.85, 1.15)
+    heights.z_m[cells(heights, x, y)] -= 0.3
+    assert not carried(heights)
+
+
+def test_two_beams_about_the_middle_carry_and_two_on_one_side_do_not() -> None:
+    for ends, fits in (
+        ((-2.0, 2.0), True),
+        ((-3.0, 3.0), False),
+        ((0.5, 3.0), False),
+        ((-0.8, 0.8), False),
+        ((0.0, 0.0), False),
+    ):
+        heights = yard()
+        for y in ends:
+            heights.z_m[cells(heights, (1.0, 2.2), (y - 0.05, y + 0.05))] += 0.1
+        assert carried(heights) is fits, ends
+
+
+def test_gullies_between_bars_are_no_holes_and_a_ridge_is_no_support() -> None:
+    close = map_of(
+        [laid(1.0 + 0.091 * k, bars=1, diameter_m=0.09, z=0.045) for k in range(14)], x_m=(-0.5, 3.5)
+    )
+    far = map_of([laid(0.9 + 0.3 * k, bars=1, diameter_m=0.2, z=0.1) for k in range(6)], x_m=(-0.5, 3.5))
+    dunnage = LiftSettings(dunnage_m=0.09)
+    for heights, bare, bridged in ((close, False, True), (far, False, False)):
+        assert carried(heights) is bare
+        found = find_bearing(heights, LOAD, *FREE, 0.0, MAGNET, dunnage)
+        assert (found is not None) is bridged
+        assert found is None or found.z_m == pytest.approx(0.18, abs=0.006)
+    across = [laid(1.6, bars=1, diameter_m=0.09, z=0.045, yaw_deg=90.0, length_m=2.0)] * 2
+    across = [replace(one, y_m=y) for one, y in zip(across, (-2.0, 2.0), strict=True)]
+    assert carried(map_of(across, x_m=(-0.5, 3.5)))
+
+
+def test_a_slope_a_neighbour_a_tall_thing_under_the_beam_and_the_unseen_refuse() -> None:
+    sloped = yard()
+    sloped.z_m[:] += (np.tan(np.radians(4)) * sloped.x_m[None]).astype(np.float32)
+    assert not carried(sloped)
+    sloped = yard()
+    sloped.z_m[:] += (np.tan(np.radians(3)) * sloped.y_m[:, None]).astype(np.float32)
+    assert not carried(sloped)
+    beside = FREE[0] + LOAD.width_m / 2 + SETTINGS.set_down_clear_m
+    low = yard()
+    low.z_m[cells(low, (beside - 0.02, beside + 0.2), (1.0, 1.5))] += 0.1
+    assert not carried(low)
+    unseen = yard()
+    unseen.source[cells(unseen, (1.5, 1.6), (1.0, 1.1))] = HeightSource.FILLED
+    assert not carried(unseen)
+    tall = yard()
+    tall.z_m[cells(tall, (beside + 0.1, beside + 0.2), (1.0, 1.5))] += 3.0
+    assert carried(tall)
+    broad = replace(MAGNET, beam=replace(MAGNET.beam, width_m=0.8))
+    assert find_bearing(tall, LOAD, *FREE, 0.0, broad, SETTINGS) is None
+
+
+def test_a_stanchion_is_not_touched_and_stands_over_what_it_holds() -> None:
+    for x, top, fits in ((1.65, 2.0, False), (2.3, 2.0, True), (2.3, 0.2, False), (2.95, 0.2, True)):
+        settings = LiftSettings(stanchions=((x, 1.0, top),))
+        found = find_bearing(yard(), LOAD, *FREE, 0.0, MAGNET, settings)
+        assert (found is not None) is fits, (x, top)
+
+
+def test_the_place_is_the_bundles_own_kind_of_place() -> None:
+    heights = yard()
+    place = find_set_down(Ground.of(heights), LOAD, MAGNET, SETTINGS)
+    assert place is not None and place.turn_deg == 0 and place.z_m < 0.02
+    clear = place.x_m - LOAD.width_m / 2 - (0.3 + LOAD.width_m / 2)
+    assert clear >= SETTINGS.set_down_clear_m
+    assert abs(place.y_m) + LENGTH_M / 2 < 4.0
+    # Nearest to where it lies, and never where the load itself is all that is known.
+    assert place.x_m < 1.2
+    heights.source[:, heights.x_m > 0.8] = HeightSource.UNKNOWN
+    heights.source[:, heights.x_m < -0.2] = HeightSource.UNKNOWN
+    assert find_set_down(Ground.of(heights), LOAD, MAGNET, SETTINGS) is None
+    long = replace(LOAD, length_m=9.0)
+    assert find_set_down(Ground.of(yard()), long, MAGNET, SETTINGS) is None
+
+
+def test_a_place_across_counts_where_the_crane_can_turn() -> None:
+    stock = [laid(-3.0)]
+    heights = map_of(stock, x_m=(-3.5, 6.5))
+    heights.source[(heights.y_m < -1) | (heights.y_m > 1)] = HeightSource.UNKNOWN
+    load = Load.of((record(stock[0]),))
+    assert find_set_down(Ground.of(heights), load, MAGNET, SETTINGS) is None
+    turning = LiftSettings(max_turn_deg=90.0)
+    place = find_set_down(Ground.of(heights), load, MAGNET, turning)
+    assert place is not None and abs(abs(place.yaw_deg) - 90) < 0.1 and place.turn_deg == 90
+
+
+def test_a_single_round_bar_rolls() -> None:
+    bar = Load.of((record(laid(0.3, bars=1, diameter_m=0.2)),))
+    assert bar.rolls and find_set_down(Ground.of(yard()), bar, MAGNET, SETTINGS) is None
+    assert not LOAD.rolls and LOAD.height_m == pytest.approx(laid(0).top_z_m * 2 - 0.4, abs=1e-9)
+    assert math.isclose(LOAD.x_m, 0.3)
