@@ -13,7 +13,7 @@ from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove
 from barsight.stereo.direct.curvature import curvature_row
 from barsight.stereo.direct.depth_edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
 from barsight.stereo.direct.disparity_update import blend_fits, fit_variance, update_disparity
-from barsight.stereo.direct.kernels.box_sums import window_means
+from barsight.stereo.direct.kernels.box_sums import allocate_columns, roll_sum, slide_window, window_means
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
 from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
 from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes
@@ -24,7 +24,9 @@ from barsight.stereo.direct.photometric_residuals import (
     step_gain,
 )
 from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
+from barsight.stereo.direct.semiglobal.cost import BESIDE_COST, describe_pixels, reverse_rows, row_costs
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
+from barsight.stereo.direct.semiglobal.paths import Penalties, allocate_paths, extend_row, p2_table
 from barsight.stereo.direct.support_regions import (
     TILE_COLUMNS,
     TILE_ROWS,
@@ -232,6 +234,75 @@ def test_semiglobal_is_the_minimum_of_the_eight_paths(lowest: int) -> None:
         if seen:
             best = min(seen, key=lambda d: total[y, x + d + lowest, d])
             assert found.right_px[y, x] == best + lowest
+
+
+def test_costs_are_hamming_distance_and_truncated_differences() -> None:
+    rng = np.random.default_rng(12)
+    left, right = (rng.integers(0, 256, (6, 40)).astype(np.uint8) for _ in range(2))
+    lowest, count, places = -3, 20, 32
+    found = np.empty((40, places), dtype=np.uint8)
+    row_costs(
+        describe_pixels(left), reverse_rows(describe_pixels(right), lowest, places), 4, lowest, count, found
+    )
+    framed = [np.pad(image, 2, mode="edge") for image in (left, right)]
+    grey, slope = (
+        [image[4].astype(int) for image in (left, right)],
+        [np.gradient(np.pad(image[4].astype(int), 1, mode="reflect"))[1:-1] * 2 for image in (left, right)],
+    )
+    for x in range(40):
+        for k in range(count):
+            there = x - lowest - k
+            if 0 <= there < 40:
+                codes = [f[4:9, at : at + 5] > f[6, at + 2] for f, at in zip(framed, (x, there), strict=True)]
+                steep = min(abs(slope[0][x] - slope[1][there]), 20)
+                bright = min(abs(grey[0][x] - grey[1][there]), 20)
+                assert found[x, k] == (codes[0] != codes[1]).sum() + (steep + bright) // 2
+    assert (found[:, count:] == BESIDE_COST).all()
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_rows_of_paths_follow_the_recursion(backwards: bool) -> None:
+    rng = np.random.default_rng(13)
+    width, places, small, jumps = 9, 48, 22, p2_table(150, 28)
+    costs, greys = rng.integers(0, 61, (3, width, places)), rng.integers(0, 256, (3, width))
+    paths, leasts = allocate_paths(width, places, small), np.empty((2, width, 3), dtype=np.uint8)
+    sums = np.empty((width, places), dtype=np.uint16)
+    above: dict[tuple[int, int], np.ndarray] = {}
+    for y in range(3):
+        extend_row(
+            costs[y].astype(np.uint8), greys[y].astype(np.uint8), greys[max(y - 1, 0)].astype(np.uint8),
+            Penalties(small, jumps), y == 0, (y & 1) == 1, backwards, paths, leasts, sums,
+        )  # fmt: skip
+        here: dict[tuple[int, int], np.ndarray] = {}
+        beside: np.ndarray | None = None
+        for x in range(width)[:: -1 if backwards else 1]:
+            befores = [
+                (above.get((way, x + way)), greys[y - 1, min(max(x + way, 0), width - 1)])
+                for way in (-1, 0, 1)
+            ]
+            befores.append((beside, greys[y, min(max(x + (1 if backwards else -1), 0), width - 1)]))
+            values = []
+            for before, grey in befores:
+                value = costs[y, x]
+                if before is not None:
+                    near = np.minimum(np.append(before[1:], 10**6), np.append(10**6, before[:-1]))
+                    jump = before.min() + int(jumps[abs(greys[y, x] - grey)])
+                    value = value + np.minimum(np.minimum(before, near + small), jump) - before.min()
+                values.append(value)
+            for way, value in zip((-1, 0, 1), values, strict=False):
+                here[way, x] = value
+            beside = values[3]
+            assert np.array_equal(sums[x], sum(values))
+        above = here
+
+
+def test_rolling_sums_are_window_means() -> None:
+    image, reach = _noise(24, 20), 3
+    columns, mean = allocate_columns(1, WIDTH, reach)[0], np.empty(WIDTH, dtype=np.float32)
+    for y in range(2 * reach + 1):
+        roll_sum(columns, reach, image[y], np.zeros(WIDTH, dtype=np.float32))
+    slide_window(columns, reach, mean)
+    np.testing.assert_allclose(mean, _mean(image, 2 * reach + 1)[reach], rtol=1e-4, atol=1e-4)
 
 
 def test_stripes_of_the_semiglobal_match_leave_no_mark() -> None:

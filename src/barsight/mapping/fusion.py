@@ -40,17 +40,14 @@ def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -
         _vote(
             store.take(key),
             members,
-            key[0] * TILE_CELLS,
-            key[1] * TILE_CELLS,
-            view.x,
-            view.y,
+            (key[0] * TILE_CELLS, key[1] * TILE_CELLS),
+            (view.x, view.y),
             view.z_m,
             view.variance_m2,
             view.shared_m,
             view.intensity,
             view.central,
-            settings.gate_sigma,
-            settings.min_gate_m,
+            (settings.gate_sigma, settings.min_gate_m),
         )
     store.hold(2 * edges.size)
 
@@ -59,26 +56,24 @@ def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -
 def _vote(
     tile: Float32,
     members: Int64,
-    first_column: int,
-    first_row: int,
-    x: Int32,
-    y: Int32,
+    first: tuple[int, int],
+    cells: tuple[Int32, Int32],
     z: Float32,
     variance: Float32,
     shared: Float32,
     intensity: Float32,
     central: Bool,
-    gate_sigma: float,
-    min_gate: float,
+    gates: tuple[float, float],
 ) -> None:
     """Fuse a view's heights into a tile's slots, in place.
 
     tile: (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS). members: (M,) indices of the heights that lie in the tile;
-    first_column, first_row: number of its first cell. x, y, z (m), variance (m^2), shared (m), intensity,
-    central: (N,), see `CellObservations`. gate_sigma, min_gate (m): a height joins the nearest slot within
-    the larger of both. One that joins none takes an empty slot, else replaces a height of a single view, else
+    first: column and row of its first cell. cells (x, y), z (m), variance (m^2), shared (m), intensity,
+    central: (N,), see `CellObservations`. gates (sigma, m): a height joins the nearest slot within the larger
+    of both. One that joins none takes an empty slot, else replaces a height of a single view, else
     is dropped.
     """
+    (first_column, first_row), (x, y), (gate_sigma, min_gate) = first, cells, gates
     for m in members:
         slots = tile[y[m] - first_row, x[m] - first_column]
         best, best_gap = -1, np.inf

@@ -49,9 +49,7 @@ def bilateral_update(
     updated = np.empty_like(disparity_px)
     _weighted_means(values, present, grays, near, alike, updated)
     _compete_at_edges(
-        values,
-        present,
-        grays,
+        (values, present, grays),
         near,
         alike,
         lowest,
@@ -119,9 +117,7 @@ def _add_neighbours(
 
 @kernel(parallel=True)
 def _compete_at_edges(
-    values: Float32,
-    present: Float32,
-    grays: UInt8,
+    images: tuple[Float32, Float32, UInt8],
     near: Float32,
     alike: Float32,
     lowest: Float32,
@@ -135,7 +131,11 @@ def _compete_at_edges(
 
     A neighbour's credit w (T - (d - D)^2) is a polynomial in d between its two ends: its three coefficients
     are added where it begins and taken off where it ends, and running sums over d give all credits.
+
+    images: disparity (px, 0 where unknown), 1 where it is known, grays; all with the window's margin. lowest,
+    highest: (H, W) px of the window. first, count: the candidates. Updates (H, W) px in place.
     """
+    values, present, grays = images
     height, width = updated.shape
     side = near.shape[0]
     radius = side // 2

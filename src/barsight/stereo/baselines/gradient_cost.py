@@ -70,12 +70,9 @@ def gradient_cost(
     pixel is invalid or outside.
     """
     _fill(
-        images.left,
-        images.right,
-        images.left_gradient,
-        images.right_gradient,
-        images.left_valid,
-        images.right_valid,
+        (images.left, images.right),
+        (images.left_gradient, images.right_gradient),
+        (images.left_valid, images.right_valid),
         lowest_px,
         np.float32(settings.gray_weight),
         np.float32(settings.gray_limit),
@@ -86,12 +83,9 @@ def gradient_cost(
 
 @kernel(parallel=True)
 def _fill(
-    left: Float32,
-    right: Float32,
-    left_gradient: Float32,
-    right_gradient: Float32,
-    left_valid: Bool,
-    right_valid: Bool,
+    images: tuple[Float32, Float32],
+    gradients: tuple[Float32, Float32],
+    valid: tuple[Bool, Bool],
     lowest: int,
     share: np.float32,
     gray_limit: np.float32,
@@ -100,10 +94,11 @@ def _fill(
 ) -> None:
     """Compute truncated gray and gradient costs of the candidates from `lowest` px on [Hosni 2013].
 
-    left, right, their gradients and masks: (H, W), gray levels. share: weight of the gray difference. Fills
-    slices (K, H, W): left pixel x against right pixel x - d, the worst cost where either is invalid or
-    outside.
+    images, gradients, valid: of the left and the right image, (H, W), gray levels. share: weight of the gray
+    difference. Fills slices (K, H, W): left pixel x against right pixel x - d, the worst cost where either is
+    invalid or outside.
     """
+    (left, right), (left_gradient, right_gradient), (left_valid, right_valid) = images, gradients, valid
     count, height, width = slices.shape
     rest = np.float32(1) - share
     worst = share * gray_limit + rest * gradient_limit

@@ -77,8 +77,8 @@ def _median(_: Any, theres: Any, greys: Any, at: Any, stride: Any, near: Any) ->
     """Compute the weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GREY),
     of its grey's gap to that of the window's middle, times `near`. All arrays are flat.
 
-    The interval of values is quartered until it is short enough: faster than to sort a hundred of them. The
-    window stays in registers, where there are as many.
+    The interval of values is quartered until it is short enough: faster than to sort a hundred of them. In
+    vector instructions, so that the window stays in registers, where there are as many.
     """
     signature = types.float32(theres, greys, at, stride, near)
 

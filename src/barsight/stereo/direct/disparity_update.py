@@ -45,7 +45,7 @@ def blend_fits(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[
     fitted, variance = np.empty_like(power), np.empty_like(power)
 
     def work(first: int, end: int) -> None:
-        _blend(*long, *short, power, usable, _BLEND_REACH_PX, fitted, variance, first, end)
+        _blend(long, short, power, usable, _BLEND_REACH_PX, fitted, variance, first, end)
 
     parallel_bands(work, len(power), BAND_ROWS)
     return fitted, variance
@@ -65,15 +65,17 @@ def _excess(long: Float32, short: Float32, power: Float32, information: Float32,
 
 @kernel(fastmath=True)
 def _blend(
-    long: Float32, long_information: Float32, short: Float32, short_information: Float32, power: Float32,
-    usable: Float32, reach: int, fitted: Float32, variance: Float32, first: int, end: int,
+    long_fit: Fit, short_fit: Fit, power: Float32, usable: Float32, reach: int, fitted: Float32,
+    variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
     """Blend the long and short supports' fits in rows first...end, see `blend_fits`.
 
-    Fits: (H, W) px with their information. power: (H, W), see `noise_power`; usable: (H, W) 0...1. The mean
-    excess over a window of 2 reach + 1 px shares between them. Fills fitted (H, W) px and variance (H, W)
-    px^2.
+    long_fit, short_fit: (H, W) px with their information. power: (H, W), see `noise_power`; usable:
+    (H, W) 0...1. The mean excess over a window of 2 reach + 1 px shares between them. Fills fitted (H, W) px
+    and variance (H, W) px^2.
     """
+    long, long_information = long_fit
+    short, short_information = short_fit
     height, width = power.shape
     columns = allocate_columns(2, width, reach)
     rows = np.zeros((5, width), dtype=np.float32)

@@ -58,11 +58,10 @@ def fill_occlusions_by_planes(
     # A ray may leap as far as no pixel in any direction is matched.
     leaps = cv2.distanceTransform(holes, cv2.DIST_C, 3).astype(np.int32)
 
+    slopes, limits, found = (slope_x, slope_y), (lowest_px, highest_px), (filled, sigma)
+
     def guess(first: int, end: int) -> None:
-        _fill(
-            disparity, smooth, leaps, slope_x, slope_y, right_px, rays, lowest_px, highest_px, filled, sigma,
-            first, end,
-        )  # fmt: skip
+        _fill(disparity, smooth, leaps, slopes, right_px, rays, limits, found, first, end)
 
     parallel_bands(guess, len(disparity), _BAND_ROWS)
     return filled, sigma
@@ -178,23 +177,22 @@ def _fill(
     disparity: Float32,
     grey: Float32,
     leaps: Int32,
-    slope_x: Float32,
-    slope_y: Float32,
+    slopes: tuple[Float32, Float32],
     right_px: Float32,
     rays: Float32,
-    lowest: float,
-    highest: float,
-    filled: Float32,
-    sigma: Float32,
+    limits: tuple[float, float],
+    guesses: tuple[Float32, Float32],
     first: int,
     end: int,
 ) -> None:
     """Fill the holes (NaN) of rows first...end by planes, see `fill_occlusions_by_planes`.
 
     disparity, right_px: (H, W) px. grey: (H, W) smoothed grey levels. leaps: (H, W) px to the nearest match,
-    0 at one. slope_x, slope_y: (H, W) px per px. rays: (_RAYS, 2) x, y, the larger of them 1. Fills filled
-    and sigma (H, W) px in the holes; a hole whose rays find nothing keeps NaN in both.
+    0 at one. slopes: in x and y, (H, W) px per px. rays: (_RAYS, 2) x, y, the larger of them 1. limits: the
+    least and the greatest px. Fills the guesses and
+    their sigmas (H, W) px in the holes; a hole whose rays find nothing keeps NaN in both.
     """
+    (slope_x, slope_y), (lowest, highest), (filled, sigma) = slopes, limits, guesses
     height, width = disparity.shape
     values, weights, pixels = np.empty(_RAYS), np.empty(_RAYS), np.hypot(rays[:, 0], rays[:, 1])
     for y in range(first, end):

@@ -100,7 +100,7 @@ def robust_weights(
 
     def work(first: int, end: int) -> None:
         _weigh(
-            residual, slope, trust, *means, side // 2, samples, np.float32(gloss_trust), weight, pull, first,
+            residual, slope, trust, means, side // 2, samples, np.float32(gloss_trust), (weight, pull), first,
             end,
         )  # fmt: skip
 
@@ -109,16 +109,16 @@ def robust_weights(
 
 @kernel(fastmath=True)
 def _weigh(
-    residual: Float32, slope: Float32, trust: Float32, residual_mean: Float32, slope_mean: Float32,
-    reach: int, samples: np.float32, gloss_trust: np.float32, weight: Float32, pull: Float32, first: int,
-    end: int,
+    residual: Float32, slope: Float32, trust: Float32, means: tuple[Float32, Float32], reach: int,
+    samples: np.float32, gloss_trust: np.float32, evidence: tuple[Float32, Float32], first: int, end: int,
 ) -> None:  # fmt: skip
     """Compute the Gauss-Newton weights and pulls of rows first...end, see `robust_weights`.
 
-    residual (grey levels), slope (grey levels per px), trust (0...1): frames. residual_mean, slope_mean: (H,
-    W) along the axis. samples: independent pixels behind a mean; windows are 2 reach + 1 px. Fills the frames
-    weight ((grey levels / px)^2) and pull (grey levels^2 / px).
+    residual (grey levels), slope (grey levels per px), trust (0...1): frames. means: of residual and slope
+    along the axis, (H, W). samples: independent pixels behind a mean; windows are 2 reach + 1 px. Fills the
+    evidence, two frames: weight ((grey levels / px)^2) and pull (grey levels^2 / px).
     """
+    (residual_mean, slope_mean), (weight, pull) = means, evidence
     height, width = residual_mean.shape
     columns = allocate_columns(2, width, reach)
     powers = np.empty((2, width), dtype=np.float32)

@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int64, kernel
 from barsight.core.parallel import parallel_bands
-from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
-from barsight.stereo.direct.support_regions import BAND_TILES, MARGIN, TILE_COLUMNS, TILE_ROWS
+from barsight.stereo.direct.support_regions import BAND_TILES, MARGIN, TILE_COLUMNS, TILE_ROWS, biweight
 
 _REACH = 2.0
+_LANES = TILE_COLUMNS
+
+
+class Evidence(NamedTuple):
+    """Each pixel's disparity, its weight and its pull: frames, or flat."""
+
+    disparity: Float32
+    weight: Float32
+    pull: Float32
+
+
+class _Pairs(NamedTuple):
+    """Pairs of points (a, c) and (-a, -c) that a support has beside its middle.
+
+    along, across: (K,) px. factors: (K, 6), the share times 1, a, c, a a, a c, c c.
+    """
+
+    along: Int64
+    across: Int64
+    factors: Float32
 
 
 @dataclass(frozen=True)
@@ -49,148 +65,148 @@ def fit_planes(
     # In units of same_surface_px, each point takes one product less.
     if unit != 1:
         disparity, pull = disparity / unit, pull / unit
+    heard = evidence = Evidence(disparity, weight, pull)
     if step > 1:
         # Summed over a step along the axis first, the support can go in steps and still hear every pixel.
         near = np.arange(step) - step // 2
 
         def sum_up(first: int, end: int) -> None:
-            _sum_near(disparity, weight, pull, axes, near, fitted.shape, *room, first, end)
+            _sum_near(evidence, axes, near, fitted.shape, room, first, end)
 
         parallel_bands(sum_up, len(axes), BAND_TILES)
-        weight, pull = room
-    alongs, acrosses, factors = _pairs(shape)
+        heard = Evidence(disparity, *room)
+    pairs = _pairs(shape)
 
     def gather(first: int, end: int) -> None:
-        _gather(
-            disparity, weight, pull, axes, alongs, acrosses, factors, step, fitted, information, first, end
-        )
+        _gather(heard, axes, pairs, step, fitted, information, first, end)
 
     parallel_bands(gather, len(axes), BAND_TILES)
     if unit != 1:
         fitted *= unit
 
 
-def _pairs(shape: SupportShape) -> tuple[Int64, Int64, Float32]:
-    """List each pair of points (a, c) and (-a, -c) that a support has beside its middle: a along and c across
-    the axis, (K,) px each, and its share times 1, a, c, a a, a c, c c (6, K).
-    """
+def _pairs(shape: SupportShape) -> _Pairs:
+    """List a support's pairs of points, of which each half of the support has one."""
     furthest = min(int(_REACH * shape.along_px), MARGIN - 8) // shape.step
     reach = int(_REACH * shape.across_px + 0.5)
     c, a = np.mgrid[-reach : reach + 1, -furthest : furthest + 1].reshape(2, -1)
     a, c = a[: a.size // 2], c[: c.size // 2]
     a *= shape.step
     share = np.exp(-0.5 * ((a / shape.along_px) ** 2 + (c / shape.across_px) ** 2))
-    factors = share * np.stack([np.ones_like(a), a, c, a * a, a * c, c * c])
-    return a, c, factors.astype(np.float32)
+    factors = share[:, None] * np.stack([np.ones_like(a), a, c, a * a, a * c, c * c], axis=1)
+    return _Pairs(a, c, factors.astype(np.float32))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _fit(
-    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, factors: Any, planes: Any,
-    certain: Any, at: Any,
-) -> Any:  # fmt: skip
-    """Solve the planes' disparities and information for 16 pixels from `middle` on, written from `at` on, out
-    of the nine sums of a plane's normal equations: the weights times 1, a, c, a a, a c, c c and the pulls
-    times 1, a, c; a along, c across the axis.
+@kernel(fastmath=True)
+def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32, sums: Float32) -> None:
+    """Sum the nine terms of a plane's normal equations for TILE_COLUMNS pixels from `middle` on: the weights
+    times 1, a, c, a a, a c, c c and the pulls times 1, a, c; a along, c across the axis.
 
-    Points come in pairs on both sides of the middle: what a pair has in common is worked out once. offsets:
-    (K,), from a pixel to one point of each pair. factors: see `_pairs`. All arrays are flat.
+    Points come in pairs on both sides of the middle: what a pair has in common is worked out once. evidence:
+    flat. offsets: (K,), from a pixel to one point of each pair. factors: (K, 6), see `_Pairs`. Fills sums
+    (9 TILE_COLUMNS,), term by term.
     """
-    signature = types.void(theres, weights, pulls, middle, offsets, factors, planes, certain, at)
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, builder, signature, arguments)
-        middle, pairs = arguments[3], v.length(4)
-        centre = v.load(v.data(0), middle, v.floats)
-        totals = v.zeros(9)
-        for place, image in ((0, 1), (6, 2)):
-            builder.store(v.load(v.data(image), middle, v.floats), totals[place])
-
-        def heard(there: Any) -> tuple[Any, Any]:
-            """Weight and pull of the points `there`."""
-            gap = v.difference(v.load(v.data(0), there, v.floats), centre)
-            alike = v.biweight(gap)
-            weight = v.product(alike, v.load(v.data(1), there, v.floats))
-            return weight, v.sum(v.product(weight, gap), v.product(alike, v.load(v.data(2), there, v.floats)))
-
-        with cgutils.for_range(builder, pairs) as loop:
-            offset = builder.load(builder.gep(v.data(4), [loop.index]))
-            forth, back = heard(builder.add(middle, offset)), heard(builder.sub(middle, offset))
-            weight, pull = (v.sum(one, other) for one, other in zip(forth, back, strict=True))
-            lean, pull_lean = (v.difference(one, other) for one, other in zip(forth, back, strict=True))
-            factors = [
-                v.number(5, builder.add(loop.index, builder.mul(pairs, pairs.type(k))), v.floats)
-                for k in range(6)
-            ]
-            terms = (weight, lean, lean, weight, weight, weight, pull, pull_lean, pull_lean)
-            for place, term, factor in zip(totals, terms, factors + factors[:3], strict=True):
-                v.add_to(place, v.product(term, factor))
-        plane, information = _solved(v, *(builder.load(place) for place in totals))
-        v.store(v.sum(centre, plane), v.data(6), arguments[8])
-        v.store(information, v.data(7), arguments[8])
-        return context.get_dummy_value()
-
-    return signature, generate
+    disparity, weight, pull = evidence
+    here = np.uint64(middle)
+    for i in range(_LANES, 9 * _LANES):
+        sums[i] = 0
+    for i in range(_LANES):
+        sums[i] = weight[here + np.uint64(i)]
+    for i in range(_LANES):
+        sums[6 * _LANES + i] = pull[here + np.uint64(i)]
+    for j in range(len(offsets)):
+        # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+        forth, back = np.uint64(middle + offsets[j]), np.uint64(middle - offsets[j])
+        f, fa, fc = factors[j, 0], factors[j, 1], factors[j, 2]
+        faa, fac, fcc = factors[j, 3], factors[j, 4], factors[j, 5]
+        for i in range(_LANES):
+            lane = np.uint64(i)
+            centre = disparity[here + lane]
+            gap, gap_back = disparity[forth + lane] - centre, disparity[back + lane] - centre
+            alike, alike_back = biweight(gap), biweight(gap_back)
+            one, other = alike * weight[forth + lane], alike_back * weight[back + lane]
+            one_pull = one * gap + alike * pull[forth + lane]
+            other_pull = other * gap_back + alike_back * pull[back + lane]
+            both, lean = one + other, one - other
+            both_pull, lean_pull = one_pull + other_pull, one_pull - other_pull
+            sums[i] += both * f
+            sums[_LANES + i] += lean * fa
+            sums[2 * _LANES + i] += lean * fc
+            sums[3 * _LANES + i] += both * faa
+            sums[4 * _LANES + i] += both * fac
+            sums[5 * _LANES + i] += both * fcc
+            sums[6 * _LANES + i] += both_pull * f
+            sums[7 * _LANES + i] += lean_pull * fa
+            sums[8 * _LANES + i] += lean_pull * fc
 
 
-def _solved(
-    v: Vectors, s: Any, sa: Any, sc: Any, saa: Any, sac: Any, scc: Any, r: Any, ra: Any, rc: Any
-) -> tuple[Any, Any]:
-    """Solve a plane's height at the pixel and its information, vectors all.
+@kernel(fastmath=True)
+def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
+    """Solve each plane's height at its pixel and that height's information out of the sums of `_sum_pairs`.
 
-    A slope of zero is held with a small weight, so that a line of pixels still has a plane.
+    A slope of zero is held with a small weight, so that a line of pixels still has a plane. Fills steps
+    (TILE_COLUMNS,) from the pixels' own disparities on, and information (TILE_COLUMNS,).
     """
-    less, times = v.difference, v.product
-    held = v.sum(times(v.all(0.02, v.floats), v.sum(saa, scc)), v.all(1e-3, v.floats))
-    aa, cc = v.sum(saa, held), v.sum(scc, held)
-    scale = v.quotient(v.all(1.0, v.floats), less(times(aa, cc), times(sac, sac)))
-    from_a = times(less(times(sa, cc), times(sc, sac)), scale)
-    from_c = times(less(times(sc, aa), times(sa, sac)), scale)
-    certain = v.at_least(less(less(s, times(from_a, sa)), times(from_c, sc)), 1e-6)
-    return v.quotient(less(less(r, times(from_a, ra)), times(from_c, rc)), certain), certain
+    for i in range(_LANES):
+        s, sa, sc = sums[i], sums[_LANES + i], sums[2 * _LANES + i]
+        saa, sac, scc = sums[3 * _LANES + i], sums[4 * _LANES + i], sums[5 * _LANES + i]
+        r, ra, rc = sums[6 * _LANES + i], sums[7 * _LANES + i], sums[8 * _LANES + i]
+        held = np.float32(0.02) * (saa + scc) + np.float32(1e-3)
+        aa, cc = saa + held, scc + held
+        scale = np.float32(1) / (aa * cc - sac * sac)
+        from_a, from_c = (sa * cc - sc * sac) * scale, (sc * aa - sa * sac) * scale
+        certain = s - from_a * sa - from_c * sc
+        certain = certain if certain > np.float32(1e-6) else np.float32(1e-6)
+        steps[i] = (r - from_a * ra - from_c * rc) / certain
+        information[i] = certain
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _add_near(
-    _: Any, theres: Any, weights: Any, pulls: Any, middle: Any, offsets: Any, weight_sums: Any, pull_sums: Any
-) -> Any:
-    """Add the sums of the weights and of the pulls of a few points for 16 pixels from `middle` on, written to
-    the same places. All arrays are flat.
+@kernel(fastmath=True)
+def _add_near(evidence: Evidence, middle: int, offsets: Int64, sums: Float32) -> None:
+    """Add the weights and the pulls of a few points for TILE_COLUMNS pixels from `middle` on.
+
+    evidence: flat. offsets: (K,), from a pixel to each point. Fills sums (2 TILE_COLUMNS,), the weights'
+    before the pulls'.
     """
-    signature = types.void(theres, weights, pulls, middle, offsets, weight_sums, pull_sums)
+    disparity, weight, pull = evidence
+    here = np.uint64(middle)
+    for i in range(_LANES):
+        sums[i] = 0
+    for i in range(_LANES):
+        sums[_LANES + i] = 0
+    for j in range(len(offsets)):
+        there = np.uint64(middle + offsets[j])
+        for i in range(_LANES):
+            lane = np.uint64(i)
+            gap = disparity[there + lane] - disparity[here + lane]
+            alike = biweight(gap)
+            heard = alike * weight[there + lane]
+            sums[i] += heard
+            sums[_LANES + i] += heard * gap + alike * pull[there + lane]
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, builder, signature, arguments)
-        centre = v.load(v.data(0), arguments[3], v.floats)
-        totals = v.zeros(2)
-        with cgutils.for_range(builder, v.length(4)) as loop:
-            there = builder.add(arguments[3], builder.load(builder.gep(v.data(4), [loop.index])))
-            gap = v.difference(v.load(v.data(0), there, v.floats), centre)
-            kept = v.biweight(gap)
-            weight = v.product(kept, v.load(v.data(1), there, v.floats))
-            v.add_to(totals[0], weight)
-            v.add_to(
-                totals[1], v.sum(v.product(weight, gap), v.product(kept, v.load(v.data(2), there, v.floats)))
-            )
-        for place, total in zip((5, 6), totals, strict=True):
-            v.store(builder.load(total), v.data(place), arguments[3])
-        return context.get_dummy_value()
 
-    return signature, generate
+@kernel()
+def _flat(evidence: Evidence) -> Evidence:
+    """Flatten the three frames."""
+    return Evidence(evidence.disparity.reshape(-1), evidence.weight.reshape(-1), evidence.pull.reshape(-1))
 
 
 @kernel()
 def _sum_near(
-    disparity: Float32, weight: Float32, pull: Float32, axes: Float32, near: Int64,
-    shape: tuple[int, int], weight_sum: Float32, pull_sum: Float32, first_tile: int, end_tile: int,
+    evidence: Evidence, axes: Float32, near: Int64, shape: tuple[int, int], sums: tuple[Float32, Float32],
+    first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
-    """Sum weights and pulls from each pixel's own disparity over the points `near` along the axis.
-    Frames in and out."""
+    """Sum weights and pulls from each pixel's own disparity over the points `near` along the axis, in tile
+    rows first_tile...end_tile.
+
+    near: (K,) px. shape: of the image, (H, W). Fills the frames of sums, weights' and pulls'.
+    """
     height, width = shape
-    framed_width = disparity.shape[1]
-    theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
+    framed_width = evidence.disparity.shape[1]
+    flat = _flat(evidence)
     offsets = np.empty(len(near), dtype=np.int64)
-    weight_sums, pull_sums = weight_sum.reshape(-1), pull_sum.reshape(-1)
+    weight_sums, pull_sums = sums[0].reshape(-1), sums[1].reshape(-1)
+    found = np.empty(2 * _LANES, dtype=np.float32)
     for tile_x in range(axes.shape[1]):
         for tile_y in range(first_tile, end_tile):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
@@ -200,36 +216,39 @@ def _sum_near(
             count = min(TILE_COLUMNS, width - x0)
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                for part in range(0, count, FLOAT_LANES):
-                    _add_near(theres, weights, pulls, middle + part, offsets, weight_sums, pull_sums)
-                for beyond in range(middle + count, middle + TILE_COLUMNS):
-                    weight_sums[beyond] = pull_sums[beyond] = 0
+                _add_near(flat, middle, offsets, found)
+                for i in range(count, _LANES):
+                    found[i] = found[_LANES + i] = 0
+                at = np.uint64(middle)
+                for i in range(_LANES):
+                    weight_sums[at + np.uint64(i)] = found[i]
+                for i in range(_LANES):
+                    pull_sums[at + np.uint64(i)] = found[_LANES + i]
 
 
 @kernel()
 def _gather(
-    disparity: Float32, weight: Float32, pull: Float32, axes: Float32, alongs: Int64, acrosses: Int64,
-    factors: Float32, step: int, fitted: Float32, information: Float32, first_tile: int, end_tile: int,
+    evidence: Evidence, axes: Float32, pairs: _Pairs, step: int, fitted: Float32, information: Float32,
+    first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
     """Fit each pixel's plane in tile rows first_tile...end_tile, see `fit_planes`.
 
-    disparity, weight, pull: frames, disparity and pull in units of same_surface_px. axes: (tile rows, tile
-    columns, 2). alongs, acrosses: (K,) px and factors (6, K), see `_pairs`. step: the support's, in which
-    rows are taken too. Fills fitted (in the same units) and information, (H, W).
+    evidence: frames, disparity and pull in units of same_surface_px. axes: (tile rows, tile columns, 2).
+    step: the support's, in which rows are taken too. Fills fitted (in the same units) and information, both
+    (H, W).
     """
     height, width = fitted.shape
-    framed_width = disparity.shape[1]
-    theres, weights, pulls = disparity.reshape(-1), weight.reshape(-1), pull.reshape(-1)
-    flat_factors = factors.reshape(-1)
-    found = np.empty((2, TILE_COLUMNS), dtype=np.float32)
-    planes, certain = found[0], found[1]
-    offsets = np.empty(len(alongs), dtype=np.int64)
+    framed_width = evidence.disparity.shape[1]
+    flat = _flat(evidence)
+    sums, found = np.empty(9 * _LANES, dtype=np.float32), np.empty((2, _LANES), dtype=np.float32)
+    steps, certain = found[0], found[1]
+    offsets = np.empty(len(pairs.along), dtype=np.int64)
     for tile_x in range(axes.shape[1]):
         for tile_y in range(first_tile, end_tile):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
-            for j in range(len(alongs)):
-                row = round(alongs[j] * axis_y + acrosses[j] * axis_x)
-                offsets[j] = row * framed_width + round(alongs[j] * axis_x - acrosses[j] * axis_y)
+            for j in range(len(offsets)):
+                a, c = pairs.along[j], pairs.across[j]
+                offsets[j] = round(a * axis_y + c * axis_x) * framed_width + round(a * axis_x - c * axis_y)
             x0 = tile_x * TILE_COLUMNS
             count = min(TILE_COLUMNS, width - x0)
             # Rows a step apart have most of their supports' rows in common: those stay in the nearest cache.
@@ -237,12 +256,10 @@ def _gather(
             for turn in range(step):
                 for y in range(first_row + turn, end_row, step):
                     middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                    for part in range(0, count, FLOAT_LANES):
-                        _fit(
-                            theres, weights, pulls, middle + part, offsets, flat_factors, planes, certain,
-                            part,
-                        )  # fmt: skip
+                    _sum_pairs(flat, middle, offsets, pairs.factors, sums)
+                    _solve_planes(sums, steps, certain)
+                    row, row_information = fitted[y, x0 : x0 + count], information[y, x0 : x0 + count]
                     for i in range(count):
-                        fitted[y, x0 + i] = planes[i]
+                        row[i] = flat.disparity[np.uint64(middle + i)] + steps[i]
                     for i in range(count):
-                        information[y, x0 + i] = certain[i]
+                        row_information[i] = certain[i]

@@ -7,17 +7,13 @@ and the compiler makes vector instructions of it. Arrays read at offsets carry a
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int64, kernel
 from barsight.core.parallel import parallel_bands
-from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
 
 TILE_ROWS = 16
 TILE_COLUMNS = 32
@@ -26,6 +22,15 @@ _LINE_FLOATS = 16
 BAND_TILES = 16
 """Rows of tiles that are worked through column by column: what their supports read fits into the cache."""
 _MIN_COHERENCE = 0.35
+
+
+class AxisImages(NamedTuple):
+    """Two images that are averaged, their weight and what makes places alike: frames, or flat."""
+
+    first: Float32
+    second: Float32
+    weight: Float32
+    alike: Float32
 
 
 def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
@@ -83,78 +88,75 @@ def axis_means(
     alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at 1), so that
     a strap or a shadow across the bars has a mean of its own.
     """
+    images = AxisImages(first, second, weight, alike)
     steps = np.arange(1, min(int(2.5 * sigma_px), MARGIN - 1) + 1)
     shares = np.exp(-0.5 * (steps / sigma_px) ** 2).astype(np.float32)
 
     def work(first_tile: int, end_tile: int) -> None:
-        _axis_means(first, second, weight, alike, axes, steps, shares, *means, first_tile, end_tile)
+        _axis_means(images, axes, steps, shares, means, first_tile, end_tile)
 
     parallel_bands(work, len(axes), BAND_TILES)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _take_means(
-    _: Any, theres: Any, firsts: Any, seconds: Any, weights: Any, middle: Any, offsets: Any, shares: Any,
-    first_mean: Any, second_mean: Any, at: Any,
-) -> Any:  # fmt: skip
-    """Average the first and the second image for 16 pixels from `middle` on, written from `at` on.
-    offsets: from a pixel to its support's points on one side; the other side's are mirror images. All arrays
-    are flat."""
-    signature = types.void(
-        theres, firsts, seconds, weights, middle, offsets, shares, first_mean, second_mean, at
-    )
+@kernel(inline=True)
+def biweight(gap: np.float32) -> np.float32:
+    """Evaluate Tukey's biweight that ends at 1."""
+    rest = np.float32(1) - gap * gap
+    rest = rest if rest > np.float32(0) else np.float32(0)
+    return rest * rest
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, builder, signature, arguments)
-        middle = arguments[4]
-        centre, own = v.load(v.data(0), middle, v.floats), v.load(v.data(3), middle, v.floats)
-        totals = v.zeros(3)
-        builder.store(own, totals[0])
-        for total, image in zip(totals[1:], (1, 2), strict=True):
-            builder.store(v.product(own, v.load(v.data(image), middle, v.floats)), total)
-        with cgutils.for_range(builder, v.length(5)) as loop:
-            offset = builder.load(builder.gep(v.data(5), [loop.index]))
-            sides = builder.add(middle, offset), builder.sub(middle, offset)
-            both = [
-                v.product(
-                    v.biweight(v.difference(v.load(v.data(0), there, v.floats), centre)),
-                    v.load(v.data(3), there, v.floats),
-                )
-                for there in sides
-            ]
-            share = v.number(6, loop.index, v.floats)
-            v.add_to(totals[0], v.product(share, v.sum(*both)))
-            for total, image in zip(totals[1:], (1, 2), strict=True):
-                one, other = (
-                    v.product(weight, v.load(v.data(image), there, v.floats))
-                    for weight, there in zip(both, sides, strict=True)
-                )
-                v.add_to(total, v.product(share, v.sum(one, other)))
-        whole = v.sum(builder.load(totals[0]), v.all(1e-6, v.floats))
-        for total, place in zip(totals[1:], (7, 8), strict=True):
-            v.store(v.quotient(builder.load(total), whole), v.data(place), arguments[9])
-        return context.get_dummy_value()
 
-    return signature, generate
+@kernel(fastmath=True)
+def _take_means(images: AxisImages, middle: int, offsets: Int64, shares: Float32, sums: Float32) -> None:
+    """Average the first and the second image for TILE_COLUMNS pixels from `middle` on.
+
+    images: flat. offsets: (K,), from a pixel to its support's points on one side; the other side's are mirror
+    images; shares: (K,) their Gaussian weights. Fills sums (3 TILE_COLUMNS,): the weights, both means.
+    """
+    first, second, weight, alike = images
+    # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+    here = np.uint64(middle)
+    for i in range(TILE_COLUMNS):
+        at = here + np.uint64(i)
+        sums[i] = weight[at]
+        sums[TILE_COLUMNS + i] = weight[at] * first[at]
+        sums[2 * TILE_COLUMNS + i] = weight[at] * second[at]
+    for j in range(len(offsets)):
+        forth, back, share = np.uint64(middle + offsets[j]), np.uint64(middle - offsets[j]), shares[j]
+        for i in range(TILE_COLUMNS):
+            lane = np.uint64(i)
+            centre = alike[here + lane]
+            one = biweight(alike[forth + lane] - centre) * weight[forth + lane]
+            other = biweight(alike[back + lane] - centre) * weight[back + lane]
+            sums[i] += share * (one + other)
+            sums[TILE_COLUMNS + i] += share * (one * first[forth + lane] + other * first[back + lane])
+            sums[2 * TILE_COLUMNS + i] += share * (one * second[forth + lane] + other * second[back + lane])
+    for i in range(TILE_COLUMNS):
+        whole = sums[i] + np.float32(1e-6)
+        sums[TILE_COLUMNS + i] /= whole
+        sums[2 * TILE_COLUMNS + i] /= whole
 
 
 @kernel()
 def _axis_means(
-    first: Float32, second: Float32, weight: Float32, alike: Float32, axes: Float32, steps: Int64,
-    shares: Float32, first_mean: Float32, second_mean: Float32, first_tile: int, end_tile: int,
+    images: AxisImages, axes: Float32, steps: Int64, shares: Float32, means: tuple[Float32, Float32],
+    first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
     """Average two images along the axes in tile rows first_tile...end_tile, see `axis_means`.
 
-    first, second, weight, alike: frames, no NaN. axes: (tile rows, tile columns, 2). steps: (K,) px to one
-    side, shares: (K,) their Gaussian weights. Fills first_mean and second_mean (H, W).
+    images: frames, no NaN. axes: (tile rows, tile columns, 2). steps: (K,) px to one side, shares: (K,) their
+    Gaussian weights. Fills both means (H, W).
     """
+    first_mean, second_mean = means
     height, width = first_mean.shape
-    framed_width = first.shape[1]
-    firsts, seconds, weights, theres = (
-        first.reshape(-1), second.reshape(-1), weight.reshape(-1), alike.reshape(-1),
-    )  # fmt: skip
-    found = np.empty((2, TILE_COLUMNS), dtype=np.float32)
-    one, two = found[0], found[1]
+    framed_width = images.first.shape[1]
+    flat = AxisImages(
+        images.first.reshape(-1),
+        images.second.reshape(-1),
+        images.weight.reshape(-1),
+        images.alike.reshape(-1),
+    )
+    sums = np.empty(3 * TILE_COLUMNS, dtype=np.float32)
     offsets = np.empty(len(steps), dtype=np.int64)
     for tile_x in range(axes.shape[1]):
         for tile_y in range(first_tile, end_tile):
@@ -164,12 +166,8 @@ def _axis_means(
             x0 = tile_x * TILE_COLUMNS
             count = min(TILE_COLUMNS, width - x0)
             for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
-                middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                for part in range(0, count, FLOAT_LANES):
-                    _take_means(
-                        theres, firsts, seconds, weights, middle + part, offsets, shares, one, two, part
-                    )
+                _take_means(flat, (y + MARGIN) * framed_width + x0 + MARGIN, offsets, shares, sums)
                 for i in range(count):
-                    first_mean[y, x0 + i] = one[i]
+                    first_mean[y, x0 + i] = sums[TILE_COLUMNS + i]
                 for i in range(count):
-                    second_mean[y, x0 + i] = two[i]
+                    second_mean[y, x0 + i] = sums[2 * TILE_COLUMNS + i]

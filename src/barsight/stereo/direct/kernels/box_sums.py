@@ -8,17 +8,10 @@ compiler makes vectors of no others.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Float64, kernel
 from barsight.core.parallel import parallel_bands
-from barsight.stereo.direct.kernels.vectors import FLOAT_LANES, Vectors
 
 BAND_ROWS = 128
 
@@ -48,7 +41,7 @@ def mirror_index(place: int, count: int) -> int:
 @kernel()
 def allocate_columns(count: int, width: int, reach: int) -> Float64:
     """Allocate columns' sums (count, ...), one row for each of the roll_* below."""
-    return np.zeros((count, width + 2 * reach + 2 * FLOAT_LANES))
+    return np.zeros((count, width + 2 * reach + 2))
 
 
 @kernel()
@@ -77,39 +70,28 @@ def roll_square(
         column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _add_columns(_: Any, column: Any, threes: Any, side: Any, mean: Any, chunks: Any, scale: Any) -> Any:
-    """Sum `side` columns, times `scale`, for so many chunks of 16 windows. threes: for use inside."""
-    signature = types.void(column, threes, side, mean, chunks, scale)
+@kernel(fastmath=True)
+def _add_columns(column: Float64, threes: Float32, side: int, mean: Float32) -> None:
+    """Average (W,) `side` columns each: three by three first, so that each is read a third as often.
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, builder, signature, arguments)
-        side, chunks = arguments[2], arguments[4]
-        index, wide = side.type, ir.VectorType(ir.DoubleType(), FLOAT_LANES)
-        whole = builder.sdiv(side, index(3))
-
-        def columns(at: Any) -> Any:
-            return v.load(v.data(0), at, wide)
-
-        beyond = builder.add(builder.sdiv(side, index(FLOAT_LANES)), index(1))
-        with cgutils.for_range(builder, builder.add(chunks, beyond)) as loop:
-            at = builder.mul(loop.index, index(FLOAT_LANES))
-            one, two, three = (columns(builder.add(at, index(step))) for step in range(3))
-            v.store(builder.fptrunc(v.sum(v.sum(one, two), three), v.floats), v.data(1), at)
-        with cgutils.for_range(builder, chunks) as loop:
-            at = builder.mul(loop.index, index(FLOAT_LANES))
-            (total,) = v.zeros(1)
-            with cgutils.for_range(builder, whole) as inner:
-                v.add_to(
-                    total, v.load(v.data(1), builder.add(at, builder.mul(inner.index, index(3))), v.floats)
-                )
-            with cgutils.for_range(builder, builder.srem(side, index(3))) as inner:
-                last = builder.sub(builder.add(at, side), builder.add(inner.index, index(1)))
-                v.add_to(total, builder.fptrunc(columns(last), v.floats))
-            v.store(v.product(builder.load(total), v.all(arguments[5], v.floats)), v.data(3), at)
-        return context.get_dummy_value()
-
-    return signature, generate
+    column: (W + side - 1,) sums at least. threes: as long as column less 2, for use inside.
+    """
+    count, width = side // 3, mean.shape[0]
+    one, two, three = column[:-2], column[1:-1], column[2:]
+    for x in range(threes.shape[0]):
+        threes[x] = np.float32(one[x] + two[x] + three[x])
+    mean[:] = 0
+    for step in range(0, 3 * count, 3):
+        ahead = threes[step : step + width]
+        for x in range(width):
+            mean[x] += ahead[x]
+    for step in range(3 * count, side):
+        last = column[step : step + width]
+        for x in range(width):
+            mean[x] += np.float32(last[x])
+    scale = np.float32(1.0 / (side * side))
+    for x in range(width):
+        mean[x] *= scale
 
 
 @kernel()
@@ -119,14 +101,7 @@ def slide_window(column: Float64, reach: int, mean: Float32) -> None:
     for step in range(1, reach + 1):
         column[reach - step] = column[reach + mirror_index(-step, width)]
         column[reach + width - 1 + step] = column[reach + mirror_index(width - 1 + step, width)]
-    scale, chunks = 1.0 / (side * side), width // FLOAT_LANES
-    threes = np.empty(len(column), dtype=np.float32)
-    _add_columns(column, threes, side, mean, chunks, np.float32(scale))
-    for x in range(chunks * FLOAT_LANES, width):
-        total = 0.0
-        for step in range(side):
-            total += column[x + step]
-        mean[x] = total * scale
+    _add_columns(column, np.empty(len(column) - 2, dtype=np.float32), side, mean)
 
 
 @kernel(fastmath=True)

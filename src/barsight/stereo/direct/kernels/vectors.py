@@ -15,7 +15,7 @@ from numba.core import cgutils
 
 LANES = 32
 HALF_LANES = LANES // 2
-BYTE, SHORT, NUMBER, FLOAT = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.FloatType()
+BYTE, SHORT, FLOAT = ir.IntType(8), ir.IntType(16), ir.FloatType()
 FLOAT_LANES = 16
 _FAST = ("fast",)
 
@@ -64,11 +64,6 @@ class Vectors:
         with self.builder.if_then(self.builder.icmp_unsigned("<", whole, count)):
             body(whole, HALF_LANES)
 
-    def length(self, place: int) -> Any:
-        """Elements of the array that is argument number `place`."""
-        array = self._context.make_array(self._kinds[place])
-        return array(self._context, self.builder, self._arguments[place]).nitems
-
     def number(self, place: int, at: Any, kind: Any) -> Any:
         """Return a vector of one element of the array that is argument number `place`."""
         return self.all(self.builder.load(self.builder.gep(self.data(place), [at])), kind)
@@ -113,27 +108,6 @@ class Vectors:
         """Of floats."""
         return self.builder.fadd(one, other, flags=_FAST)
 
-    def add_to(self, place: Any, term: Any) -> None:
-        """Floats, added to what lies at a pointer."""
-        self.builder.store(self.sum(self.builder.load(place), term), place)
-
-    def zeros(self, count: int) -> list[Any]:
-        """Pointers to float vectors of zeros: registers, where there are enough."""
-        return [cgutils.alloca_once_value(self.builder, self.all(0.0, self.floats)) for _ in range(count)]
-
-    def biweight(self, scaled: Any) -> Any:
-        """Tukey's biweight, whose reach is 1."""
-        same = self.not_negative(self.difference(self.all(1.0, self.floats), self.product(scaled, scaled)))
-        return self.product(same, same)
-
-    def difference(self, one: Any, other: Any) -> Any:
-        """Of floats."""
-        return self.builder.fsub(one, other, flags=_FAST)
-
-    def quotient(self, one: Any, other: Any) -> Any:
-        """Of floats."""
-        return self.builder.fdiv(one, other, flags=_FAST)
-
     def not_negative(self, vector: Any) -> Any:
         """Floats, zero in place of what is less."""
         return self.at_least(vector, 0.0)
@@ -154,17 +128,9 @@ class Vectors:
         """Return the "min" or "max" of a vector's floats."""
         return self._call(f"llvm.vector.reduce.f{which}.v{vector.type.count}f32", FLOAT, vector)
 
-    def ones(self, vector: Any) -> Any:
-        """Return the number of bits set in each byte."""
-        return self._call(f"llvm.ctpop.v{vector.type.count}i8", vector.type, vector)
-
     def min_of(self, vector: Any) -> Any:
         """Return the least byte of a vector."""
         return self._call(f"llvm.vector.reduce.umin.v{vector.type.count}i8", BYTE, vector)
-
-    def min_number(self, vector: Any) -> Any:
-        """Return the least of a vector's signed 32 bit numbers."""
-        return self._call(f"llvm.vector.reduce.smin.v{vector.type.count}i32", NUMBER, vector)
 
     def _call(self, name: str, result: Any, *values: Any) -> Any:
         kind = ir.FunctionType(result, [value.type for value in values])

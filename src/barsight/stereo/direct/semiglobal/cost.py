@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from barsight.core.arrays import UInt8, kernel
 from barsight.core.parallel import parallel_bands
-from barsight.stereo.direct.kernels.vectors import Vectors, bytes_of, shorts_of
 
 Int16 = NDArray[np.int16]
 
 _UNKNOWN_COST = 60
 BESIDE_COST = 61
 """Of the places that fill up the last vector: dearer than any candidate, so that no path goes there."""
+LANES = 16
+"""Candidates are filled up to multiples of this, so that no vector is left half empty."""
 _MAX_APART = 20
 _CODE_BYTES = 3
 _BAND_ROWS = 64
 
 
-@dataclass(frozen=True, eq=False)
-class PixelDescriptors:
+class PixelDescriptors(NamedTuple):
     """Descriptors of each pixel. codes: (H, 3, W) the census' 24 bits. slope: (H, W) difference of the
     neighbours in the row. grey: (H, W).
     """
@@ -79,60 +76,65 @@ def _write_census(framed: UInt8, codes: UInt8, first: int, end: int) -> None:
                     row[x] = np.uint8(np.uint8(row[x] << one) | np.uint8(there[x] > centre[x]))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@kernel(inline=True)
+def _bits_in_halves(byte: np.uint8) -> np.uint8:
+    """Count the bits set in each half of a byte: in pairs, then in fours."""
+    pairs = np.uint8(byte - np.uint8(np.uint8(byte >> np.uint8(1)) & np.uint8(0x55)))
+    return np.uint8(
+        np.uint8(pairs & np.uint8(0x33)) + np.uint8(np.uint8(pairs >> np.uint8(2)) & np.uint8(0x33))
+    )
+
+
+@kernel()
 def _write_costs(
-    _: Any, code: Any, slope: Any, grey: Any, codes: Any, slopes: Any, greys: Any, at: Any, cost: Any,
-    start: Any, places: Any,
-) -> Any:  # fmt: skip
-    """Compute costs of one left pixel (code: tuple of bytes, slope, grey) with the right ones from column
-    `at` on, written into the flat cost volume from `start` on.
+    own: tuple[np.uint8, np.uint8, np.uint8, np.int16, np.uint8],
+    row: tuple[UInt8, UInt8, UInt8, Int16, UInt8], at: int, cost: UInt8,
+) -> None:  # fmt: skip
+    """Compute the costs (places,) of one left pixel with the right ones from column `at` on.
+
+    own, row: the three bytes of the census, slope and grey, of the pixel and of the right row.
     """
-    signature = types.void(code, slope, grey, codes, slopes, greys, at, cost, start, places)
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, builder, signature, arguments)
-        width = v.length(4)
-
-        def write(offset: Any, lanes: int) -> None:
-            kind, wide = bytes_of(lanes), shorts_of(lanes)
-            there = builder.add(arguments[6], offset)
-            hamming = v.all(0, kind)
-            for part, byte in enumerate(v.members(0)):
-                place = builder.add(there, builder.mul(width, width.type(part)))
-                changed = builder.xor(v.all(byte, kind), v.load(v.data(3), place, kind))
-                hamming = builder.add(hamming, v.ones(changed))
-            steep = v.apart(v.all(arguments[1], wide), v.load(v.data(4), there, wide), signed=True)
-            steep = builder.trunc(v.least(steep, v.all(_MAX_APART, wide)), kind)
-            bright = v.apart(v.all(arguments[2], kind), v.load(v.data(5), there, kind))
-            bright = v.least(bright, v.all(_MAX_APART, kind))
-            apart = builder.lshr(builder.add(steep, bright), v.all(1, kind))
-            v.store(builder.add(hamming, apart), v.data(7), builder.add(arguments[8], offset))
-
-        v.by_chunks(arguments[9], write)
-        return context.get_dummy_value()
-
-    return signature, generate
+    one, two, three, slope, grey = own
+    ones, twos, threes, slopes, greys = row
+    # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+    first, most = np.uint64(at), np.int16(_MAX_APART)
+    for part in range(0, cost.shape[0], LANES):
+        for lane in range(LANES):
+            i = np.uint64(part) + np.uint64(lane)
+            k = first + i
+            changed, changed_too, third = (
+                np.uint8(one ^ ones[k]), np.uint8(two ^ twos[k]), np.uint8(three ^ threes[k]),
+            )  # fmt: skip
+            # Three bytes' bits as ones and twos: two counts in place of three.
+            odd = np.uint8(changed ^ changed_too)
+            carried = np.uint8(np.uint8(changed & changed_too) | np.uint8(odd & third))
+            halves = _bits_in_halves(np.uint8(odd ^ third))
+            twice = _bits_in_halves(carried)
+            halves = np.uint8(halves + np.uint8(twice + twice))
+            hamming = np.uint8(np.uint8(halves & np.uint8(0x0F)) + np.uint8(halves >> np.uint8(4)))
+            steep = np.int16(slope - slopes[k])
+            bright = np.int16(np.int16(grey) - np.int16(greys[k]))
+            steep = steep if steep > 0 else np.int16(-steep)
+            bright = bright if bright > 0 else np.int16(-bright)
+            steep = steep if steep < most else most
+            bright = bright if bright < most else most
+            cost[i] = np.uint8(hamming + np.uint8(np.int16(steep + bright) >> np.int16(1)))
 
 
 @kernel()
 def row_costs(
-    code: UInt8, slope: Int16, grey: UInt8, codes: UInt8, slopes: Int16, greys: UInt8, lowest: int,
-    count: int, cost: UInt8,
-) -> None:  # fmt: skip
-    """Compute costs (W, places) of one row, of which `count` are candidates.
-
-    codes, slopes, greys: the right row, see `reverse_rows`.
-    """
-    width, places = cost.shape
-    flat, flat_codes = cost.reshape(-1), codes.reshape(-1)
+    left: PixelDescriptors, right: PixelDescriptors, y: int, lowest: int, count: int, cost: UInt8
+) -> None:
+    """Compute costs (W, places) of row y, of which `count` are candidates. right: see `reverse_rows`."""
+    width = cost.shape[0]
+    code, slope, grey = left.codes[y], left.slope[y], left.grey[y]
+    row = right.codes[y, 0], right.codes[y, 1], right.codes[y, 2], right.slope[y], right.grey[y]
     for x in range(width):
         base = width - 1 - x + lowest
         first, end = max(0, -base), min(count, width - base)
         here = cost[x]
-        here_code = (code[0, x], code[1, x], code[2, x])
-        _write_costs(
-            here_code, slope[x], grey[x], flat_codes, slopes, greys, width - 1 - x, flat, x * places, places
-        )
+        own = code[0, x], code[1, x], code[2, x], slope[x], grey[x]
+        _write_costs(own, row, width - 1 - x, here)
         if end <= first:
             here[:count] = _UNKNOWN_COST
         else:

@@ -9,27 +9,22 @@ height.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from barsight.core.arrays import Float32, Int32, UInt8, kernel
 from barsight.core.errors import ConfigError
 from barsight.core.parallel import parallel_bands
-from barsight.stereo.direct.kernels.vectors import HALF_LANES, NUMBER, Vectors, shorts_of
 from barsight.stereo.direct.semiglobal.cost import (
     BESIDE_COST,
-    Int16,
+    LANES,
+    PixelDescriptors,
     describe_pixels,
     reverse_rows,
     row_costs,
 )
-from barsight.stereo.direct.semiglobal.paths import UInt16, allocate_paths, extend_row, p2_table
+from barsight.stereo.direct.semiglobal.paths import Penalties, UInt16, allocate_paths, extend_row, p2_table
 
 _OVERLAP_ROWS = 20
 _STRIPE_BYTES = 128 * 2**20
@@ -76,66 +71,45 @@ def match_semiglobal(
     """
     height, width = left.shape
     left_px, right_px = np.empty((2, height, width), dtype=np.float32)
-    threads, places = numba.get_num_threads(), -(-count // HALF_LANES) * HALF_LANES
+    threads, places = numba.get_num_threads(), -(-count // LANES) * LANES
     affordable = max(_STRIPE_BYTES // (3 * width * places) - 2 * _OVERLAP_ROWS, 16)
     stripes = threads * -(-height // (threads * min(affordable, 256)))
     rows = -(-height // stripes)
     volume = (min(height, rows + 2 * _OVERLAP_ROWS), width, places)
     rooms = [(np.empty(volume, dtype=np.uint8), np.empty(volume, dtype=np.uint16)) for _ in range(threads)]
     seen, others = describe_pixels(left), reverse_rows(describe_pixels(right), lowest_px, places)
+    penalties = Penalties(settings.p1, p2_table(settings.p2, settings.min_p2))
 
     def work(first: int, end: int) -> None:
         room = rooms.pop()
-        _match_stripe(
-            seen.codes, seen.slope, seen.grey, others.codes, others.slope, others.grey, lowest_px, count,
-            settings.p1, settings.p2, settings.min_p2, *room, left_px, right_px, first,
-            end,
-        )  # fmt: skip
+        _match_stripe(seen, others, lowest_px, count, penalties, room, (left_px, right_px), first, end)
         rooms.append(room)
 
     parallel_bands(work, height, rows)
     return SemiGlobalMatch(left_px, right_px)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@kernel()
 def _compete(
-    _: Any, downs: Any, ups: Any, at: Any, count: Any, places: Any, least: Any, right: Any
-) -> Any:  # fmt: skip
-    """Find the least key of one left pixel.
+    down: UInt16, up: UInt16, at: int, count: int, least: Int32, right: int
+) -> np.int32:  # fmt: skip
+    """Find the least key of one left pixel; its keys are written to `least` where they are less, that of
+    candidate k at `right` + k.
 
-    Its keys are written to `least` where they are less, that of candidate k at `right` + k. A key is a
-    candidate's sum and below it, in 16 bits, the candidate: the least number is the winner. downs, ups: flat,
-    the pixel's sums from `at` on.
+    A key is a candidate's sum and below it, in 16 bits, the candidate: the least number is the winner. down,
+    up: flat, the pixel's sums of four paths each from `at` on.
     """
-    signature = types.int32(downs, ups, at, count, places, least, right)
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        v = Vectors(context, builder, signature, arguments)
-        kind = ir.VectorType(NUMBER, HALF_LANES)
-        worst = v.all(int(_WORST), kind)
-        lanes = ir.Constant(kind, list(range(HALF_LANES)))
-        end = v.all(builder.trunc(arguments[3], NUMBER), kind)
-        winner = cgutils.alloca_once_value(builder, worst)
-
-        def smaller(one: Any, other: Any) -> Any:
-            return builder.select(builder.icmp_signed("<", one, other), one, other)
-
-        chunks = builder.udiv(arguments[4], arguments[4].type(HALF_LANES))
-        with cgutils.for_range(builder, chunks) as loop:
-            offset = builder.mul(loop.index, loop.index.type(HALF_LANES))
-            place = builder.add(arguments[2], offset)
-            down, up = (
-                builder.zext(v.load(v.data(part), place, shorts_of(HALF_LANES)), kind) for part in (0, 1)
-            )
-            candidate = builder.add(lanes, v.all(builder.trunc(offset, NUMBER), kind))
-            key = builder.or_(builder.shl(builder.add(down, up), v.all(16, kind)), candidate)
-            key = builder.select(builder.icmp_signed("<", candidate, end), key, worst)
-            builder.store(smaller(builder.load(winner), key), winner)
-            there = builder.add(arguments[6], offset)
-            v.store(smaller(v.load(v.data(5), there, kind), key), v.data(5), there)
-        return v.min_number(builder.load(winner))
-
-    return signature, generate
+    winner = np.int32(_WORST)
+    # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+    first, there = np.uint64(at), np.uint64(right)
+    for i in range(count):
+        k = np.uint64(i)
+        total = np.int32(np.int32(down[first + k]) + np.int32(up[first + k]))
+        key = np.int32(np.int32(total << np.int32(16)) | np.int32(i))
+        winner = key if key < winner else winner
+        other = least[there + k]
+        least[there + k] = key if key < other else other
+    return winner
 
 
 @kernel()
@@ -153,7 +127,7 @@ def _choose(
     least[:] = _WORST
     for x in range(width):
         at = x * places
-        winner = _compete(downs, ups, at, count, places, least, margin + width - 1 - x + lowest)
+        winner = _compete(downs, ups, at, count, least, margin + width - 1 - x + lowest)
         best = winner & 0xFFFF
         fraction = np.float32(0)
         if 0 < best < count - 1:
@@ -172,32 +146,36 @@ def _choose(
 
 @kernel()
 def _match_stripe(
-    code: UInt8, slope: Int16, grey: UInt8, codes: UInt8, slopes: Int16, greys: UInt8, lowest: int,
-    count: int, small: int, large: int, min_p2: int, cost: UInt8, down: UInt16, left_px: Float32,
-    right_px: Float32, start: int, end: int,
+    left: PixelDescriptors, right: PixelDescriptors, lowest: int, count: int, penalties: Penalties,
+    room: tuple[UInt8, UInt16], px: tuple[Float32, Float32], start: int, end: int,
 ) -> None:  # fmt: skip
-    """Match a stripe: once down, where the costs are made, and once up, where the winners are chosen row by
-    row. cost, down:
-    volumes for use inside."""
-    height, width = left_px.shape
+    """Match rows start...end: once down, where the costs are made, and once up, where the winners are chosen
+    row by row.
+
+    right: reversed, see `reverse_rows`. room: volumes (rows, W, places) for use inside. Fills px, the
+    disparities (H, W) of the left and the right image.
+    """
+    cost, down = room
+    left_px, right_px = px
+    grey = left.grey
+    height, width = grey.shape
     places = cost.shape[2]
-    jumps = p2_table(large, min_p2)
-    paths = allocate_paths(width, places, small)
+    paths = allocate_paths(width, places, penalties.small)
     leasts = np.empty((2, width, 3), dtype=np.uint8)
     up = np.empty((width, places), dtype=np.uint16)
     least = np.empty(width + 2 * (abs(lowest) + places), dtype=np.int32)
     above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
     for y in range(above, below):
         here = cost[y - above]
-        row_costs(code[y], slope[y], grey[y], codes[y], slopes[y], greys[y], lowest, count, here)
+        row_costs(left, right, y, lowest, count, here)
         extend_row(
-            here, grey[y], grey[max(y - 1, 0)], small, jumps, y == above, (y & 1) == 1, False, paths, leasts,
+            here, grey[y], grey[max(y - 1, 0)], penalties, y == above, (y & 1) == 1, False, paths, leasts,
             down[y - above],
         )  # fmt: skip
     for y in range(below - 1, start - 1, -1):
         extend_row(
-            cost[y - above], grey[y], grey[min(y + 1, height - 1)], small, jumps, y == below - 1,
-            (y & 1) == 1, True, paths, leasts, up,
+            cost[y - above], grey[y], grey[min(y + 1, height - 1)], penalties, y == below - 1, (y & 1) == 1,
+            True, paths, leasts, up,
         )  # fmt: skip
         if y < end:
             _choose(down[y - above], up, count, lowest, least, left_px[y], right_px[y])

@@ -6,7 +6,7 @@ holds them. Candidates are filled up to whole vectors with places that no path t
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -19,6 +19,14 @@ from barsight.stereo.direct.kernels.vectors import HALF_LANES, LANES, Vectors, b
 
 UInt16 = NDArray[np.uint16]
 
+
+class Penalties(NamedTuple):
+    """small: P1, of a change by one candidate. jumps: (256,) P2, see `p2_table`."""
+
+    small: int
+    jumps: UInt8
+
+
 _EDGE_GREY = 8
 _PATHS = 4
 
@@ -26,16 +34,19 @@ _PATHS = 4
 @intrinsic  # type: ignore[untyped-decorator]
 def _extend_paths(
     _: Any, cost: Any, at: Any, paths: Any, before: Any, after: Any, least: Any, ceiling: Any, small: Any,
-    sums: Any, at_sums: Any, places: Any,
+    sums: Any, places: Any,
 ) -> Any:  # fmt: skip
     """Step one pixel further along four paths [Hirschmueller 2008, Eq. 13]; returns the least value of each.
 
-    before, after: where each path's values at the pixels before and here begin in `paths`, with one place
-    before the first. least, ceiling: each path's least value before, the same with the dearest jump. The sum
-    of the four is written to `sums`. All arrays are flat.
+    cost: the pixel's `places` costs from `at` on; the sum of the four is written to `sums` there. before,
+    after: where each path's values at the pixels before and here begin in `paths`, with one place before the
+    first. least, ceiling: each path's least value before, the same with the dearest jump. All arrays flat.
+
+    In vector instructions: plain Numba takes four times as long here, a fifth more for all of stereo. The
+    four paths of a pixel are a few vectors of bytes, and checks for overlap cost more than the steps.
     """
     four = types.Tuple((types.uint8,) * _PATHS)
-    signature = four(cost, at, paths, before, after, least, ceiling, small, sums, at_sums, places)
+    signature = four(cost, at, paths, before, after, least, ceiling, small, sums, places)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
@@ -60,9 +71,9 @@ def _extend_paths(
                 v.store(value, v.data(2), builder.add(place, place.type(1)))
                 builder.store(v.least(builder.load(lowest[lanes][k]), value), lowest[lanes][k])
                 total = builder.add(total, builder.zext(value, total.type))
-            v.store(total, v.data(8), builder.add(arguments[9], offset))
+            v.store(total, v.data(8), builder.add(arguments[1], offset))
 
-        v.by_chunks(arguments[10], extend)
+        v.by_chunks(arguments[9], extend)
         found = [
             v.least(*(v.min_of(builder.load(lowest[lanes][k])) for lanes in (LANES, HALF_LANES)))
             for k in range(_PATHS)
@@ -94,22 +105,15 @@ def allocate_paths(width: int, places: int, small: int) -> UInt8:
 
 @kernel()
 def extend_row(
-    cost: UInt8,
-    grey: UInt8,
-    grey_before: UInt8,
-    small: int,
-    jumps: UInt8,
-    is_first: bool,
-    is_odd: bool,
-    backwards: bool,
-    paths: UInt8,
-    leasts: UInt8,
-    sums: UInt16,
-) -> None:
+    cost: UInt8, grey: UInt8, grey_before: UInt8, penalties: Penalties, is_first: bool, is_odd: bool,
+    backwards: bool, paths: UInt8, leasts: UInt8, sums: UInt16,
+) -> None:  # fmt: skip
     """Extend four paths through one row: along it and from the three neighbours in the row before.
 
-    cost, sums: (W, places). paths, leasts (2, W, 3): kept from row to row.
+    cost: (W, places). grey, grey_before: (W,) of this row and the one before. paths (`allocate_paths`),
+    leasts (2, W, 3): kept from row to row. Fills sums (W, places).
     """
+    small, jumps = penalties
     width, places = cost.shape
     side = places + 2
     costs, totals = cost.reshape(-1), sums.reshape(-1)
@@ -136,15 +140,13 @@ def extend_row(
         if not is_first and x < width - 1:
             start_r, base_r = ((old * 3 + 2) * width + x + 1) * side, leasts[old, x + 1, 2]
             top_r = np.uint8(base_r + jumps[abs(here - np.int32(grey_before[x + 1]))])
+        ends = (
+            along + (j & 1) * side, (new * 3 * width + x) * side,
+            ((new * 3 + 1) * width + x) * side, ((new * 3 + 2) * width + x) * side,
+        )  # fmt: skip
         found = _extend_paths(
-            costs, at, paths,
-            (start_a, start_l, start_m, start_r),
-            (
-                along + (j & 1) * side, (new * 3 * width + x) * side,
-                ((new * 3 + 1) * width + x) * side, ((new * 3 + 2) * width + x) * side,
-            ),
-            (base_a, base_l, base_m, base_r), (top_a, top_l, top_m, top_r), np.uint8(small), totals, at,
-            places,
+            costs, at, paths, (start_a, start_l, start_m, start_r), ends, (base_a, base_l, base_m, base_r),
+            (top_a, top_l, top_m, top_r), np.uint8(small), totals, places,
         )  # fmt: skip
         min_along = found[0]
         leasts[new, x, 0], leasts[new, x, 1], leasts[new, x, 2] = found[1], found[2], found[3]
