@@ -16,9 +16,24 @@ from barsight.core.types import RectifiedCamera
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ImuBias
 from barsight.motion.frontend.tracking import Sighting
-from barsight.motion.linear import skyline_inverse
-from barsight.motion.linear.chain_elimination import Chain, back_substitute_nodes, eliminate_nodes
-from barsight.motion.problem.gauss_newton import GraphState, cost_of, optimise_graph, retract
+from barsight.motion.linear.chain_elimination import (
+    Chain,
+    add_chain,
+    add_products,
+    back_substitute_nodes,
+    eliminate_nodes,
+)
+from barsight.motion.linear.motion_only_kernel import frame_equations
+from barsight.motion.linear.reprojection_kernels import residuals
+from barsight.motion.problem.gauss_newton import (
+    GraphState,
+    cost_of,
+    linearisation_point,
+    observations_of,
+    optimise_graph,
+    retract,
+    rig_of,
+)
 from barsight.motion.problem.gtsam_factors import build_graph, initial_values
 from barsight.motion.problem.marginals import marginals, slide_variances
 from barsight.motion.problem.problem import (
@@ -63,7 +78,7 @@ def test_a_band_is_solved_like_a_dense_matrix(n: int, width: int) -> None:
     blocks = np.empty((n // 3, 3, 3))
     pairs = np.array([[k, k + 1] for k in range(n // 3 - 1)], np.int64).reshape(-1, 2)
     cross, diagonal = np.empty((len(pairs), 3, 3)), np.empty(n)
-    skyline_inverse.inverse_blocks(factor, np.arange(0, n, 3), diagonal, blocks, pairs, cross)
+    skyline.inverse_blocks(factor, np.arange(0, n, 3), diagonal, blocks, pairs, cross)
     inverse = np.linalg.inv(matrix)
     np.testing.assert_allclose(diagonal, np.diag(inverse), rtol=1e-8)
     for k, block in enumerate(cross):
@@ -100,32 +115,55 @@ def test_rows_that_begin_late_are_solved_like_a_dense_matrix() -> None:
     skyline.solve_back_dense(factor, right)
     np.testing.assert_allclose(right, expected, rtol=1e-9, atol=1e-12)
     diagonal, none = np.empty(n), np.empty((0, 1, 1))
-    skyline_inverse.inverse_blocks(
-        factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none
-    )
+    skyline.inverse_blocks(factor, np.empty(0, np.int64), diagonal, none, np.empty((0, 2), np.int64), none)
     np.testing.assert_allclose(diagonal, np.diag(np.linalg.inv(matrix)), rtol=1e-9)
 
 
 def test_nodes_between_frames_are_taken_out() -> None:
     """A chain of seven nodes of which three are kept, against the whole one solved."""
     rng, size, count = np.random.default_rng(3), 3, 7
-    matrix, rows = banded(rng, size * count, size + 1)
-    wide = np.zeros((size * count, 2 * size))
-    wide[:, -size - 1 :] = rows
+    matrix, _ = banded(rng, size * count, size + 1)
+    blocks = matrix.reshape(count, size, count, size)
+    own = np.array([blocks[k, :, k] for k in range(count)])
+    link = np.array([blocks[k, :, max(k - 1, 0)] for k in range(count)])
+    link[0] = 0
     gradient, side = rng.normal(size=(2, size * count))
     kept, latency = np.array([1, 2, 5]), 0.7
-    left, gaps = eliminate_nodes(Chain(wide, gradient, side, 9.0, 0.5), kept)
-    small = np.zeros((9, 9))
-    for i in range(9):
-        for j in range(max(0, i - 2 * size + 1), i + 1):
-            small[i, j] = small[j, i] = left.rows[i, 2 * size - 1 - i + j]
-    step = -np.linalg.solve(small, left.gradient + latency * left.side)
+    rows = (count, size)
+    chain = Chain(own, link, gradient.reshape(rows), side.reshape(rows), np.array([9.0, 0.5]))
+    left, gaps = eliminate_nodes(chain, kept)
+    band = skyline.full(np.zeros((9, 9)))
+    add_chain(left, np.arange(0, 9, 3), band)
+    small = np.tril(band.values.reshape(9, 9))
+    small += np.tril(small, -1).T
+    left_gradient, left_side = left.gradient.ravel(), left.side.ravel()
+    step = -np.linalg.solve(small, left_gradient + latency * left_side)
     found = back_substitute_nodes(step.reshape(3, 3), latency, kept, gaps, count)
     np.testing.assert_allclose(found.ravel(), -np.linalg.solve(matrix, gradient + latency * side), atol=1e-12)
     whole = np.linalg.solve(matrix, np.column_stack([side, gradient]))
-    rest = np.linalg.solve(small, np.column_stack([left.side, left.gradient]))
-    np.testing.assert_allclose(left.corner - left.side @ rest[:, 0], 9.0 - side @ whole[:, 0])
-    np.testing.assert_allclose(left.corner_gradient - left.side @ rest[:, 1], 0.5 - side @ whole[:, 1])
+    rest = np.linalg.solve(small, np.column_stack([left_side, left_gradient]))
+    np.testing.assert_allclose(left.corner[0] - left_side @ rest[:, 0], 9.0 - side @ whole[:, 0])
+    np.testing.assert_allclose(left.corner[1] - left_side @ rest[:, 1], 0.5 - side @ whole[:, 1])
+
+
+def test_sparse_rows_are_added_to_a_chain() -> None:
+    """Four nodes of two unknowns; each row binds two neighbours and the latency."""
+    rng = np.random.default_rng(8)
+    dense = np.zeros((15, 9))
+    for r, row in enumerate(dense):
+        row[2 * (r % 3) : 2 * (r % 3) + 4], row[8] = rng.normal(size=4), rng.normal()
+    row, at = np.nonzero(dense)
+    right = rng.normal(size=15)
+    chain = Chain.empty(4, 2)
+    add_products(np.searchsorted(row, np.arange(16)), at, dense[row, at], right, chain)
+    matrix, gradient = dense.T @ dense, -dense.T @ right
+    for k in range(4):
+        own = slice(2 * k, 2 * k + 2)
+        np.testing.assert_allclose(chain.own[k], matrix[own, own])
+        np.testing.assert_allclose(chain.link[k], matrix[own, 2 * k - 2 : 2 * k] if k else np.zeros((2, 2)))
+    np.testing.assert_allclose(chain.gradient.ravel(), gradient[:8])
+    np.testing.assert_allclose(chain.side.ravel(), matrix[8, :8])
+    np.testing.assert_allclose(chain.corner, [matrix[8, 8], gradient[8]])
 
 
 def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple[Problem, np.ndarray]:
@@ -220,6 +258,32 @@ def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
         sigma = np.sqrt(np.diag(covariance.marginalCovariance(X(k))))
         assert (np.abs(off) < 0.01 * sigma + 1e-9).all()
         np.testing.assert_allclose(np.sqrt(np.diag(found.poses[k])), sigma, rtol=0.01)
+
+
+def test_one_frames_equations_are_its_costs_slope() -> None:
+    """Points known, some sightings wrong: the slope against small changes; and steps lead to its end."""
+    problem, used = seen_from(4, 6, False, 2.0)
+    seen, values = problem.sightings, initial_values(problem)
+    assert seen is not None
+    rig, sights = rig_of(seen), observations_of(problem, used)
+    state = GraphState(values, initial_points(problem), np.zeros(2))
+
+    def moved(step: np.ndarray) -> GraphState:
+        there = gtsam.Values(state.values)
+        there.update(X(2), there.atPose3(X(2)).retract(step))
+        return replace(state, values=there)
+
+    for _ in range(20):
+        normal, gradient = np.zeros((6, 6)), np.zeros(6)
+        frame_equations(rig, sights, linearisation_point(problem, state), 2, normal, gradient)
+        slope = np.empty(6)
+        for axis, by in enumerate(1e-7 * np.eye(6)):
+            ends = [linearisation_point(problem, moved(side * by)) for side in (1, -1)]
+            high, low = (residuals(rig, sights, end, np.zeros((len(used), 3))) for end in ends)
+            slope[axis] = (high - low) / 2e-7
+        np.testing.assert_allclose(gradient, slope, atol=1e-5 * np.sqrt(np.diag(normal)).max())
+        state = moved(-np.linalg.solve(normal, gradient))
+    assert gradient @ np.linalg.solve(normal, gradient) < 1e-8
 
 
 def test_what_is_shared_costs_what_the_system_says() -> None:

@@ -1,8 +1,7 @@
-"""The live window's own algebra against NumPy's."""
+"""The live window's algebra against NumPy's."""
 
 import numpy as np
 
-from barsight.core.linalg import skyline
 from barsight.motion.fixed_lag.window_equations import (
     SLIDE_SIGMA_RAD,
     SLIDE_WAY_M,
@@ -10,44 +9,12 @@ from barsight.motion.fixed_lag.window_equations import (
     marginal_prior,
     propagate_slide,
 )
-from barsight.motion.linear import dense_cholesky
 
 
 def positive(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(n, n + 3))
     return root @ root.T, rng.normal(size=n)
-
-
-def test_a_dense_system_is_solved() -> None:
-    """Whole as a skyline."""
-    matrix, right = positive(0, 23)
-    factor, x = matrix.copy(), right[:, None].copy()
-    assert skyline.factorise_skyline(skyline.full(factor))
-    np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix))
-    skyline.solve_forward(skyline.full(factor), x)
-    skyline.solve_back_dense(skyline.full(factor), x)
-    np.testing.assert_allclose(x[:, 0], np.linalg.solve(matrix, right))
-    np.testing.assert_allclose(dense_cholesky.multiply(matrix, right), matrix @ right)
-    assert not skyline.factorise_skyline(skyline.full(-matrix))
-
-
-def test_bands_and_blocks_are_added() -> None:
-    matrix, _ = positive(1, 12)
-    rows = np.zeros((12, 6))
-    band = np.where(abs(np.subtract.outer(range(12), range(12))) < 6, matrix, 0)
-    for i in range(12):
-        for j in range(max(0, i - 5), i + 1):
-            rows[i, j - i + 5] = matrix[i, j]
-    result = np.zeros((20, 20))
-    dense_cholesky.add_band(rows, 5, result)
-    np.testing.assert_array_equal(result[5:17, 5:17], band)
-    blocks = np.zeros((2, 6, 12))
-    blocks[0, :, 6:], blocks[1] = matrix[:6, :6], matrix[6:]
-    result = np.zeros((20, 20))
-    dense_cholesky.add_blocks(blocks, 8, result)
-    at = np.r_[0:6, 8:14]
-    np.testing.assert_array_equal(result[np.ix_(at, at)], matrix)
 
 
 def test_a_prior_says_the_same_of_what_stays() -> None:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.boards.board_views import BoardView
 from barsight.calibration.geometry.projection import Lens, project_lens
 from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg.dense import solve_positive
 from barsight.core.linalg.levenberg_marquardt import Options, minimise
 from barsight.core.pose import skew
 
@@ -235,7 +236,7 @@ def _move(state: AdjustmentState, normal: _Normal, damping: float) -> Adjustment
     through = normal.mixed @ inverse
     reduced = common - np.einsum("vci,vdi->cd", through, normal.mixed)
     target = normal.gradient - np.einsum("vci,vi->c", through, normal.board_gradient)
-    step = np.linalg.solve(reduced, target)
+    step = solve_positive(reduced, target)
     rest = normal.board_gradient - np.einsum("vci,c->vi", normal.mixed, step)
     return retract_adjustment(state, step, np.einsum("vij,vj->vi", inverse, rest))
 

@@ -8,6 +8,8 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from barsight.core.linalg.dense import one_blas_thread
+
 _TINY = 1e-18
 _FACTOR = 10.0
 
@@ -73,6 +75,7 @@ class Minimum(Generic[I]):
         return self.termination is Termination.CONVERGED
 
 
+@one_blas_thread()
 def minimise(best: I, options: Options) -> Minimum[I]:
     """Find a minimum from the iterate `best` on; never ends at a higher cost."""
     damping = options.first_damping

@@ -1,8 +1,8 @@
 """Factorise and solve symmetric matrices of which each row begins late: the skyline Cholesky factor.
 
 A factor's rows begin where the matrix's do [Jennings 1966], so nothing before is stored or worked on. Plain
-loops: LAPACK is two to six times as fast on one thread, but slower than these on its own threads where the
-machine is busy (benchmarks/results/2026-11-23-linear-algebra.md).
+loops: poses' rows are long and velocities' and biases' short, which costs LAPACK's band and
+blocks more than they gain (benchmarks/results/2026-11-23-linear-algebra.md).
 """
 
 from __future__ import annotations
@@ -112,11 +112,51 @@ def solve_back_dense(factor: Skyline, x: Float64) -> None:
 
 
 @kernel(fastmath=True)
-def gram_matrix(x: Float64, result: Float64) -> None:
-    """Multiply x^T x (m, m) of x (n, m). BLAS's threads wait for each other where the machine is busy."""
-    result[:] = 0
-    for i in range(x.shape[0]):
-        for a in range(x.shape[1]):
-            share = x[i, a]
-            for b in range(x.shape[1]):
-                result[a, b] += share * x[i, b]
+def inverse_blocks(
+    factor: Skyline, at: Int64, diagonal: Float64, blocks: Float64, pairs: Int64, cross: Float64
+) -> None:
+    """Compute blocks of the inverse, from the last column back [Takahashi 1973]: only its elements within the
+    band are needed, and of these only those of the rows that a column reaches. diagonal: (n,). blocks: (K, b,
+    b) of the unknowns from at[k] on, at ascending; cross: (P, b, b) those in the rows of block pairs[:, 0],
+    ascending, and the columns of the later pairs[:, 1]; NaN beyond the band.
+    """
+    values, first, offset = factor
+    n, size = len(first), blocks.shape[1]
+    reach = 1
+    for i in range(n):
+        reach = max(reach, i - first[i] + 1)
+    held = reach + size
+    near = np.zeros((held, held))  # element (i, j) at [i % held, j % held]
+    column, below, sums = np.zeros(held), np.empty(held, np.int64), np.empty(held)
+    block, pair = len(blocks) - 1, len(pairs) - 1
+    for j in range(n - 1, -1, -1):
+        own, count = values[offset[j] + j], 0
+        column[:] = 0.0
+        for i in range(j + 1, min(n, j + reach)):
+            if first[i] <= j:
+                below[count] = i % held
+                column[below[count]] = values[offset[i] + j] / own
+                count += 1
+        here, spread = j % held, 1 / own**2
+        for a in range(count):
+            row, total = near[below[a]], 0.0
+            for k in range(held):
+                total += column[k] * row[k]
+            sums[a] = total
+        for a in range(count):
+            near[below[a], here] = near[here, below[a]] = -sums[a]
+            spread += column[below[a]] * sums[a]
+        near[here, here] = diagonal[j] = spread
+        if block < 0 or at[block] != j:
+            continue
+        for i in range(size):
+            for k in range(size):
+                blocks[block, i, k] = near[(j + i) % held, (j + k) % held]
+        while pair >= 0 and pairs[pair, 0] == block:
+            for k in range(size):
+                later = at[pairs[pair, 1]] + k
+                for i in range(size):
+                    within = first[later] <= j + i
+                    cross[pair, i, k] = near[(j + i) % held, later % held] if within else np.nan
+            pair -= 1
+        block -= 1

@@ -12,16 +12,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64
-from barsight.core.linalg import skyline
+from barsight.core.linalg import dense, skyline
 from barsight.core.pose import Pose, skew
-from barsight.motion.linear import dense_cholesky
 from barsight.motion.linear.chain_elimination import (
     Chain,
     EliminatedNodes,
+    add_chain,
     back_substitute_nodes,
     eliminate_nodes,
 )
-from barsight.motion.linear.schur_complement import ReducedSystem, eliminate_points
+from barsight.motion.linear.schur_complement import (
+    NO_PIECES,
+    ReducedSystem,
+    eliminate_points,
+    scatter_reduced,
+)
 from barsight.motion.problem.encoder_factors import add_encoders
 from barsight.motion.problem.gauss_newton import (
     GraphState,
@@ -106,14 +111,14 @@ def assemble_equations(
     if used.any():
         _add_pictures(problem, state, used, matrix, gradient)
     begin = int(np.searchsorted(kept, first)) * size
-    here = slice(begin, begin + len(chain.rows))
-    dense_cholesky.add_band(chain.rows, begin, matrix)
-    gradient[here] += chain.gradient
+    here = slice(begin, begin + chain.gradient.size)
+    add_chain(chain, np.arange(here.start, here.stop, size), skyline.full(matrix))
+    gradient[here] += chain.gradient.ravel()
     if problem.has_latency:
-        matrix[count, here] += chain.side
-        matrix[here, count] += chain.side
-        matrix[count, count] += chain.corner
-        gradient[count] += chain.corner_gradient
+        matrix[count, here] += chain.side.ravel()
+        matrix[count, count] += chain.corner[0]
+        gradient[count] += chain.corner[1]
+    matrix += np.tril(matrix, -1).T
     gaps = tuple(replace(gap, first=gap.first + first, end=gap.end + first) for gap in gaps)
     return DenseEquations(matrix, gradient, gaps)
 
@@ -124,33 +129,31 @@ def _chain(problem: Problem, state: GraphState, first: int, end: int, last: int)
     chain = linearise_chain(build_graph(problem, first, end), state.values, size, len(problem.start))
     placed = tuple(place for place in problem.placed if first <= place.node < end)
     add_encoders(chain, replace(problem, placed=placed), state.poses, latency_of(state.values))
-    here = slice(first * size, (last + 1) * size)
-    return replace(chain, rows=chain.rows[here], gradient=chain.gradient[here], side=chain.side[here])
+    return chain.at(slice(first, last + 1))
 
 
 def _add_pictures(
     problem: Problem, state: GraphState, used: Bool, matrix: Float64, gradient: Float64
 ) -> None:
+    """Add the sightings' equations to the lower half of the matrix."""
     seen, nodes, size = problem.sightings, len(problem.kept), problem.width
     assert seen is not None
-    reduced = ReducedSystem.empty(nodes, nodes)
+    reduced, border = ReducedSystem.empty(nodes, nodes), np.zeros((2, 2))
     eliminate_points(
         rig_of(seen), observations_of(problem, used), linearisation_point(problem, state), reduced
     )
-    dense_cholesky.add_blocks(reduced.band, size, matrix)
-    at = (np.arange(nodes)[:, None] * size + np.arange(6)).ravel()
-    gradient[at] += reduced.gradient
-    matrix[-2:, at] += reduced.side[0, 2:]
-    matrix[at, -2:] += reduced.side[0, 2:].T
-    matrix[-2:, -2:] += reduced.corner[0, 2:, 2:]
-    gradient[-2:] += reduced.corner_gradient[0, 2:]
+    node = np.arange(nodes) * size
+    scatter_reduced(
+        reduced, node, NO_PIECES[:, 0], skyline.full(matrix), gradient, matrix[-2:], border, gradient[-2:]
+    )
+    matrix[-2:, -2:] += np.tril(border)
     if problem.has_latency:
         by_slide = np.zeros(len(gradient))
-        by_slide[at] = np.tile(slide_twist(seen.body_from_rect0), nodes)
-        side = dense_cholesky.multiply(matrix, by_slide)
+        by_slide[(node[:, None] + np.arange(6)).ravel()] = np.tile(slide_twist(seen.body_from_rect0), nodes)
+        side = (matrix + np.tril(matrix, -1).T) @ by_slide
         matrix[-3] += side
-        matrix[:, -3] += side
-        matrix[-3, -3] = by_slide @ side
+        matrix[-2:, -3] += side[-2:]
+        matrix[-3, -3:] = by_slide @ side, 0.0, 0.0
         gradient[-3] += by_slide @ gradient
 
 
@@ -166,7 +169,7 @@ def prior_equations(problem: Problem, state: GraphState, slide: float) -> DenseE
         at = np.concatenate([np.arange(count), np.arange(whole - len(border), whole)])
         since = np.concatenate([prior.since(state.values), border - prior.border])
         matrix[np.ix_(at, at)] = prior.matrix
-        gradient[at] = prior.gradient + dense_cholesky.multiply(prior.matrix, since)
+        gradient[at] = prior.gradient + prior.matrix @ since
     elif problem.has_latency:
         matrix[-3, -3], gradient[-3] = SLIDE_SIGMA_RAD**-2, slide * SLIDE_SIGMA_RAD**-2
     return DenseEquations(matrix, gradient, ())
@@ -178,22 +181,18 @@ def solve_step(
     """Solve for the full step. Raises LinAlgError where the measurements leave an unknown undetermined."""
     size, matrix = problem.width, equations.matrix.copy()
     matrix[[-2, -1], [-2, -1]] += 1 / np.array(LOOSE) ** 2
-    band, right = skyline.full(matrix), equations.gradient[:, None].copy()
-    if not skyline.factorise_skyline(band):
-        raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
-    skyline.solve_forward(band, right)
-    factor, forward = matrix, right[:, 0]
+    factor = dense.cholesky(matrix)
+    forward = dense.solve_lower(factor, equations.gradient)
     covariance, by_drift = None, np.zeros(2)
     if problem.offset_prior_px > 0 and used.any():
-        own = np.tril(factor[-2:, -2:])
-        best = state.drift - np.linalg.solve(own.T, forward[-2:])
+        own = factor[-2:, -2:]
+        best = state.drift - dense.solve_lower(own, forward[-2:], transposed=True)
         drift = combine_with_prior(best, np.linalg.inv(own @ own.T).astype(np.float64), problem)
         by_drift, covariance = np.array([drift.yaw_rad, drift.scale]) - state.drift, drift.covariance
-    left = -right[:-2] - (by_drift @ factor[-2:, :-2])[:, None]
-    skyline.solve_back_dense(skyline.Skyline(band.values, band.first[:-2], band.offset[:-2]), left)
-    step = np.concatenate([left[:, 0], by_drift])
+    left = -forward[:-2] - by_drift @ factor[-2:, :-2]
+    step = np.concatenate([dense.solve_lower(factor[:-2, :-2], left, transposed=True), by_drift])
     tail = len(matrix) - len(problem.kept) * size + size
-    own = np.tril(factor[-tail:, -tail:])
+    own = factor[-tail:, -tail:]
     information = own @ own.T
     inverse = np.linalg.inv(information[:-2, :-2])[:size].astype(np.float64)
     newest = NewestNode(inverse[:, :size], -inverse @ information[:-2, -2:])
@@ -219,8 +218,8 @@ def _stepped(
 
 def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Float64, Float64]:
     """Marginalise: matrix and gradient of all unknowns but the first `count`, after the step."""
-    matrix, slope = left.matrix, left.gradient + dense_cholesky.multiply(left.matrix, step)
-    share = np.linalg.solve(matrix[:count, :count], matrix[:count, count:]).T
+    matrix, slope = left.matrix, left.gradient + left.matrix @ step
+    share = dense.solve_positive(matrix[:count, :count], matrix[:count, count:]).T
     own = matrix[count:, count:] - share @ matrix[:count, count:]
     return (own + own.T) / 2, slope[count:] - share @ slope[:count]
 

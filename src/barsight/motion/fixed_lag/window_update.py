@@ -14,6 +14,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64
+from barsight.core.linalg import dense
 from barsight.core.pose import Pose
 from barsight.motion.batch.bundle_adjustment import FARTHEST_OUTLIER_SIGMAS, MIN_AGREEING, MIN_FACTOR
 from barsight.motion.fixed_lag.sliding_window import Window
@@ -64,6 +65,7 @@ class MarginalisedPart:
     step: Float64
 
 
+@dense.one_blas_thread()
 def solve_window(window: Window, held: int) -> tuple[Window, MarginalisedPart | None]:
     """Solve the window, and select what is to leave so that `held` frames are left. Raises LinAlgError where
     the measurements leave an unknown undetermined.
@@ -131,7 +133,7 @@ def _placed_by_points(problem: Problem, state: GraphState, used: Bool) -> GraphS
             frame_equations(
                 rig, sights, linearisation_point(problem, state), len(problem.kept) - 1, normal, gradient
             )
-            values.update(X(node), values.atPose3(X(node)).retract(-np.linalg.solve(normal, gradient)))
+            values.update(X(node), values.atPose3(X(node)).retract(-dense.solve_positive(normal, gradient)))
             state = replace(state, values=values)
     points, still = state.points.copy(), np.zeros((len(problem.kept), 6))
     shown = np.zeros(len(points), np.bool_)
@@ -143,6 +145,7 @@ def _placed_by_points(problem: Problem, state: GraphState, used: Bool) -> GraphS
     return replace(state, points=points)
 
 
+@dense.one_blas_thread()
 def marginalise(window: Window, leaving: MarginalisedPart) -> Window:
     """Marginalise what leaves."""
     problem, count = window.problem, leaving.nodes

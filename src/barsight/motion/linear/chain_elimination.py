@@ -6,35 +6,40 @@ their own. The band of what is left is as wide as the longest track in frames, n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Float64, Int64, kernel
 from barsight.core.linalg import skyline
+from barsight.core.linalg.skyline import Skyline
 
 
-@dataclass(eq=False)
-class Chain:
-    """Normal equations of M nodes that bind their neighbours and the latency only. rows: (M n, 2 n) a band;
-    gradient (M n,); side (M n,) with the latency; corner, corner_gradient of the latency itself.
+class Chain(NamedTuple):
+    """Normal equations of M nodes of n unknowns that bind their neighbours and the latency only. own (M, n,
+    n): each one's; link (M, n, n): of each (rows) with the one before, 0 for the first; gradient (M, n); side
+    (M, n) with the latency; corner (2,): the latency's own, matrix and gradient.
     """
 
-    rows: Float64
+    own: Float64
+    link: Float64
     gradient: Float64
     side: Float64
-    corner: float
-    corner_gradient: float
+    corner: Float64
 
-    @property
-    def size(self) -> int:
-        """Return the number of unknowns a node."""
-        return int(self.rows.shape[1]) // 2
+    @classmethod
+    def empty(cls, nodes: int, size: int) -> Chain:
+        """Allocate zeros."""
+        blocks, rows = (nodes, size, size), (nodes, size)
+        return cls(np.zeros(blocks), np.zeros(blocks), np.zeros(rows), np.zeros(rows), np.zeros(2))
 
-    def at(self, nodes: Int64) -> Int64:
-        """Return the indices of the nodes' unknowns."""
-        return (nodes[:, None] * self.size + np.arange(self.size)).ravel()
+    def at(self, nodes: Int64 | slice) -> Chain:
+        """Select nodes. What binds the first of them to one before is no part of it."""
+        link = self.link[nodes].copy()
+        link[:1] = 0.0
+        return Chain(self.own[nodes], link, self.gradient[nodes], self.side[nodes], self.corner.copy())
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +57,8 @@ def eliminate_nodes(chain: Chain, kept: Int64) -> tuple[Chain, tuple[EliminatedN
     """Form the Schur complement on the nodes `kept` (K,), and what was taken out. Raises LinAlgError where
     the sensors leave a node between undetermined.
     """
-    nodes, at = len(chain.rows) // chain.size, chain.at(kept)
-    left = replace(chain, rows=chain.rows[at], gradient=chain.gradient[at], side=chain.side[at])
-    gaps = []
-    for k, (before, after) in enumerate(pairwise([-1, *kept.tolist(), nodes])):
+    left, gaps = chain.at(kept), []
+    for k, (before, after) in enumerate(pairwise([-1, *kept.tolist(), len(chain.own)])):
         if after - before > 1:
             gaps.append(_take_out(chain, before + 1, after, k, left))
     return left, tuple(gaps)
@@ -63,42 +66,70 @@ def eliminate_nodes(chain: Chain, kept: Int64) -> tuple[Chain, tuple[EliminatedN
 
 def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> EliminatedNodes:
     """Eliminate the nodes first...end - 1, between the kept nodes k - 1 and k where there are such."""
-    size = chain.size
-    here = slice(first * size, end * size)
-    right = np.zeros(((end - first) * size, 2 * size + 2))
-    if first > 0:
-        right[:size, :size] = _link(chain.rows, first)
-    if end * size < len(chain.rows):
-        right[-size:, size:-2] = _link(chain.rows, end).T
-    right[:, -2], right[:, -1] = chain.side[here], chain.gradient[here]
-    factor = skyline.uniform_band(chain.rows[here].copy())
-    if not skyline.factorise_skyline(factor):
+    size, here = chain.own.shape[1], slice(first, end)
+    right = np.zeros((end - first, size, 2 * size + 2))
+    right[0, :, :size] = chain.link[first]
+    if end < len(chain.own):
+        right[-1, :, size:-2] = chain.link[end].T
+    right[..., -2], right[..., -1] = chain.side[here], chain.gradient[here]
+    right = right.reshape(-1, right.shape[2])
+    at = size * np.arange(end - first)
+    band = skyline.empty_skyline(np.repeat(np.maximum(at - size, 0), size))
+    add_chain(chain.at(here), at, band)
+    if not skyline.factorise_skyline(band):
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
-    skyline.solve_forward(factor, right)
-    taken = np.empty((right.shape[1], right.shape[1]))
-    skyline.gram_matrix(right, taken)
-    skyline.solve_back_dense(factor, right)
-    row, column = np.tril_indices(size)
+    skyline.solve_forward(band, right)
+    taken = right.T @ right
+    skyline.solve_back_dense(band, right)
     for node, part in ((k - 1, slice(size)), (k, slice(size, 2 * size))):
-        if 0 <= node * size < len(left.rows):
-            own = slice(node * size, (node + 1) * size)
-            left.rows[own][row, 2 * size - 1 - row + column] -= taken[part, part][row, column]
-            left.side[own] -= taken[part, -2]
-            left.gradient[own] -= taken[part, -1]
-    if first > 0 and end * size < len(chain.rows):
-        row, column = np.indices((size, size))
-        left.rows[k * size : (k + 1) * size][row, size - 1 - row + column] = -taken[size:-2, :size]
-    left.corner -= taken[-2, -2]
-    left.corner_gradient -= taken[-2, -1]
+        if 0 <= node < len(left.own):
+            left.own[node] -= taken[part, part]
+            left.side[node] -= taken[part, -2]
+            left.gradient[node] -= taken[part, -1]
+    if 0 < k < len(left.own):
+        left.link[k] = -taken[size:-2, :size]
+    left.corner[:] -= taken[-2, -2:]
     return EliminatedNodes(first, end, right)
 
 
-def _link(rows: Float64, node: int) -> Float64:
-    """Extract how a node (rows) is bound to the one before (n, n)."""
-    size = rows.shape[1] // 2
-    row, column = np.indices((size, size))
-    link: Float64 = rows[node * size : (node + 1) * size][row, size - 1 - row + column]
-    return link
+@kernel()
+def add_chain(chain: Chain, at: Int64, band: Skyline) -> None:
+    """Add a chain's nodes, each node's unknowns from at[k] on."""
+    own, link, values, offset, size = chain.own, chain.link, band.values, band.offset, chain.own.shape[1]
+    for k in range(len(at)):
+        for i in range(size):
+            row = at[k] + i
+            for j in range(i + 1):
+                values[offset[row] + at[k] + j] += own[k, i, j]
+            if k > 0:
+                for j in range(size):
+                    values[offset[row] + at[k - 1] + j] += link[k, i, j]
+
+
+@kernel(fastmath=True)
+def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain: Chain) -> None:
+    """Add the normal equations of sparse rows: row r has `right` and values[k] at unknown at[k], where
+    first[r] <= k < first[r + 1]. Unknown M n, after the nodes', is the latency.
+    """
+    own, link, gradient, side, corner = chain
+    size, end = own.shape[1], own.shape[0] * own.shape[1]
+    for r in range(len(right)):
+        for a in range(first[r], first[r + 1]):
+            node, i = at[a] // size, at[a] % size
+            if at[a] == end:
+                corner[1] -= values[a] * right[r]
+            else:
+                gradient[node, i] -= values[a] * right[r]
+            for b in range(first[r], first[r + 1]):
+                other, j, product = at[b] // size, at[b] % size, values[a] * values[b]
+                if at[a] == end and at[b] == end:
+                    corner[0] += product
+                elif at[a] == end:
+                    side[other, j] += product
+                elif at[b] < end and other == node:
+                    own[node, i, j] += product
+                elif at[b] < end and other == node - 1:
+                    link[node, i, j] += product
 
 
 def back_substitute_nodes(

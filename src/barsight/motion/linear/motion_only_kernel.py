@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from barsight.core.arrays import Float64, kernel
-from barsight.motion.linear.reprojection_kernels import LinearisationPoint, Observations, Rig, whitened_rows
+from barsight.motion.linear.reprojection_kernels import (
+    POSE,
+    Given,
+    LinearisationPoint,
+    Observations,
+    Rig,
+    empty_rows,
+    whitened_rows,
+)
 
 
 @kernel(fastmath=True)
 def frame_equations(
     rig: Rig, sights: Observations, guess: LinearisationPoint, frame: int, normal: Float64, gradient: Float64
-) -> None:  # fmt: skip
+) -> None:
     """Add to the matrix (6, 6) and gradient (6,) of the frame's pose what its used sightings say."""
-    lens, mount, huber, scale = rig.lens, rig.mount, rig.huber, sights.scale
-    first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
-    camera, points, shared = guess.camera, guess.points, guess.shared
-    error, q, by_shared, by_pose, by_point = (
-        np.empty(3), np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 4)),
-    )  # fmt: skip
-    for t in range(len(first) - 1):
-        for k in range(first[t], first[t + 1]):
-            if not used[k] or node[k] != frame:
+    lens, mount, camera, points, rows = rig.lens, rig.mount, guess.camera, guess.points, empty_rows()
+    stereo, weight, node, last = sights.stereo, sights.weight, sights.node, len(guess.shared) - 1
+    given = Given(rig.huber, sights.scale, 0.0, guess.shared[last - 1], guess.shared[last])
+    for t in range(len(sights.first) - 1):
+        for k in range(sights.first[t], sights.first[t + 1]):
+            if not sights.used[k] or node[k] != frame:
                 continue
-            whitened_rows(
-                lens, mount, huber, camera, points, shared, 0.0, scale, stereo, weight, frame, k, t, error, q,
-                by_pose, by_point, by_shared,
-            )  # fmt: skip
+            whitened_rows(lens, mount, camera, points, stereo, weight[k], given, (frame, k, t), rows)
             for a in range(6):
                 for i in range(3):
-                    gradient[a] += by_pose[i, a] * error[i]
+                    gradient[a] += rows[i, POSE + a] * rows[i, 0]
                     for b in range(6):
-                        normal[a, b] += by_pose[i, a] * by_pose[i, b]
+                        normal[a, b] += rows[i, POSE + a] * rows[i, POSE + b]

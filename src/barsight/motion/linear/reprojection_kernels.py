@@ -2,7 +2,8 @@
 
 Errors are predicted minus seen; poses move as GTSAM's do, by a small turn and shift in body axes. A point has
 four unknowns: its place, and how it slides (`slides`), a turn of its image about the camera's axis. The inner
-functions take plain arrays and no slices of them: each view would be counted, which costs more than the sums.
+functions take plain arrays, no slices and no tuples of them: each would be counted, which costs more than the
+sums.
 """
 
 from __future__ import annotations
@@ -55,33 +56,59 @@ class LinearisationPoint(NamedTuple):
     shared: Float64
 
 
+class Given(NamedTuple):
+    """Numbers that a point's sightings share. huber, scale: as `Rig` and `Observations` have them; off_px:
+    what its disparity is too large by with its piece's; yaw, drift: the rig's drift (rad, share).
+    """
+
+    huber: float
+    scale: float
+    off_px: float
+    yaw: float
+    drift: float
+
+
+POINT, POSE, PLACE, SHARED = 1, 2, 8, 12
+"""Columns of a sighting's rows (3, 13). 0: error, predicted minus seen; then the point in the left camera;
+derivatives by the pose (6) and by the point (4); last, one below the other, those of the right column by the
+piece's disparity and by the rig's drift.
+"""
+
+
+@kernel(inline=True)
+def empty_rows() -> Float64:
+    """Allocate a sighting's rows (3, 13)."""
+    return np.empty((3, SHARED + 1))
+
+
 @kernel(fastmath=True, inline=True)
 def _error(
-    lens: Float64, camera: Float64, points: Float64, shared: Float64, off_px: float, scale: float,
-    stereo: Float64, node: int, k: int, t: int, error: Float64, q: Float64, by_shared: Float64,
+    lens: Float64, camera: Float64, points: Float64, stereo: Float64, given: Given, node: int, k: int, t: int,
+    rows: Float64,
 ) -> bool:  # fmt: skip
-    """Compute error (3,) px predicted minus seen; q (3,) the point in the left camera; by_shared (3,) how the
-    right column goes with the piece's disparity, which is off_px too large, and the rig's drift. False behind
-    the camera.
+    """Compute error px, point and derivatives by what is shared of sighting k, of point t, by node's camera.
+    False behind the camera.
     """
     x, y, z = points[t, 0], points[t, 1], points[t, 2]
     for i in range(3):
-        q[i] = camera[node, i, 0] * x + camera[node, i, 1] * y + camera[node, i, 2] * z + camera[node, i, 3]
-    if q[2] < NEAREST_M:
+        rows[i, POINT] = (
+            camera[node, i, 0] * x + camera[node, i, 1] * y + camera[node, i, 2] * z + camera[node, i, 3]
+        )
+    if rows[2, POINT] < NEAREST_M:
         return False
-    z, last = 1 / q[2], len(shared) - 1
-    x, y = q[0] * z, q[1] * z
+    z = 1 / rows[2, POINT]
+    x, y = rows[0, POINT] * z, rows[1, POINT] * z
     slide = points[t, 3] * lens[0]
     u = lens[0] * x + lens[1]
     # By the predicted place: by the seen one, a scale would shrink the right picture's noise and be liked.
     across = x - lens[3] / lens[0] * z
-    by_shared[0] = -1.0
-    by_shared[1] = -lens[0] * (1 + across**2)
-    by_shared[2] = -scale * lens[3] * z
-    shift = by_shared[1] * shared[last - 1] + by_shared[2] * shared[last] - off_px
-    error[0] = u - slide * y - stereo[k, 0]
-    error[1] = lens[0] * y + lens[2] + slide * x - stereo[k, 1]
-    error[2] = u - slide * y - lens[3] * z + lens[4] + shift - stereo[k, 2]
+    rows[0, SHARED] = -1.0
+    rows[1, SHARED] = -lens[0] * (1 + across**2)
+    rows[2, SHARED] = -given.scale * lens[3] * z
+    shift = rows[1, SHARED] * given.yaw + rows[2, SHARED] * given.drift - given.off_px
+    rows[0, 0] = u - slide * y - stereo[k, 0]
+    rows[1, 0] = lens[0] * y + lens[2] + slide * x - stereo[k, 1]
+    rows[2, 0] = u - slide * y - lens[3] * z + lens[4] + shift - stereo[k, 2]
     return True
 
 
@@ -102,29 +129,34 @@ def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
     return off
 
 
+@kernel(fastmath=True, inline=True)
+def given_of(rig: Rig, sights: Observations, shared: Float64, t: int) -> Given:
+    """Collect the numbers that the sightings of point t share; shared: as `LinearisationPoint` has it."""
+    last = len(shared) - 1
+    off_px = disparity_offset(shared, sights.piece, t)
+    return Given(rig.huber, sights.scale, off_px, shared[last - 1], shared[last])
+
+
 @kernel(fastmath=True)
 def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result: Float64) -> float:
     """Compute residuals (N, 3) px, seen minus predicted, of the used sightings; returns their robust cost."""
-    lens, huber, scale = rig.lens, rig.huber, sights.scale
+    lens, camera, points, shared = rig.lens, guess.camera, guess.points, guess.shared
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
-    camera, points, shared = guess.camera, guess.points, guess.shared
-    error, q, by_shared, cost = np.empty(3), np.empty(3), np.empty(3), 0.0
+    rows, cost = empty_rows(), 0.0
     for t in range(len(first) - 1):
-        seen, off_px = False, disparity_offset(shared, sights.piece, t)
+        seen, given = False, given_of(rig, sights, shared, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
             seen = True
-            if not _error(
-                lens, camera, points, shared, off_px, scale, stereo, node[k], k, t, error, q, by_shared
-            ):
-                error[:] = BEHIND_SIGMAS / weight[k]
+            if not _error(lens, camera, points, stereo, given, node[k], k, t, rows):
+                rows[:, 0] = BEHIND_SIGMAS / weight[k]
             total = 0.0
             for i in range(3):
-                result[k, i] = -error[i]
-                total += error[i] ** 2
+                result[k, i] = -rows[i, 0]
+                total += rows[i, 0] ** 2
             size = np.sqrt(total) * weight[k]
-            cost += size**2 / 2 if size < huber else huber * (size - huber / 2)
+            cost += size**2 / 2 if size < given.huber else given.huber * (size - given.huber / 2)
         if seen:
             cost += (sights.tight[t] * slide_offset(points, shared, sights.piece, t)) ** 2 / 2
     return cost
@@ -132,42 +164,37 @@ def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result:
 
 @kernel(fastmath=True, inline=True)
 def whitened_rows(
-    lens: Float64, mount: Float64, huber: float, camera: Float64, points: Float64, shared: Float64,
-    off_px: float, scale: float, stereo: Float64, weights: Float64, node: int, k: int, t: int, error: Float64,
-    q: Float64, by_pose: Float64, by_point: Float64, by_shared: Float64,
+    lens: Float64, mount: Float64, camera: Float64, points: Float64, stereo: Float64, weight: float,
+    given: Given, at: tuple[int, int, int], rows: Float64,
 ) -> None:  # fmt: skip
-    """Compute the whitened error (3,) of a sighting and its Jacobians: by_pose (3, 6), by_point (3, 4),
-    by_shared (3,) of a sighting and its derivatives: by_pose (3, 6), by_point (3, 4), by_shared (3,) of its
-    third row. q: (3,) scratch.
+    """Compute the whitened rows of a sighting of 1 / sigma `weight`; at: its node, its own number and its
+    point's. All 0 behind the camera.
     """
-    if not _error(lens, camera, points, shared, off_px, scale, stereo, node, k, t, error, q, by_shared):
-        error[:] = 0
-        by_pose[:] = 0
-        by_point[:] = 0
-        by_shared[:] = 0
+    node, k, t = at
+    if not _error(lens, camera, points, stereo, given, node, k, t, rows):
+        rows[:] = 0
         return
-    weight = weights[k]
-    square = (error[0] ** 2 + error[1] ** 2 + error[2] ** 2) * weight**2
-    if square > huber**2:
-        weight *= np.sqrt(huber / np.sqrt(square))
-    x = mount[0, 0] * q[0] + mount[0, 1] * q[1] + mount[0, 2] * q[2] + mount[0, 3]
-    y = mount[1, 0] * q[0] + mount[1, 1] * q[1] + mount[1, 2] * q[2] + mount[1, 3]
-    z = mount[2, 0] * q[0] + mount[2, 1] * q[1] + mount[2, 2] * q[2] + mount[2, 3]
-    flat = 1 / q[2]
+    square = (rows[0, 0] ** 2 + rows[1, 0] ** 2 + rows[2, 0] ** 2) * weight**2
+    if square > given.huber**2:
+        weight *= np.sqrt(given.huber / np.sqrt(square))
+    u, v, w = rows[0, POINT], rows[1, POINT], rows[2, POINT]
+    x = mount[0, 0] * u + mount[0, 1] * v + mount[0, 2] * w + mount[0, 3]
+    y = mount[1, 0] * u + mount[1, 1] * v + mount[1, 2] * w + mount[1, 3]
+    z = mount[2, 0] * u + mount[2, 1] * v + mount[2, 2] * w + mount[2, 3]
+    flat = 1 / w
     along, slope = weight * lens[0] * flat, weight * flat**2
     for i in range(3):
         axis = 1 if i == 1 else 0
-        deep = -slope * lens[0] * q[axis]
+        deep = -slope * lens[0] * rows[axis, POINT]
         if i == 2:
             deep += slope * lens[3]
         a = along * mount[0, axis] + deep * mount[0, 2]
         b = along * mount[1, axis] + deep * mount[1, 2]
         c = along * mount[2, axis] + deep * mount[2, 2]
-        by_pose[i, 0], by_pose[i, 1], by_pose[i, 2] = b * z - c * y, c * x - a * z, a * y - b * x
-        by_pose[i, 3], by_pose[i, 4], by_pose[i, 5] = -a, -b, -c
+        rows[i, POSE], rows[i, POSE + 1], rows[i, POSE + 2] = b * z - c * y, c * x - a * z, a * y - b * x
+        rows[i, POSE + 3], rows[i, POSE + 4], rows[i, POSE + 5] = -a, -b, -c
         for j in range(3):
-            by_point[i, j] = along * camera[node, axis, j] + deep * camera[node, 2, j]
-        by_point[i, 3] = along * q[0] if i == 1 else -along * q[1]
-        error[i] *= weight
-    for c in range(3):
-        by_shared[c] *= weight
+            rows[i, PLACE + j] = along * camera[node, axis, j] + deep * camera[node, 2, j]
+        rows[i, PLACE + 3] = along * u if i == 1 else -along * v
+        rows[i, 0] *= weight
+        rows[i, SHARED] *= weight

@@ -15,10 +15,15 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64, kernel
 from barsight.core.linalg.skyline import Skyline
 from barsight.motion.linear.reprojection_kernels import (
+    PLACE,
+    POSE,
+    SHARED,
     LinearisationPoint,
     Observations,
     Rig,
     disparity_offset,
+    empty_rows,
+    given_of,
     slide_offset,
     whitened_rows,
 )
@@ -52,6 +57,19 @@ class ReducedSystem(NamedTuple):
         )  # fmt: skip
 
 
+class Span(NamedTuple):
+    """A point's place in a reduced system. begun: the first node that sees it; piece, since: its piece, and
+    the node at which that one's side begins; begin: of the piece's slide and disparity and of the drift those
+    from here on count; size: the point's unknowns, 3 or 4.
+    """
+
+    begun: int
+    piece: int
+    since: int
+    begin: int
+    size: int
+
+
 @kernel(fastmath=True, inline=True)
 def _factorise(m: Float64, size: int) -> None:
     """Replace a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse."""
@@ -68,48 +86,44 @@ def _factorise(m: Float64, size: int) -> None:
 
 
 @kernel(fastmath=True, inline=True)
-def _add_point(error: Float64, by_point: Float64, size: int, normal: Float64, gradient: Float64) -> None:
-    """Add a sighting's part of its point's own equations; of the matrix the lower half."""
+def _add_point(rows: Float64, size: int, normal: Float64, gradient: Float64) -> None:
+    """Add a sighting's part of its point's own equations (4, 4), of the matrix the lower half, and (4,)."""
     for a in range(size):
-        gradient[a] += by_point[0, a] * error[0] + by_point[1, a] * error[1] + by_point[2, a] * error[2]
+        x, y, z = rows[0, PLACE + a], rows[1, PLACE + a], rows[2, PLACE + a]
+        gradient[a] += x * rows[0, 0] + y * rows[1, 0] + z * rows[2, 0]
         for b in range(a + 1):
-            normal[a, b] += (
-                by_point[0, a] * by_point[0, b] + by_point[1, a] * by_point[1, b]
-                + by_point[2, a] * by_point[2, b]
-            )  # fmt: skip
+            normal[a, b] += x * rows[0, PLACE + b] + y * rows[1, PLACE + b] + z * rows[2, PLACE + b]
 
 
 @kernel(fastmath=True, inline=True)
 def _add_pose(
-    error: Float64, by_pose: Float64, by_point: Float64, by_shared: Float64, node: int, first: int,
-    piece: int, since: int, begin: int, band: Float64, gradient: Float64, side: Float64, size: int,
-    bound: Float64,
-) -> None:  # fmt: skip
-    """Add a sighting's part of its pose's own equations and of those with what is shared (since, begin: as
-    `_take_out` has them); bound (4, 6 R) from column `first` on with its point.
+    rows: Float64, span: Span, node: int, band: Float64, gradient: Float64, side: Float64, bound: Float64
+) -> None:
+    """Add a sighting's part of its pose's own equations and of those with what is shared; to bound (4, 6 R)
+    that with its point.
     """
-    own = band.shape[2] - 6
+    own, first = band.shape[2] - 6, 6 * (node - span.begun)
     for a in range(6):
-        x, y, z = by_pose[0, a], by_pose[1, a], by_pose[2, a]
+        x, y, z = rows[0, POSE + a], rows[1, POSE + a], rows[2, POSE + a]
         for b in range(a + 1):
-            band[node, a, own + b] += x * by_pose[0, b] + y * by_pose[1, b] + z * by_pose[2, b]
-        gradient[6 * node + a] += x * error[0] + y * error[1] + z * error[2]
-        for c in range(max(begin, 1), 4):
-            side[piece, c, 6 * (node - since) + a] += by_shared[c - 1] * z
-        for b in range(size):
-            bound[b, first + a] = x * by_point[0, b] + y * by_point[1, b] + z * by_point[2, b]
+            band[node, a, own + b] += x * rows[0, POSE + b] + y * rows[1, POSE + b] + z * rows[2, POSE + b]
+        gradient[6 * node + a] += x * rows[0, 0] + y * rows[1, 0] + z * rows[2, 0]
+        for c in range(max(span.begin, 1), 4):
+            side[span.piece, c, 6 * (node - span.since) + a] += rows[c - 1, SHARED] * z
+        for b in range(span.size):
+            bound[b, first + a] = x * rows[0, PLACE + b] + y * rows[1, PLACE + b] + z * rows[2, PLACE + b]
 
 
 @kernel(fastmath=True)
 def _take_out(
-    bound: Float64, width: int, first: int, factor: Float64, size: int, rest: Float64, since: int, begin: int,
-    band: Float64, gradient: Float64, side: Float64, corner: Float64, corner_gradient: Float64,
-) -> None:  # fmt: skip
-    """Subtract U^T U, U being the factor's inverse times what the point shares: bound (4, width) with the
-    poses of nodes from `first` on, rest (4, 5) with the piece's slide and disparity, drift and gradient; of
-    the shared ones those from `begin` on count. side (its first node is `since`), corner, corner_gradient:
-    the piece's.
+    bound: Float64, width: int, rest: Float64, factor: Float64, span: Span, result: ReducedSystem
+) -> None:
+    """Subtract U^T U, U being the factor's inverse times what the point shares: bound (4, width) with poses,
+    rest (4, 5) with the piece's slide and disparity, drift and gradient.
     """
+    band, gradient, side = result.band, result.gradient, result.side[span.piece]
+    corner, corner_gradient = result.corner[span.piece], result.corner_gradient[span.piece]
+    size, begun, begin, since = span.size, span.begun, span.begin, span.since
     for i in range(size):
         mine = bound[i, :width]
         for j in range(i):
@@ -127,7 +141,7 @@ def _take_out(
     for i in range(width // 6):
         for a in range(6):
             x, y, z, w = b0[6 * i + a], b1[6 * i + a], b2[6 * i + a], b3[6 * i + a]
-            line = band[first + i, a, band.shape[2] - 6 * (i + 1) :]
+            line = band[begun + i, a, band.shape[2] - 6 * (i + 1) :]
             if size == 3:
                 for b in range(len(line)):
                     line[b] -= x * b0[b] + y * b1[b] + z * b2[b]
@@ -136,7 +150,7 @@ def _take_out(
                     line[b] -= x * b0[b] + y * b1[b] + z * b2[b] + w * b3[b]
     for c in range(begin, 5):
         x, y, z, w = rest[0, c], rest[1, c], rest[2, c], rest[3, c]
-        whole, left = (gradient, first) if c == 4 else (side[c], first - since)
+        whole, left = (gradient, begun) if c == 4 else (side[c], begun - since)
         line = whole[6 * left : 6 * left + width]
         for a in range(len(line)):
             line[a] -= x * b0[a] + y * b1[a] + z * b2[a] + w * b3[a]
@@ -152,21 +166,16 @@ def eliminate_points(
     rig: Rig, sights: Observations, guess: LinearisationPoint, result: ReducedSystem
 ) -> None:
     """Form the Schur complement of the points over all used sightings and add it to `result`."""
-    lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
+    lens, mount, camera, points, shared = rig.lens, rig.mount, guess.camera, guess.points, guess.shared
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
-    camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
-    band, slope, begun_at, sides, corners, corner_slopes = result
-    error, q, by_shared, by_pose, by_point = (
-        np.empty(3), np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 4)),
-    )  # fmt: skip
-    normal, gradient, rest, last = np.empty((4, 4)), np.empty(4), np.empty((4, 5)), len(shared) - 1
+    band, slope, sides = result.band, result.gradient, result.side
+    rows, normal, gradient, rest = empty_rows(), np.empty((4, 4)), np.empty(4), np.empty((4, 5))
     bound = np.empty((4, band.shape[2]))
-    begin, size = (0, 4) if last > 1 else (2, 3)
+    begin, size = (0, 4) if len(shared) > 2 else (2, 3)
     for t in range(len(first) - 1):
         normal[:], gradient[:], rest[:] = 0.0, 0.0, 0.0
-        begun, end, off_px = -1, -1, disparity_offset(shared, piece, t)
-        own = piece[t]
-        since, corner, corner_slope = begun_at[own], corners[own], corner_slopes[own]
+        begun, end, own, given = -1, -1, sights.piece[t], given_of(rig, sights, shared, t)
+        since, corner, corner_slope = result.first[own], result.corner[own], result.corner_gradient[own]
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
@@ -175,26 +184,20 @@ def eliminate_points(
                 begun = n
                 bound[:] = 0.0
             end = n + 1
-            whitened_rows(
-                lens, mount, huber, camera, points, shared, off_px, scale, stereo, weight, n, k, t, error, q,
-                by_pose, by_point, by_shared,
-            )  # fmt: skip
-            _add_point(error, by_point, size, normal, gradient)
-            _add_pose(
-                error, by_pose, by_point, by_shared, n, 6 * (n - begun), own, since, begin, band, slope,
-                sides, size, bound,
-            )  # fmt: skip
+            whitened_rows(lens, mount, camera, points, stereo, weight[k], given, (n, k, t), rows)
+            _add_point(rows, size, normal, gradient)
+            _add_pose(rows, Span(begun, own, since, begin, size), n, band, slope, sides, bound)
             for c in range(max(begin, 1), 4):
-                corner_slope[c] += by_shared[c - 1] * error[2]
+                corner_slope[c] += rows[c - 1, SHARED] * rows[2, 0]
                 for d in range(max(begin, 1), 4):
-                    corner[c, d] += by_shared[c - 1] * by_shared[d - 1]
+                    corner[c, d] += rows[c - 1, SHARED] * rows[d - 1, SHARED]
                 for a in range(size):
-                    rest[a, c] += by_shared[c - 1] * by_point[2, a]
+                    rest[a, c] += rows[c - 1, SHARED] * rows[2, PLACE + a]
         if begun < 0 or normal[0, 0] == 0:
             continue
         if begin == 0:
-            held = tight[t] ** 2
-            pull = held * slide_offset(points, shared, piece, t)
+            held = sights.tight[t] ** 2
+            pull = held * slide_offset(points, shared, sights.piece, t)
             normal[3, 3] += held
             gradient[3] += pull
             rest[3, 0] = -held
@@ -203,11 +206,7 @@ def eliminate_points(
         for a in range(size):
             rest[a, 4] = gradient[a]
         _factorise(normal, size)
-        width = 6 * (end - begun)
-        side = sides[own]
-        _take_out(
-            bound, width, begun, normal, size, rest, since, begin, band, slope, side, corner, corner_slope
-        )
+        _take_out(bound, 6 * (end - begun), rest, normal, Span(begun, own, since, begin, size), result)
 
 
 @kernel(fastmath=True)
@@ -266,35 +265,31 @@ def back_substitute(
     """Back-substitute the points `moved` (T, 4) after steps (M, 6) of the poses and (2 S + 2,) of what is
     shared; variance (T,) of each point's slide, all else taken as known.
     """
-    lens, mount, huber, scale, tight = rig.lens, rig.mount, rig.huber, sights.scale, sights.tight
+    lens, mount, camera, points, shared = rig.lens, rig.mount, guess.camera, guess.points, guess.shared
     first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
-    camera, points, shared, piece = guess.camera, guess.points, guess.shared, sights.piece
-    error, q, by_shared, by_pose, by_point = (
-        np.empty(3), np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 4)),
-    )  # fmt: skip
-    normal, gradient, last = np.empty((4, 4)), np.empty(4), len(shared_step) - 1
+    rows, normal, gradient, last = empty_rows(), np.empty((4, 4)), np.empty(4), len(shared_step) - 1
     size = 4 if last > 1 else 3
     for t in range(len(first) - 1):
-        normal[:], gradient[:], off_px = 0.0, 0.0, disparity_offset(shared, piece, t)
-        step = disparity_offset(shared_step, piece, t)
+        normal[:], gradient[:], given = 0.0, 0.0, given_of(rig, sights, shared, t)
+        step = disparity_offset(shared_step, sights.piece, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
             n = node[k]
-            whitened_rows(
-                lens, mount, huber, camera, points, shared, off_px, scale, stereo, weight, n, k, t, error, q,
-                by_pose, by_point, by_shared,
-            )  # fmt: skip
-            error[2] += by_shared[0] * step + by_shared[1] * shared_step[last - 1]
-            error[2] += by_shared[2] * shared_step[last]
+            whitened_rows(lens, mount, camera, points, stereo, weight[k], given, (n, k, t), rows)
+            rows[2, 0] += rows[0, SHARED] * step + rows[1, SHARED] * shared_step[last - 1]
+            rows[2, 0] += rows[2, SHARED] * shared_step[last]
             for i in range(3):
                 for a in range(6):
-                    error[i] += by_pose[i, a] * pose_step[n, a]
-            _add_point(error, by_point, size, normal, gradient)
+                    rows[i, 0] += rows[i, POSE + a] * pose_step[n, a]
+            _add_point(rows, size, normal, gradient)
         if normal[0, 0] == 0:
             continue
         if size == 4:
-            held, off = tight[t] ** 2, slide_offset(points, shared, piece, t) - shared_step[piece[t]]
+            held, off = (
+                sights.tight[t] ** 2,
+                slide_offset(points, shared, sights.piece, t) - shared_step[sights.piece[t]],
+            )
             normal[3, 3] += held
             gradient[3] += held * off
         _factorise(normal, size)

@@ -85,12 +85,12 @@ def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Floa
     sigma = _sigmas(problem.placed, MIN_SIGMA_M)
     distance = np.linalg.norm(error, axis=1) / sigma
     weight = HUBER_SIGMAS / np.maximum(distance, HUBER_SIGMAS) / sigma**2
-    at = node[:, None] * chain.size + np.arange(3, 6)  # GTSAM's shift, in body axes
-    chain.rows[at, -1] += weight[:, None]
-    chain.gradient[at] += np.einsum("p,pij,pi->pj", weight, turn, error)
-    chain.side[at] -= np.einsum("p,pij,pi->pj", weight, turn, velocity)
-    chain.corner += float(np.einsum("p,pi,pi", weight, velocity, velocity))
-    chain.corner_gradient -= float(np.einsum("p,pi,pi", weight, velocity, error))
+    shift = np.arange(3, 6)  # GTSAM's, in body axes
+    chain.own[node[:, None], shift, shift] += weight[:, None]
+    chain.gradient[node, 3:6] += np.einsum("p,pij,pi->pj", weight, turn, error)
+    chain.side[node, 3:6] -= np.einsum("p,pij,pi->pj", weight, turn, velocity)
+    chain.corner[0] += np.einsum("p,pi,pi", weight, velocity, velocity)
+    chain.corner[1] -= np.einsum("p,pi,pi", weight, velocity, error)
 
 
 def encoders_cost(values: Any, problem: Problem) -> float:

@@ -17,8 +17,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.levenberg_marquardt import Options, Termination, minimise
 from barsight.core.linalg.skyline import Skyline
-from barsight.motion.linear import skyline_inverse
-from barsight.motion.linear.chain_elimination import eliminate_nodes
+from barsight.motion.linear.chain_elimination import add_chain, eliminate_nodes
 from barsight.motion.linear.ordering import Ordering
 from barsight.motion.linear.reprojection_kernels import LinearisationPoint, Observations, Rig, residuals
 from barsight.motion.linear.schur_complement import (
@@ -145,11 +144,11 @@ def linearise_graph(problem: Problem, graph: Any, state: GraphState, used: Bool)
     whole = linearise_chain(graph, state.values, layout.size, len(problem.start))
     add_encoders(whole, problem, state.poses, latency_of(state.values))
     chain, gaps = eliminate_nodes(whole, problem.kept)
-    skyline_inverse.add_chain(chain.rows, layout.node, rows)
-    gradient[layout.nodes] = chain.gradient
+    add_chain(chain, layout.node, rows)
+    gradient[layout.nodes] = chain.gradient.ravel()
     if problem.has_latency:
-        side[0, layout.nodes] = chain.side
-        corner[0, 0], corner_gradient[0] = chain.corner, chain.corner_gradient
+        side[0, layout.nodes] = chain.side.ravel()
+        corner[0, 0], corner_gradient[0] = chain.corner
     if seen is not None and used.any():
         reduced = ReducedSystem.empty(len(layout.node), layout.reach, layout.seen)
         eliminate_points(

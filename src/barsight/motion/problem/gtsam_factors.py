@@ -12,8 +12,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
-from barsight.motion.linear import skyline_inverse
-from barsight.motion.linear.chain_elimination import Chain
+from barsight.motion.linear.chain_elimination import Chain, add_products
 from barsight.motion.problem.problem import Problem
 
 WIDTHS = {"x": 6, "v": 3, "b": 6, "e": 1}
@@ -52,16 +51,13 @@ def initial_values(problem: Problem) -> Any:
 
 def linearise_chain(graph: Any, values: Any, width: int, nodes: int) -> Chain:
     """Linearise a graph: each node with the next and the latency. width: unknowns a node."""
-    size = nodes * width
-    rows, gradient, side = np.zeros((size, 2 * width)), np.zeros(size), np.zeros((1, size))
-    corner, corner_gradient = np.zeros((1, 1)), np.zeros(1)
-    first, at, found, right = _sparse_rows(graph, values, width, size)
-    skyline_inverse.add_products(first, at, found, right, rows, gradient, side, corner, corner_gradient)
-    return Chain(rows, gradient, side[0], float(corner[0, 0]), float(corner_gradient[0]))
+    chain = Chain.empty(nodes, width)
+    add_products(*_sparse_rows(graph, values, width, nodes * width), chain)
+    return chain
 
 
 def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64, Int64, Float64, Float64]:
-    """Convert GTSAM's whitened rows to the form of `band.add_products`; the latency is unknown `size`."""
+    """Convert GTSAM's whitened rows to the form of `add_products`; the latency is unknown `size`."""
     linear = graph.linearize(values)
     if linear.size() == 0:
         return np.zeros(1, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)

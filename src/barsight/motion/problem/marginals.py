@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.linalg.skyline import solve_back_dense, solve_forward
-from barsight.motion.linear.skyline_inverse import inverse_blocks
+from barsight.core.linalg.dense import one_blas_thread
+from barsight.core.linalg.skyline import inverse_blocks, solve_back_dense, solve_forward
 from barsight.motion.problem.normal_equations import System
 
 NO_PAIRS = np.empty((0, 2), np.int64)
@@ -29,6 +29,7 @@ class Marginals:
     cross: Float64
 
 
+@one_blas_thread()
 def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
     """Compute marginals of a system at its best state. pairs: (P, 2) of these nodes, the earlier first."""
     layout = system.layout
@@ -51,6 +52,7 @@ def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
     return Marginals(poses, latency, drift_jacobian_of_pose, nodes, cross)
 
 
+@one_blas_thread()
 def slide_variances(system: System, weights: Float64) -> tuple[Float64, float]:
     """Compute variances (2 S,) of the pieces' slides and disparities, and that of their sum with `weights` (2
     S,), the rig's drift taken as known.

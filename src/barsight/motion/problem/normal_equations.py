@@ -9,6 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg import skyline
+from barsight.core.linalg.dense import solve_positive
 from barsight.core.linalg.skyline import Skyline
 from barsight.motion.linear.chain_elimination import EliminatedNodes, back_substitute_nodes
 from barsight.motion.linear.ordering import Ordering
@@ -58,8 +59,7 @@ class System:
 
     def schur(self, forward: Float64) -> tuple[Float64, Float64]:
         """Form the Schur complement (b, b) of the border and its gradient (b,)."""
-        taken = np.empty((forward.shape[1], forward.shape[1]))
-        skyline.gram_matrix(forward, taken)
+        taken = forward.T @ forward
         loose = np.zeros(len(self.corner))
         loose[-2:] = 1 / np.array(LOOSE) ** 2
         return self.corner - taken[1:, 1:] + np.diag(loose), self.corner_gradient - taken[1:, 0]
@@ -77,7 +77,7 @@ class System:
             left, right = self.schur(forward)
             left = left + damping * np.diag(np.diag(left))
             right = right + left @ border
-            border[free] = -np.linalg.solve(left[np.ix_(free, free)], right[free])
+            border[free] = -solve_positive(left[np.ix_(free, free)], right[free])
         step = -(forward[:, :1] + forward[:, 1:] @ border[:, None])
         skyline.solve_back_dense(factor, step)
         latency = float(border[0]) if self.has_latency else 0.0
