@@ -39,6 +39,8 @@ class Surroundings:
         poles = magnet.poles
         across = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max()) + STRAY_M + slack_m + 0.01
         along = magnet.half_span_m + STRAY_M + slack_m + 0.01
+        # Cells lie where the points of a face of whole millimetres do.
+        across, along = (math.ceil(half / STEP_M) * STEP_M + STEP_M / 2 for half in (across, along))
         wide, long = max(magnet.beam[1] / 2 + slack_m, across), max(magnet.beam[0] / 2 + slack_m, along)
         near = SolidYard(
             tuple(

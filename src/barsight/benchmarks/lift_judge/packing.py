@@ -1,4 +1,4 @@
-"""Pack round bars as they come to lie when they are strapped: drawn together at random, not in a lattice."""
+"""Pack round bars as they come to lie when they are strapped: drawn together at random, in no full hexagon."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ STRAP_M = (0.032, 0.0012)
 def packed(count: int, diameter_m: float, rng: np.random.Generator) -> Float64:
     """Pack discs (count, 2): attracted to their middle and a little downwards, pushed off each other.
 
-    They shake less and less and lie apart by 0.1 % of their diameter at the end.
+    They shake less and less, some long enough to find a lattice, most not, and lie apart by 0.1 % of their
+    diameter at the end.
     """
     places = rng.uniform(-1, 1, (count, 2)) * diameter_m * math.sqrt(count)
     flat = float(rng.uniform(0.6, 1.0))
-    for step in range(400):
-        left = 1 - step / 400
-        places -= places * (0.04, 0.04 / flat) * left
+    steps = int(rng.choice([40, 80, 400]))
+    for step in range(steps):
+        left = 1 - step / steps
+        places -= places * (0.1, 0.1 / flat) * left
         places += rng.normal(0, 0.03 * diameter_m * left, places.shape)
         _push_apart(places, 1.001 * diameter_m, 3)
     for _ in range(2000):

@@ -1,4 +1,4 @@
-"""Turn drawn worlds into what lifts are chosen from: a recording to be measured, or a map with drawn errors."""
+"""Turn drawn worlds into what lifts are chosen from: a recording to be measured, or a map with noise."""
 
 from __future__ import annotations
 
