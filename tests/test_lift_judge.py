@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from barsight.benchmarks.lift_judge.judge import Judge, Target, Verdict, covered_width
+from barsight.benchmarks.lift_judge.judge import Judge, LiftVerdict, Target, covered_width
 from barsight.benchmarks.lift_judge.magnet import magnet_of
 from barsight.benchmarks.lift_judge.packing import packed
 from barsight.benchmarks.lift_judge.solids import Solid, SolidYard, box, cut, cylinder, envelope
@@ -42,7 +42,7 @@ def plate(*, bundle: int = 0, x: float = 0.0, top: float = 0.3) -> list[Solid]:
     return [shell, bar(x, top - 0.1, 0.0718, bundle=bundle)]
 
 
-def judged(*solids: Solid, target: Target | None = None) -> Verdict:
+def judged(*solids: Solid, target: Target | None = None) -> LiftVerdict:
     return Judge(SolidYard(solids), MAGNET).judge(target or Target(0.0, 0.0, 0.0, MAGNET.tolerance))
 
 

@@ -104,6 +104,9 @@ def _look(
     u: Float64, v: Float64, across: float, along: float, turn: float, x0: float, y0: float, step: float,
     drawn: Float32, top: Int32, owner: Int32, z: Float64, found: Int32,
 ) -> None:  # fmt: skip
+    """Look up the nearest cells of points u, v (N,), moved and turned. drawn, top: (X, Y) of an `Envelope`;
+    owner: of each solid. Fills z, m, and found, the bundle (N,).
+    """
     c, s = math.cos(turn), math.sin(turn)
     for k in range(len(u)):
         i = math.floor((across + c * u[k] - s * v[k] - x0) / step + 0.5)

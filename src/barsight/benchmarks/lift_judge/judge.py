@@ -70,7 +70,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class LiftVerdict:
     """dangerous, unclear: reasons, in words and figures. load: bundles that the lift is for. figures: each
     check's worst. mass_kg, pull_n: of the load, the pull at the target itself.
     """
@@ -95,7 +95,7 @@ class Judge:
         self._yard, self._magnet, self._wanted = yard, magnet, wanted
         self._cover: dict[int, float] = {}
 
-    def judge(self, target: Target) -> Verdict:
+    def judge(self, target: Target) -> LiftVerdict:
         """Judge one placement."""
         magnet = self._magnet
         yard = self._yard.seen_from(target.x_m, target.y_m, target.yaw_rad)
@@ -105,7 +105,7 @@ class Judge:
         load = set_down.loads(self._wanted)
         if len(load) < self._wanted:
             reason = f"{len(load)} bundles lie under the faces, {self._wanted} wanted"
-            return Verdict((reason,), (), load, math.nan, 0.0, {})
+            return LiftVerdict((reason,), (), load, math.nan, 0.0, {})
         offsets = _offsets(target)
         stands = [set_down.stand(load, offset) for offset in offsets]
         checks = _Checks()
@@ -117,7 +117,9 @@ class Judge:
             over = max(set_down.over_plane(plane, offset) for offset in offsets)
             checks.add("anything over the stated plane, mm", 1e3 * over, *(1e3 * b for b in OVER_STATED_M))
         pull = float(stands[0].pull.sum())
-        return Verdict(tuple(checks.dangerous), tuple(checks.unclear), load, mass_kg, pull, checks.figures)
+        return LiftVerdict(
+            tuple(checks.dangerous), tuple(checks.unclear), load, mass_kg, pull, checks.figures
+        )
 
     def _check_stands(self, checks: _Checks, stands: list[Standing], mass_kg: float, centre: Float64) -> None:
         magnet, weight = self._magnet, mass_kg * NEWTON_PER_KG

@@ -1,4 +1,4 @@
-"""Pack round bars as they come to lie when they are strapped: drawn together at random, in no full hexagon."""
+"""Pack round bars as they lie when they are strapped: drawn together at random, in no full hexagon."""
 
 from __future__ import annotations
 

@@ -167,6 +167,10 @@ def undersides(
 def _draw(
     table: Float64, bounds: Float64, take: Float64, x0: float, y0: float, step: float, z: Float32, top: Int32
 ) -> None:
+    """Draw the highest surface over the cells (X, Y) into z, m, and its solid's number into top.
+
+    table: (N, 16); bounds: (N, 2, 3) of each solid; take: (N,), 0 for those that are left out.
+    """
     # The highest first: most of what lies below is then passed over.
     for n in np.argsort(-bounds[:, 1, 2]):
         if take[n] == 0:
@@ -186,6 +190,7 @@ def _draw(
 
 @kernel()
 def _draw_underside(solid: Float64, x0: float, y0: float, step: float, out: Float64) -> None:
+    """Draw the lowest surface of one row (16,) of the table over the cells (X, Y) into out, m."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             low, high = cut(solid, x0 + i * step, y0 + j * step)

@@ -16,7 +16,7 @@ import numpy as np
 from rich.table import Table
 from scipy.stats import beta
 
-from barsight.benchmarks.lift_judge.judge import Judge, Target, Verdict
+from barsight.benchmarks.lift_judge.judge import Judge, LiftVerdict, Target
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.benchmarks.lift_judge.worlds import DrawnWorld
 from barsight.benchmarks.provenance import Provenance, provenance
@@ -123,7 +123,7 @@ def _judged(
         box = lift.tolerance.x_m, lift.tolerance.y_m, math.radians(lift.tolerance.yaw_deg)
         plane = contact.centre_z_m, math.tan(contact.pitch_rad), math.tan(contact.roll_rad)
     place = lift.place
-    verdict: Verdict = judge.judge(Target(place.x_m, place.y_m, place.yaw_rad, box, plane))
+    verdict: LiftVerdict = judge.judge(Target(place.x_m, place.y_m, place.yaw_rad, box, plane))
     return JudgedLift(
         world.seed, world.kind, offered, place.x_m, place.y_m, place.yaw_deg,
         tuple(sorted({veto.code for veto in lift.vetoes})), verdict.dangerous, verdict.unclear,

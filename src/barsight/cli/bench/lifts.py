@@ -51,8 +51,7 @@ def bench_lift_targets(
     Args:
         seeds: Seeds of the yards, first:last, the last not included; the kind of yard is the seed modulo 8.
         placements: Random placements on each yard, beside the lifts that are offered there.
-        rendered: Render and measure each yard, a minute or two of computing; without it the exact map gets
-            drawn errors.
+        rendered: Render and measure each yard, a minute of computing; without it the exact map gets noise.
         keep: Folder for the rendered yards; what is finished there is not done again.
         magnet: TOML file of the magnet; an example is assumed without it.
         save: JSON file for all placements, with commit and machine.
