@@ -113,6 +113,8 @@ def test_each_danger_is_named(reason: str) -> None:
     ("reason", "target"),
     [
         ("anything over the stated plane", Target(0.0, 0.0, 0.0, NOWHERE, (0.28, 0.0, 0.0))),
+        ("true mass over the stated bound", Target(0.0, 0.0, 0.0, NOWHERE, None, 340.0)),
+        ("stated bound of the pull", Target(0.0, 0.0, 0.0, NOWHERE, None, 450.0, 81e3)),
         ("centre off across", Target(0.06, 0.0, 0.0, NOWHERE)),
         ("centre off along", Target(0.0, 0.4, 0.0, NOWHERE)),
         ("pull over weight", Target(0.165, 0.0, 0.0, NOWHERE)),

@@ -14,6 +14,8 @@ every figure is within the second; between it is neither.
 | true pull over true weight | < the safety factor | >= 1.25 of it |
 | a pole's pull over its share of the weight by moments | < 1 | >= 1.25 |
 | load over what magnet and crane carry | > 1 | <= 0.9 |
+| true mass over the upper bound that the lift states | > 1.25 | <= 1 |
+| lower bound of the pull that the lift states, over the true pull | > 1.25 | <= 1 |
 | what lies on the load or hangs over it: width seen from above | >= 8 mm | <= 3 mm |
 | faces' slope, the worst pole's least gap, overhang, centre of mass off, over limits | > 1.25 | <= 0.75 |
 | share of the faces on the load, over its limit | < 0.75 | >= 1.25 |
@@ -59,7 +61,8 @@ OTHER_STEEL_N = 500.0
 @dataclass(frozen=True)
 class Target:
     """A magnet's place: centre, yaw of the beam from +Y; half sides of the box (m, m, rad) within which the
-    lift claims to hold. plane: (height, slope along, slope across) of the faces as the lift states it.
+    lift claims to hold. What the lift states, None where it states nothing: plane: (height, slope along,
+    slope across) of the faces; upper_kg: of the load's mass; pull_low_n: of the pull.
     """
 
     x_m: float
@@ -67,6 +70,8 @@ class Target:
     yaw_rad: float
     box: tuple[float, float, float]
     plane: tuple[float, float, float] | None = None
+    upper_kg: float | None = None
+    pull_low_n: float | None = None
 
 
 @dataclass(frozen=True)
@@ -181,7 +186,7 @@ class _Checks:
         text = f"{name}: {abs(value) if fine_to < 0 and value < 0 else value:.3g}"
         if value > dangerous_over:
             self.dangerous.append(f"{text} (bound {abs(dangerous_over):.3g})")
-        elif value > fine_to:
+        elif not value <= fine_to:
             self.unclear.append(f"{text} (fine to {abs(fine_to):.3g})")
 
     def most(self, name: str, value: float, limit: float) -> None:

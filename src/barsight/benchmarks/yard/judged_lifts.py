@@ -16,7 +16,7 @@ import numpy as np
 from rich.table import Table
 from scipy.stats import beta
 
-from barsight.benchmarks.lift_judge.judge import Judge, LiftVerdict, Target
+from barsight.benchmarks.lift_judge.judge import Judge, Target
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.benchmarks.lift_judge.worlds import DrawnWorld
 from barsight.benchmarks.provenance import Provenance, provenance
@@ -118,12 +118,15 @@ def _beside(middle: Placement, rng: np.random.Generator) -> Placement:
 def _judged(
     world: DrawnWorld, lift: Lift, judge: Judge, magnet: JudgedMagnet, *, offered: bool
 ) -> JudgedLift:
-    box, plane, contact = magnet.tolerance, None, lift.contact
+    place, contact = lift.place, lift.contact
+    target = Target(place.x_m, place.y_m, place.yaw_rad, magnet.tolerance)
     if not lift.vetoes and contact is not None:
         box = lift.tolerance.x_m, lift.tolerance.y_m, math.radians(lift.tolerance.yaw_deg)
         plane = contact.centre_z_m, math.tan(contact.pitch_rad), math.tan(contact.roll_rad)
-    place = lift.place
-    verdict: LiftVerdict = judge.judge(Target(place.x_m, place.y_m, place.yaw_rad, box, plane))
+        target = Target(
+            place.x_m, place.y_m, place.yaw_rad, box, plane, lift.mass.upper_kg, contact.pull_low_n
+        )
+    verdict = judge.judge(target)
     return JudgedLift(
         world.seed, world.kind, offered, place.x_m, place.y_m, place.yaw_deg,
         tuple(sorted({veto.code for veto in lift.vetoes})), verdict.dangerous, verdict.unclear,
