@@ -122,9 +122,13 @@ class Judge:
             over = max(set_down.over_plane(plane, offset) for offset in offsets)
             checks.add("anything over the stated plane, mm", 1e3 * over, *(1e3 * b for b in OVER_STATED_M))
         pull = float(stands[0].pull.sum())
-        return LiftVerdict(
-            tuple(checks.dangerous), tuple(checks.unclear), load, mass_kg, pull, checks.figures
-        )
+        if target.upper_kg is not None:
+            checks.add("true mass over the stated bound", mass_kg / target.upper_kg, MORE, 1.0)
+        if target.pull_low_n is not None:
+            claimed = target.pull_low_n / max(pull, 1.0)
+            checks.add("stated bound of the pull over the true pull", claimed, MORE, 1.0)
+        dangerous, unclear = tuple(checks.dangerous), tuple(checks.unclear)
+        return LiftVerdict(dangerous, unclear, load, mass_kg, pull, checks.figures)
 
     def _check_stands(self, checks: _Checks, stands: list[Standing], mass_kg: float, centre: Float64) -> None:
         magnet, weight = self._magnet, mass_kg * NEWTON_PER_KG
