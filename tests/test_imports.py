@@ -33,7 +33,7 @@ ROOMS = {
     "mapping": (".", "surface"),
     "yard": (".", "bundles.fitting", "bundles", "stability", "lifting", "inventory"),
     "report": (".", "calibration"),
-    "benchmarks": (".", "stereo", "motion", "yard"),
+    "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "cli": (".", "calibrate", "bench"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
@@ -136,6 +136,15 @@ def test_optional_libraries_are_imported_in_few_files(library: str) -> None:
         if library in {n.split(".")[0] for n in imported_modules(ast.parse(path.read_text(encoding="utf-8")))}
     ]
     assert len(importing) <= OPTIONAL[library]
+
+
+def test_the_judge_of_lifts_shares_nothing_with_what_it_judges() -> None:
+    room = sorted((ROOT / "benchmarks" / "lift_judge").glob("*.py"))
+    names = {name for path in room for name in imported_modules(ast.parse(path.read_text(encoding="utf-8")))}
+    own = {name for name in names if name.startswith("barsight.")}
+    assert own and all(
+        name.startswith(("barsight.core.arrays.", "barsight.benchmarks.lift_judge.")) for name in own
+    )
 
 
 def test_an_import_that_points_up_is_found() -> None:

@@ -46,7 +46,11 @@ class World:
     def build(cls, settings: SimulationSettings) -> World:
         """Draw everything from the seed; each part has its own stream, so that one can change alone."""
         stock = stack_yard(settings, _stream(settings, 0))
-        scene = build_scene(stock, settings, _stream(settings, 1))
+        return cls.over(build_scene(stock, settings, _stream(settings, 1)), settings, stock)
+
+    @classmethod
+    def over(cls, scene: Scene, settings: SimulationSettings, stock: Stock) -> World:
+        """Draw rig and way over a scene that may come from elsewhere; stock: what the truth tells of it."""
         mounted = mount_rig(settings, _stream(settings, 2))
         trajectory = SimulatedTrajectory.plan(
             settings.length_m, settings.camera, settings.motion, mounted.nominal_yard_from_body,
@@ -62,15 +66,19 @@ class World:
 
 
 def simulate(
-    out: Path, settings: SimulationSettings, progress: Callable[[int, int], None] | None = None
+    out: Path,
+    settings: SimulationSettings,
+    progress: Callable[[int, int], None] | None = None,
+    scene: Scene | None = None,
 ) -> None:
     """Write a simulated recording with its truth to the new folder `out`.
 
-    progress: called with (pairs written, pairs in all). Raises OutputError where `out` can't be written;
+    progress: called with (pairs written, pairs in all). scene: what lies there, instead of a stock drawn from
+    the seed; its truth lists no bundles then. Raises OutputError where `out` can't be written;
     nothing half-written is left then, nor after an interruption.
     """
     with atomic_directory(out) as folder:
-        world = World.build(settings)
+        world = World.build(settings) if scene is None else World.over(scene, settings, Stock((), ()))
         truth_folder = folder / "truth"
         truth_folder.mkdir()
         surface = SurfaceTruth(world.scene, settings)

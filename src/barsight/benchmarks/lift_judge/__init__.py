@@ -1,0 +1,1 @@
+"""Judge lifts by exact geometry alone; nothing here imports what it judges."""

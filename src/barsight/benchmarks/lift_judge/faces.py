@@ -1,0 +1,231 @@
+"""Set the magnet down at one place on the exact solids: what it rests on, pulls, touches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.benchmarks.lift_judge.lowering import Rest, lower
+from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
+from barsight.benchmarks.lift_judge.solids import NOTHING, STEP_M, Envelope, SolidYard, envelope
+from barsight.core.arrays import Float32, Float64, Int32, Int64, kernel
+
+STRAY_M = 0.03
+"""Margin around the faces in which the stray field, and the poles' bodies, want nothing above them."""
+CONTACT_GAP_M = 0.003
+"""A face nearer than this to steel lies on it."""
+NEAR_M = 0.15
+"""A bundle further below the resting faces than this is not what they are set down for."""
+SPARE_REACH_M = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The solids near a magnet, in its frame: X across, Y along the beam; drawn at 1 mm where its faces may
+    come and at 5 mm under the beam. owner: of each solid.
+    """
+
+    yard: SolidYard
+    owner: Int32
+    all: Envelope
+    steel: Envelope
+    coarse: Envelope
+
+    @classmethod
+    def around(cls, yard: SolidYard, magnet: JudgedMagnet, slack_m: float) -> Surroundings:
+        """Draw what stands around the frame's origin. slack_m: how far any point of the magnet may be off."""
+        poles = magnet.poles
+        across = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max()) + STRAY_M + slack_m + 0.01
+        along = magnet.half_span_m + STRAY_M + slack_m + 0.01
+        # Cells lie where the points of a face of whole millimetres do.
+        across, along = (math.ceil(half / STEP_M) * STEP_M + STEP_M / 2 for half in (across, along))
+        wide, long = max(magnet.beam[1] / 2 + slack_m, across), max(magnet.beam[0] / 2 + slack_m, along)
+        near = SolidYard(
+            tuple(
+                s for s in yard.solids
+                if (s.bounds[0, :2] < (wide, long)).all() and (s.bounds[1, :2] > (-wide, -long)).all()
+            )
+        )  # fmt: skip
+        corners = (-across, -along), (across, along)
+        steel = np.array([s.is_steel for s in near.solids])
+        every = envelope(near, *corners)
+        return cls(
+            near, near.owner, every,
+            every if steel.all() else envelope(near, *corners, take=steel.astype(float)),
+            envelope(near, (-wide, -long), (wide, long), step=5 * STEP_M),
+        )  # fmt: skip
+
+    def own(self, load: tuple[int, ...]) -> Envelope:
+        """Draw the load alone."""
+        low = self.all.x0, self.all.y0
+        return envelope(self.yard, low, (-low[0], -low[1]), take=np.isin(self.owner, load).astype(float))
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Points over rectangles of the magnet, before it is moved: u across, v along (N,). pole: whose each is;
+    cell: its part of a face, of eight.
+    """
+
+    u: Float64
+    v: Float64
+    pole: Int64
+    cell: Int64
+
+    @classmethod
+    def over(cls, rectangles: Float64, margin: float, step: float) -> Spread:
+        """Spread points over rectangles (P, 4) of along, across, length, width, `margin` larger all round."""
+        parts = []
+        for number, (along, across, length, width) in enumerate(rectangles):
+            v = _middles(along, length / 2 + margin, step)
+            u = _middles(across, width / 2 + margin, step)
+            vv, uu = (a.ravel() for a in np.meshgrid(v, u))
+            quarter = np.minimum((4 * ((vv - along) / (length + 2 * margin) + 0.5)).astype(np.int64), 3)
+            cell = 8 * number + 2 * quarter + (uu > across)
+            parts.append((uu, vv, np.full(len(uu), number), cell))
+        u, v, pole, cell = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return cls(u, v, pole, cell)
+
+    def look(
+        self, drawn: Envelope, owner: Int32, offset: tuple[float, float, float]
+    ) -> tuple[Float64, Int32]:
+        """Look up height and bundle under the points, moved by across, along and a turn; the height is -inf
+        and the bundle NOTHING where nothing was drawn.
+        """
+        z, found = np.empty(len(self.u)), np.empty(len(self.u), np.int32)
+        _look(self.u, self.v, *offset, drawn.x0, drawn.y0, drawn.step, drawn.z, drawn.top, owner, z, found)
+        return z, found
+
+
+@kernel()
+def _look(
+    u: Float64, v: Float64, across: float, along: float, turn: float, x0: float, y0: float, step: float,
+    drawn: Float32, top: Int32, owner: Int32, z: Float64, found: Int32,
+) -> None:  # fmt: skip
+    """Look up the nearest cells of points u, v (N,), moved and turned. drawn, top: (X, Y) of an `Envelope`;
+    owner: of each solid. Fills z, m, and found, the bundle (N,).
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    for k in range(len(u)):
+        i = math.floor((across + c * u[k] - s * v[k] - x0) / step + 0.5)
+        j = math.floor((along + s * u[k] + c * v[k] - y0) / step + 0.5)
+        i, j = min(max(i, 0), drawn.shape[0] - 1), min(max(j, 0), drawn.shape[1] - 1)
+        z[k], found[k] = -np.inf, NOTHING
+        if top[i, j] != NOTHING:
+            z[k], found[k] = drawn[i, j], owner[top[i, j]]
+
+
+def _middles(centre: float, half: float, step: float) -> Float64:
+    count = max(round(2 * half / step), 1)
+    return np.asarray(centre - half + (np.arange(count) + 0.5) * 2 * half / count, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """The magnet at rest at one place.
+
+    rise_m: the highest of what isn't the load over the faces' plane as the load alone would carry it;
+    stray_m: the same with STRAY_M around the faces, over the plane at rest. beam_m: the highest of anything
+    over the beam's underside. pull: (P,) N on the load; others: N on each other bundle, and on other steel
+    under NOTHING. spare: bundles within SPARE_REACH_M beyond the reach. gaps: (P,) the least to the load's
+    steel. contact_share: of the faces on the load.
+    """
+
+    rest: Rest
+    rise_m: float
+    stray_m: float
+    beam_m: float
+    pull: Float64
+    others: dict[int, float]
+    spare: tuple[int, ...]
+    gaps: Float64
+    contact_share: float
+
+
+class MagnetOnSolids:
+    """Sets one magnet down at places around the origin of its surroundings."""
+
+    def __init__(self, magnet: JudgedMagnet, around: Surroundings) -> None:
+        self._magnet, self._around = magnet, around
+        beam = np.array([[0.0, 0.0, magnet.beam[0], magnet.beam[1]]])
+        self._faces = Spread.over(magnet.poles, 0.0, STEP_M)
+        self._stray = Spread.over(magnet.poles, STRAY_M, 3 * STEP_M)
+        self._beam = Spread.over(beam, 0.0, 5 * STEP_M)
+        self._own: dict[tuple[int, ...], Envelope] = {}
+
+    def rest(self, z: Float64) -> Rest:
+        """Lower the faces onto heights z (N,) under their points."""
+        faces = self._faces
+        return lower(faces.v, faces.u, z, faces.cell, math.tan(self._magnet.roll_rad))
+
+    def loads(self, count: int) -> tuple[int, ...]:
+        """Tell which bundles the magnet is set down for: the `count` with most of the faces over them."""
+        around, here = self._around, (0.0, 0.0, 0.0)
+        z, _ = self._faces.look(around.all, around.owner, here)
+        if not np.isfinite(z).any():
+            return ()
+        steel, owner = self._faces.look(around.steel, around.owner, here)
+        plane = self.rest(z).at(self._faces.v, self._faces.u)
+        under = owner[(steel > plane - NEAR_M) & (owner != NOTHING)]
+        bundles, points = np.unique(under, return_counts=True)
+        return tuple(int(b) for b in bundles[np.argsort(-points, kind="stable")][:count])
+
+    def stand(self, load: tuple[int, ...], offset: tuple[float, float, float]) -> Standing:
+        """Set down at an offset (across, along, turn) from the origin."""
+        faces, around = self._faces, self._around
+        z, owner = faces.look(around.all, around.owner, offset)
+        foreign = ~np.isin(owner, load)
+        rest = self.rest(z)
+        rise = float((z - rest.at(faces.v, faces.u))[foreign].max(initial=-np.inf))
+        if foreign[rest.contacts].any():
+            if load not in self._own:
+                self._own[load] = around.own(load)
+            own, _ = faces.look(self._own[load], around.owner, offset)
+            alone = self.rest(own) if np.isfinite(own).any() else Rest(-np.inf, 0.0, 0.0, rest.contacts)
+            rise = float((z - alone.at(faces.v, faces.u))[foreign].max())
+        return Standing(
+            rest, rise, self._above(self._stray, around.all, rest, offset, load),
+            self._above(self._beam, around.coarse, rest, offset, ()) - self._magnet.beam[2],
+            *self._pulls(load, rest, offset),
+        )  # fmt: skip
+
+    def over_plane(self, plane: Rest, offset: tuple[float, float, float]) -> float:
+        """Compute the highest of anything over a plane given in the magnet's frame, under moved faces."""
+        faces = self._faces
+        z, _ = faces.look(self._around.all, self._around.owner, offset)
+        c, s = math.cos(offset[2]), math.sin(offset[2])
+        v, u = offset[1] + s * faces.u + c * faces.v, offset[0] + c * faces.u - s * faces.v
+        return float((z - plane.at(v, u)).max())
+
+    def _above(
+        self, spread: Spread, drawn: Envelope, rest: Rest, offset: tuple[float, float, float],
+        load: tuple[int, ...],
+    ) -> float:  # fmt: skip
+        z, owner = spread.look(drawn, self._around.owner, offset)
+        foreign = ~np.isin(owner, load)
+        return float((z - rest.at(spread.v, spread.u))[foreign].max(initial=-np.inf))
+
+    def _pulls(
+        self, load: tuple[int, ...], rest: Rest, offset: tuple[float, float, float]
+    ) -> tuple[Float64, dict[int, float], tuple[int, ...], Float64, float]:
+        """Integrate the pull over the faces at 1 mm, by pole and by whom it pulls."""
+        faces, magnet, around = self._faces, self._magnet, self._around
+        z, owner = faces.look(around.steel, around.owner, offset)
+        gap = rest.at(faces.v, faces.u) - z
+        poles = len(magnet.poles)
+        area = magnet.poles[:, 2] * magnet.poles[:, 3] / np.bincount(faces.pole, minlength=poles)
+        is_load = np.isin(owner, load)
+        near = is_load & (gap < magnet.reach_m)
+        newton = magnet.pressure(gap[near]) * area[faces.pole[near]]
+        pull = np.asarray(np.bincount(faces.pole[near], newton, poles), np.float64)
+        others, spare = dict[int, float](), list[int]()
+        beside = ~is_load & (gap < magnet.reach_m + SPARE_REACH_M)
+        for bundle in np.unique(owner[beside]).tolist():
+            of = beside & (owner == bundle)
+            spare.append(bundle)
+            others[bundle] = float((magnet.pressure(gap[of]) * area[faces.pole[of]]).sum())
+        gaps = np.array([gap[is_load & (faces.pole == p)].min(initial=np.inf) for p in range(poles)])
+        share = float((is_load & (gap <= CONTACT_GAP_M)).mean())
+        return pull, others, tuple(spare), gaps, share

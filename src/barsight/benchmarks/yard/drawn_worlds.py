@@ -1,0 +1,113 @@
+"""Turn drawn worlds into what lifts are chosen from: a recording to be measured, or a map with noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from barsight.benchmarks.lift_judge.solids import Solid, SolidYard, envelope
+from barsight.benchmarks.lift_judge.worlds import DrawnWorld
+from barsight.core.arrays import Float64
+from barsight.core.types import HeightSource
+from barsight.result_folder import read_heights, read_summary
+from barsight.simulation.scene import Primitives, Scene, build_grid
+from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.simulate import simulate
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.assessment import LiftScene
+from barsight.yard.lifting.footprint import BundleTable
+from barsight.yard.lifting.targets import map_vetoes
+from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.stability.stability import footings
+from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.vetoes import Veto
+
+ALBEDO = {"bar": 0.27, "strap": 0.13, "tag": 0.75, "beam": 0.36, "wall": 0.45, "stanchion": 0.2}
+CELLS_M = (0.09, 0.5)
+CELL_M, MARGIN_M = 0.01, 0.6
+WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
+"""Noise of `noisy_scene`: of each cell, and alike over cells."""
+ASIDE_M = 1.3
+"""How far beside a yard the trolley travels that is to hide a part of it."""
+
+
+def scene_of(yard: SolidYard, rng: np.random.Generator) -> Scene:
+    """Give the solids surfaces and sort them for the renderer."""
+    ordered = sorted(yard.solids, key=lambda s: not s.is_round)
+    shape = np.array([_shape(s) for s in ordered])
+    material = np.array([_material(s, rng) for s in ordered], dtype=np.float32)
+    primitives = Primitives(shape, material, sum(s.is_round for s in ordered))
+    return Scene(primitives, build_grid(primitives, CELLS_M))
+
+
+def _shape(solid: Solid) -> Float64:
+    sizes = [solid.half[1], solid.half[0], 0.0] if solid.is_round else solid.half
+    return np.concatenate([solid.centre, solid.axes.ravel(), sizes])
+
+
+def _material(solid: Solid, rng: np.random.Generator) -> list[float]:
+    albedo = ALBEDO[solid.part] * float(np.exp(rng.normal(0, 0.12)))
+    gloss = {"bar": 1.0, "strap": 0.5, "stanchion": 0.3}.get(solid.part, 0.0)
+    twist = float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08)) if solid.part == "bar" else 0.0
+    return [albedo, gloss * float(np.exp(rng.normal(0, 0.25))), *rng.uniform(0, 10, 2), twist,
+            float(rng.uniform(0.85, 1.15)), 0.0, 0.3 if solid.part == "tag" else 1.0]  # fmt: skip
+
+
+def recording_settings(world: DrawnWorld) -> SimulationSettings:
+    """Choose a short recording over a world: small pictures, ten pairs for 3 m."""
+    base, length = SimulationSettings.demo(), world.size_m[0]
+    aside = ASIDE_M * (-1 if world.seed // 8 % 2 else 1) if world.hides else base.camera.trolley_y_m
+    return replace(
+        base, seed=world.seed, length_m=length, frames=round(3 + 2.3 * length), depth_views=0,
+        camera=replace(base.camera, trolley_y_m=aside),
+    )  # fmt: skip
+
+
+def render_world(world: DrawnWorld, recording: Path) -> None:
+    """Render a world as a recording."""
+    scene = scene_of(world.yard, np.random.default_rng((29, world.seed)))
+    simulate(recording, recording_settings(world), scene=scene)
+
+
+def measured_scene(out: Path, settings: LiftSettings) -> LiftScene:
+    """Read what lifts are chosen from out of a measured folder, as of its last frame."""
+    summary = read_summary(out)
+    travel = Travel.read(summary)
+    captured = travel.captured_ns if travel else None
+    now_ns = captured[1] if captured else 0
+    warnings = [(str(w["code"]), str(w["message"])) for w in summary["warnings"]]
+    vetoes = map_vetoes(warnings, summary["reference"], now_ns, now_ns, settings, has_magnet=True)
+    whole = read_heights(out)
+    rows, columns = whole.shape
+    heights = whole.part(slice(0, rows), slice(0, columns))
+    return _scene(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
+
+
+def noisy_scene(world: DrawnWorld, settings: LiftSettings) -> LiftScene:
+    """Draw noise onto the exact heights of every cell, and find the bundles in that: all is seen, nothing is
+    smoothed; no travel is known.
+    """
+    rng = np.random.default_rng((31, world.seed))
+    (x, y), margin = world.size_m, MARGIN_M
+    drawn = envelope(world.yard, (-margin, -y / 2 - margin), (x + margin, y / 2 + margin), step=CELL_M)
+    alike = ndimage.gaussian_filter(rng.normal(0, 1, drawn.z.T.shape), ALIKE_CELLS)
+    noise = WHITE_M * rng.normal(0, 1, alike.shape) + ALIKE_M * alike / alike.std()
+    z = (drawn.z.T + noise).astype(np.float32)
+    sigma = np.full_like(z, np.hypot(WHITE_M, ALIKE_M))
+    vision = np.full(z.shape, HeightSource.VISION, np.uint8)
+    heights = HeightMap(drawn.x0, drawn.y0, CELL_M, z, sigma, np.full_like(z, 6.0), vision)
+    return _scene(heights, find_bundles(heights, BundleSettings()), (), None, 0, settings)
+
+
+def _scene(
+    heights: HeightMap, bundles: tuple[Bundle, ...], vetoes: tuple[Veto, ...], travel: Travel | None,
+    now_ns: int, settings: LiftSettings,
+) -> LiftScene:  # fmt: skip
+    stands = footings(heights, bundles, settings)
+    return LiftScene(heights, BundleTable.of(bundles), stands, vetoes, travel, now_ns)

@@ -1,0 +1,190 @@
+"""Let the independent judge try to prove lifts wrong (`barsight bench lifts`).
+
+The lifts that are offered, and random placements, are assessed on a measured map of a drawn world; each that
+is not vetoed is judged by the world's solids at the stated tolerance, and so are the vetoed ones over a
+bundle on which nothing lies, for what is refused although it is fine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.table import Table
+from scipy.stats import beta
+
+from barsight.benchmarks.lift_judge.judge import Judge, Target
+from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
+from barsight.benchmarks.lift_judge.worlds import DrawnWorld
+from barsight.benchmarks.provenance import Provenance, provenance
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.lifting.targets import plan_lifts
+
+TWO_SIDED = 1.96
+SPREAD = (0.1, 0.012, math.radians(0.1))
+"""Standard deviations along, across and of the yaw with which placements miss a bundle's middle."""
+
+
+@dataclass(frozen=True)
+class JudgedLift:
+    """One placement and what the judge says. offered: it is in the plan's list; vetoes: the product's codes.
+
+    stated_*: by the product; true_*: by the judge, NaN where there is no load.
+    """
+
+    seed: int
+    kind: str
+    offered: bool
+    x_m: float
+    y_m: float
+    yaw_deg: float
+    vetoes: tuple[str, ...]
+    dangerous: tuple[str, ...]
+    unclear: tuple[str, ...]
+    stated_mass_kg: float
+    stated_sigma_kg: float
+    stated_pull_low_n: float
+    true_mass_kg: float
+    true_pull_n: float
+
+    @property
+    def is_fine(self) -> bool:
+        """Tell whether the judge finds every figure clear of its limit."""
+        return not self.dangerous and not self.unclear
+
+
+@dataclass(frozen=True)
+class JudgedBench:
+    """All that was judged, over how many yards."""
+
+    yards: int
+    lifts: tuple[JudgedLift, ...]
+    provenance: Provenance
+
+    @classmethod
+    def of(cls, yards: int, lifts: Sequence[JudgedLift]) -> JudgedBench:
+        """Record what was judged, with commit and machine."""
+        return cls(yards, tuple(lifts), provenance())
+
+    @property
+    def unvetoed(self) -> tuple[JudgedLift, ...]:
+        """Return those that nothing forbids."""
+        return tuple(one for one in self.lifts if not one.vetoes)
+
+    @property
+    def dangerous(self) -> tuple[JudgedLift, ...]:
+        """Return those of them that the judge finds dangerous."""
+        return tuple(one for one in self.unvetoed if one.dangerous)
+
+
+def judge_yard(
+    world: DrawnWorld, scene: LiftScene, magnet: Magnet, judged: JudgedMagnet, settings: LiftSettings,
+    placements: int,
+) -> Iterator[JudgedLift]:  # fmt: skip
+    """Assess and judge the offered lifts and so many placements of one world."""
+    rng, judge = np.random.default_rng((37, world.seed)), Judge(world.yard, judged, settings.bundles)
+    plan = plan_lifts(
+        scene.heights, scene.table.bundles, magnet, settings, scene.vetoes, scene.travel, scene.now_ns
+    )
+    for lift in plan.offered:
+        yield _judged(world, lift, judge, judged, offered=True)
+    offered = [lift.place for lift in plan.offered]
+    for number in range(placements):
+        middles = offered if number % 2 and offered else [_over(world, b) for b in world.free]
+        if not middles:
+            return
+        place = _beside(middles[int(rng.integers(len(middles)))], rng)
+        yield _judged(world, assess_placement(place, scene, magnet, settings), judge, judged, offered=False)
+
+
+def _over(world: DrawnWorld, bundle: int) -> Placement:
+    _, centre = world.yard.load(bundle)
+    along = world.yard.bars(bundle)[0].axes[0]
+    return Placement(float(centre[0]), float(centre[1]), math.atan2(-along[0], along[1]))
+
+
+def _beside(middle: Placement, rng: np.random.Generator) -> Placement:
+    along, across, turn = rng.normal(0, SPREAD)
+    x, y = (middle.x_m, middle.y_m) + along * middle.along + across * middle.across
+    return Placement(float(x), float(y), middle.yaw_rad + float(turn))
+
+
+def _judged(
+    world: DrawnWorld, lift: Lift, judge: Judge, magnet: JudgedMagnet, *, offered: bool
+) -> JudgedLift:
+    place, contact = lift.place, lift.contact
+    target = Target(place.x_m, place.y_m, place.yaw_rad, magnet.tolerance)
+    if not lift.vetoes and contact is not None:
+        box = lift.tolerance.x_m, lift.tolerance.y_m, math.radians(lift.tolerance.yaw_deg)
+        plane = contact.centre_z_m, math.tan(contact.pitch_rad), math.tan(contact.roll_rad)
+        target = Target(
+            place.x_m, place.y_m, place.yaw_rad, box, plane, lift.mass.upper_kg, contact.pull_low_n
+        )
+    verdict = judge.judge(target)
+    return JudgedLift(
+        world.seed, world.kind, offered, place.x_m, place.y_m, place.yaw_deg,
+        tuple(sorted({veto.code for veto in lift.vetoes})), verdict.dangerous, verdict.unclear,
+        lift.mass.kg, lift.mass.sigma_kg, contact.pull_low_n if contact else math.nan,
+        verdict.mass_kg, verdict.pull_n,
+    )  # fmt: skip
+
+
+def upper_bound(found: int, of: int) -> float:
+    """Compute the 95 % upper bound of a share [Clopper 1934], one-sided."""
+    return float(beta.ppf(0.95, found + 1, of - found)) if found < of else 1.0
+
+
+def bench_table(bench: JudgedBench) -> Table:
+    """Tabulate the bench for people."""
+    table = Table("figure", "value", title=f"{len(bench.lifts)} placements on {bench.yards} yards")
+    free, bad = bench.unvetoed, bench.dangerous
+    fine = [one for one in bench.lifts if one.is_fine]
+    refused = [one for one in fine if one.vetoes]
+    codes = Counter(code for one in refused for code in one.vetoes)
+    reasons = Counter(reason.split(":")[0] for one in bad for reason in one.dangerous)
+    low = [one.stated_pull_low_n <= one.true_pull_n for one in free]
+    mass = [
+        abs(one.stated_mass_kg - one.true_mass_kg) <= TWO_SIDED * one.stated_sigma_kg
+        for one in free if math.isfinite(one.stated_mass_kg)
+    ]  # fmt: skip
+    yards = len({one.seed for one in bad})
+    for name, value in (
+        ("without a veto", f"{len(free)}, {sum(one.offered for one in free)} of them offered"),
+        ("of these dangerous", f"{_share(len(bad), len(free))}, on {yards} yards; 95 % upper bound "
+         f"{100 * upper_bound(len(bad), len(free)):.2f} %"),
+        ("offered and dangerous", f"{sum(one.offered for one in bad)}"),
+        ("why dangerous", _counts(reasons)),
+        ("neither dangerous nor fine", f"{len(free) - len(bad) - sum(one.is_fine for one in free)}"),
+        ("truly fine", f"{len(fine)}"),
+        ("of these vetoed", _share(len(refused), len(fine))),
+        ("why those were vetoed", _counts(codes)),
+        ("lower bound of the pull holds", _share(sum(low), len(low))),
+        ("mass in its 95 % interval", _share(sum(mass), len(mass))),
+    ):  # fmt: skip
+        table.add_row(name, value)
+    return table
+
+
+def dangerous_table(bench: JudgedBench) -> Table:
+    """List each dangerous placement that nothing forbids, with its reasons."""
+    table = Table("seed", "kind", "offered", "x m", "y m", "yaw deg", "why")
+    for one in bench.dangerous:
+        table.add_row(
+            str(one.seed), one.kind, "yes" if one.offered else "", f"{one.x_m:.3f}", f"{one.y_m:.3f}",
+            f"{one.yaw_deg:.2f}", "; ".join(one.dangerous),
+        )  # fmt: skip
+    return table
+
+
+def _share(count: int, of: int) -> str:
+    return f"{count} of {of} ({100 * count / of:.1f} %)" if of else "0 of 0"
+
+
+def _counts(found: Counter[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in found.most_common()) or "-"

@@ -1,0 +1,72 @@
+"""The bench of lifts: its scenes are the drawn solids, its counts what was judged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.benchmarks.lift_judge.magnet import magnet_of, read_magnet
+from barsight.benchmarks.lift_judge.solids import envelope
+from barsight.benchmarks.lift_judge.worlds import draw_world
+from barsight.benchmarks.yard.drawn_worlds import noisy_scene, recording_settings, scene_of
+from barsight.benchmarks.yard.judged_lifts import JudgedBench, bench_table, judge_yard, upper_bound
+from barsight.cli.bench.lifts import bench_lift_targets
+from barsight.core.errors import ConfigError
+from barsight.simulation.sensors import heights
+from barsight.simulation.simulate import World
+from barsight.simulation.stock import Stock
+from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.magnet import example_magnet, load_magnet
+
+
+@pytest.mark.parametrize("seed", [5, 7])
+def test_the_renderer_sees_the_solids_that_are_judged(seed: int) -> None:
+    world = draw_world(seed, 3.0, 1.5)
+    scene = scene_of(world.yard, np.random.default_rng(1))
+    drawn = envelope(world.yard, (0.0, -1.5), world.size_m, step=0.037)
+    i, j = np.meshgrid(np.arange(drawn.z.shape[0]), np.arange(drawn.z.shape[1]), indexing="ij")
+    cast = heights(scene, (drawn.x0 + 0.037 * i).ravel(), (drawn.y0 + 0.037 * j).ravel()).reshape(i.shape)
+    # At a cylinder's very side one of the two may just miss it.
+    assert (np.abs(cast - drawn.z) < 1e-5).mean() > 0.999 and drawn.z.max() > 0.2
+    way = World.over(scene, recording_settings(world), Stock((), ()))
+    assert way.scene is scene and len(way.frame_stamp_ns) >= 6
+
+
+def test_the_bench_tells_what_was_judged(tmp_path: Path) -> None:
+    described = tmp_path / "magnet.toml"
+    described.write_text(example_magnet(), encoding="utf-8")
+    magnet, settings = read_magnet(described), LiftSettings()
+    world = draw_world(4, 2 * magnet.half_span_m + 0.3, 1.2)
+    scene = noisy_scene(world, settings)
+    judged = tuple(judge_yard(world, scene, load_magnet(described), magnet, settings, 4))
+    masses = [world.yard.load(bundle)[0] for bundle in world.yard.bundles]
+    assert len(judged) >= 4 and all(not one.vetoes for one in judged if one.offered)
+    for one in judged:
+        assert np.isnan(one.true_mass_kg) or min(abs(one.true_mass_kg - kg) for kg in masses) < 1e-6
+    table = bench_table(JudgedBench.of(1, judged))
+    assert table.row_count == 10
+
+
+def test_the_judge_reads_the_magnet_as_the_product_does(tmp_path: Path) -> None:
+    described = tmp_path / "magnet.toml"
+    described.write_text(example_magnet(), encoding="utf-8")
+    magnet, other = load_magnet(described), read_magnet(described)
+    assert other.poles == pytest.approx(magnet.pole_table)
+    assert other.reach_m == magnet.reach_m and other.factor == magnet.safety_factor
+    assert other.carries_kg == min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
+    with pytest.raises(KeyError):
+        magnet_of({"poles": []})
+
+
+def test_the_upper_bound_is_clopper_and_pearsons() -> None:
+    assert upper_bound(0, 2995) == pytest.approx(1 - 0.05 ** (1 / 2995))
+    assert upper_bound(2, 140) == pytest.approx(0.0443, abs=5e-4)
+    assert upper_bound(3, 3) == 1.0
+
+
+@pytest.mark.parametrize("seeds", ["7", "9:9", "a:b"])
+def test_seeds_that_are_none_are_told(seeds: str) -> None:
+    with pytest.raises(ConfigError, match="500:560"):
+        bench_lift_targets(seeds=seeds)
