@@ -107,7 +107,7 @@ def bench_lifts(
 
 
 def _judged(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> LiftScene:
-    return LiftScene(heights, BundleTable.of(bundles), footings(heights, bundles, settings), ())
+    return LiftScene(heights, BundleTable.of(bundles), footings(heights, bundles, settings))
 
 
 def random_place(known: KnownYard, rng: np.random.Generator) -> Placement:

@@ -5,7 +5,7 @@ vetoes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,16 +15,17 @@ from barsight.yard.lifting.footprint import BundleTable, Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.set_down import FreePlace, free_places
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.lifting.validity import age_vetoes
+from barsight.yard.lifting.validity import age_checks
 from barsight.yard.sections import split_map
 from barsight.yard.stability.pile_sides import PileSide, pile_sides
 from barsight.yard.stability.stability import Footing, footings
 from barsight.yard.types import Bundle, YardMap
-from barsight.yard.vetoes import Veto
+from barsight.yard.vetoes import Veto, vetoes_of
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
-FINALISTS = 3
+ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight"})
+"""Vetoes of the load itself: another place of the magnet changes nothing."""
 SAME_TOP_M = 0.03
 SAME_YAW_RAD = np.radians(2.0)
 RULE = (
@@ -79,8 +80,7 @@ def map_vetoes(
         vetoes.append(Veto("no-yard-frame", f"the map is in the {reference} frame: no crane gave its place"))
     if not has_magnet:
         vetoes.append(Veto("no-magnet", "no magnet was described: give its file with --magnet"))
-    vetoes += age_vetoes(captured_to_ns, now_ns, settings)
-    return tuple(vetoes)
+    return (*vetoes, *vetoes_of(age_checks(captured_to_ns, now_ns, settings)))
 
 
 def plan_lifts(
@@ -99,14 +99,14 @@ def plan_lifts(
     for part in parts:
         near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
         heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
-        here = LiftScene(heights, BundleTable.of(near), standing, (), travel, now_ns)
+        here = LiftScene(heights, BundleTable.of(near), standing, travel, now_ns)
         for number, group in enumerate(groups):
             if part.owns(group[0].centre_m):
                 lifts[number] = _best(group, here, magnet, settings)
     offered, refused = [], []
     for _, lift in sorted(lifts.items()):
         if lift.vetoes or vetoes:
-            refused.append(_with(lift, vetoes))
+            refused.append(replace(lift, map_vetoes=vetoes))
         else:
             offered.append(lift)
     top = {b.id: b.top_z_m for b in bundles}
@@ -127,12 +127,6 @@ def plan_lifts(
         now_ns,
         travel.captured_ns if travel else None,
     )
-
-
-def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:
-    said = {veto.code for veto in vetoes}
-    own = (veto for veto in lift.vetoes if veto.code not in said)
-    return Lift(**{**vars(lift), "vetoes": (*vetoes, *own)})
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
@@ -164,22 +158,37 @@ def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: 
 
     limit = magnet.limits.offset_across_m
     quick = tried((0.0, across) for across in ACROSS_M if abs(across) < limit)
-    if quick[0].vetoes:
-        across = quick[0].offset_across_m if np.isfinite(quick[0].offset_across_m) else 0.0
-        quick = sorted([*quick, *tried((along, across) for along in ALONG_M)], key=_worst_first)
-    if quick[0].vetoes:
-        return quick[0]
-    finalists = []
-    for lift in quick[:FINALISTS]:
+    sound = _sound(quick, yard, magnet, settings)
+    wherever = ANYWHERE.intersection(*({veto.code for veto in lift.vetoes} for lift in quick))
+    if wherever or (sound is not None and not sound.vetoes):
+        return sound or quick[0]
+    middle = _offset_across(group, quick[0].place)
+    more = tried((along, across) for along in ALONG_M for across in dict.fromkeys((0.0, middle)))
+    found = [one for one in (sound, _sound(more, yard, magnet, settings)) if one is not None]
+    return min(found or [*quick, *more], key=_worst_first)
+
+
+def _sound(quick: list[Lift], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift | None:
+    """Find the first that holds within the crane's tolerance too; the best that doesn't, None without any.
+
+    All are tried: were it some, tiny noise would choose which, and with that whether a lift is offered.
+    """
+    whole = []
+    for lift in quick:
         if not lift.vetoes:
-            finalists.append(assess_placement(lift.place, yard, magnet, settings))
-            if not finalists[-1].vetoes:
-                break
-    return min(finalists, key=_worst_first)
+            whole.append(assess_placement(lift.place, yard, magnet, settings))
+            if not whole[-1].vetoes:
+                return whole[-1]
+    return min(whole, key=_worst_first, default=None)
 
 
 def _worst_first(lift: Lift) -> tuple[int, float]:
     return len(lift.vetoes), -lift.safety
+
+
+def _offset_across(group: tuple[Bundle, ...], place: Placement) -> float:
+    centre = np.mean([b.centre_m[:2] for b in group], axis=0)
+    return float((np.array([place.x_m, place.y_m]) - centre) @ place.across)
 
 
 def _place(group: tuple[Bundle, ...], along: float, across: float) -> Placement:

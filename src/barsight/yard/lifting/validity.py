@@ -10,7 +10,7 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.vetoes import Veto
+from barsight.yard.vetoes import Check, check_least, check_most, check_true
 
 MAX_CLOCK_ERROR_NS = NS_PER_S
 """Frames may be this much ahead of this computer's clock."""
@@ -34,19 +34,25 @@ def validity(travel: Travel, place: Placement, settings: LiftSettings) -> Validi
     return Validity(seen_ns, seen_ns + seconds_to_ns(settings.max_age_s))
 
 
-def age_vetoes(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> tuple[Veto, ...]:
-    """Forbid what was captured too long ago, in the future, or nobody knows when. Stamps in ns since 1970."""
+def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> list[Check]:
+    """Check that what was captured isn't too old, of the future, or of nobody knows when. Stamps in ns since
+    1970.
+    """
     if captured_to_ns is None:
-        return (Veto("map-too-old", "when the map was captured is not known"),)
-    ahead_ns = captured_to_ns - now_ns
-    if ahead_ns > MAX_CLOCK_ERROR_NS:
-        reason = f"the last frame is {_span(ahead_ns)} ahead of this computer's clock: set the clocks"
-        return (Veto("map-from-the-future", reason),)
-    if -ahead_ns > seconds_to_ns(settings.max_age_s):
-        allowed = _span(seconds_to_ns(settings.max_age_s))
-        reason = f"the last frame that saw it is {_span(-ahead_ns)} old, {allowed} are allowed"
-        return (Veto("map-too-old", reason),)
-    return ()
+        reason = "when the map was captured is not known"
+        return [check_true("map-too-old", "age of what was seen", None, reason)]
+    age_ns, max_age_ns = now_ns - captured_to_ns, seconds_to_ns(settings.max_age_s)
+    return [
+        check_least(
+            "map-from-the-future", "age by this computer's clock", age_ns / NS_PER_S,
+            -MAX_CLOCK_ERROR_NS / NS_PER_S, "s",
+            f"the last frame is {_span(-age_ns)} ahead of this computer's clock: set the clocks",
+        ),
+        check_most(
+            "map-too-old", "age of the last frame that saw it", age_ns / NS_PER_S, settings.max_age_s, "s",
+            f"the last frame that saw it is {_span(age_ns)} old, {_span(max_age_ns)} are allowed",
+        ),
+    ]  # fmt: skip
 
 
 def _span(duration_ns: int) -> str:
