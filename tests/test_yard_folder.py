@@ -15,7 +15,7 @@ from barsight.cli.main import run
 from barsight.core.stamps import NS_PER_S
 from barsight.mapping.settings import MapSettings
 from barsight.report.orthophoto import orthophoto, write_orthophoto
-from barsight.result_folder import read_heights
+from barsight.result_folder import open_folder, read_heights, seal_map
 from barsight.viewer.yard_lines import yard_lines
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.lifting.lift_file import read_lifts
@@ -53,7 +53,6 @@ def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **ch
     photo = np.full(heights.z_m.shape, 90, np.uint8)
     (folder / "ortho.png").write_bytes(cv2.imencode(".png", photo)[1].tobytes())
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
-    write_bundles(bundles, None, "yard", folder / "bundles.json")
     stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)
     way = Travel(
         np.zeros((3, 2)),
@@ -65,8 +64,11 @@ def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **ch
         np.ones(len(stamps), bool),
         3.0,
     )
-    content = summary() | {"agreement": [], "travel": way.content()} | changes
+    captured = {"captured_from_ns": int(stamps[0]), "captured_to_ns": int(stamps[-1])}
+    content = summary() | {"agreement": [], "travel": way.content()} | captured | changes
+    identity = seal_map(content, folder)
     (folder / "result.json").write_text(json.dumps(content), encoding="utf-8")
+    write_bundles(bundles, None, "yard", identity, folder / "bundles.json")
     return folder
 
 
@@ -139,7 +141,9 @@ def test_an_old_yard_can_be_looked_back_at(tmp_path: Path) -> None:
 
 def test_an_empty_yard_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "out")
-    write_bundles((), None, "yard", folder / "bundles.json")
+    _, identity = open_folder(folder)
+    assert identity is not None
+    write_bundles((), None, "yard", identity, folder / "bundles.json")
     assert lifts(folder) == 0
     assert "no lift is offered: no bundle was found" in capsys.readouterr().err
 

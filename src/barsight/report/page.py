@@ -21,7 +21,7 @@ from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_trajectory import path_plots
 from barsight.report.page_yard import yard_part
 from barsight.report.plots import Plot, contour_plot, histogram_plot, limits_plot, pair_with_laser
-from barsight.result_folder import read_contours, read_laser, read_path, read_summary
+from barsight.result_folder import open_folder, read_contours, read_laser, read_path
 
 NONE = "–"
 
@@ -71,7 +71,7 @@ def write_summary_page(
 
 def render_page(out_dir: Path) -> str:
     """Render the page's HTML; see `write_report`."""
-    result = read_summary(out_dir)
+    result, _ = open_folder(out_dir)
     laser = read_laser(out_dir)
     compared = pair_with_laser(read_contours(out_dir), laser)
     path = read_path(out_dir)

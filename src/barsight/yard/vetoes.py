@@ -10,8 +10,9 @@ from typing import Literal
 VETOES = {
     "no-magnet": "No magnet was described: what is only assumed forbids every lift.",
     "map-too-old": "The place was last seen longer ago than the settings allow, or nobody knows when.",
-    "disturbed": "Something was lifted or set down here, or the magnet was here, after the place was last seen.",
+    "disturbed": "A lift, a set-down or a magnet came near after the place was last seen.",
     "map-from-the-future": "The last frame is ahead of this computer's clock: ages can't be told.",
+    "calibration-changed": "The calibration that the map was measured with was changed since.",
     "calibration-drift": "The cameras' calibration doesn't fit the pictures any more.",
     "trajectory-degraded": "Near the lift trajectory or encoders aren't as sure as the magnet needs.",
     "one-view": "One frame made the map: no height is confirmed by another.",
@@ -109,12 +110,16 @@ def _checked(
     figure: float, most: float,
 ) -> Check:  # fmt: skip
     """Judge `figure`, which may not be over `most`; a NaN is unknown."""
-    told = tuple(float(x) if math.isfinite(x) else None for x in (value, sigma, bound))
+    found, spread, limit = (float(x) if math.isfinite(x) else None for x in (value, sigma, bound))
+
+    def check(result: Literal["passed", "failed", "unknown"], said: str) -> Check:
+        return Check(code, what, found, spread, limit, unit, result, said)
+
     if math.isnan(figure) or math.isnan(most) or math.isnan(sigma):
-        return Check(code, what, *told, unit, "unknown", reason)
+        return check("unknown", reason)
     if figure + sigmas * sigma <= most:
-        return Check(code, what, *told, unit, "passed", "")
+        return check("passed", "")
     if figure <= most:
         times = "its sigma" if sigmas == 1 else f"{sigmas:.3g} times its sigma"
         reason = f"{reason}; the figure lies within {times} of the limit"
-    return Check(code, what, *told, unit, "failed", reason)
+    return check("failed", reason)

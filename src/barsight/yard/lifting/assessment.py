@@ -9,14 +9,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.lifting.checks import count_checks, face_checks, load_checks, probability_check, unknown_check
+from barsight.yard.lifting.checks import (
+    count_checks,
+    face_checks,
+    load_checks,
+    probability_check,
+    unknown_check,
+)
 from barsight.yard.lifting.clearance import clearance_checks, resting_checks
 from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
 from barsight.yard.lifting.magnet import Magnet, Tolerance
-from barsight.yard.lifting.travel_accuracy import Travel, travel_checks
-from barsight.yard.lifting.validity import Validity, age_checks, validity
+from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
+from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
 from barsight.yard.stability.stability import Footing, footing_checks
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_least, check_true, vetoes_of
@@ -28,8 +35,8 @@ SCALES = (1.0, 1.5, 2.5)
 
 @dataclass(frozen=True, eq=False)
 class LiftScene:
-    """All that lifts are chosen from. travel: None where the map is not measured but given. now_ns: when lifts
-    are judged, on the frames' clock.
+    """All that lifts are chosen from. travel: None where the map is not measured but given. now_ns: when
+    lifts are judged, on the frames' clock. events: in the yard since it was measured.
     """
 
     heights: HeightMap
@@ -37,6 +44,7 @@ class LiftScene:
     footings: tuple[Footing, ...]
     travel: Travel | None = None
     now_ns: int = 0
+    events: tuple[YardEvent, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +56,9 @@ class Lift:
     bound times safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
     overhang_m: bars beyond the outermost pole. tolerance: half sides of the box within which all this holds.
     safety: the smallest of pull over needed, capacity over load and tolerance over the crane's; at least 1
-    where nothing is vetoed. checks: all that were made; a check that isn't passed is a veto. validity: in time,
-    None where no frame is known to have seen the place. map_vetoes: those that forbid every lift of the map.
+    where nothing is vetoed. checks: all that were made; a check that isn't passed is a veto. validity: in
+    time, None where no frame is known to have seen the place. covariance: (4, 4) of the target's x, y,
+    z and yaw, None without a contact. map_vetoes: those that forbid every lift of the map.
     """
 
     place: Placement
@@ -67,6 +76,7 @@ class Lift:
     safety: float
     checks: tuple[Check, ...]
     validity: Validity | None = None
+    covariance: Float64 | None = None
     map_vetoes: tuple[Veto, ...] = ()
 
     @property
@@ -88,9 +98,7 @@ def assess_placement(
         nan = math.nan
         reason = "nothing is known under the magnet"
         unseen = check_true("unknown-under-footprint", "something was seen under the magnet", None, reason)
-        return Lift(
-            place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0, (unseen,)
-        )
+        return Lift(place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0, (unseen,))
     held = count_gripped(place, magnet, magnet.tolerance, near, contact.z_m)
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
@@ -102,6 +110,7 @@ def assess_placement(
     checks = [
         *(travel_checks(yard.travel, place, magnet, settings) if yard.travel else ()),
         *(age_checks(valid.from_ns, yard.now_ns, settings) if valid else ()),
+        *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, settings),
         *clearance_checks(place, yard.heights, magnet, contact),
@@ -128,6 +137,7 @@ def assess_placement(
         contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
         Tolerance(box.x_m * scale, box.y_m * scale, min(box.yaw_deg * scale, 20.0)),
         float(np.nan_to_num(min(ratios))), tuple(checks), valid,
+        target_covariance(place, load, contact.sigma_m, yard.travel),
     )  # fmt: skip
 
 
@@ -160,7 +170,7 @@ def _load(load: tuple[Bundle, ...]) -> tuple[Mass, Float64]:
 
 
 def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tuple[float, float]:
-    """Compute the longest way from the outermost pole to an end, and its sigma; NaN where nothing is taken."""
+    """Compute the longest way from the outermost pole to an end, and its sigma; NaN where none is taken."""
     beyond = [
         (
             float(abs((end[:2] - (place.x_m, place.y_m)) @ place.along)) - magnet.half_span_m,

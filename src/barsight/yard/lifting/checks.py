@@ -168,9 +168,7 @@ def load_checks(
             check_most("off-centre", what, 1e3 * abs(offset), 1e3 * most, "mm", reason, sigma=1e3 * sigma)
         )
     upper = overhang_m[0] + UPPER * overhang_m[1]
-    reason = (
-        f"the bars reach {upper:.2f} m beyond the outermost pole, {limits.overhang_m:g} m are allowed"
-    )
+    reason = f"the bars reach {upper:.2f} m beyond the outermost pole, {limits.overhang_m:g} m are allowed"
     checks.append(
         check_most("overhang", "bars beyond the outermost pole", overhang_m[0], limits.overhang_m, "m",
                    reason, sigma=overhang_m[1], sigmas=UPPER)
@@ -182,7 +180,9 @@ def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
     what = "something lies on" if bundle.on_top is False else "it isn't known what lies on"
     ends = " and ".join(e for e, o in zip(("low-y", "high-y"), bundle.ends_open, strict=True) if o)
     return [
-        check_true("covered", f"nothing lies on bundle {bundle.id}", bundle.on_top, f"{what} bundle {bundle.id}"),
+        check_true(
+            "covered", f"nothing lies on bundle {bundle.id}", bundle.on_top, f"{what} bundle {bundle.id}"
+        ),
         check_least(
             "bundle-doubtful", f"how sure bundle {bundle.id} is", bundle.confidence, settings.min_confidence,
             "", f"bundle {bundle.id} is {100 * bundle.confidence:.0f} % sure: "

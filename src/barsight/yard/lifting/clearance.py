@@ -62,8 +62,8 @@ def clearance_checks(place: Placement, heights: HeightMap, magnet: Magnet, conta
     for code, what, bound_mm in (
         ("obstructed", "what stands highest above the faces' plane, under the magnet or beside it",
          1e3 * MAX_RISE_M),
-        ("unknown-under-footprint", "the widest place under the magnet or beside it that was neither seen nor "
-         "proven free", 1e3 * MAX_HOLE_M),
+        ("unknown-under-footprint", "the widest place under the magnet or beside it that was neither seen "
+         "nor proven free", 1e3 * MAX_HOLE_M),
     ):  # fmt: skip
         if obstacle is None or obstacle.code != code:
             unknown = obstacle is not None and code == "unknown-under-footprint"
@@ -73,9 +73,7 @@ def clearance_checks(place: Placement, heights: HeightMap, magnet: Magnet, conta
         reason = obstacle.reason
         if find_obstacle(place, heights, magnet, contact, careful=False) is None:
             reason += "; it lies within its sigma of the limit"
-        checks.append(
-            Check(code, what, obstacle.value_mm, sigma, obstacle.bound_mm, "mm", "failed", reason)
-        )
+        checks.append(Check(code, what, obstacle.value_mm, sigma, obstacle.bound_mm, "mm", "failed", reason))
     return checks
 
 

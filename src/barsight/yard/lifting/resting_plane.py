@@ -24,8 +24,8 @@ BENT_SIGMA, STRAIGHT_UP_TO = 3.0, 0.8
 """What is this many sigma from straight is taken as it was measured; from this part of them on, the more the
 further it is."""
 NEAR_LINE_M = 0.02
-"""A height further than this from its line along the bars has less say in the load's slope, from twice this on
-none."""
+"""A height further than this from its line along the bars has less say in the load's slope, from twice this
+on none."""
 COLUMNS = 8
 U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)
 _STEEPEST = 0.35
@@ -100,7 +100,7 @@ def _likely(measured: float, sigma: float) -> float:
     bent = abs(measured) / (BENT_SIGMA * np.hypot(STRAIGHT_M, sigma))
     share = min(max((bent - STRAIGHT_UP_TO) / (1 - STRAIGHT_UP_TO), 0.0), 1.0)
     shrunk = STRAIGHT_M**2 / (STRAIGHT_M**2 + sigma**2)
-    return measured * (share + (1 - share) * shrunk)
+    return float(measured * (share + (1 - share) * shrunk))
 
 
 @kernel()

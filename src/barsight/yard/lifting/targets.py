@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.footprint import BundleTable, Placement
@@ -47,7 +48,7 @@ class LiftPlan:
     vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
     stands. sides: of the piles. judged_at_ns: when, on the frames' clock; captured_ns: stamps of the first
     and last frame, None where the map is given. free: places to set down the longest and widest bundle, in
-    the order of `set_down.RULE`.
+    the order of `set_down.RULE`. events: in the yard since it was measured.
     """
 
     magnet: Magnet
@@ -60,6 +61,7 @@ class LiftPlan:
     free: tuple[FreePlace, ...]
     judged_at_ns: int
     captured_ns: tuple[int, int] | None
+    events: tuple[YardEvent, ...] = ()
 
     @property
     def looks_back(self) -> bool:
@@ -86,9 +88,10 @@ def map_vetoes(
 def plan_lifts(
     yard: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
     vetoes: tuple[Veto, ...], travel: Travel | None = None, now_ns: int = 0,
+    events: tuple[YardEvent, ...] = (),
 ) -> LiftPlan:  # fmt: skip
     """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames.
-    now_ns: when the lifts are judged, on the frames' clock.
+    now_ns: when the lifts are judged, on the frames' clock. events: in the yard since it was measured.
     """
     parts, stands = split_map(yard), dict[int, Footing]()
     for part in parts:
@@ -99,7 +102,7 @@ def plan_lifts(
     for part in parts:
         near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
         heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
-        here = LiftScene(heights, BundleTable.of(near), standing, travel, now_ns)
+        here = LiftScene(heights, BundleTable.of(near), standing, travel, now_ns, events)
         for number, group in enumerate(groups):
             if part.owns(group[0].centre_m):
                 lifts[number] = _best(group, here, magnet, settings)
@@ -126,6 +129,7 @@ def plan_lifts(
         free,
         now_ns,
         travel.captured_ns if travel else None,
+        events,
     )
 
 

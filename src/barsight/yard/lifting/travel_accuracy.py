@@ -19,6 +19,7 @@ from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_most, check_true
 
 ALONGSIDE_M = 1.0
@@ -171,8 +172,9 @@ def _encoder_checks(travel: Travel, place: Placement, most_m: float) -> list[Che
     checks = []
     if passing.any():
         worst = int(np.argmax(np.where(passing, excess, -np.inf)))
-        checks.append((worst, "beside the lift", f"encoders and map disagree by {1e3 * travel.off_m[worst]:.0f} "
-                       f"mm within {ALONGSIDE_M:g} m of it, {1e3 * most_m:.0f} mm are allowed"))  # fmt: skip
+        checks.append((worst, "beside the lift", "encoders and map disagree by "
+                       f"{1e3 * travel.off_m[worst]:.0f} mm within {ALONGSIDE_M:g} m of it, "
+                       f"{1e3 * most_m:.0f} mm are allowed"))  # fmt: skip
     checks.append((last, "at the end of the way", f"at the end of the way encoders and map disagreed by "
                    f"{1e3 * travel.off_m[last]:.0f} mm: the crane would go beside its target, "
                    f"{1e3 * most_m:.0f} mm are allowed"))  # fmt: skip
@@ -189,8 +191,8 @@ def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
     """
     return [
         check_most(
-            CODE, f"how well the trajectory knows {name} near it (95 %)", 1e3 * UPPER * float(one), 1e3 * most,
-            "mm", f"near it the trajectory knows {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
+            CODE, f"how well the trajectory knows {name} near it (95 %)", 1e3 * UPPER * float(one),
+            1e3 * most, "mm", f"near it the trajectory knows {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
             f"{1e3 * most:.0f} mm are allowed",
         )
         for name, one, most in (
@@ -199,3 +201,33 @@ def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
             ("height", sigma[2], magnet.limits.gap_m),
         )
     ]  # fmt: skip
+
+
+def target_covariance(
+    place: Placement, load: tuple[Bundle, ...], plane_sigma_m: float, travel: Travel | None
+) -> Float64:
+    """Estimate the covariance (4, 4) of a target's x, y, z (m) and yaw (rad), in the map's frame.
+
+    The bundles' own, which holds what all of the map shares (the calibration's part of the heights among it),
+    the plane's over its points, and the trajectory's near it. Of several bundles the worst counts: their
+    errors are common. NaN where a bundle doesn't know.
+    """
+    if not load:
+        return np.full((4, 4), np.nan)
+    lateral, along, yaw, top = (
+        max((getattr(b.sigma, name) for b in load), key=lambda s: np.inf if np.isnan(s) else s)
+        for name in ("lateral_m", "along_m", "yaw_rad", "top_z_m")
+    )
+    axes = np.stack([place.across, place.along], axis=1)
+    found = np.zeros((4, 4))
+    found[:2, :2] = axes @ np.diag([lateral**2, along**2]) @ axes.T
+    found[2, 2] = top**2 + plane_sigma_m**2
+    # The place turns with the load's yaw about the load's middle.
+    away = np.array([place.x_m, place.y_m]) - np.mean([b.centre_m[:2] for b in load], axis=0)
+    turn = np.array([-away[1], away[0], 0.0, 1.0])
+    found += yaw**2 * np.outer(turn, turn)
+    if travel is not None:
+        near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.reach_m
+        shared = np.median(travel.sigma_m[near], axis=0) if near.any() else np.full(3, np.nan)
+        found[:3, :3] += np.diag(shared**2)
+    return found

@@ -1,4 +1,6 @@
-"""Validity in time: ages count from the frames' capture, never from the time of computing."""
+"""Validity in time: ages count from the frames' capture, never from the time of computing; what happened in
+the yard since then forbids around it.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_least, check_most, check_true
 
 MAX_CLOCK_ERROR_NS = NS_PER_S
@@ -53,6 +58,29 @@ def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) 
             f"the last frame that saw it is {_span(age_ns)} old, {_span(max_age_ns)} are allowed",
         ),
     ]  # fmt: skip
+
+
+def disturbed_checks(
+    events: tuple[YardEvent, ...], place: Placement, magnet: Magnet, load: tuple[Bundle, ...],
+    seen: Validity | None, settings: LiftSettings,
+) -> list[Check]:  # fmt: skip
+    """Check that nothing happened within reach of magnet and load since the place was last seen."""
+    size = magnet.beam.width_m, 2 * magnet.half_span_m
+    outlines = [corners((place.x_m, place.y_m), place.yaw_rad, *size)]
+    for bundle in load:
+        x, y = bundle.centre_m[:2]
+        outlines.append(corners((x, y), bundle.yaw_rad, bundle.width_m, bundle.length_m))
+    since = [event for event in events if seen is None or event.stamp_ns > seen.from_ns]
+    checks = []
+    for event in since:
+        away = min(gap_between(outline, event.corners_m) for outline in outlines)
+        reason = (
+            f"a {event.kind} at {event.x_m:.2f}, {event.y_m:.2f} m, {away:.2f} m from it, came after it was "
+            f"last seen; {settings.disturbed_reach_m:g} m are needed: measure again"
+        )
+        what = f"distance from a {event.kind} since it was last seen"
+        checks.append(check_least("disturbed", what, away, settings.disturbed_reach_m, "m", reason))
+    return sorted(checks, key=lambda check: check.value or 0.0)[:1]
 
 
 def _span(duration_ns: int) -> str:

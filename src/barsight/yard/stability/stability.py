@@ -186,8 +186,8 @@ def footing_checks(
         checks.append(
             check_most(
                 "overhanging", "how far it stands over the edge of what carries it", mm * over, mm * limit,
-                "mm", f"it stands {mm * over:.0f} mm over the edge of what carries it, {mm * limit:.0f} mm are "
-                "allowed", sigma=mm * _sure(target.sigma.width_m / 2) if over else 0.0, sigmas=UPPER,
+                "mm", f"it stands {mm * over:.0f} mm over the edge of what carries it, {mm * limit:.0f} mm "
+                "are allowed", sigma=mm * _sure(target.sigma.width_m / 2) if over else 0.0, sigmas=UPPER,
             )
         )  # fmt: skip
     checks.append(
