@@ -38,6 +38,21 @@ MAX_HOLE_M = 0.08
 """An unseen place narrower than this is taken to hide nothing that stands."""
 
 
+@dataclass(frozen=True)
+class FacePlane:
+    """The faces' plane as it rests: height at the magnet's centre, rise along and across, sigma of height."""
+
+    centre_z_m: float
+    pitch_rad: float
+    roll_rad: float
+    sigma_m: float
+
+    @classmethod
+    def of(cls, contact: Contact) -> FacePlane:
+        """Take it from a contact."""
+        return cls(contact.centre_z_m, contact.pitch_rad, contact.roll_rad, contact.sigma_m)
+
+
 @dataclass(frozen=True, eq=False)
 class Obstacle:
     """What obstructs. code, reason: of its check. value_mm: its height, or its width where nobody saw it.
@@ -56,7 +71,8 @@ def clearance_checks(place: Placement, heights: HeightMap, magnet: Magnet, conta
 
     Limits are held with the plane's sigma in height and a cell's in place.
     """
-    obstacle = find_obstacle(place, heights, magnet, contact)
+    faces = FacePlane.of(contact)
+    obstacle = find_obstacle(place, heights, magnet, faces)
     sigma = 1e3 * contact.sigma_m
     checks = []
     for code, what, bound_mm in (
@@ -71,24 +87,24 @@ def clearance_checks(place: Placement, heights: HeightMap, magnet: Magnet, conta
                 checks.append(Check(code, what, None, sigma, bound_mm, "mm", "passed", ""))
             continue
         reason = obstacle.reason
-        if find_obstacle(place, heights, magnet, contact, careful=False) is None:
+        if find_obstacle(place, heights, magnet, faces, careful=False) is None:
             reason += "; it lies within its sigma of the limit"
         checks.append(Check(code, what, obstacle.value_mm, sigma, obstacle.bound_mm, "mm", "failed", reason))
     return checks
 
 
 def find_obstacle(
-    place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact, *, careful: bool = True
+    place: Placement, heights: HeightMap, magnet: Magnet, faces: FacePlane, *, careful: bool = True
 ) -> Obstacle | None:
     """Find what obstructs the magnet at its contact plane, or an unseen place that could.
 
     careful: what is within its sigma of a limit obstructs too.
     """
     region = _region(place, heights, magnet, EDGE_SIGMA_M if careful else 0.0)
-    slope = np.array([math.tan(contact.pitch_rad), math.tan(contact.roll_rad)])
-    plane = contact.centre_z_m + region.grid @ slope
+    slope = np.array([math.tan(faces.pitch_rad), math.tan(faces.roll_rad)])
+    plane = faces.centre_z_m + region.grid @ slope
     if careful:
-        plane = plane - contact.sigma_m
+        plane = plane - faces.sigma_m
     rise = lookup_heights(heights, region.xy_m[..., 0], region.xy_m[..., 1]) - plane
     unseen = np.isnan(rise)
     allowed = np.where(region.faces, MAX_RISE_M, max(magnet.beam.above_faces_m / 2, MAX_RISE_M))
