@@ -60,11 +60,10 @@ def test_a_micrometre_moves_a_contact_by_no_more(x_m: float) -> None:
     one, other = (set_down(heights, Placement(x_m + d, 0.0, 0.0), MAGNET, 0.003) for d in (-1e-6, 1e-6))
     assert one is not None and other is not None
     assert abs(one.centre_z_m - other.centre_z_m) < 1e-5
-    assert one.pull_low_n == pytest.approx(other.pull_low_n, rel=1e-3)
+    assert one.pull_low_n == pytest.approx(other.pull_low_n, rel=5e-3)
 
 
 def test_tiny_noise_changes_no_offer() -> None:
-    """The bundles' tops are a micrometre apart in both maps; the offers are the same."""
     stock = [laid(0.3), laid(0.62, roll_deg=11.0), laid(1.0, diameter_m=0.07)]
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
     heights, rng = map_of(stock), np.random.default_rng(5)
@@ -87,12 +86,12 @@ def test_a_load_near_its_limit_is_refused_and_says_how_near() -> None:
 def test_the_targets_covariance_turns_with_the_bars() -> None:
     along_y, along_x = record(laid(0.3)), record(laid(0.3, yaw_deg=90.0))
     sigma = along_y.sigma
-    one = target_covariance(Placement(0.3, 0.0, 0.0), (along_y,), 0.001, None)
-    other = target_covariance(Placement(0.3, 0.0, math.pi / 2), (along_x,), 0.001, None)
-    expected = [sigma.lateral_m**2, sigma.along_m**2, sigma.top_z_m**2 + 1e-6, sigma.yaw_rad**2]
+    one = target_covariance(Placement(0.3, 0.0, 0.0), (along_y,), 0.001, 0.002, None)
+    other = target_covariance(Placement(0.3, 0.0, math.pi / 2), (along_x,), 0.001, 0.002, None)
+    expected = [sigma.lateral_m**2, sigma.along_m**2, sigma.top_z_m**2 + 5e-6, sigma.yaw_rad**2]
     np.testing.assert_allclose(one, np.diag(expected), atol=1e-15)
     np.testing.assert_allclose(other, np.diag(np.array(expected)[[1, 0, 2, 3]]), atol=1e-15)
-    beside = target_covariance(Placement(0.3, 2.0, 0.0), (along_y,), 0.001, None)
+    beside = target_covariance(Placement(0.3, 2.0, 0.0), (along_y,), 0.001, 0.002, None)
     assert beside[0, 0] == pytest.approx(sigma.lateral_m**2 + (2.0 * sigma.yaw_rad) ** 2)
     assert beside[0, 3] == pytest.approx(-2.0 * sigma.yaw_rad**2)
 

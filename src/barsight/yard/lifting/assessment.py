@@ -24,7 +24,7 @@ from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip
 from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
-from barsight.yard.stability.stability import Footing, footing_checks
+from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_least, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass
@@ -137,7 +137,9 @@ def assess_placement(
         contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
         Tolerance(box.x_m * scale, box.y_m * scale, min(box.yaw_deg * scale, 20.0)),
         float(np.nan_to_num(min(ratios))), tuple(checks), valid,
-        target_covariance(place, load, contact.sigma_m, yard.travel),
+        target_covariance(
+            place, load, contact.sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
+        ),
     )  # fmt: skip
 
 
@@ -167,6 +169,18 @@ def _load(load: tuple[Bundle, ...]) -> tuple[Mass, Float64]:
     weights = np.nan_to_num([m.kg for m in masses], nan=1.0)
     centres = np.array([b.centre_m[:2] for b in load])
     return total, np.asarray(weights @ centres / weights.sum())
+
+
+def _map_sigma(heights: HeightMap, place: Placement, magnet: Magnet) -> float:
+    """Return the median of the map's own sigma along the poles' middles; NaN where nothing was seen."""
+    parts = np.linspace(-0.5, 0.5, 20)
+    v = np.concatenate([pole.along_m + parts * pole.length_m for pole in magnet.poles])
+    u = np.repeat([pole.across_m for pole in magnet.poles], parts.size)
+    xy = np.array([place.x_m, place.y_m]) + v[:, None] * place.along + u[:, None] * place.across
+    column, row, inside = nearest_cells(heights, xy[:, 0], xy[:, 1])
+    sigma = heights.sigma_m[row, column][inside]
+    seen = sigma[np.isfinite(sigma)]
+    return float(np.median(seen)) if seen.size else math.nan
 
 
 def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tuple[float, float]:

@@ -204,13 +204,14 @@ def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
 
 
 def target_covariance(
-    place: Placement, load: tuple[Bundle, ...], plane_sigma_m: float, travel: Travel | None
-) -> Float64:
+    place: Placement, load: tuple[Bundle, ...], plane_sigma_m: float, map_sigma_m: float,
+    travel: Travel | None,
+) -> Float64:  # fmt: skip
     """Estimate the covariance (4, 4) of a target's x, y, z (m) and yaw (rad), in the map's frame.
 
-    The bundles' own, which holds what all of the map shares (the calibration's part of the heights among it),
-    the plane's over its points, and the trajectory's near it. Of several bundles the worst counts: their
-    errors are common. NaN where a bundle doesn't know.
+    The bundles' own, the plane's over its points, the trajectory's near it, and the map's: only that holds
+    the calibration's part of the heights, which moves the whole map; all of it is taken as shared. Of several
+    bundles the worst counts: their errors are common. NaN where a bundle doesn't know.
     """
     if not load:
         return np.full((4, 4), np.nan)
@@ -221,7 +222,7 @@ def target_covariance(
     axes = np.stack([place.across, place.along], axis=1)
     found = np.zeros((4, 4))
     found[:2, :2] = axes @ np.diag([lateral**2, along**2]) @ axes.T
-    found[2, 2] = top**2 + plane_sigma_m**2
+    found[2, 2] = top**2 + plane_sigma_m**2 + map_sigma_m**2
     # The place turns with the load's yaw about the load's middle.
     away = np.array([place.x_m, place.y_m]) - np.mean([b.centre_m[:2] for b in load], axis=0)
     turn = np.array([-away[1], away[0], 0.0, 1.0])
