@@ -55,8 +55,8 @@ class FacePlane:
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """What obstructs. code, reason: of its check. value_mm: its height, or its width where nobody saw it.
-    bound_mm: what is allowed. places_m: (N, 2) its cells, yard axes.
+    """An obstacle to the magnet. code, reason: of its check. value_mm: its height, or its width where nobody
+    saw it. bound_mm: what is allowed. places_m: (N, 2) its cells, yard axes.
     """
 
     code: str
