@@ -48,7 +48,7 @@ def map_of(bundles: list[Laid], **changes: Any) -> HeightMap:
 
 
 def yard_of(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings = SETTINGS) -> LiftScene:
-    return LiftScene(heights, BundleTable.of(bundles), footings(heights, bundles, settings), ())
+    return LiftScene(heights, BundleTable.of(bundles), footings(heights, bundles, settings))
 
 
 def judged(

@@ -125,6 +125,8 @@ def summary() -> dict[str, Any]:
         "is_simulated": True,
         "recording": {"path": "yards/<north> & south", "format": "euroc"},
         "reference": "yard",
+        "calibration_id": "ca1b",
+        "yard_frame_id": "f00d",
         "hashes": {"calibration": "ca1b", "configuration": "c0f1", "inputs": {"cam0/data.csv": "1a2b"}},
         "configuration": {"stereo": {"method": "sgbm", "min_disparity_px": None}},
         "sensors_used": ["stereo", "crane"],

@@ -88,8 +88,9 @@ def test_the_page_names_the_key_figures(page: Page) -> None:
         assert text in page.text
     assert "frames-refused" in page.text
     assert "cam1: <png> is cut short" in page.text
-    assert "smooth.median_mm" in page.text
-    assert "6.25" in page.text
+    assert "Against the truth" in page.text and "median / mm" in page.text
+    assert "smooth.median_mm" not in page.text
+    assert "6.2" in page.text and "97.0" in page.text
 
 
 def test_every_address_is_in_the_page_itself(page: Page, html: str) -> None:

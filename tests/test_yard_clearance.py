@@ -74,7 +74,7 @@ def test_unseen_is_an_obstacle_unless_lines_of_sight_pass_there(
 
 
 def test_an_unseen_face_needs_free_space_down_to_its_plane() -> None:
-    place = (0.2, 0.4), (1.05, 1.15)
+    place = (0.2, 0.4), (1.07, 1.15)
     assert "unknown-under-footprint" in found(with_block(*place, None, TOP_M + 0.05))
     assert found(with_block(*place, None, TOP_M)) == set()
 

@@ -15,59 +15,13 @@ from barsight.cli.main import run
 from barsight.core.stamps import NS_PER_S
 from barsight.mapping.settings import MapSettings
 from barsight.report.orthophoto import orthophoto, write_orthophoto
-from barsight.result_folder import read_heights
+from barsight.result_folder import open_folder, read_heights
 from barsight.viewer.yard_lines import yard_lines
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.lifting.lift_file import read_lifts
-from barsight.yard.lifting.magnet import example_magnet
-from barsight.yard.lifting.travel_accuracy import Travel
-from lift_yards import laid, map_of, record
+from lift_yards import map_of
 from mapping_views import block, fused, view
-from result_folders import summary
-
-STOCK = [laid(0.3), laid(0.65)]
-
-
-def lifts(folder: Path, *arguments: str) -> int:
-    """Choose lifts for the package's example magnet, given as a file."""
-    magnet = folder.parent / "magnet.toml"
-    magnet.write_text(example_magnet(), encoding="utf-8")
-    return run(["lifts", str(folder), "--magnet", str(magnet), *arguments])
-
-
-def write_folder(folder: Path, *, shift_m: float = 0.0, age_s: float = 0.0, **changes: object) -> Path:
-    """What measure leaves of a small yard, as far as lifts need it."""
-    folder.mkdir()
-    stock = [laid(0.3 + shift_m), laid(0.65)]
-    heights = map_of(stock)
-    bands = np.stack([heights.z_m, heights.sigma_m, heights.views, heights.source.astype(np.float32)])
-    top = heights.y0_m + (heights.z_m.shape[0] - 0.5) * heights.cell_m
-    tifffile.imwrite(
-        folder / "height.tif", np.ascontiguousarray(bands[:, ::-1]), photometric="minisblack",
-        planarconfig="separate", tile=(256, 256), metadata=None,
-        extratags=[
-            (33550, "d", 3, (heights.cell_m, heights.cell_m, 0.0), True),
-            (33922, "d", 6, (0.0, 0.0, 0.0, heights.x0_m - heights.cell_m / 2, top, 0.0), True),
-        ],
-    )  # fmt: skip
-    photo = np.full(heights.z_m.shape, 90, np.uint8)
-    (folder / "ortho.png").write_bytes(cv2.imencode(".png", photo)[1].tobytes())
-    bundles = tuple(record(one, k) for k, one in enumerate(stock))
-    write_bundles(bundles, None, "yard", folder / "bundles.json")
-    stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)
-    way = Travel(
-        np.zeros((3, 2)),
-        np.full((3, 3), 0.001),
-        np.zeros(3),
-        np.empty((0, 2)),
-        5.0,
-        stamps,
-        np.ones(len(stamps), bool),
-        3.0,
-    )
-    content = summary() | {"agreement": [], "travel": way.content()} | changes
-    (folder / "result.json").write_text(json.dumps(content), encoding="utf-8")
-    return folder
+from yard_folders import STOCK, lifts, write_folder
 
 
 def test_heights_come_back_as_they_were(tmp_path: Path) -> None:
@@ -154,7 +108,9 @@ def test_a_bundle_is_fetched_by_name_or_said_why_not(
 
 def test_an_empty_yard_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "out")
-    write_bundles((), None, "yard", folder / "bundles.json")
+    _, identity = open_folder(folder)
+    assert identity is not None
+    write_bundles((), None, "yard", identity, folder / "bundles.json")
     assert lifts(folder) == 0
     assert "no lift is offered: no bundle was found" in capsys.readouterr().err
 

@@ -19,6 +19,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.identity import GIVEN
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.contact import set_down
 from barsight.yard.lifting.footprint import BundleTable, Placement, count_gripped
@@ -394,13 +395,13 @@ def test_the_file_fits_its_schema_and_comes_back(tmp_path: Path) -> None:
     stock = [laid(0.3), laid(0.62)]
     bundles = (record(stock[0], 0), record(stock[1], 1, ends_open=(True, False)))
     plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, ())
-    content = lifts_content(plan, "yard")
-    jsonschema.validate(content, schema())
+    content = lifts_content(plan, "yard", GIVEN, "0")
+    jsonschema.validate(content | {"content_sha256": ""}, schema())
     assert content["magnet"]["name"].startswith("example")
     assert [lift["rank"] for lift in content["lifts"]] == [1]
     assert content["refused"][0]["vetoes"][0]["code"] == "end-open"
-    write_lifts(plan, "yard", tmp_path / "lifts.json")
-    assert read_lifts(tmp_path / "lifts.json") == json.loads(json.dumps(content))
+    digest = write_lifts(plan, "yard", GIVEN, "0", tmp_path / "lifts.json")
+    assert read_lifts(tmp_path / "lifts.json") == json.loads(json.dumps(content)) | {"content_sha256": digest}
 
 
 def test_an_unknown_code_is_no_veto() -> None:

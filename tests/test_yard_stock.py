@@ -12,6 +12,7 @@ import pytest
 from barsight.core.errors import InputError
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.identity import GIVEN
 from barsight.yard.inventory.bundle_file import read_bundles, read_match, schema, write_bundles
 from barsight.yard.inventory.stock_list import (
     ListedBundle,
@@ -125,7 +126,7 @@ def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:
 def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ...], tmp_path: Path) -> None:
     path = tmp_path / "bundles.json"
     match = match_stock((ListedBundle("gone", 9.0, 0.0),), bundles)
-    write_bundles(bundles, match, "yard", path)
+    write_bundles(bundles, match, "yard", GIVEN, path)
     content = json.loads(path.read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema())
     jsonschema.validate(content, schema())
@@ -141,7 +142,7 @@ def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ..
 
 
 def test_no_bundles_make_a_valid_file(tmp_path: Path) -> None:
-    write_bundles((), None, "world", tmp_path / "bundles.json")
+    write_bundles((), None, "world", GIVEN, tmp_path / "bundles.json")
     content = json.loads((tmp_path / "bundles.json").read_text(encoding="utf-8"))
     jsonschema.validate(content, schema())
     assert read_bundles(tmp_path / "bundles.json") == ()

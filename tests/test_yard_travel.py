@@ -7,7 +7,8 @@ import numpy as np
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
 from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.travel_accuracy import Travel, travel_vetoes
+from barsight.yard.lifting.travel_accuracy import Travel, travel_checks
+from barsight.yard.vetoes import vetoes_of
 from lift_yards import MAGNET, SETTINGS
 
 CAMERA = RectifiedCamera(1250.0, 320.0, 256.0, 0.5, 0.0, 640, 512)
@@ -45,7 +46,7 @@ def encoders(
 
 
 def reasons(one: Travel, place: Placement) -> list[str]:
-    vetoes = travel_vetoes(one, place, MAGNET, SETTINGS)
+    vetoes = vetoes_of(travel_checks(one, place, MAGNET, SETTINGS))
     assert {veto.code for veto in vetoes} <= {"trajectory-degraded"}
     return [veto.reason for veto in vetoes]
 

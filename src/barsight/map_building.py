@@ -14,6 +14,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
 from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
 from barsight.core.errors import Failed, InputError, MeasurementError
+from barsight.core.json_values import json_digest
 from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
 from barsight.core.parallel import prefetched_map
@@ -34,7 +35,7 @@ from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Preview, Refusal, json_digest, to_json
+from barsight.measurement import Preview, Refusal, to_json
 from barsight.motion.rig_check.self_calibration import self_calibrate
 from barsight.motion.settings import make_estimator
 from barsight.recording.base import Recording

@@ -17,6 +17,7 @@ from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report
 from barsight.report.result_files import RESULT_FILES, summary, write_results, write_summary, write_surface
+from barsight.result_folder import seal_map
 from barsight.yard.lifting.magnet import load_magnet
 
 
@@ -77,7 +78,7 @@ def write_measured(
         with in_background(lambda: write_surface(mapped.surface, mapped.built.free, staging)):
             measured = find_lifts(mapped, described, judged_at)
         content = summary(measured)
-        write_results(measured, staging)
+        write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)
         if truth_of is not None:
             content["truth"] = score_folder(truth_of, staging)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,7 +52,8 @@ class Preview:
 class Measurement:
     """A measured recording; `surface` reads its tiles from a scratch folder that must still be there.
 
-    seconds: by the clock on the wall; the stages' own seconds overlap.
+    seconds: by the clock on the wall; the stages' own seconds overlap. yard_frame_id: digest of how the body
+    hangs from the crane; None where the map isn't in the yard's frame.
     """
 
     recording_path: Path
@@ -82,6 +81,7 @@ class Measurement:
     lifts: LiftPlan
     stock: StockMatch | None
     travel: Travel
+    yard_frame_id: str | None
 
 
 def to_json(value: Any) -> Any:
@@ -93,8 +93,3 @@ def to_json(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return str(value) if isinstance(value, Path) else value
-
-
-def json_digest(value: Any) -> str:
-    """Compute SHA-256 of a JSON value, whatever the order of its keys."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -15,10 +15,11 @@ from typing import Literal
 import numpy as np
 
 from barsight.core.errors import Failed, MeasurementError
+from barsight.core.json_values import json_digest
 from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import Agreement, Contour, LaserProfile, Trajectory
+from barsight.core.types import Agreement, Contour, CraneSamples, LaserProfile, Trajectory
 from barsight.map_building import Advance, BuiltMap, ProbedRecording, Way, build_map, follow, probe
 from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.surface.contours import cut_contours
@@ -26,9 +27,10 @@ from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Measurement, StageTime, json_digest, to_json
+from barsight.measurement import Measurement, StageTime, to_json
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.identity import ID_DIGITS
 from barsight.yard.inventory.stock_list import (
     ListedBundle,
     StockMatch,
@@ -152,7 +154,16 @@ def find_lifts(
         lifts=lifts,
         stock=stock,
         travel=travel,
+        yard_frame_id=_yard_frame_id(source.crane(), trajectory),
     )
+
+
+def _yard_frame_id(crane: CraneSamples | None, trajectory: Trajectory) -> str | None:
+    """Compute a digest of how the body hangs from the crane, by which the map lies in the yard."""
+    if crane is None or trajectory.reference != "yard":
+        return None
+    hung = {"crane_to_body_m": crane.crane_to_body_m, "yard_from_body": crane.yard_from_body_nominal}
+    return json_digest(to_json(hung))[:ID_DIGITS]
 
 
 def _elect(
@@ -256,7 +267,14 @@ def _lifts(
     )
     listed = {} if stock is None else contradicted_bundles(stock)
     return plan_lifts(
-        heights, bundles, magnet or load_magnet(None), settings, forbidden, travel, now_ns, listed
+        heights,
+        bundles,
+        magnet or load_magnet(None),
+        settings,
+        forbidden,
+        travel,
+        now_ns,
+        contradicted=listed,
     )
 
 

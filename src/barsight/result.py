@@ -16,7 +16,7 @@ from barsight.core.files import atomic_directory
 from barsight.core.types import Contour
 from barsight.report.page import write_report
 from barsight.report.result_files import RESULT_FILES
-from barsight.result_folder import CameraPath, read_contours, read_heights, read_path, read_summary
+from barsight.result_folder import CameraPath, open_folder, read_contours, read_heights, read_path
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle, HeightMap
@@ -66,7 +66,7 @@ class Yard:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.summary = read_summary(folder)
+        self.summary, _ = open_folder(folder)
         self._kept: object = None
 
     def keep(self, owner: object) -> None:

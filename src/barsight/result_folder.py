@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +14,24 @@ from numpy.typing import NDArray
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
+from barsight.core.json_values import json_digest
 from barsight.core.ply import read_vertices
+from barsight.core.sealed_json import SEAL, read_sealed
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
+from barsight.yard.identity import ID_DIGITS, MapIdentity
+from barsight.yard.inventory import bundle_file
+from barsight.yard.lifting import lift_file
+from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap
 
+MAP_FILES = ("height.tif", "free.tif", "cloud.ply")
+MAP_FIELDS = (
+    "captured_from_ns", "captured_to_ns", "is_simulated", "reference", "hashes", "calibration_id",
+    "yard_frame_id", "travel", "warnings", "map", "files",
+)  # fmt: skip
+"""What of result.json the map's lifts depend on."""
 PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")
 
 
@@ -57,6 +70,92 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if not isinstance(summary, dict):
         raise InputError(path, "is not a JSON object", REMEDY)
     return summary
+
+
+def identify_map(summary: dict[str, Any]) -> MapIdentity:
+    """Build the identity of the map that result.json describes; its id is a digest of MAP_FIELDS."""
+    said = {name: summary.get(name) for name in MAP_FIELDS}
+    return MapIdentity(
+        json_digest(said)[:ID_DIGITS], bool(summary.get("is_simulated")), said["captured_from_ns"],
+        said["captured_to_ns"], str(said["calibration_id"]), said["yard_frame_id"],
+        str((said["files"] or {}).get("height.tif")),
+    )  # fmt: skip
+
+
+def seal_map(summary: dict[str, Any], folder: Path) -> MapIdentity:
+    """Add to result.json's content the digests of the map's files, and the map's id."""
+    files = (folder / name for name in MAP_FILES)
+    summary["files"] = {path.name: file_digest(path) for path in files if path.is_file()}
+    identity = identify_map(summary)
+    summary["map_id"] = identity.map_id
+    return identity
+
+
+def file_digest(path: Path) -> str:
+    """Compute SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def open_folder(
+    folder: Path, *, lifts: bool = True, cloud: bool = False
+) -> tuple[dict[str, Any], MapIdentity | None]:
+    """Read result.json and check that the folder's files are the map's and unchanged; None for the identity
+    of a folder that holds neither bundles nor lifts.
+
+    lifts, cloud: whether lifts.json and cloud.ply matter. Raises InputError for the first file that was
+    changed or belongs to another map.
+    """
+    summary = read_summary(folder)
+    path = folder / "result.json"
+    bundles, chosen = folder / "bundles.json", folder / "lifts.json"
+    if "map_id" not in summary:
+        if bundles.is_file() or chosen.is_file():
+            raise InputError(path, "has no map_id: an earlier version wrote it", REMEDY)
+        return summary, None
+    identity = identify_map(summary)
+    if identity.map_id != summary["map_id"]:
+        raise InputError(path, "was changed after it was written", REMEDY)
+    for name, digest in summary["files"].items():
+        file = folder / name
+        if file.is_file() and (cloud or name != "cloud.ply") and file_digest(file) != digest:
+            raise InputError(file, "is not the one that result.json was written with", REMEDY)
+    if bundles.is_file():
+        found = read_sealed(bundles, bundle_file.SCHEMA_VERSION, REMEDY)
+        identity.expect(bundles, found, REMEDY)
+        if lifts and chosen.is_file():
+            content = read_lifts(chosen)
+            identity.expect(chosen, content, lift_file.REMEDY)
+            if content["bundles_sha256"] != found[SEAL]:
+                raise InputError(chosen, "was chosen from another bundles.json", lift_file.REMEDY)
+    return summary, identity
+
+
+def bundles_digest(folder: Path) -> str:
+    """Return the digest that bundles.json carries. Raises InputError."""
+    return str(read_sealed(folder / "bundles.json", bundle_file.SCHEMA_VERSION, REMEDY)[SEAL])
+
+
+def next_sequence(lifts: Path, identity: MapIdentity) -> int:
+    """Count on from the lifts.json that is there; 1 where there is none of this map."""
+    try:
+        found = read_lifts(lifts)
+    except InputError:
+        return 1
+    return int(found["sequence"]) + 1 if found["map_id"] == identity.map_id else 1
+
+
+def changed_inputs(summary: dict[str, Any]) -> str:
+    """Find a calibration file of the recording that is no longer the one that was measured with; empty where
+    none is, or the recording isn't there any more.
+    """
+    recording = Path((summary.get("recording") or {}).get("path") or "")
+    for name, digest in ((summary.get("hashes") or {}).get("inputs") or {}).items():
+        for root in (recording, recording / "mav0"):
+            file = root / name
+            if file.suffix in (".yaml", ".yml") and file.is_file() and file_digest(file) != digest:
+                return str(file)
+    return ""
 
 
 def read_heights(folder: Path) -> PartedMap:

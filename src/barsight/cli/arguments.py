@@ -12,6 +12,8 @@ from barsight.core.settings.file import read_settings
 from barsight.core.settings.renamed import refuse_old_flags
 
 Settings = TypeVar("Settings")
+LISTS = ("--use", "--lifted")
+"""Flags whose values may be told apart by commas."""
 
 
 def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> None:
@@ -21,13 +23,13 @@ def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> N
 
 
 def _listed(arguments: Sequence[str]) -> list[str]:
-    """Rewrite `--use stereo,imu` as `--use stereo imu`."""
+    """Rewrite `--use stereo,imu` as `--use stereo imu`; the same for the other LISTS."""
     listed: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")
-        if flag == "--use" and equals:
+        if flag in LISTS and equals:
             listed += [flag, *value.split(",")]
-        elif listed and listed[-1] == "--use":
+        elif listed and listed[-1] in LISTS:
             listed += argument.split(",")
         else:
             listed.append(argument)

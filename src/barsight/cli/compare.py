@@ -17,7 +17,7 @@ from barsight.cli.arguments import call
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import json_value
-from barsight.result_folder import read_heights, read_summary
+from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.inventory.changes import Change, compare_yards
 
@@ -39,7 +39,7 @@ def run(arguments: Sequence[str]) -> None:
             json: JSON file for all figures.
         """
         for folder in (old, new):
-            reference = read_summary(folder).get("reference")
+            reference = open_folder(folder, lifts=False)[0].get("reference")
             if reference != "yard":
                 raise MeasurementError(
                     f"{folder}: is in the {reference} frame; only maps with a crane's place can be compared"

@@ -15,9 +15,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from barsight.cli.arguments import call, config_path, load_settings
-from barsight.core.errors import Failed, InputError
+from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.geotiff import REMEDY
 from barsight.report.page import write_report
-from barsight.result_folder import read_heights, read_summary
+from barsight.result_folder import (
+    bundles_digest,
+    changed_inputs,
+    next_sequence,
+    open_folder,
+    read_heights,
+)
+from barsight.yard.events import YardEvent, lift_of, merged, read_events, write_events
 from barsight.yard.inventory.bundle_file import read_bundles, read_match
 from barsight.yard.inventory.stock_list import contradicted_bundles
 from barsight.yard.lift_settings import LiftSettings
@@ -26,9 +34,10 @@ from barsight.yard.lifting.magnet import load_magnet
 from barsight.yard.lifting.order import LiftOrder, order_lifts
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Veto
 
-REMEDY = "fetch another one, or measure again once its cause is gone"
+FETCH_REMEDY = "fetch another one, or measure again once its cause is gone"
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -42,6 +51,8 @@ def run(arguments: Sequence[str]) -> None:
         config: Path | None = None,
         at: Literal["now", "end"] = "now",
         fetch: int | None = None,
+        lifted: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID[,ID...]")] = (),
+        events: Path | None = None,
     ) -> None:
         """Choose lift targets anew from a measured yard, without measuring again.
 
@@ -52,11 +63,18 @@ def run(arguments: Sequence[str]) -> None:
             magnet: TOML file of the magnet (docs/how-to/describe-a-magnet.md). Without it nothing is offered.
             settings: What a lift must fulfil.
             config: TOML file with settings; flags go before it.
+            lifted: Bundles that were lifted since the yard was measured: what is near them is refused. Kept
+                in OUT/events.csv, which counts from then on.
+            events: CSV of what else was lifted, set down or passed by a magnet since; kept in the same file.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             fetch: Id of a bundle: also print the lifts that dig it out, in order.
         """
         described = load_magnet(magnet)
-        summary = read_summary(out)
+        summary, identity = open_folder(out, lifts=False)
+        bundles = read_bundles(out / "bundles.json")
+        if identity is None:
+            raise InputError(out / "result.json", "has no map_id: an earlier version wrote it", REMEDY)
+        happened = _events(out, bundles, lifted, events)
         warnings = [(str(w.get("code")), str(w.get("message"))) for w in summary.get("warnings") or []]
         reference = str(summary.get("reference", "world"))
         travel = Travel.read(summary)
@@ -68,18 +86,34 @@ def run(arguments: Sequence[str]) -> None:
         if travel is None:
             unknown = "result.json doesn't say how sure the trajectory is: measure again"
             vetoes = (*vetoes, Veto("trajectory-degraded", unknown))
-        bundles = read_bundles(out / "bundles.json")
+        changed = changed_inputs(summary)
+        if changed:
+            vetoes = (*vetoes, Veto("calibration-changed", f"{changed} was changed since: measure again"))
         stock = read_match(out / "bundles.json")
         listed = {} if stock is None else contradicted_bundles(stock)
         heights, console = read_heights(out), Console(stderr=True)
-        plan = plan_lifts(heights, bundles, described, settings, vetoes, travel, now_ns, listed)
+        plan = plan_lifts(
+            heights,
+            bundles,
+            described,
+            settings,
+            vetoes,
+            travel,
+            now_ns,
+            events=happened,
+            contradicted=listed,
+        )
         order = None if fetch is None else order_lifts(fetch, heights, bundles, plan)
         found = None if isinstance(order, Failed) else order
-        write_lifts(plan, reference, out / "lifts.json", found)
+        target = out / "lifts.json"
+        digest, sequence = bundles_digest(out), next_sequence(target, identity)
+        write_lifts(plan, reference, identity, digest, target, sequence, found)
+        if happened:
+            write_events(happened, out / "events.csv")
         write_report(out, out / "report.html")
         print_lifts(plan, console)
         if isinstance(order, Failed):
-            raise InputError(out, f"bundle {fetch} can't be fetched: {order.reason}", REMEDY)
+            raise InputError(out, f"bundle {fetch} can't be fetched: {order.reason}", FETCH_REMEDY)
         if order is not None:
             print_order(order, console)
 
@@ -99,6 +133,22 @@ def print_order(order: LiftOrder, console: Console) -> None:
         )  # fmt: skip
     console.print(table)
     console.print("Measure again after every lift: the next one is a plan, not an offer.", highlight=False)
+
+
+def _events(
+    out: Path, bundles: tuple[Bundle, ...], ids: tuple[int, ...], file: Path | None
+) -> tuple[YardEvent, ...]:
+    """Gather what OUT/events.csv, a file and the ids of lifted bundles tell."""
+    by_id = {bundle.id: bundle for bundle in bundles}
+    missing = [number for number in ids if number not in by_id]
+    if missing:
+        raise ConfigError(
+            f"--lifted {missing[0]}: {out / 'bundles.json'} has no such bundle; it has {len(by_id)}, from 0"
+        )
+    kept = out / "events.csv"
+    known = read_events(kept) if kept.is_file() else ()
+    told = read_events(file) if file is not None else ()
+    return merged(known, (*told, *(lift_of(by_id[number], time.time_ns()) for number in ids)))
 
 
 def print_lifts(plan: LiftPlan, console: Console) -> None:

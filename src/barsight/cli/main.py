@@ -16,6 +16,7 @@ COMMANDS = {
     "demo": "Simulate a small yard, measure it and compare with truth and laser: try this first",
     "measure": "Measure a stereo recording: map, contours, trajectory, cloud, report",
     "lifts": "Choose lift targets anew from a measured yard, for another magnet",
+    "explain": "Tell why a lift is offered or refused: every check, and a picture of the place",
     "compare": "Compare two measured yards: moved, settled, taken, added",
     "view": "Show a measured yard in 3D in the browser",
     "info": "Say what is in a recording: sensors, rates, gaps, calibration",

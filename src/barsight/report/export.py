@@ -15,7 +15,7 @@ import numpy as np
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
-from barsight.result_folder import Cloud, read_cloud
+from barsight.result_folder import Cloud, open_folder, read_cloud
 
 _LAS_STEP_M = 1e-4
 
@@ -25,8 +25,11 @@ def export(folder: Path, target: Path) -> int:
 
     .ply and .tif are the folder's own files, .csv needs nothing else, the others the extra `export`. Raises
     ConfigError for another suffix or without the extra, InputError where the folder lacks the file,
-    OutputError where `target` can't be written.
+    or has
+    a file that was changed, OutputError where `target` can't be written.
     """
+    if (folder / "result.json").is_file():
+        open_folder(folder, lifts=False, cloud=True)
     kind = target.suffix.lower()
     copies = {".ply": "cloud.ply", ".tif": "height.tif", ".tiff": "height.tif"}
     if kind in copies:

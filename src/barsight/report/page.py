@@ -21,9 +21,15 @@ from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_trajectory import path_plots
 from barsight.report.page_yard import yard_part
 from barsight.report.plots import Plot, contour_plot, histogram_plot, limits_plot, pair_with_laser
-from barsight.result_folder import read_contours, read_laser, read_path, read_summary
+from barsight.result_folder import open_folder, read_contours, read_laser, read_path
 
 NONE = "–"
+TRUTH_HEADS = {
+    "samples": "samples", "coverage_pct": "coverage / %", "bias_mm": "bias / mm", "median_mm": "median / mm",
+    "mae_mm": "MAE / mm", "p95_mm": "P95 / mm", "max_mm": "max / mm",
+    "within_95_pct": "within the stated 95 % / %",
+}  # fmt: skip
+"""Figures against the truth, in words."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ def write_summary_page(
 
 def render_page(out_dir: Path) -> str:
     """Render the page's HTML; see `write_report`."""
-    result = read_summary(out_dir)
+    result, _ = open_folder(out_dir)
     laser = read_laser(out_dir)
     compared = pair_with_laser(read_contours(out_dir), laser)
     path = read_path(out_dir)
@@ -100,7 +106,7 @@ def render_page(out_dir: Path) -> str:
         stages=_stages(result),
         refused_by_stage=_refused_by_stage(result),
         configuration=list(flatten(result.get("configuration") or {})),
-        truth=list(flatten(result.get("truth") or {})),
+        truth=_truth_table(result.get("truth") or {}),
         preview=preview_uri(out_dir / "preview.png"),
         plotly_js=get_plotlyjs(),
         css=resource("page.css"),
@@ -177,6 +183,16 @@ def flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]
             yield from flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", format_value(value)
+
+
+def _truth_table(truth: dict[str, dict[str, float]]) -> dict[str, Any]:
+    """Arrange the figures against the truth: a row for each kind of place, a column for each figure."""
+    kept = {key: head for key, head in TRUTH_HEADS.items() if any(key in row for row in truth.values())}
+    rows = [
+        (place, [format_number(figures.get(key), int(key != "samples")) for key in kept])
+        for place, figures in truth.items()
+    ]
+    return {"heads": tuple(kept.values()), "rows": rows} if rows else {}
 
 
 def _stages(result: dict[str, Any]) -> list[dict[str, Any]]:

@@ -22,13 +22,14 @@ from barsight.mapping.free_space import UNPROVEN, FreeSpace
 from barsight.mapping.surface.surface import Layers, Surface
 from barsight.measurement import Measurement, Preview
 from barsight.report.orthophoto import georeference, write_orthophoto
+from barsight.yard.identity import ID_DIGITS, MapIdentity
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.lifting.lift_file import write_lifts
 
 SCHEMA_VERSION = 1
 RESULT_FILES = (
     "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "contour.csv", "laser.csv", "bundles.json",
-    "lifts.json", "ortho.tif", "ortho.png", "preview.png", "result.json", "report.html",
+    "lifts.json", "events.csv", "ortho.tif", "ortho.png", "preview.png", "result.json", "report.html",
 )  # fmt: skip
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
@@ -46,13 +47,14 @@ def write_surface(surface: Surface, free: FreeSpace, folder: Path) -> None:
     write_cloud(surface, folder / "cloud.ply")
 
 
-def write_results(measurement: Measurement, folder: Path) -> None:
+def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
     """Write all other files that a measurement fills but result.json, into an existing folder."""
     write_trajectory(measurement.trajectory, folder / "trajectory.tum")
     write_contours(measurement.contours, folder / "contour.csv")
     reference = measurement.trajectory.reference
-    write_bundles(measurement.bundles, measurement.stock, reference, folder / "bundles.json")
-    write_lifts(measurement.lifts, reference, folder / "lifts.json")
+    path = folder / "bundles.json"
+    digest = write_bundles(measurement.bundles, measurement.stock, reference, identity, path)
+    write_lifts(measurement.lifts, reference, identity, digest, folder / "lifts.json")
     if measurement.laser:
         write_laser(measurement.laser, folder / "laser.csv")
     if measurement.preview is not None:
@@ -247,6 +249,8 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "captured_from_ns": captured[0] if captured else None,
         "captured_to_ns": captured[1] if captured else None,
         "is_simulated": measurement.is_simulated,
+        "calibration_id": measurement.calibration_hash[:ID_DIGITS],
+        "yard_frame_id": measurement.yard_frame_id,
         "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
         "reference": trajectory.reference,
         "hashes": {

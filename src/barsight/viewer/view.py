@@ -20,12 +20,12 @@ from barsight.core.types import Contour, LaserProfile
 from barsight.result_folder import (
     CameraPath,
     Cloud,
+    open_folder,
     read_cloud,
     read_contours,
     read_heights,
     read_laser,
     read_path,
-    read_summary,
 )
 from barsight.viewer.cloud import Layer, colour_layer, seen_layer, surface_layer
 from barsight.viewer.yard_lines import yard_lines
@@ -60,7 +60,7 @@ def view(out_dir: Path, port: int = 8080, open_browser: bool = True, max_points:
 @contextlib.contextmanager
 def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[str]:
     """Serve the folder to this machine's browsers as long as the context is open; yields the URL."""
-    summary = read_summary(out_dir)
+    summary, _ = open_folder(out_dir, cloud=True)
     cloud = read_cloud(out_dir / "cloud.ply", max_points)
     path, laser, contours = read_path(out_dir), read_laser(out_dir), read_contours(out_dir)
     yard = yard_lines(out_dir)

@@ -27,6 +27,8 @@ class LiftSettings:
     """Of the frames that see the place of the lift."""
     max_age_s: float = 600.0
     """A place that was last seen longer ago than this is not lifted from."""
+    disturbed_reach_m: float = 1.0
+    """A lift, set-down or magnet since a place was last seen, nearer than this to its lift, forbids that."""
     max_overhang_ratio: float = 0.25
     """Of its width that a bundle may stand over the edge of what carries it."""
     max_lean_deg: float = 5.0
@@ -61,6 +63,8 @@ class LiftSettings:
             raise ConfigError("lift shares, min_confidence and min_count_probability lie in 0...1")
         if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
             raise ConfigError("lift contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
+        if not 0 <= self.disturbed_reach_m <= 100:
+            raise ConfigError(f"lift disturbed_reach_m must lie in 0...100, not {self.disturbed_reach_m}")
         if min(self.set_down_clear_m, self.travel_clear_m, self.swing_m) <= 0:
             raise ConfigError("lift set_down_clear_m, travel_clear_m and swing_m must be over 0")
         if not 0 <= self.dunnage_m <= 0.5:

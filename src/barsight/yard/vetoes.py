@@ -1,13 +1,18 @@
-"""Define all reasons not to lift: one table of codes, and the record that carries one with its figures."""
+"""Define all reasons not to lift: one table of codes, the checks that find them, the vetoes that say them."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 VETOES = {
     "no-magnet": "No magnet was described: what is only assumed forbids every lift.",
     "map-too-old": "The place was last seen longer ago than the settings allow, or nobody knows when.",
+    "disturbed": "A lift, a set-down or a magnet came near after the place was last seen.",
     "map-from-the-future": "The last frame is ahead of this computer's clock: ages can't be told.",
+    "calibration-changed": "The calibration that the map was measured with was changed since.",
     "calibration-drift": "The cameras' calibration doesn't fit the pictures any more.",
     "trajectory-degraded": "Trajectory or encoders aren't as sure as the magnet needs, near it or at all.",
     "units-doubtful": "A sensor's numbers are of a size that can't be: a wrong unit.",
@@ -50,3 +55,74 @@ class Veto:
     def __post_init__(self) -> None:
         if self.code not in VETOES:
             raise ValueError(f"{self.code!r} is no veto")
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check of a placement. code: the veto that it is where it isn't passed.
+
+    what: is checked, in words. value: what was found, with sigma, bound: what it is held against, all in
+    `unit`; None where there is none. result: unknown forbids as failed does. reason: a sentence with the
+    figures, empty where passed.
+    """
+
+    code: str
+    what: str
+    value: float | None
+    sigma: float | None
+    bound: float | None
+    unit: str
+    result: Literal["passed", "failed", "unknown"]
+    reason: str
+
+    def __post_init__(self) -> None:
+        if self.code not in VETOES:
+            raise ValueError(f"{self.code!r} is no veto")
+
+
+def vetoes_of(checks: Iterable[Check]) -> tuple[Veto, ...]:
+    """Derive the vetoes: every check that isn't passed."""
+    return tuple(Veto(check.code, check.reason) for check in checks if check.result != "passed")
+
+
+def check_most(
+    code: str, what: str, value: float, bound: float, unit: str, reason: str, *, sigma: float = 0.0,
+    sigmas: float = 1.0,
+) -> Check:  # fmt: skip
+    """Check that a value and `sigmas` times its sigma above it are within an upper bound."""
+    return _checked(code, what, value, bound, unit, reason, sigma, sigmas, value, bound)
+
+
+def check_least(
+    code: str, what: str, value: float, bound: float, unit: str, reason: str, *, sigma: float = 0.0,
+    sigmas: float = 1.0,
+) -> Check:  # fmt: skip
+    """Check that a value and `sigmas` times its sigma below it are within a lower bound."""
+    return _checked(code, what, value, bound, unit, reason, sigma, sigmas, -value, -bound)
+
+
+def check_true(code: str, what: str, holds: bool | None, reason: str) -> Check:
+    """Check what is so or not; None where nobody knows."""
+    result: Literal["passed", "failed", "unknown"]
+    result = "unknown" if holds is None else "passed" if holds else "failed"
+    return Check(code, what, None, None, None, "", result, "" if holds else reason)
+
+
+def _checked(
+    code: str, what: str, value: float, bound: float, unit: str, reason: str, sigma: float, sigmas: float,
+    figure: float, most: float,
+) -> Check:  # fmt: skip
+    """Judge `figure`, which may not be over `most`; a NaN is unknown."""
+    found, spread, limit = (float(x) if math.isfinite(x) else None for x in (value, sigma, bound))
+
+    def check(result: Literal["passed", "failed", "unknown"], said: str) -> Check:
+        return Check(code, what, found, spread, limit, unit, result, said)
+
+    if math.isnan(figure) or math.isnan(most) or math.isnan(sigma):
+        return check("unknown", reason)
+    if figure + sigmas * sigma <= most:
+        return check("passed", "")
+    if figure <= most:
+        times = "its sigma" if sigmas == 1 else f"{sigmas:.3g} times its sigma"
+        reason = f"{reason}; the figure lies within {times} of the limit"
+    return check("failed", reason)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ ALBEDO = {"bar": 0.27, "strap": 0.13, "tag": 0.75, "beam": 0.36, "wall": 0.45, "
 CELLS_M = (0.09, 0.5)
 CELL_M, MARGIN_M = 0.01, 0.6
 WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
-"""Noise of `noisy_scene`: of each cell, and alike over cells."""
+"""Noise of `noisy_world`: of each cell, and alike over cells."""
 ASIDE_M = 1.3
 """How far beside a yard the trolley travels that is to hide a part of it."""
 
@@ -75,7 +75,15 @@ def render_world(world: DrawnWorld, recording: Path) -> None:
     simulate(recording, recording_settings(world), scene=scene)
 
 
-def measured_scene(out: Path, settings: LiftSettings) -> LiftScene:
+@dataclass(frozen=True, eq=False)
+class MappedWorld:
+    """All that lifts are chosen from. vetoes: those that hold for the whole map."""
+
+    scene: LiftScene
+    vetoes: tuple[Veto, ...]
+
+
+def measured_world(out: Path, settings: LiftSettings) -> MappedWorld:
     """Read what lifts are chosen from out of a measured folder, as of its last frame."""
     summary = read_summary(out)
     travel = Travel.read(summary)
@@ -86,10 +94,10 @@ def measured_scene(out: Path, settings: LiftSettings) -> LiftScene:
     whole = read_heights(out)
     rows, columns = whole.shape
     heights = whole.part(slice(0, rows), slice(0, columns))
-    return _scene(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
+    return _mapped(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
 
 
-def noisy_scene(world: DrawnWorld, settings: LiftSettings) -> LiftScene:
+def noisy_world(world: DrawnWorld, settings: LiftSettings) -> MappedWorld:
     """Draw noise onto the exact heights of every cell, and find the bundles in that: all is seen, nothing is
     smoothed; no travel is known.
     """
@@ -102,12 +110,12 @@ def noisy_scene(world: DrawnWorld, settings: LiftSettings) -> LiftScene:
     sigma = np.full_like(z, np.hypot(WHITE_M, ALIKE_M))
     vision = np.full(z.shape, HeightSource.VISION, np.uint8)
     heights = HeightMap(drawn.x0, drawn.y0, CELL_M, z, sigma, np.full_like(z, 6.0), vision)
-    return _scene(heights, find_bundles(heights, BundleSettings()), (), None, 0, settings)
+    return _mapped(heights, find_bundles(heights, BundleSettings()), (), None, 0, settings)
 
 
-def _scene(
+def _mapped(
     heights: HeightMap, bundles: tuple[Bundle, ...], vetoes: tuple[Veto, ...], travel: Travel | None,
     now_ns: int, settings: LiftSettings,
-) -> LiftScene:  # fmt: skip
+) -> MappedWorld:  # fmt: skip
     stands = footings(heights, bundles, settings)
-    return LiftScene(heights, BundleTable.of(bundles), stands, vetoes, travel, now_ns)
+    return MappedWorld(LiftScene(heights, BundleTable.of(bundles), stands, travel, now_ns), vetoes)

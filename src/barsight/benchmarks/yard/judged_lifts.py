@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.table import Table
@@ -20,8 +20,9 @@ from barsight.benchmarks.lift_judge.judge import Judge, Target
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.benchmarks.lift_judge.worlds import DrawnWorld
 from barsight.benchmarks.provenance import Provenance, provenance
+from barsight.benchmarks.yard.drawn_worlds import MappedWorld
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
+from barsight.yard.lifting.assessment import Lift, assess_placement
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.targets import plan_lifts
@@ -84,13 +85,14 @@ class JudgedBench:
 
 
 def judge_yard(
-    world: DrawnWorld, scene: LiftScene, magnet: Magnet, judged: JudgedMagnet, settings: LiftSettings,
+    world: DrawnWorld, mapped: MappedWorld, magnet: Magnet, judged: JudgedMagnet, settings: LiftSettings,
     placements: int,
 ) -> Iterator[JudgedLift]:  # fmt: skip
     """Assess and judge the offered lifts and so many placements of one world."""
     rng, judge = np.random.default_rng((37, world.seed)), Judge(world.yard, judged, settings.bundles)
+    scene = mapped.scene
     plan = plan_lifts(
-        scene.heights, scene.table.bundles, magnet, settings, scene.vetoes, scene.travel, scene.now_ns
+        scene.heights, scene.table.bundles, magnet, settings, mapped.vetoes, scene.travel, scene.now_ns
     )
     for lift in plan.offered:
         yield _judged(world, lift, judge, judged, offered=True)
@@ -100,7 +102,8 @@ def judge_yard(
         if not middles:
             return
         place = _beside(middles[int(rng.integers(len(middles)))], rng)
-        yield _judged(world, assess_placement(place, scene, magnet, settings), judge, judged, offered=False)
+        lift = replace(assess_placement(place, scene, magnet, settings), map_vetoes=mapped.vetoes)
+        yield _judged(world, lift, judge, judged, offered=False)
 
 
 def _over(world: DrawnWorld, bundle: int) -> Placement:

@@ -13,7 +13,7 @@ from rich.console import Console
 from barsight.benchmarks.lift_judge.magnet import read_magnet
 from barsight.benchmarks.lift_judge.worlds import DrawnWorld, draw_world
 from barsight.benchmarks.provenance import write_json
-from barsight.benchmarks.yard.drawn_worlds import measured_scene, noisy_scene, render_world
+from barsight.benchmarks.yard.drawn_worlds import MappedWorld, measured_world, noisy_world, render_world
 from barsight.benchmarks.yard.judged_lifts import (
     JudgedBench,
     JudgedLift,
@@ -26,7 +26,6 @@ from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import LiftScene
 from barsight.yard.lifting.magnet import example_magnet, load_magnet
 
 SPAN_M = 3.0
@@ -69,8 +68,8 @@ def bench_lift_targets(
         for done, seed in enumerate(numbers):
             world = draw_world(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M)
             folder = (keep or Path(scratch)) / f"seed_{seed}"
-            scene = _measured(world, folder, settings) if rendered else noisy_scene(world, settings)
-            found += judge_yard(world, scene, described, judged, settings, placements)
+            mapped = _measured(world, folder, settings) if rendered else noisy_world(world, settings)
+            found += judge_yard(world, mapped, described, judged, settings, placements)
             advance("yards", done + 1, len(numbers))
             if save is not None:
                 write_json(save, JudgedBench.of(done + 1, found))
@@ -87,7 +86,7 @@ def _numbers(seeds: str) -> range:
     return range(int(match[1]), int(match[2]))
 
 
-def _measured(world: DrawnWorld, folder: Path, settings: LiftSettings) -> LiftScene:
+def _measured(world: DrawnWorld, folder: Path, settings: LiftSettings) -> MappedWorld:
     """Render and measure the yard where its folders are not there yet."""
     recording, out = folder / "recording", folder / "measured"
     folder.mkdir(parents=True, exist_ok=True)
@@ -95,4 +94,4 @@ def _measured(world: DrawnWorld, folder: Path, settings: LiftSettings) -> LiftSc
         render_world(world, recording)
     if not (out / "result.json").is_file():
         measure_into(recording, out, MeasureSettings(), report=False, judged_at="end")
-    return measured_scene(out, settings)
+    return measured_world(out, settings)

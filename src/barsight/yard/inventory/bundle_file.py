@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from barsight.core.errors import InputError
-from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
+from barsight.core.sealed_json import read_sealed, write_sealed
+from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.stock_list import MatchedEntry, StockMatch
 from barsight.yard.types import Bar, Bundle, BundleSigma
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+REMEDY = "measure the recording again"
 
 
 def schema() -> dict[str, Any]:
@@ -27,32 +29,27 @@ def schema() -> dict[str, Any]:
 
 
 def write_bundles(
-    bundles: tuple[Bundle, ...], stock: StockMatch | None, reference: str, target: Path
-) -> None:
-    """Write bundles.json whole or not at all. reference: the frame, `yard` or `world`."""
+    bundles: tuple[Bundle, ...], stock: StockMatch | None, reference: str, identity: MapIdentity,
+    target: Path, sequence: int = 1,
+) -> str:  # fmt: skip
+    """Write bundles.json whole or not at all; return its digest. reference: the frame, `yard` or `world`."""
     content = {
         "schema_version": SCHEMA_VERSION,
+        **identity.header(sequence),
         "reference": reference,
         "bundles": [_record(bundle) for bundle in bundles],
         "stock": None if stock is None else json_value(asdict(stock), DIGITS),
     }
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return write_sealed(content, target)
 
 
 def read_bundles(path: Path) -> tuple[Bundle, ...]:
-    """Read bundles.json. Raises InputError where the file is missing, torn or of another version."""
-    remedy = "measure the recording again"
+    """Read bundles.json. Raises InputError where it is missing, torn, changed or of another version."""
+    content = read_sealed(path, SCHEMA_VERSION, REMEDY)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        version = content["schema_version"]
-        if version != SCHEMA_VERSION:
-            raise InputError(path, f"has schema version {version} instead of {SCHEMA_VERSION}", remedy)
         return tuple(_bundle(record) for record in content["bundles"])
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", remedy) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
+        raise InputError(path, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
 
 
 def read_match(path: Path) -> StockMatch | None:
@@ -67,8 +64,7 @@ def read_match(path: Path) -> StockMatch | None:
         )
         return StockMatch(matched, *(tuple(stock[name]) for name in ("moved", "missing", "hidden", "extra")))
     except (KeyError, TypeError) as error:
-        remedy = "measure the recording again"
-        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
+        raise InputError(path, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
 
 
 def _record(bundle: Bundle) -> dict[str, Any]:

@@ -9,18 +9,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.lifting.checks import count_vetoes, face_vetoes, load_vetoes
-from barsight.yard.lifting.clearance import clearance_vetoes, resting_vetoes
+from barsight.yard.lifting.checks import (
+    count_checks,
+    face_checks,
+    load_checks,
+    probability_check,
+    unknown_check,
+)
+from barsight.yard.lifting.clearance import clearance_checks, resting_checks
 from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
 from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.lifting.set_down import SetDown
-from barsight.yard.lifting.travel_accuracy import Travel, travel_vetoes
-from barsight.yard.lifting.validity import Validity, age_vetoes, validity
-from barsight.yard.stability.stability import Footing, footing_vetoes
+from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
+from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
+from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Veto
+from barsight.yard.vetoes import Check, Veto, check_least, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass
 
 SCALES = (1.0, 1.5, 2.5)
@@ -29,16 +36,16 @@ SCALES = (1.0, 1.5, 2.5)
 
 @dataclass(frozen=True, eq=False)
 class LiftScene:
-    """All that lifts are chosen from. vetoes: those that hold for the whole map. travel: None where the map
-    is not measured but given. now_ns: when lifts are judged, on the frames' clock.
+    """All that lifts are chosen from. travel: None where the map is not measured but given. now_ns: when
+    lifts are judged, on the frames' clock. events: in the yard since it was measured.
     """
 
     heights: HeightMap
     table: BundleTable
     footings: tuple[Footing, ...]
-    vetoes: tuple[Veto, ...]
     travel: Travel | None = None
     now_ns: int = 0
+    events: tuple[YardEvent, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +57,10 @@ class Lift:
     bound times safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
     overhang_m: bars beyond the outermost pole. tolerance: half sides of the box within which all this holds.
     safety: the smallest of pull over needed, capacity over load and tolerance over the crane's; at least 1
-    where nothing is vetoed. validity: in time, None where no frame is known to have seen the place. set_down:
-    where the load can be put, None where no place is known or none was looked for.
+    where nothing is vetoed. checks: all that were made; a check that isn't passed is a veto. validity: in
+    time, None where no frame is known to have seen the place. covariance: (4, 4) of the target's x, y,
+    z and yaw, None without a contact. map_vetoes: those that forbid every lift of the map. set_down: where
+    the load can be put, None where no place is known or none was looked for.
     """
 
     place: Placement
@@ -67,9 +76,18 @@ class Lift:
     overhang_m: float
     tolerance: Tolerance
     safety: float
-    vetoes: tuple[Veto, ...]
+    checks: tuple[Check, ...]
     validity: Validity | None = None
+    covariance: Float64 | None = None
+    map_vetoes: tuple[Veto, ...] = ()
     set_down: SetDown | None = None
+
+    @property
+    def vetoes(self) -> tuple[Veto, ...]:
+        """List every reason not to lift: the whole map's, then the failed and unknown checks."""
+        said = {veto.code for veto in self.map_vetoes}
+        own = (veto for veto in vetoes_of(self.checks) if veto.code not in said)
+        return (*self.map_vetoes, *own)
 
 
 def assess_placement(
@@ -79,37 +97,36 @@ def assess_placement(
     near = nearby_bundles(yard.table, place, magnet)
     contact = set_down(yard.heights, place, magnet, settings.contact_gap_m)
     if contact is None:
-        unknown = Veto("unknown-under-footprint", "nothing is known under the magnet")
         nothing = Tolerance(0.0, 0.0, 0.0)
         nan = math.nan
-        return Lift(
-            place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0,
-            (*yard.vetoes, unknown),
-        )  # fmt: skip
+        reason = "nothing is known under the magnet"
+        unseen = check_true("unknown-under-footprint", "something was seen under the magnet", None, reason)
+        return Lift(place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0, (unseen,))
     held = count_gripped(place, magnet, magnet.tolerance, near, contact.z_m)
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
     mass, middle = _load(load)
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.safety_factor
     away = np.array([place.x_m, place.y_m]) - middle
-    along, across = float(away @ place.along), float(away @ place.across)
+    offset = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
-    vetoes = [
-        *yard.vetoes,
-        *(travel_vetoes(yard.travel, place, magnet, settings) if yard.travel else ()),
-        *(age_vetoes(valid.from_ns, yard.now_ns, settings) if valid else ()),
-        *count_vetoes(place, yard.heights, magnet, near, contact, held, settings),
-        *face_vetoes(contact, needed, magnet, settings),
-        *clearance_vetoes(place, yard.heights, magnet, contact),
-        *resting_vetoes(place, magnet, contact, load),
-        *load_vetoes(load, mass, along, across, overhang, magnet, settings),
-        *(v for b in load for v in footing_vetoes(b, near.bundles, yard.footings, settings)),
+    checks = [
+        *(travel_checks(yard.travel, place, magnet, settings) if yard.travel else ()),
+        *(age_checks(valid.from_ns, yard.now_ns, settings) if valid else ()),
+        *disturbed_checks(yard.events, place, magnet, load, valid, settings),
+        *count_checks(place, yard.heights, magnet, near, contact, held, settings),
+        *face_checks(contact, needed, magnet, settings),
+        *clearance_checks(place, yard.heights, magnet, contact),
+        *resting_checks(place, magnet, contact, load),
+        *load_checks(load, mass, offset, overhang, magnet, settings),
+        *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]
     scale = 0.0
-    if search and not vetoes:
+    if search and not vetoes_of(checks):
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)
-        if scale < 1:
-            vetoes.append(Veto("narrow-tolerance", f"within the crane's tolerance {end}"))
+        reason = f"within the crane's tolerance {end}"
+        what = "the box within which the lift stays as checked, over the crane's tolerance"
+        checks.append(check_least("narrow-tolerance", what, scale, SCALES[0], "", reason))
     box = magnet.tolerance
     ratios = (
         contact.pull_low_n / needed if needed > 0 else 0.0,
@@ -120,9 +137,12 @@ def assess_placement(
     return Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
-        contact, mass, needed, along, across, overhang,
+        contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
         Tolerance(box.x_m * scale, box.y_m * scale, min(box.yaw_deg * scale, 20.0)),
-        float(np.nan_to_num(min(ratios))), tuple(vetoes), valid,
+        float(np.nan_to_num(min(ratios))), tuple(checks), valid,
+        target_covariance(
+            place, load, contact.sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
+        ),
     )  # fmt: skip
 
 
@@ -154,14 +174,28 @@ def _load(load: tuple[Bundle, ...]) -> tuple[Mass, Float64]:
     return total, np.asarray(weights @ centres / weights.sum())
 
 
-def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> float:
-    """Compute the longest way from the outermost pole to an end, upper bound; NaN where nothing is taken."""
+def _map_sigma(heights: HeightMap, place: Placement, magnet: Magnet) -> float:
+    """Return the median of the map's own sigma along the poles' middles; NaN where nothing was seen."""
+    parts = np.linspace(-0.5, 0.5, 20)
+    v = np.concatenate([pole.along_m + parts * pole.length_m for pole in magnet.poles])
+    u = np.repeat([pole.across_m for pole in magnet.poles], parts.size)
+    xy = np.array([place.x_m, place.y_m]) + v[:, None] * place.along + u[:, None] * place.across
+    column, row, inside = nearest_cells(heights, xy[:, 0], xy[:, 1])
+    sigma = heights.sigma_m[row, column][inside]
+    seen = sigma[np.isfinite(sigma)]
+    return float(np.median(seen)) if seen.size else math.nan
+
+
+def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tuple[float, float]:
+    """Compute the longest way from the outermost pole to an end, and its sigma; NaN where none is taken."""
     beyond = [
-        abs((end[:2] - (place.x_m, place.y_m)) @ place.along) - magnet.half_span_m
-        + UPPER * float(np.nan_to_num(bundle.sigma.length_m, nan=0.05)) / 2
+        (
+            float(abs((end[:2] - (place.x_m, place.y_m)) @ place.along)) - magnet.half_span_m,
+            float(np.nan_to_num(bundle.sigma.length_m, nan=0.05)) / 2,
+        )
         for bundle in load for end in bundle.ends_m
     ]  # fmt: skip
-    return max(beyond, default=math.nan)
+    return max(beyond, key=lambda way: way[0] + UPPER * way[1], default=(math.nan, math.nan))
 
 
 def _tolerance(
@@ -178,12 +212,14 @@ def _tolerance(
             min(magnet.tolerance.yaw_deg * scale, 20.0),
         )  # fmt: skip
         sure = count_gripped(place, magnet, box, near, contact.z_m).probability
-        if sure < settings.min_count_probability:
-            return found, f"a count of {len(held.gripped)} has the probability {sure:.4f} only"
+        unsure = vetoes_of([probability_check(sure, len(held.gripped), settings)])
+        if unsure:
+            return found, unsure[0].reason
         changed = _change(place, box, yard, magnet, near, held, needed_n, settings)
         if changed:
             return found, changed
-        for veto in clearance_vetoes(place, yard.heights, replace(magnet, tolerance=box), contact):
+        wider = replace(magnet, tolerance=box)
+        for veto in vetoes_of(clearance_checks(place, yard.heights, wider, contact)):
             return found, veto.reason
         found = scale
     return found, ""
@@ -200,11 +236,11 @@ def _change(
             yaw_rad=place.yaw_rad + dyaw * math.radians(box.yaw_deg),
         )  # fmt: skip
         contact = set_down(yard.heights, moved, magnet, settings.contact_gap_m)
-        if contact is None or contact.unknown_share > settings.max_unknown_ratio:
-            return "too much under the poles was not seen"
-        vetoes = face_vetoes(contact, needed_n, magnet, settings)
-        if vetoes:
-            return f"{vetoes[0].reason}"
+        if contact is None:
+            return "nothing is known under the magnet"
+        checks = [unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, settings)]
+        for veto in vetoes_of(checks):
+            return veto.reason
         exact = count_gripped(moved, magnet, Tolerance(0.0, 0.0, 0.0), near, contact.z_m)
         if exact.gripped != held.gripped:
             return f"it takes {len(exact.gripped)} bundles"

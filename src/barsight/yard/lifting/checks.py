@@ -1,152 +1,209 @@
-"""Check a placement for vetoes: the count under it, how the faces lie, the load, what stands around."""
+"""Check a placement: the count under it, how the faces lie and pull, the load."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
+from statistics import NormalDist
 
 import numpy as np
 
 from barsight.core.arrays import Float64, frozen
-from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.contact import Contact
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.stability.stability import lookup_heights
+from barsight.yard.stability.stability import interpolate_heights
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Veto
+from barsight.yard.vetoes import Check, check_least, check_most, check_true
 from barsight.yard.weight import Mass
 
 MARGIN_M = 0.02
 """How far beyond its stated outline a bundle may show."""
 STEP_M = 0.02
+EDGE_M = 0.01
+"""Outlines and heights of reach are blurred over this, so that no row of samples goes in or out at once."""
+UNKNOWN_SIGMA = 0.01
+"""How well cells tell the part of a face that was seen."""
+SURE_OF_SIGMA = 0.1
+"""How well sigmas themselves are known, of them."""
 
 
-def count_vetoes(
+def count_checks(
     place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, held: Grip,
     settings: LiftSettings,
-) -> list[Veto]:  # fmt: skip
+) -> list[Check]:  # fmt: skip
     """Check what the footprint takes: too much, too little, unsure, unseen, unknown."""
-    vetoes = []
-    count = len(held.gripped)
+    count, wanted = len(held.gripped), settings.bundles
     ids = ", ".join(str(near.bundles[k].id) for k in held.gripped)
-    if contact.unknown_share > settings.max_unknown_ratio:
-        vetoes.append(
-            Veto("unknown-under-footprint", f"{100 * contact.unknown_share:.0f} % of the cells under a pole "
-                 f"were not seen, {100 * settings.max_unknown_ratio:.0f} % are allowed")
-        )  # fmt: skip
-    if count == 0:
-        vetoes.append(Veto("no-bundle", "no known bundle lies under the poles within reach"))
-    if count > settings.bundles:
-        vetoes.append(
-            Veto(
-                "straddles-neighbour", f"the footprint takes {count} bundles ({ids}), not {settings.bundles}"
-            )
+    checks = [
+        unknown_check(contact, settings),
+        check_least(
+            "no-bundle", "bundles under the poles within reach", count, 1, "",
+            "no known bundle lies under the poles within reach",
+        ),
+        check_most(
+            "straddles-neighbour", "bundles that the footprint takes", count, wanted, "",
+            f"the footprint takes {count} bundles ({ids}), not {wanted}",
+        ),
+    ]  # fmt: skip
+    if 0 < count < wanted:
+        reason = f"the footprint takes {count} bundles, {wanted} are asked for"
+        checks.append(check_least("count-uncertain", "bundles that are taken", count, wanted, "", reason))
+    elif near.bundles:
+        why = f": bundle {near.bundles[int(np.argmax(held.flips))].id} may be in or out"
+        checks.append(probability_check(held.probability, count, settings, why))
+    shares = [_unexplained(place, heights, magnet, near, contact, sigmas) for sigmas in (3.0, 2.0)]
+    checks.append(
+        check_most(
+            "unexplained-surface", "part within the poles' reach that belongs to no known bundle", shares[0],
+            settings.max_unexplained_ratio, "", f"{100 * shares[1]:.0f} % of what lies within reach of the "
+            "poles belongs to no known bundle", sigma=shares[1] - shares[0],
         )
-    if count < settings.bundles and count:
-        vetoes.append(
-            Veto("count-uncertain", f"the footprint takes {count} bundles, {settings.bundles} are asked for")
-        )
-    elif held.probability < settings.min_count_probability:
-        worst = near.bundles[int(np.argmax(held.flips))].id
-        vetoes.append(
-            Veto("count-uncertain", f"a count of {count} has the probability {held.probability:.4f} only: "
-                 f"bundle {worst} may be in or out")
-        )  # fmt: skip
-    share = _unexplained(place, heights, magnet, near, contact)
-    if share > settings.max_unexplained_ratio:
-        vetoes.append(
-            Veto("unexplained-surface", f"{100 * share:.0f} % of what lies within reach of the poles "
-                 f"belongs to no known bundle")
-        )  # fmt: skip
-    return vetoes
+    )  # fmt: skip
+    return checks
 
 
-def face_vetoes(contact: Contact, needed_n: float, magnet: Magnet, settings: LiftSettings) -> list[Veto]:
+def unknown_check(contact: Contact, settings: LiftSettings) -> Check:
+    """Check that enough was seen under each pole."""
+    share, most = contact.unknown_share, settings.max_unknown_ratio
+    reason = f"{100 * share:.0f} % of the cells under a pole were not seen, {100 * most:.0f} % are allowed"
+    what = "unseen part of the cells under the worst pole"
+    return check_most("unknown-under-footprint", what, share, most, "", reason, sigma=UNKNOWN_SIGMA)
+
+
+def probability_check(probability: float, count: int, settings: LiftSettings, why: str = "") -> Check:
+    """Check that a count is sure enough, in sigmas of the normal distribution."""
+    sure, asked = (
+        NormalDist().inv_cdf(min(max(p, 1e-12), 1 - 1e-12))
+        for p in (probability, settings.min_count_probability)
+    )
+    reason = f"a count of {count} has the probability {probability:.4f} only{why}"
+    bound = asked / (1 + SURE_OF_SIGMA)
+    return check_least(
+        "count-uncertain", "how sure the count is", sure, bound, "sigma", reason, sigma=SURE_OF_SIGMA * bound
+    )
+
+
+def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: LiftSettings) -> list[Check]:
     """Check how the faces lie and pull."""
-    vetoes = []
-    pitch = abs(math.degrees(contact.pitch_rad))
-    if pitch > magnet.limits.pitch_deg:
-        vetoes.append(
-            Veto("tilt", f"the faces slope by {pitch:.1f} deg along the beam, "
-                 f"{magnet.limits.pitch_deg:g} are allowed")
-        )  # fmt: skip
+    limits, sigma = magnet.limits, contact.sigma_m
+    pitch, roll = (abs(math.degrees(angle)) for angle in (contact.pitch_rad, contact.roll_rad))
     narrowest = min(pole.width_m for pole in magnet.poles)
-    if contact.rests_off_m > narrowest / 4:
-        vetoes.append(
-            Veto("tilt", f"the faces rest {1e3 * contact.rests_off_m:.0f} mm beside their middle and would "
-                 f"lean further than the {magnet.limits.roll_deg:g} deg that the suspension allows")
-        )  # fmt: skip
-    if math.isinf(contact.widest_gap_m):
-        vetoes.append(Veto("gap", "under one of the poles no steel is known"))
-    elif contact.widest_gap_m > magnet.limits.gap_m:
-        vetoes.append(
-            Veto("gap", f"a pole hangs {1e3 * contact.widest_gap_m:.0f} mm above the steel, "
-                 f"{1e3 * magnet.limits.gap_m:.0f} mm are allowed")
-        )  # fmt: skip
-    elif contact.contact_share < magnet.limits.contact_share:
-        vetoes.append(
-            Veto("gap", f"only {100 * contact.contact_share:.0f} % of the faces lie on steel, "
-                 f"{100 * magnet.limits.contact_share:.0f} % are needed")
-        )  # fmt: skip
-    if contact.pull_low_n < needed_n:
-        vetoes.append(
-            Veto("weak-pull", f"the pull is at least {contact.pull_low_n / 1e3:.1f} kN, "
-                 f"{needed_n / 1e3:.1f} kN are needed")
-        )  # fmt: skip
-    return vetoes
+    gap, share = contact.widest_gap_m, contact.contact_share
+    low, high = (_contact_share(contact, settings.contact_gap_m + k * sigma) for k in (0.0, 1.0))
+    held = roll >= (1 - 1e-3) * limits.roll_deg
+    aside = (
+        f"the faces rest {1e3 * contact.rests_off_m:.0f} mm beside their middle and "
+        f"{'would lean further than' if held else 'lean nearly by'} the {limits.roll_deg:g} deg that the "
+        "suspension allows"
+    )
+    if not held:
+        aside += ": the lean lies within its sigma of the limit"
+    return [
+        check_most(
+            "tilt", "slope of the faces along the beam", pitch, limits.pitch_deg, "deg",
+            f"the faces slope by {pitch:.1f} deg along the beam, {limits.pitch_deg:g} are allowed",
+            sigma=math.degrees(sigma / magnet.half_span_m),
+        ),
+        check_most(
+            "tilt", "how far beside their middle the faces rest, leaning as far as the suspension lets them",
+            1e3 * contact.rests_off_m, 1e3 * narrowest / 4, "mm", aside,
+            sigma=0.0 if contact.rests_off_m == 0 else 1e3 * EDGE_M / 2,
+        ),
+        check_most(
+            "gap", "least gap of the pole that is furthest from steel",
+            1e3 * gap if math.isfinite(gap) else math.nan, 1e3 * limits.gap_m, "mm",
+            f"a pole hangs {1e3 * gap:.0f} mm above the steel, {1e3 * limits.gap_m:.0f} mm are allowed"
+            if math.isfinite(gap) else "under one of the poles no steel is known", sigma=1e3 * sigma,
+        ),
+        check_least(
+            "gap", "part of the faces that lies on steel", high, limits.contact_share, "",
+            f"only {100 * share:.0f} % of the faces lie on steel, {100 * limits.contact_share:.0f} % are "
+            "needed", sigma=high - low,
+        ),
+        check_least(
+            "weak-pull", "pull on the load", contact.pull_n, needed_n, "N",
+            f"the pull is at least {contact.pull_low_n / 1e3:.1f} kN, {needed_n / 1e3:.1f} kN are needed",
+            sigma=(contact.pull_n - contact.pull_low_n) / UPPER, sigmas=UPPER,
+        ),
+    ]  # fmt: skip
 
 
-def load_vetoes(
-    load: tuple[Bundle, ...], mass: Mass, along: float, across: float, overhang: float, magnet: Magnet,
-    settings: LiftSettings,
-) -> list[Veto]:  # fmt: skip
-    """Check the load: covered, doubtful, open, heavy, off balance."""
-    vetoes = []
-    limits = magnet.limits
-    for bundle in load:
-        if bundle.on_top is not True:
-            what = "something lies on" if bundle.on_top is False else "it isn't known what lies on"
-            vetoes.append(Veto("covered", f"{what} bundle {bundle.id}"))
-        if bundle.confidence < settings.min_confidence:
-            vetoes.append(
-                Veto("bundle-doubtful", f"bundle {bundle.id} is {100 * bundle.confidence:.0f} % sure: "
-                     + ("; ".join(bundle.reasons) or "no reason is given"))
-            )  # fmt: skip
-        if any(bundle.ends_open):
-            ends = " and ".join(e for e, o in zip(("low-y", "high-y"), bundle.ends_open, strict=True) if o)
-            vetoes.append(
-                Veto("end-open", f"the {ends} end of bundle {bundle.id} was not seen: length, mass and "
-                     "balance are not known")
-            )  # fmt: skip
-    if load and math.isnan(mass.kg):
-        vetoes.append(Veto("mass-unknown", "number or diameter of the bars is not known"))
+def load_checks(
+    load: tuple[Bundle, ...], mass: Mass, offset_m: tuple[float, float], overhang_m: tuple[float, float],
+    magnet: Magnet, settings: LiftSettings,
+) -> list[Check]:  # fmt: skip
+    """Check the load: covered, doubtful, open, heavy, off balance.
+
+    offset_m: along and across. overhang_m: and its sigma.
+    """
+    if not load:
+        return []
+    checks = [check for bundle in load for check in _bundle_checks(bundle, settings)]
+    known = not math.isnan(mass.kg)
+    reason = "number or diameter of the bars is not known"
+    checks.append(check_true("mass-unknown", "mass of the load", known or None, reason))
     for carrier, most in (
         ("magnet", magnet.capacity_kg),
         ("crane beside the magnet", magnet.crane_capacity_kg - magnet.own_mass_kg),
     ):
-        if mass.upper_kg > most:
-            vetoes.append(
-                Veto(
-                    "overweight",
-                    f"the load may weigh {mass.upper_kg:.0f} kg, the {carrier} carries {most:.0f}",
-                )
-            )
-    for name, offset, most in (
-        ("along", along, limits.offset_along_m),
-        ("across", across, limits.offset_across_m),
-    ):
-        if abs(offset) > most:
-            vetoes.append(
-                Veto("off-centre", f"the magnet's centre is {1e3 * abs(offset):.0f} mm {name} the bars from "
-                     f"the load's, {1e3 * most:.0f} mm are allowed")
+        if known:
+            reason = f"the load may weigh {mass.upper_kg:.0f} kg, the {carrier} carries {most:.0f}"
+            checks.append(
+                check_most("overweight", f"load against what the {carrier} carries", mass.kg, most, "kg",
+                           reason, sigma=mass.sigma_kg, sigmas=UPPER)
             )  # fmt: skip
-    if overhang > limits.overhang_m:
-        vetoes.append(
-            Veto("overhang", f"the bars reach {overhang:.2f} m beyond the outermost pole, "
-                 f"{limits.overhang_m:g} m are allowed")
-        )  # fmt: skip
-    return vetoes
+    limits = magnet.limits
+    for name, offset, most, sigma in (
+        ("along", offset_m[0], limits.offset_along_m, max(_known(b.sigma.along_m) for b in load)),
+        ("across", offset_m[1], limits.offset_across_m, max(_known(b.sigma.lateral_m) for b in load)),
+    ):
+        reason = (
+            f"the magnet's centre is {1e3 * abs(offset):.0f} mm {name} the bars from the load's, "
+            f"{1e3 * most:.0f} mm are allowed"
+        )
+        what = f"the magnet's centre {name} the bars from the load's"
+        checks.append(
+            check_most("off-centre", what, 1e3 * abs(offset), 1e3 * most, "mm", reason, sigma=1e3 * sigma)
+        )
+    upper = overhang_m[0] + UPPER * overhang_m[1]
+    reason = f"the bars reach {upper:.2f} m beyond the outermost pole, {limits.overhang_m:g} m are allowed"
+    checks.append(
+        check_most("overhang", "bars beyond the outermost pole", overhang_m[0], limits.overhang_m, "m",
+                   reason, sigma=overhang_m[1], sigmas=UPPER)
+    )  # fmt: skip
+    return checks
+
+
+def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
+    what = "something lies on" if bundle.on_top is False else "it isn't known what lies on"
+    ends = " and ".join(e for e, o in zip(("low-y", "high-y"), bundle.ends_open, strict=True) if o)
+    return [
+        check_true(
+            "covered", f"nothing lies on bundle {bundle.id}", bundle.on_top, f"{what} bundle {bundle.id}"
+        ),
+        check_least(
+            "bundle-doubtful", f"how sure bundle {bundle.id} is", bundle.confidence, settings.min_confidence,
+            "", f"bundle {bundle.id} is {100 * bundle.confidence:.0f} % sure: "
+            + ("; ".join(bundle.reasons) or "no reason is given"),
+        ),
+        check_true(
+            "end-open", f"both ends of bundle {bundle.id} were seen", None if ends else True,
+            f"the {ends} end of bundle {bundle.id} was not seen: length, mass and balance are not known",
+        ),
+    ]  # fmt: skip
+
+
+def _known(sigma: float) -> float:
+    return sigma if math.isfinite(sigma) else 0.05
+
+
+def _contact_share(contact: Contact, near_m: float) -> float:
+    """Compute the part of all faces nearer to steel than `near_m`, by gaps blurred by half a millimetre."""
+    blur = 0.0005
+    shares = [np.clip((near_m - pole.gap_map_m) / blur + 0.5, 0, 1) for pole in contact.poles]
+    return float(np.mean([np.nan_to_num(share).mean() for share in shares]))
 
 
 @lru_cache(maxsize=64)
@@ -168,23 +225,24 @@ def _in_yard(place: Placement, grid: Float64) -> Float64:
 
 
 def _unexplained(
-    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact
+    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, sigmas: float
 ) -> float:
     """Compute the fraction of the places under the poles, within reach, that lie outside all bundles'
-    outlines.
+    outlines, made wider by so many sigmas.
     """
     across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
-    grid = _face_grid(magnet, round(1e3 * float(across)))
+    grid = _face_grid(magnet, math.ceil(1e3 * float(across)))
     points = _in_yard(place, grid)
-    z = lookup_heights(heights, points[:, 0], points[:, 1])
-    reached = z > contact.z_m[grid[:, 2].astype(np.int64)] - magnet.reach_m
+    z = interpolate_heights(heights, points[:, 0], points[:, 1])
+    over = z - (contact.z_m[grid[:, 2].astype(np.int64)] - magnet.reach_m)
+    reached = np.nan_to_num(np.clip(over / EDGE_M + 0.5, 0, 1))
     if not reached.any():
         return 0.0
-    away = points[reached, None, :] - near.centre
+    away = points[:, None, :] - near.centre
     beside = np.abs(away[..., 0] * near.along[:, 1] - away[..., 1] * near.along[:, 0])
     beyond = np.abs((away * near.along).sum(axis=-1))
-    wide = near.half[:, 0] + MARGIN_M + 2 * np.hypot(near.sigma[:, 0], near.sigma[:, 3])
-    long = near.half[:, 1] + MARGIN_M + 2 * np.hypot(near.sigma[:, 1], near.sigma[:, 4])
+    wide = near.half[:, 0] + MARGIN_M + sigmas * np.hypot(near.sigma[:, 0], near.sigma[:, 3])
+    long = near.half[:, 1] + MARGIN_M + sigmas * np.hypot(near.sigma[:, 1], near.sigma[:, 4])
     long = long + near.open_ends.any(axis=1) * BEYOND_OPEN_END_M
-    own = ((beside < wide) & (beyond < long)).any(axis=1)
-    return float((~own).sum() / len(points))
+    outside = np.maximum(beside - wide, beyond - long).min(axis=1, initial=np.inf)
+    return float((reached * np.clip(outside / EDGE_M + 0.5, 0, 1)).mean())

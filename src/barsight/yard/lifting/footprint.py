@@ -155,12 +155,11 @@ def _grip(
                 # Where a bundle's open end may lie under the pole, nobody knows.
                 longer = (open_ends[b, 0] + open_ends[b, 1]) * BEYOND_OPEN_END_M / 2
                 shift = (1.0 * open_ends[b, 1] - 1.0 * open_ends[b, 0]) * BEYOND_OPEN_END_M / 2
-                most = overlap(
+                most, unsure, astray = overlap(
                     dx - shift * along[b, 0], dy - shift * along[b, 1], cos, sin, poles[p], along[b],
                     half[b, 0], half[b, 1] + longer, sigma[b], slack,
-                )[0]  # fmt: skip
-                if most > 0:
-                    miss = 0.5
+                )  # fmt: skip
+                miss = max(miss, 0.5 * _below((most + astray) / unsure))
             over = top[b] + (dx * along[b, 0] + dy * along[b, 1]) * slope[b] - reach_z[p]
             low = _below(-abs(over) / np.hypot(sigma_top[b], HEIGHT_SIGMA_M))
             under = (1 - miss if depth > 0 else miss) * (1 - low if over > 0 else low)

@@ -9,9 +9,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import InputError
-from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
+from barsight.core.sealed_json import read_sealed, write_sealed
+from barsight.yard.identity import MapIdentity
 from barsight.yard.lifting.assessment import Lift
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
@@ -19,6 +19,7 @@ from barsight.yard.stability.stability import Footing
 from barsight.yard.vetoes import Veto
 
 SCHEMA_VERSION = 2
+REMEDY = "run barsight lifts on the folder"
 
 
 def schema() -> dict[str, Any]:
@@ -28,40 +29,38 @@ def schema() -> dict[str, Any]:
     return content
 
 
-def write_lifts(plan: LiftPlan, reference: str, target: Path, order: LiftOrder | None = None) -> None:
-    """Write lifts.json whole or not at all. reference: the frame, `yard` or `world`."""
-    with atomic_path(target) as path:
-        text = json.dumps(lifts_content(plan, reference, order), indent=1, allow_nan=False)
-        path.write_text(text + "\n", encoding="utf-8")
+def write_lifts(
+    plan: LiftPlan, reference: str, identity: MapIdentity, bundles_sha256: str, target: Path,
+    sequence: int = 1, order: LiftOrder | None = None,
+) -> str:  # fmt: skip
+    """Write lifts.json whole or not at all; return its digest. reference: the frame, `yard` or `world`.
+    bundles_sha256: the digest in bundles.json.
+    """
+    return write_sealed(lifts_content(plan, reference, identity, bundles_sha256, sequence, order), target)
 
 
 def read_lifts(path: Path) -> dict[str, Any]:
-    """Read lifts.json. Raises InputError where it is missing, torn or of another version."""
-    remedy = "run barsight lifts on the folder"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        version = content["schema_version"]
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", remedy) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
-    if version != SCHEMA_VERSION:
-        raise InputError(path, f"has schema version {version} instead of {SCHEMA_VERSION}", remedy)
-    lifts: dict[str, Any] = content
-    return lifts
+    """Read lifts.json. Raises InputError where it is missing, torn, changed or of another version."""
+    return read_sealed(path, SCHEMA_VERSION, REMEDY)
 
 
-def lifts_content(plan: LiftPlan, reference: str, order: LiftOrder | None = None) -> dict[str, Any]:
-    """Build the content of lifts.json. order: that digs out the bundle that was asked for, if one was."""
+def lifts_content(
+    plan: LiftPlan, reference: str, identity: MapIdentity, bundles_sha256: str, sequence: int = 1,
+    order: LiftOrder | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Build the content of lifts.json, without its digest. order: that digs out the bundle that was asked
+    for, if one was.
+    """
     content: dict[str, Any] = json_value(
         {
             "schema_version": SCHEMA_VERSION,
+            **identity.header(sequence),
+            "bundles_sha256": bundles_sha256,
             "reference": reference,
-            "captured_from_ns": plan.captured_ns[0] if plan.captured_ns else None,
-            "captured_to_ns": plan.captured_ns[1] if plan.captured_ns else None,
             "judged_at_ns": plan.judged_at_ns,
             "looks_back": plan.looks_back,
             "rule": RULE,
+            "events": [asdict(event) for event in plan.events],
             "magnet": asdict(plan.magnet),
             "settings": asdict(plan.settings),
             "vetoes": _vetoes(plan.vetoes),
@@ -119,7 +118,9 @@ def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
             }
             for pole in (contact.poles if contact else ())
         ],
+        "target_covariance": None if lift.covariance is None else lift.covariance.tolist(),
         "set_down": asdict(lift.set_down) if lift.set_down else None,
+        "checks": [asdict(check) for check in lift.checks],
         "vetoes": _vetoes(lift.vetoes),
     }
 

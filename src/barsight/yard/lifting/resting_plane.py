@@ -20,10 +20,12 @@ CORRELATED_CELLS = 5.0
 STRAIGHT_M = 0.002
 """How straight and even bundles are along their bars, one sigma: what the map shows beyond that is mostly the
 map's own error, as long as its sigma explains it."""
-BENT_SIGMA = 3.0
-"""What is this many sigma from straight is taken as it was measured."""
+BENT_SIGMA, STRAIGHT_UP_TO = 3.0, 0.8
+"""What is this many sigma from straight is taken as it was measured; from this part of them on, the more the
+further it is."""
 NEAR_LINE_M = 0.02
-"""A height further than this from its line along the bars has no say in the load's slope."""
+"""A height further than this from its line along the bars has less say in the load's slope, from twice this
+on none."""
 COLUMNS = 8
 U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)
 _STEEPEST = 0.35
@@ -76,8 +78,8 @@ def _straight(known: Float64, column: Int64, noise: float) -> Float64:
             own = column == c
             line[own] = np.median(z[own] - slope * v[own])
         rest_of = z - slope * v - line
-        near = np.abs(rest_of) < NEAR_LINE_M
-        slope += (v[near] * rest_of[near]).sum() / max((v[near] ** 2).sum(), 1e-9)
+        near = np.minimum(np.maximum(2 - np.abs(rest_of) / NEAR_LINE_M, 0.0), 1.0)
+        slope += (near * v * rest_of).sum() / max((near * v**2).sum(), 1e-9)
     line += slope * v
     likely = line.copy()
     for p in range(pole.max() + 1):
@@ -94,23 +96,29 @@ def _straight(known: Float64, column: Int64, noise: float) -> Float64:
 @kernel()
 def _likely(measured: float, sigma: float) -> float:
     """Estimate what a departure of `measured` from straight most likely is."""
-    if abs(measured) > BENT_SIGMA * np.hypot(STRAIGHT_M, sigma):
-        return measured
-    return measured * STRAIGHT_M**2 / (STRAIGHT_M**2 + sigma**2)
+    # Between straight and bent the share rises steadily: a jump would decide a lift by a micrometre.
+    bent = abs(measured) / (BENT_SIGMA * np.hypot(STRAIGHT_M, sigma))
+    share = min(max((bent - STRAIGHT_UP_TO) / (1 - STRAIGHT_UP_TO), 0.0), 1.0)
+    shrunk = STRAIGHT_M**2 / (STRAIGHT_M**2 + sigma**2)
+    return float(measured * (share + (1 - share) * shrunk))
 
 
 @kernel()
 def rest_faces(
     u: Float64, v: Float64, z: Float64, noise: float, max_roll: float
 ) -> tuple[float, float, float, float]:
-    """Rest the faces: height at the centre, roll, pitch, and how far beside the middle they rest."""
+    """Rest the faces: height at the centre, roll, pitch, and how far beside the middle they rest where the
+    suspension holds them, within the lean's sigma; else 0.
+    """
     height, roll, pitch = rest_plane(u, v, z, max_roll)
     # The highest of many noisy points is too high.
     height -= noise
     rests_off = 0.0
-    if abs(roll) > 0.999 * max_roll:
+    sigma = noise / max(u.max() - u.min(), 1e-3)
+    if abs(roll) > 0.999 * max_roll - sigma:
         gap = height + roll * u + pitch * v - z
-        rests_off = abs(np.median(u[gap <= gap.min() + noise + 0.0005]))
+        near = np.maximum(1 - (gap - gap.min()) / (noise + 0.0005), 0.0)
+        rests_off = abs((near * u).sum() / near.sum())
     return height, roll, pitch, rests_off
 
 
@@ -134,21 +142,29 @@ def _profile(
     for i in range(columns):
         u = across + width * ((i + 0.5) / columns - 0.5)
         for k in range(parts):
-            count, unsure = 0, 0.0
+            count, unsure, weight = 0, 0.0, 0.0
             for m in range(samples):
                 v = along + length * ((k + (m + 0.5) / samples) / parts - 0.5)
-                column = int(np.floor((x + u * cos - v * sin - x0) / cell + 0.5))
-                row = int(np.floor((y + u * sin + v * cos - y0) / cell + 0.5))
-                if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
-                    continue
-                if source[row, column] == _UNKNOWN or source[row, column] == _FILLED:
-                    continue
-                values[count] = z[row, column]
-                unsure += sigma[row, column]
-                count += 1
+                column, row = (x + u * cos - v * sin - x0) / cell, (y + u * sin + v * cos - y0) / cell
+                left, low = int(np.floor(column)), int(np.floor(row))
+                total, spread, found = 0.0, 0.0, 0.0
+                for c, share_c in ((left, 1 - (column - left)), (left + 1, column - left)):
+                    for r, share_r in ((low, 1 - (row - low)), (low + 1, row - low)):
+                        if r < 0 or c < 0 or r >= z.shape[0] or c >= z.shape[1]:
+                            continue
+                        if source[r, c] == _UNKNOWN or source[r, c] == _FILLED:
+                            continue
+                        total += share_c * share_r * z[r, c]
+                        spread += share_c * share_r * sigma[r, c]
+                        found += share_c * share_r
+                weight += found
+                if found >= 0.5:
+                    values[count] = total / found
+                    unsure += spread / found
+                    count += 1
             own = out[i * parts + k]
             own[U], own[V] = u, along + length * ((k + 0.5) / parts - 0.5)
-            own[SEEN], own[ALL], own[SIGMA] = count, samples, unsure / max(count, 1)
+            own[SEEN], own[ALL], own[SIGMA] = weight, samples, unsure / max(count, 1)
             own[Z] = own[SCATTER] = np.nan
             if 2 * count >= samples:
                 middle = np.median(values[:count])

@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from barsight.core.notices import FORBIDS
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.footprint import BundleTable, Placement
@@ -19,17 +20,18 @@ from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.set_down import find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.lifting.validity import age_vetoes
+from barsight.yard.lifting.validity import age_checks
 from barsight.yard.sections import split_map
 from barsight.yard.stability.blockers import Blocked, find_blocked
 from barsight.yard.stability.pile_sides import PileSide, pile_sides
 from barsight.yard.stability.stability import Footing, footings, high_side, turn_between
 from barsight.yard.types import Bundle, YardMap
-from barsight.yard.vetoes import Veto
+from barsight.yard.vetoes import Veto, check_true, vetoes_of
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
-FINALISTS = 3
+ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight"})
+"""Vetoes of the load itself: another place of the magnet changes nothing."""
 SAME_TOP_M = 0.03
 SAME_YAW_RAD = np.radians(2.0)
 RULE = (
@@ -44,7 +46,8 @@ class LiftPlan:
 
     vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
     stands. sides: of the piles. blocked: what must go before each bundle. judged_at_ns: when, on the frames'
-    clock; captured_ns: stamps of the first and last frame, None where the map is given.
+    clock; captured_ns: stamps of the first and last frame, None where the map is given. events: in the yard
+    since it was measured.
     """
 
     magnet: Magnet
@@ -57,6 +60,7 @@ class LiftPlan:
     blocked: tuple[Blocked, ...]
     judged_at_ns: int
     captured_ns: tuple[int, int] | None
+    events: tuple[YardEvent, ...] = ()
 
     @property
     def looks_back(self) -> bool:
@@ -77,18 +81,17 @@ def map_vetoes(
         vetoes.append(Veto("no-yard-frame", f"the map is in the {reference} frame: no crane gave its place"))
     if not has_magnet:
         vetoes.append(Veto("no-magnet", "no magnet was described: give its file with --magnet"))
-    vetoes += age_vetoes(captured_to_ns, now_ns, settings)
-    return tuple(vetoes)
+    return (*vetoes, *vetoes_of(age_checks(captured_to_ns, now_ns, settings)))
 
 
 def plan_lifts(
     yard: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
     vetoes: tuple[Veto, ...], travel: Travel | None = None, now_ns: int = 0,
-    contradicted: Mapping[int, str] = MappingProxyType({}),
+    events: tuple[YardEvent, ...] = (), contradicted: Mapping[int, str] = MappingProxyType({}),
 ) -> LiftPlan:  # fmt: skip
     """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames.
-    now_ns: when the lifts are judged, on the frames' clock. contradicted: bundles, by id, of which the stock
-    list says something else, and what.
+    now_ns: when the lifts are judged, on the frames' clock. events: in the yard since it was measured.
+    contradicted: bundles, by id, of which the stock list says something else, and what.
     """
     parts, stands = split_map(yard), dict[int, Footing]()
     for part in parts:
@@ -99,15 +102,18 @@ def plan_lifts(
     for part in parts:
         near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
         heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
-        here = LiftScene(heights, BundleTable.of(near), standing, (), travel, now_ns)
+        here = LiftScene(heights, BundleTable.of(near), standing, travel, now_ns, events)
         for number, group in enumerate(groups):
             if part.owns(group[0].centre_m):
                 lifts[number] = _best(group, here, magnet, settings)
     offered, refused = [], []
     for _, lift in sorted(lifts.items()):
-        listed = tuple(Veto("stock-list", contradicted[i]) for i in lift.bundles if i in contradicted)
+        listed = tuple(
+            check_true("stock-list", "what the stock list says of it", False, contradicted[i])
+            for i in lift.bundles if i in contradicted
+        )  # fmt: skip
         if lift.vetoes or vetoes or listed:
-            refused.append(_with(lift, (*vetoes, *listed)))
+            refused.append(replace(lift, map_vetoes=vetoes, checks=(*lift.checks, *listed)))
         else:
             offered.append(lift)
     top = {b.id: b.top_z_m for b in bundles}
@@ -130,13 +136,8 @@ def plan_lifts(
         find_blocked(bundles, standing, settings),
         now_ns,
         travel.captured_ns if travel else None,
+        events,
     )
-
-
-def _with(lift: Lift, vetoes: tuple[Veto, ...]) -> Lift:
-    said = {veto.code for veto in vetoes}
-    own = (veto for veto in lift.vetoes if veto.code not in said)
-    return Lift(**{**vars(lift), "vetoes": (*vetoes, *own)})
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
@@ -173,22 +174,37 @@ def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: 
 
     limit = magnet.limits.offset_across_m
     quick = tried((0.0, across) for across in ACROSS_M if abs(across) < limit)
-    if quick[0].vetoes:
-        across = quick[0].offset_across_m if np.isfinite(quick[0].offset_across_m) else 0.0
-        quick = sorted([*quick, *tried((along, across) for along in ALONG_M)], key=_worst_first)
-    if quick[0].vetoes:
-        return quick[0]
-    finalists = []
-    for lift in quick[:FINALISTS]:
+    sound = _sound(quick, yard, magnet, settings)
+    wherever = ANYWHERE.intersection(*({veto.code for veto in lift.vetoes} for lift in quick))
+    if wherever or (sound is not None and not sound.vetoes):
+        return sound or quick[0]
+    middle = _offset_across(group, quick[0].place)
+    more = tried((along, across) for along in ALONG_M for across in dict.fromkeys((0.0, middle)))
+    found = [one for one in (sound, _sound(more, yard, magnet, settings)) if one is not None]
+    return min(found or [*quick, *more], key=_worst_first)
+
+
+def _sound(quick: list[Lift], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift | None:
+    """Find the first that holds within the crane's tolerance too; the best that doesn't, None without any.
+
+    All are tried: were it some, tiny noise would choose which, and with that whether a lift is offered.
+    """
+    whole = []
+    for lift in quick:
         if not lift.vetoes:
-            finalists.append(assess_placement(lift.place, yard, magnet, settings))
-            if not finalists[-1].vetoes:
-                break
-    return min(finalists, key=_worst_first)
+            whole.append(assess_placement(lift.place, yard, magnet, settings))
+            if not whole[-1].vetoes:
+                return whole[-1]
+    return min(whole, key=_worst_first, default=None)
 
 
 def _worst_first(lift: Lift) -> tuple[int, float]:
     return len(lift.vetoes), -lift.safety
+
+
+def _offset_across(group: tuple[Bundle, ...], place: Placement) -> float:
+    centre = np.mean([b.centre_m[:2] for b in group], axis=0)
+    return float((np.array([place.x_m, place.y_m]) - centre) @ place.across)
 
 
 def _place(group: tuple[Bundle, ...], along: float, across: float) -> Placement:

@@ -19,13 +19,15 @@ from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.vetoes import Veto
+from barsight.yard.types import Bundle
+from barsight.yard.vetoes import Check, check_most, check_true
 
 ALONGSIDE_M = 1.0
 """Encoders are held against the map where the crane passed no further than this from the lift."""
 SURE_SIGMAS = 3.0
 """Encoders this many sigma off the trajectory disagree with it."""
 MOVING_MPS = 0.05
+CODE = "trajectory-degraded"
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,55 +141,94 @@ def _disagreement(
     return size
 
 
-def travel_vetoes(
-    travel: Travel, place: Placement, magnet: Magnet, settings: LiftSettings
-) -> tuple[Veto, ...]:
-    """Return `trajectory-degraded` where the map's place or height isn't sure enough for this lift."""
+def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: LiftSettings) -> list[Check]:
+    """Check that the map's place and height are sure enough for this lift."""
     here = np.array([place.x_m, place.y_m])
-    away = np.linalg.norm(travel.place_m - here, axis=1)
-    near = away < travel.reach_m
-    reasons = []
-    if not near.any():
-        reasons.append(f"no frame was placed within {travel.reach_m:.1f} m of it")
-    else:
-        reasons += _unsure(np.median(travel.sigma_m[near], axis=0), magnet)
+    near = np.linalg.norm(travel.place_m - here, axis=1) < travel.reach_m
+    reason = f"no frame was placed within {travel.reach_m:.1f} m of it"
+    checks = [check_true(CODE, "frames were placed near it", bool(near.any()), reason)]
+    if near.any():
+        checks += _sure_enough(np.median(travel.sigma_m[near], axis=0), magnet)
         refused = int((np.linalg.norm(travel.refused_m - here, axis=1) < travel.reach_m).sum())
-        if refused > settings.max_refused_ratio * (refused + near.sum()):
-            reasons.append(
-                f"{refused} of {refused + near.sum()} frames that see it were refused, "
-                f"{100 * settings.max_refused_ratio:.0f} % are allowed"
-            )
-    most = min(magnet.tolerance.x_m, magnet.tolerance.y_m)
+        seen = refused + int(near.sum())
+        reason = (
+            f"{refused} of {seen} frames that see it were refused, "
+            f"{100 * settings.max_refused_ratio:.0f} % are allowed"
+        )
+        what = "refused part of the frames that see it"
+        checks.append(check_most(CODE, what, refused / seen, settings.max_refused_ratio, "", reason))
+    return [*checks, *_encoder_checks(travel, place, min(magnet.tolerance.x_m, magnet.tolerance.y_m))]
+
+
+def _encoder_checks(travel: Travel, place: Placement, most_m: float) -> list[Check]:
+    """Check that encoders and map agree beside the lift and at the end of the way."""
     known = np.isfinite(travel.off_m)
-    beyond = known & (travel.off_m > most + SURE_SIGMAS * travel.sigma_m[:, :2].max(axis=1, initial=0))
-    passing = beyond & (np.abs(travel.place_m[:, 0] - place.x_m) < ALONGSIDE_M)
+    if not known.any():
+        return []
+    sigma = travel.sigma_m[:, :2].max(axis=1, initial=0)
+    excess = np.where(known, travel.off_m - SURE_SIGMAS * sigma, -np.inf)
+    passing = known & (np.abs(travel.place_m[:, 0] - place.x_m) < ALONGSIDE_M)
+    last = int(np.flatnonzero(known)[-1])
+    checks = []
     if passing.any():
-        reasons.append(
-            f"encoders and map disagree by {1e3 * travel.off_m[passing].max():.0f} mm within "
-            f"{ALONGSIDE_M:g} m of it, {1e3 * most:.0f} mm are allowed"
-        )
-    elif known.any() and beyond[np.flatnonzero(known)[-1]]:
-        last = travel.off_m[np.flatnonzero(known)[-1]]
-        reasons.append(
-            f"at the end of the way encoders and map disagreed by {1e3 * last:.0f} mm: the crane would "
-            f"go beside its target, {1e3 * most:.0f} mm are allowed"
-        )
-    return tuple(Veto("trajectory-degraded", reason) for reason in reasons)
+        worst = int(np.argmax(np.where(passing, excess, -np.inf)))
+        checks.append((worst, "beside the lift", "encoders and map disagree by "
+                       f"{1e3 * travel.off_m[worst]:.0f} mm within {ALONGSIDE_M:g} m of it, "
+                       f"{1e3 * most_m:.0f} mm are allowed"))  # fmt: skip
+    checks.append((last, "at the end of the way", f"at the end of the way encoders and map disagreed by "
+                   f"{1e3 * travel.off_m[last]:.0f} mm: the crane would go beside its target, "
+                   f"{1e3 * most_m:.0f} mm are allowed"))  # fmt: skip
+    return [
+        check_most(CODE, f"what surely parts encoders and map {where}", 1e3 * float(excess[frame]),
+                   1e3 * most_m, "mm", reason)
+        for frame, where, reason in checks
+    ]  # fmt: skip
 
 
-def _unsure(sigma: Float64, magnet: Magnet) -> list[str]:
-    """Find where the 95 % bound of the map's place is over the crane's tolerance, or its height's over the
+def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
+    """Check that the 95 % bound of the map's place is within the crane's tolerance, its height's within the
     gap.
     """
-    out = []
-    for name, one, most in (
-        ("x", sigma[0], magnet.tolerance.x_m),
-        ("y", sigma[1], magnet.tolerance.y_m),
-        ("height", sigma[2], magnet.limits.gap_m),
-    ):
-        if not UPPER * one <= most:
-            out.append(
-                f"near it the trajectory knows {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
-                f"{1e3 * most:.0f} mm are allowed"
-            )
-    return out
+    return [
+        check_most(
+            CODE, f"how well the trajectory knows {name} near it (95 %)", 1e3 * UPPER * float(one),
+            1e3 * most, "mm", f"near it the trajectory knows {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
+            f"{1e3 * most:.0f} mm are allowed",
+        )
+        for name, one, most in (
+            ("x", sigma[0], magnet.tolerance.x_m),
+            ("y", sigma[1], magnet.tolerance.y_m),
+            ("height", sigma[2], magnet.limits.gap_m),
+        )
+    ]  # fmt: skip
+
+
+def target_covariance(
+    place: Placement, load: tuple[Bundle, ...], plane_sigma_m: float, map_sigma_m: float,
+    travel: Travel | None,
+) -> Float64:  # fmt: skip
+    """Estimate the covariance (4, 4) of a target's x, y, z (m) and yaw (rad), in the map's frame.
+
+    The bundles' own, the plane's over its points, the trajectory's near it, and the map's: only that holds
+    the calibration's part of the heights, which moves the whole map; all of it is taken as shared. Of several
+    bundles the worst counts: their errors are common. NaN where a bundle doesn't know.
+    """
+    if not load:
+        return np.full((4, 4), np.nan)
+    lateral, along, yaw, top = (
+        max((getattr(b.sigma, name) for b in load), key=lambda s: np.inf if np.isnan(s) else s)
+        for name in ("lateral_m", "along_m", "yaw_rad", "top_z_m")
+    )
+    axes = np.stack([place.across, place.along], axis=1)
+    found = np.zeros((4, 4))
+    found[:2, :2] = axes @ np.diag([lateral**2, along**2]) @ axes.T
+    found[2, 2] = top**2 + plane_sigma_m**2 + map_sigma_m**2
+    # The place turns with the load's yaw about the load's middle.
+    away = np.array([place.x_m, place.y_m]) - np.mean([b.centre_m[:2] for b in load], axis=0)
+    turn = np.array([-away[1], away[0], 0.0, 1.0])
+    found += yaw**2 * np.outer(turn, turn)
+    if travel is not None:
+        near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.reach_m
+        shared = np.median(travel.sigma_m[near], axis=0) if near.any() else np.full(3, np.nan)
+        found[:3, :3] += np.diag(shared**2)
+    return found

@@ -1,4 +1,6 @@
-"""Validity in time: ages count from the frames' capture, never from the time of computing."""
+"""Validity in time: ages count from the frames' capture, never from the time of computing; what happened in
+the yard since then forbids around it.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.vetoes import Veto
+from barsight.yard.types import Bundle
+from barsight.yard.vetoes import Check, check_least, check_most, check_true
 
 MAX_CLOCK_ERROR_NS = NS_PER_S
 """Frames may be this much ahead of this computer's clock."""
@@ -34,19 +39,48 @@ def validity(travel: Travel, place: Placement, settings: LiftSettings) -> Validi
     return Validity(seen_ns, seen_ns + seconds_to_ns(settings.max_age_s))
 
 
-def age_vetoes(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> tuple[Veto, ...]:
-    """Forbid what was captured too long ago, in the future, or nobody knows when. Stamps in ns since 1970."""
+def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> list[Check]:
+    """Check that what was captured isn't too old, of the future, or of nobody knows when. Stamps in ns since
+    1970.
+    """
     if captured_to_ns is None:
-        return (Veto("map-too-old", "when the map was captured is not known"),)
-    ahead_ns = captured_to_ns - now_ns
-    if ahead_ns > MAX_CLOCK_ERROR_NS:
-        reason = f"the last frame is {_span(ahead_ns)} ahead of this computer's clock: set the clocks"
-        return (Veto("map-from-the-future", reason),)
-    if -ahead_ns > seconds_to_ns(settings.max_age_s):
-        allowed = _span(seconds_to_ns(settings.max_age_s))
-        reason = f"the last frame that saw it is {_span(-ahead_ns)} old, {allowed} are allowed"
-        return (Veto("map-too-old", reason),)
-    return ()
+        reason = "when the map was captured is not known"
+        return [check_true("map-too-old", "age of what was seen", None, reason)]
+    age_ns, max_age_ns = now_ns - captured_to_ns, seconds_to_ns(settings.max_age_s)
+    return [
+        check_least(
+            "map-from-the-future", "age by this computer's clock", age_ns / NS_PER_S,
+            -MAX_CLOCK_ERROR_NS / NS_PER_S, "s",
+            f"the last frame is {_span(-age_ns)} ahead of this computer's clock: set the clocks",
+        ),
+        check_most(
+            "map-too-old", "age of the last frame that saw it", age_ns / NS_PER_S, settings.max_age_s, "s",
+            f"the last frame that saw it is {_span(age_ns)} old, {_span(max_age_ns)} are allowed",
+        ),
+    ]  # fmt: skip
+
+
+def disturbed_checks(
+    events: tuple[YardEvent, ...], place: Placement, magnet: Magnet, load: tuple[Bundle, ...],
+    seen: Validity | None, settings: LiftSettings,
+) -> list[Check]:  # fmt: skip
+    """Check that nothing happened within reach of magnet and load since the place was last seen."""
+    size = magnet.beam.width_m, 2 * magnet.half_span_m
+    outlines = [corners((place.x_m, place.y_m), place.yaw_rad, *size)]
+    for bundle in load:
+        x, y = bundle.centre_m[:2]
+        outlines.append(corners((x, y), bundle.yaw_rad, bundle.width_m, bundle.length_m))
+    since = [event for event in events if seen is None or event.stamp_ns > seen.from_ns]
+    checks = []
+    for event in since:
+        away = min(gap_between(outline, event.corners_m) for outline in outlines)
+        reason = (
+            f"a {event.kind} at {event.x_m:.2f}, {event.y_m:.2f} m, {away:.2f} m from it, came after it was "
+            f"last seen; {settings.disturbed_reach_m:g} m are needed: measure again"
+        )
+        what = f"distance from a {event.kind} since it was last seen"
+        checks.append(check_least("disturbed", what, away, settings.disturbed_reach_m, "m", reason))
+    return sorted(checks, key=lambda check: check.value or 0.0)[:1]
 
 
 def _span(duration_ns: int) -> str:

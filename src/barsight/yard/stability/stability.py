@@ -16,7 +16,7 @@ from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Veto
+from barsight.yard.vetoes import Check, check_least, check_most, check_true
 
 STEP_M = 0.01
 LOOK_M = 1.5
@@ -156,6 +156,24 @@ def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Flo
     return found
 
 
+def interpolate_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
+    """Interpolate heights between the four cells about each place; NaN where less than half was seen."""
+    columns, rows = (x - heights.x0_m) / heights.cell_m, (y - heights.y0_m) / heights.cell_m
+    left, low = np.floor(columns), np.floor(rows)
+    total, weight = np.zeros(x.shape), np.zeros(x.shape)
+    for right in (0, 1):
+        for up in (0, 1):
+            part = np.abs(1 - right - (columns - left)) * np.abs(1 - up - (rows - low))
+            z = lookup_heights(
+                heights, heights.x0_m + (left + right) * heights.cell_m,
+                heights.y0_m + (low + up) * heights.cell_m,
+            )  # fmt: skip
+            seen = np.isfinite(z)
+            total += np.where(seen, part * z, 0)
+            weight += np.where(seen, part, 0)
+    return np.where(weight >= 0.5, total / np.maximum(weight, 0.5), np.nan)
+
+
 def _side(profile: Float64, bundle: Bundle) -> Side:
     z, known = profile[:, 0], profile[:, 1] >= MIN_KNOWN
     share = float(profile[:, 1].mean())
@@ -183,54 +201,78 @@ def _distance(bundle: Bundle, x: float, y: float) -> float:
     return math.hypot(max(float(beside), 0.0), max(float(beyond), 0.0))
 
 
-def footing_vetoes(
+def footing_checks(
     target: Bundle, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
-) -> tuple[Veto, ...]:
-    """List what in the pile speaks against lifting this bundle."""
+) -> list[Check]:
+    """Check what in the pile speaks against lifting this bundle."""
     by_id = {footing.bundle: footing for footing in standing}
-    vetoes = []
-    own = by_id[target.id]
+    own, mm = by_id[target.id], 1e3
+    over = own.overhang_m if own.overhang_side else 0.0
     limit = settings.max_overhang_ratio * target.width_m
-    upper = own.overhang_m + UPPER * _sure(target.sigma.width_m / 2)
-    if own.overhang_m > 0.5 * target.width_m:
-        vetoes.append(
-            Veto("no-support", f"what carries it ends {1e3 * own.overhang_m:.0f} mm before its edge, "
-                 f"its middle is not carried")
+    checks = [
+        check_most(
+            "no-support", "how far what carries it ends before its edge", mm * over, mm * target.width_m / 2,
+            "mm", f"what carries it ends {mm * over:.0f} mm before its edge, its middle is not carried",
+        )
+    ]  # fmt: skip
+    if checks[0].result == "passed":
+        checks.append(
+            check_most(
+                "overhanging", "how far it stands over the edge of what carries it", mm * over, mm * limit,
+                "mm", f"it stands {mm * over:.0f} mm over the edge of what carries it, {mm * limit:.0f} mm "
+                "are allowed", sigma=mm * _sure(target.sigma.width_m / 2) if over else 0.0, sigmas=UPPER,
+            )
         )  # fmt: skip
-    elif own.overhang_side and upper > limit:
-        vetoes.append(
-            Veto("overhanging", f"it stands {1e3 * own.overhang_m:.0f} mm over the edge of what carries it, "
-                 f"{1e3 * limit:.0f} mm are allowed")
-        )  # fmt: skip
-    if own.lean_deg > settings.max_lean_deg:
-        vetoes.append(
-            Veto("unstable-side", f"the side of the pile below it leans by {own.lean_deg:.1f} deg, "
-                 f"{settings.max_lean_deg:g} are allowed")
-        )  # fmt: skip
-    if own.freeboard_m < settings.min_freeboard_m:
-        vetoes.append(
-            Veto("over-stanchion", f"the stanchion beside it is {1e3 * own.freeboard_m:.0f} mm above its "
-                 f"top, {1e3 * settings.min_freeboard_m:.0f} mm are needed")
+    checks.append(
+        check_most(
+            "unstable-side", "lean of the side of the pile below it", own.lean_deg, settings.max_lean_deg,
+            "deg", f"the side of the pile below it leans by {own.lean_deg:.1f} deg, "
+            f"{settings.max_lean_deg:g} are allowed",
+        )
+    )  # fmt: skip
+    if not math.isnan(own.freeboard_m):
+        checks.append(
+            check_least(
+                "over-stanchion", "the lowest stanchion beside it over its top", mm * own.freeboard_m,
+                mm * settings.min_freeboard_m, "mm", f"the stanchion beside it is {mm * own.freeboard_m:.0f} "
+                f"mm above its top, {mm * settings.min_freeboard_m:.0f} mm are needed",
+                sigma=mm * _sure(target.sigma.top_z_m),
+            )
         )  # fmt: skip
     for other in bundles:
-        if leans_on(other, target, by_id[other.id], settings):
-            vetoes.append(
-                Veto("unstable-side", f"bundle {other.id} stands {1e3 * by_id[other.id].overhang_m:.0f} mm "
-                     f"over the edge on this side")
+        leaning = by_id[other.id]
+        if lies_over_edge_of(other, target, leaning):
+            reason = f"bundle {other.id} stands {mm * leaning.overhang_m:.0f} mm over the edge on this side"
+            checks += [
+                check_most("unstable-side", f"bundle {other.id} {what}", value, most, unit, reason)
+                for what, value, most, unit in (
+                    ("over the edge on this side", mm * leaning.overhang_m,
+                     mm * settings.max_overhang_ratio * other.width_m, "mm"),
+                    ("leaning to this side", leaning.lean_deg, settings.max_lean_deg, "deg"),
+                )
+            ]  # fmt: skip
+        if other.id in target.neighbours:
+            checks.append(
+                check_true(
+                    "unstable-side", f"bundle {other.id} beside it stands by itself",
+                    not rests_against(other, target), f"bundle {other.id} rests against it from above",
+                )
             )  # fmt: skip
-        elif rests_against(other, target):
-            vetoes.append(Veto("unstable-side", f"bundle {other.id} rests against it from above"))
-    return tuple(vetoes)
+    return checks
 
 
 def leans_on(other: Bundle, target: Bundle, footing: Footing, settings: LiftSettings) -> bool:
     """Check whether `other`, of this footing, stands or leans over the edge beside which `target` lies."""
+    over = footing.overhang_m > settings.max_overhang_ratio * other.width_m
+    return (over or footing.lean_deg > settings.max_lean_deg) and lies_over_edge_of(other, target, footing)
+
+
+def lies_over_edge_of(other: Bundle, target: Bundle, footing: Footing) -> bool:
+    """Check whether `other`, of this footing, stands over the edge beside which `target` lies."""
     if other.id == target.id or not footing.overhang_side or not _beside(target, other):
         return False
     away = target.centre_m[:2] - other.centre_m[:2]
-    over = footing.overhang_m > settings.max_overhang_ratio * other.width_m
-    leans = over or footing.lean_deg > settings.max_lean_deg
-    return bool(leans and footing.overhang_side * (away @ high_side(other.yaw_rad)) > 0)
+    return bool(footing.overhang_side * (away @ high_side(other.yaw_rad)) > 0)
 
 
 def rests_against(other: Bundle, target: Bundle) -> bool:

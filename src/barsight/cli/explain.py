@@ -1,0 +1,58 @@
+"""Run `barsight explain OUT LIFT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from barsight.cli.arguments import call
+from barsight.report.explanation import Explanation, explain, format_check, write_explanation
+
+COLOUR = {"passed": "green", "failed": "red", "unknown": "red"}
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, print and write."""
+
+    def command(
+        folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+        lift: tyro.conf.Positional[str],
+        out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
+    ) -> None:
+        """Tell why a lift is offered or refused: every check with its figure and bound, and a picture.
+
+        Args:
+            folder: A folder written by barsight measure.
+            lift: The rank of an offered lift, like 3, or bundle:12 for the lift of bundle 12, offered or not.
+            out: HTML file for checks and picture; OUT/explain-LIFT.html if not given.
+        """
+        told = explain(folder, lift)
+        target = out or folder / f"explain-{lift.replace(':', '-')}.html"
+        write_explanation(told, target)
+        console = Console()
+        _print(told, console)
+        console.print(f"page: {target}", soft_wrap=True, highlight=False, markup=False)
+
+    call(command, "explain", arguments)
+
+
+def _print(told: Explanation, console: Console) -> None:
+    console.print(told.title, highlight=False)
+    for veto in told.map_vetoes:
+        console.print(f"[red]{veto['code']}:[/red] {escape(veto['reason'])}", highlight=False)
+    table = Table(box=SIMPLE_HEAD)
+    for head in ("result", "what is checked", "figure", "bound", "veto"):
+        table.add_column(head, overflow="fold")
+    for check in told.checks:
+        figure, bound = format_check(check)
+        what = check["what"] + (f"\n{check['reason']}" if check["reason"] else "")
+        colour = COLOUR[check["result"]]
+        table.add_row(f"[{colour}]{check['result']}[/{colour}]", escape(what), figure, bound, check["code"])
+    console.print(table)

@@ -1,0 +1,40 @@
+"""Read and write JSON documents that carry their own digest, so that a changed one is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import InputError
+from barsight.core.files import atomic_path
+from barsight.core.json_values import json_digest
+
+SEAL = "content_sha256"
+
+
+def write_sealed(content: dict[str, Any], target: Path) -> str:
+    """Write JSON's own values and their digest, whole or not at all; return the digest."""
+    digest = json_digest(content)
+    text = json.dumps(content | {SEAL: digest}, indent=1, allow_nan=False)
+    with atomic_path(target) as path:
+        path.write_text(text + "\n", encoding="utf-8")
+    return digest
+
+
+def read_sealed(path: Path, version: int, remedy: str) -> dict[str, Any]:
+    """Read a document. Raises InputError where it is missing, torn, of another version or changed."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        found = content["schema_version"]
+    except FileNotFoundError as error:
+        raise InputError(path, "no such file", remedy) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
+    if found != version:
+        raise InputError(path, f"has schema version {found} instead of {version}", remedy)
+    document: dict[str, Any] = content
+    inside = {key: value for key, value in document.items() if key != SEAL}
+    if document.get(SEAL) != json_digest(inside):
+        raise InputError(path, "was changed after it was written", remedy)
+    return document

@@ -1,0 +1,207 @@
+"""Explain a lift: every check with its figure and bound, and a picture of the place."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cattrs
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Float64, UInt8
+from barsight.core.errors import ConfigError
+from barsight.core.files import atomic_path
+from barsight.report.page import environment, format_number, resource
+from barsight.result_folder import open_folder, read_heights
+from barsight.yard.events import corners
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lifting.clearance import FacePlane, find_obstacle
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.lift_file import read_lifts
+from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.stability.stability import lookup_heights
+from barsight.yard.types import Bundle, HeightMap, YardMap
+
+PIXELS_PER_M = 180.0
+BEYOND_M = 0.5
+"""How much of the place is shown around the magnet."""
+LOW_M, HIGH_M = -0.3, 0.1
+"""Heights from the faces' plane that the colours span."""
+BGR = {
+    "face": (180, 47, 255), "beam": (255, 255, 255), "tolerance": (0, 215, 255), "bundle": (83, 211, 57),
+    "offending": (30, 30, 230),
+}  # fmt: skip
+UNSEEN_BGR, HATCH_BGR = (225, 225, 225), (150, 150, 150)
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A lift of lifts.json with what its checks found. title: in words. picture: (H, W, 3) BGR, None where
+    nothing was known under the magnet. map_vetoes: what forbids every lift of the map.
+    """
+
+    title: str
+    record: dict[str, Any]
+    map_vetoes: tuple[dict[str, str], ...]
+    picture: UInt8 | None
+    is_simulated: bool
+
+    @property
+    def checks(self) -> list[dict[str, Any]]:
+        """Return the checks, those that forbid first."""
+        order = {"failed": 0, "unknown": 1, "passed": 2}
+        return sorted(self.record["checks"], key=lambda check: order[check["result"]])
+
+
+def explain(folder: Path, which: str) -> Explanation:
+    """Explain the lift `which` of a folder: `3` is the offered lift of rank 3, `bundle:12` the one that would
+    take bundle 12, offered or refused.
+
+    Raises ConfigError where there is no such lift, InputError for a folder that can't be read.
+    """
+    summary, _ = open_folder(folder)
+    lifts = read_lifts(folder / "lifts.json")
+    record = _find(lifts, which, folder)
+    ids = ", ".join(str(number) for number in record["bundles"]) or "no bundle"
+    rank = record["rank"]
+    state = f"is offered at rank {rank}" if rank is not None else "is refused"
+    picture = None
+    if record["target"]["z_m"] is not None:
+        picture = draw_place(
+            read_heights(folder), record, cattrs.structure(lifts["magnet"], Magnet),
+            read_bundles(folder / "bundles.json"),
+        )  # fmt: skip
+    title = f"The lift of bundle {ids} {state}"
+    return Explanation(title, record, tuple(lifts["vetoes"]), picture, bool(summary.get("is_simulated")))
+
+
+def _find(lifts: dict[str, Any], which: str, folder: Path) -> dict[str, Any]:
+    told = re.fullmatch(r"(bundle:)?(\d+)", which)
+    if told is None:
+        raise ConfigError(f"{which!r} names no lift; give a rank like 3, or a bundle like bundle:12")
+    number = int(told[2])
+    every: list[dict[str, Any]] = [*lifts["lifts"], *lifts["refused"]]
+    for record in every:
+        if number in record["bundles"] if told[1] else number == record["rank"]:
+            return record
+    if told[1]:
+        known = sorted({k for record in every for k in record["bundles"]})
+        listed = f"it judges those of {', '.join(str(k) for k in known)}" if known else "it judges none"
+        raise ConfigError(f"{folder}: lifts.json has no lift of bundle {number}; {listed}")
+    raise ConfigError(
+        f"{folder}: no lift of rank {number} is offered; there are {len(lifts['lifts'])}. A refused one is "
+        "named by its bundle, like bundle:12"
+    )
+
+
+def format_check(check: dict[str, Any]) -> tuple[str, str]:
+    """Format a check's figure with sigma, and its bound."""
+    unit = {"deg": "°", "s": "s"}.get(check["unit"], check["unit"])
+    decimals = {"mm": 1, "N": 0, "kg": 0, "s": 0, "": 3, "deg": 2}.get(check["unit"], 2)
+    if float(check["value"] or 0).is_integer() and float(check["bound"] or 0).is_integer():
+        decimals = 0
+    figure, bound = (format_number(check[name], decimals) for name in ("value", "bound"))
+    if check["sigma"]:
+        figure += f" ± {format_number(check['sigma'], decimals)}"
+    return f"{figure} {unit}".strip("– "), f"{bound} {unit}".strip("– ")
+
+
+def write_explanation(told: Explanation, target: Path) -> None:
+    """Write the page, one file, whole or not at all."""
+    rows = [{**check, "figure": figure, "limit": limit} for check in told.checks
+            for figure, limit in [format_check(check)]]  # fmt: skip
+    picture = None
+    if told.picture is not None:
+        encoded = cv2.imencode(".png", told.picture)[1].tobytes()
+        picture = f"data:image/png;base64,{base64.b64encode(encoded).decode('ascii')}"
+    colours = {name: f"rgb({r}, {g}, {b})" for name, (b, g, r) in BGR.items()}
+    page = environment().get_template("explanation_page.html.jinja").render(
+        told=told, rows=rows, picture=picture, colours=colours, css=resource("page.css")
+    )  # fmt: skip
+    with atomic_path(target) as path:
+        path.write_text(page, encoding="utf-8")
+
+
+def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tuple[Bundle, ...]) -> UInt8:
+    """Draw the heights about a lift (H, W, 3), the beam from left to right, with faces, tolerance, bundles
+    and the cells that offend.
+    """
+    target = record["target"]
+    place = Placement(target["x_m"], target["y_m"], math.radians(target["yaw_deg"]))
+    long = max(magnet.half_span_m, magnet.beam.length_m / 2) + BEYOND_M
+    wide = max(magnet.beam.width_m / 2, *(abs(p.across_m) + p.width_m / 2 for p in magnet.poles)) + BEYOND_M
+    part = _part(heights, place, math.hypot(long, wide))
+    faces = FacePlane(
+        target["z_m"], math.radians(record["pitch_deg"]), math.radians(record["roll_deg"]),
+        record["contact_sigma_m"],
+    )  # fmt: skip
+    picture = _paint(part, place, faces, long, wide)
+
+    def pixels(xy_m: Float64) -> Float64:
+        away = xy_m - (place.x_m, place.y_m)
+        along, across = away @ place.along, away @ place.across
+        return np.stack([(along + long) * PIXELS_PER_M, (across + wide) * PIXELS_PER_M], axis=-1)
+
+    obstacle = find_obstacle(place, part, magnet, faces)
+    if obstacle is not None:
+        half = math.ceil(0.005 * PIXELS_PER_M)
+        for x, y in np.round(pixels(obstacle.places_m)).astype(int):
+            cv2.rectangle(picture, (x - half, y - half), (x + half, y + half), BGR["offending"], -1)
+
+    def outline(corners_m: Float64, kind: str, thickness: int = 2) -> None:
+        points = np.round(pixels(corners_m)).astype(np.int32)
+        cv2.polylines(picture, [points], True, BGR[kind], thickness, cv2.LINE_AA)
+
+    for bundle in bundles:
+        x, y = bundle.centre_m[:2]
+        outline(corners((x, y), bundle.yaw_rad, bundle.width_m, bundle.length_m), "bundle")
+        middle = np.round(pixels(bundle.centre_m[None, :2]))[0].astype(int).tolist()
+        cv2.putText(picture, str(bundle.id), middle, cv2.FONT_HERSHEY_SIMPLEX, 0.6, BGR["bundle"], 2)
+    centre = np.array([place.x_m, place.y_m])
+    outline(corners((place.x_m, place.y_m), place.yaw_rad, magnet.beam.width_m, magnet.beam.length_m), "beam")
+    slack = np.array([magnet.tolerance.x_m, magnet.tolerance.y_m])
+    more_v, more_u = (2 * float(np.abs(axis) @ slack) for axis in (place.along, place.across))
+    for pole in magnet.poles:
+        at = centre + pole.along_m * place.along + pole.across_m * place.across
+        size = pole.width_m, pole.length_m
+        outline(corners((at[0], at[1]), place.yaw_rad, size[0] + more_u, size[1] + more_v), "tolerance", 1)
+        outline(corners((at[0], at[1]), place.yaw_rad, *size), "face")
+    return picture
+
+
+def _part(heights: YardMap, place: Placement, reach_m: float) -> HeightMap:
+    """Cut the map about a place."""
+    cuts = []
+    for centre, first, count in (
+        (place.y_m, heights.y0_m, heights.shape[0]), (place.x_m, heights.x0_m, heights.shape[1]),
+    ):  # fmt: skip
+        low = math.floor((centre - reach_m - first) / heights.cell_m)
+        high = math.ceil((centre + reach_m - first) / heights.cell_m) + 1
+        cuts.append(slice(min(max(low, 0), count - 1), max(min(high, count), 1)))
+    return heights.part(*cuts)
+
+
+def _paint(heights: HeightMap, place: Placement, faces: FacePlane, long: float, wide: float) -> UInt8:
+    """Paint the heights from the faces' plane in colours, what was not seen hatched."""
+    v = np.arange(-long, long, 1 / PIXELS_PER_M)
+    u = np.arange(-wide, wide, 1 / PIXELS_PER_M)
+    vv, uu = np.meshgrid(v, u)
+    x, y = (
+        centre + vv * along + uu * across
+        for centre, along, across in zip((place.x_m, place.y_m), place.along, place.across, strict=True)
+    )
+    plane = faces.centre_z_m + vv * math.tan(faces.pitch_rad) + uu * math.tan(faces.roll_rad)
+    rise = lookup_heights(heights, x, y) - plane
+    level = np.clip((np.nan_to_num(rise, nan=LOW_M) - LOW_M) / (HIGH_M - LOW_M), 0, 1)
+    picture = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    rows, columns = np.indices(rise.shape)
+    hatch = (rows + columns) // 4 % 3 == 0
+    unseen = np.isnan(rise)
+    picture[unseen] = UNSEEN_BGR
+    picture[unseen & hatch] = HATCH_BGR
+    return np.ascontiguousarray(picture, dtype=np.uint8)

@@ -1,0 +1,113 @@
+"""Record what has happened in the yard since it was measured: lifts, set-downs, magnets seen."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, astuple, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.errors import InputError
+from barsight.core.files import atomic_path
+from barsight.yard.types import Bundle
+
+KINDS = ("lift", "set-down", "magnet")
+
+
+@dataclass(frozen=True)
+class YardEvent:
+    """A rectangle in the yard where something was moved. stamp_ns: on the frames' clock. kind: of KINDS.
+
+    yaw_deg: of its length, from +Y about Z.
+    """
+
+    stamp_ns: int
+    kind: str
+    x_m: float
+    y_m: float
+    yaw_deg: float
+    length_m: float
+    width_m: float
+
+    @property
+    def corners_m(self) -> Float64:
+        """Compute its corners (4, 2)."""
+        return corners((self.x_m, self.y_m), math.radians(self.yaw_deg), self.width_m, self.length_m)
+
+
+COLUMNS = tuple(field.name for field in fields(YardEvent))
+
+
+def lift_of(bundle: Bundle, stamp_ns: int) -> YardEvent:
+    """Record that a bundle was lifted."""
+    x, y = (round(float(value), 4) for value in bundle.centre_m[:2])
+    yaw_deg = round(math.degrees(bundle.yaw_rad), 4)
+    return YardEvent(stamp_ns, "lift", x, y, yaw_deg, round(bundle.length_m, 4), round(bundle.width_m, 4))
+
+
+def read_events(path: Path) -> tuple[YardEvent, ...]:
+    """Read a CSV of COLUMNS. Raises InputError where it is missing or a line is no event."""
+    remedy = f"give a CSV with the columns {','.join(COLUMNS)}; a kind is one of {', '.join(KINDS)}"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.reader(file))
+    except FileNotFoundError as error:
+        raise InputError(path, "no such file", remedy) from error
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, f"can't be read ({error})", remedy) from error
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise InputError(path, "has another first line", remedy)
+    return tuple(_event(path, number, row, remedy) for number, row in enumerate(rows[1:], start=2) if row)
+
+
+def _event(path: Path, number: int, row: list[str], remedy: str) -> YardEvent:
+    try:
+        stamp, kind, *rest = row
+        x, y, yaw, length, width = (float(value) for value in rest)
+        event = YardEvent(int(stamp), kind, x, y, yaw, length, width)
+    except ValueError as error:
+        raise InputError(path, f"line {number} is no event ({error})", remedy) from error
+    finite = all(math.isfinite(value) for value in (x, y, yaw, length, width))
+    if kind not in KINDS or not finite or min(length, width) < 0 or event.stamp_ns < 0:
+        raise InputError(path, f"line {number} is no event", remedy)
+    return event
+
+
+def write_events(events: Iterable[YardEvent], target: Path) -> None:
+    """Write a CSV of COLUMNS, whole or not at all."""
+    with atomic_path(target) as path, path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows(astuple(event) for event in events)
+
+
+def merged(first: Iterable[YardEvent], more: Iterable[YardEvent]) -> tuple[YardEvent, ...]:
+    """Join events, each once, in time's order."""
+    return tuple(sorted({*first, *more}, key=lambda event: tuple(asdict(event).values())))
+
+
+def corners(centre: tuple[float, float], yaw_rad: float, width_m: float, length_m: float) -> Float64:
+    """Compute the corners (4, 2) of a rectangle whose length runs along yaw."""
+    across = width_m / 2 * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
+    along = length_m / 2 * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
+    turns = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    return np.asarray(np.array(centre) + turns[:, :1] * across + turns[:, 1:] * along)
+
+
+def gap_between(one: Float64, other: Float64) -> float:
+    """Compute a lower bound (m) of the distance between two rectangles, by the axes across their sides; 0
+    where they overlap.
+    """
+    widest = 0.0
+    for corner in (one, other):
+        for side in (corner[1] - corner[0], corner[2] - corner[1]):
+            length = float(np.linalg.norm(side))
+            if length == 0:
+                continue
+            a, b = one @ side / length, other @ side / length
+            widest = max(widest, float(a.min() - b.max()), float(b.min() - a.max()))
+    return widest

@@ -1,0 +1,45 @@
+"""Identify a map, so that what was found in it can't be taken for another's."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import barsight
+from barsight.core.errors import InputError
+
+ID_DIGITS = 16
+
+
+@dataclass(frozen=True)
+class MapIdentity:
+    """A map that files belong to.
+
+    map_id: digest of the map and of all that its lifts depend on. captured_from_ns, captured_to_ns: stamps of
+    its first and last frame, None where unknown. calibration_id, yard_frame_id: digests of the cameras' rig
+    and of how it hangs from the crane, None where there is no crane. height_sha256: of height.tif.
+    """
+
+    map_id: str
+    is_simulated: bool
+    captured_from_ns: int | None
+    captured_to_ns: int | None
+    calibration_id: str
+    yard_frame_id: str | None
+    height_sha256: str
+
+    def header(self, sequence: int) -> dict[str, Any]:
+        """Build what files of this map begin with. sequence: counts what was written of the same map."""
+        software = {"name": "barsight", "version": barsight.__version__}
+        return {"software": software, **asdict(self), "sequence": sequence}
+
+    def expect(self, path: Path, content: dict[str, Any], remedy: str) -> None:
+        """Raise InputError where a file's content belongs to another map."""
+        if content.get("map_id") != self.map_id:
+            problem = f"belongs to another map ({content.get('map_id')}, this one is {self.map_id})"
+            raise InputError(path, problem, remedy)
+
+
+GIVEN = MapIdentity("given", False, None, None, "given", None, "")
+"""Identity of a map that was not measured but given."""

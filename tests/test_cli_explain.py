@@ -1,0 +1,64 @@
+"""`barsight explain`: every check, and a picture that shows what stands in the way."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.cli.main import run
+from barsight.report.explanation import BGR, PIXELS_PER_M, explain
+from yard_folders import lifts, write_folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = write_folder(tmp_path_factory.mktemp("explain") / "out", block_m=0.06)
+    assert lifts(made) == 0
+    return made
+
+
+@pytest.mark.parametrize(("which", "state"), [("1", "offered at rank 1"), ("bundle:1", "refused")])
+def test_every_check_is_told(
+    folder: Path, which: str, state: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    target = tmp_path / "why.html"
+    assert run(["explain", str(folder), which, "-o", str(target)]) == 0
+    said = capsys.readouterr().out
+    assert state in said
+    content = json.loads((folder / "lifts.json").read_text(encoding="utf-8"))
+    record = (content["lifts"] if which == "1" else content["refused"])[0]
+    page = target.read_text(encoding="utf-8")
+    assert page.count("<tr><td class=") == len(record["checks"]) > 15
+    assert "data:image/png;base64," in page and "http" not in page
+    if which != "1":
+        assert "obstructed" in said and "something stands" in page
+
+
+def test_the_block_is_marked_where_it_stands(folder: Path) -> None:
+    told = explain(folder, "bundle:1")
+    assert told.picture is not None
+    _, columns = np.nonzero((told.picture == BGR["offending"]).all(axis=-1))
+    along = columns / PIXELS_PER_M - told.picture.shape[1] / PIXELS_PER_M / 2
+    assert np.median(along) == pytest.approx(2.0 - told.record["target"]["y_m"], abs=0.03)
+    offered = explain(folder, "1").picture
+    assert offered is not None and not (offered == BGR["offending"]).all(axis=-1).any()
+
+
+@pytest.mark.parametrize(
+    ("which", "says"),
+    [("9", "no lift of rank 9"), ("bundle:99", "no lift of bundle 99"), ("first", "names no lift")],
+)
+def test_no_such_lift_is_one_line(
+    folder: Path, which: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["explain", str(folder), which]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1
+
+
+def test_a_folder_without_lifts_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["explain", str(write_folder(tmp_path / "out")), "1"]) == 3
+    assert capsys.readouterr().err.count("\n") == 1
