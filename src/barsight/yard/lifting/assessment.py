@@ -14,6 +14,7 @@ from barsight.yard.lifting.checks import count_vetoes, face_vetoes, load_vetoes
 from barsight.yard.lifting.clearance import clearance_vetoes, resting_vetoes
 from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
+from barsight.yard.lifting.holding import hold_load, share_vetoes, weakest_pole
 from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.lifting.travel_accuracy import Travel, travel_vetoes
 from barsight.yard.lifting.validity import Validity, age_vetoes, validity
@@ -87,7 +88,9 @@ def assess_placement(
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
     mass, middle = _load(load)
-    needed = mass.upper_kg * NEWTON_PER_KG * magnet.safety_factor
+    needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
+    contact = hold_load(contact, magnet, load, settings.strap_m)
+    weakest = weakest_pole(contact, needed, magnet, place, load)
     away = np.array([place.x_m, place.y_m]) - middle
     along, across = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
@@ -97,6 +100,7 @@ def assess_placement(
         *(age_vetoes(valid.from_ns, yard.now_ns, settings) if valid else ()),
         *count_vetoes(place, yard.heights, magnet, near, contact, held, settings),
         *face_vetoes(contact, needed, magnet, settings),
+        *share_vetoes(weakest),
         *clearance_vetoes(place, yard.heights, magnet, contact),
         *resting_vetoes(place, magnet, contact, load),
         *load_vetoes(load, mass, along, across, overhang, magnet, settings),
@@ -110,6 +114,7 @@ def assess_placement(
     box = magnet.tolerance
     ratios = (
         contact.pull_low_n / needed if needed > 0 else 0.0,
+        weakest.ratio if weakest else 0.0,
         min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg) / mass.upper_kg
         if mass.upper_kg > 0 else 0.0,
         scale if search else math.inf,
@@ -199,7 +204,10 @@ def _change(
         contact = set_down(yard.heights, moved, magnet, settings.contact_gap_m)
         if contact is None or contact.unknown_share > settings.max_unknown_ratio:
             return "too much under the poles was not seen"
-        vetoes = face_vetoes(contact, needed_n, magnet, settings)
+        load = tuple(near.bundles[k] for k in held.gripped)
+        contact = hold_load(contact, magnet, load, settings.strap_m)
+        weakest = weakest_pole(contact, needed_n, magnet, moved, load)
+        vetoes = face_vetoes(contact, needed_n, magnet, settings) + share_vetoes(weakest)
         if vetoes:
             return f"{vetoes[0].reason}"
         exact = count_gripped(moved, magnet, Tolerance(0.0, 0.0, 0.0), near, contact.z_m)
