@@ -44,7 +44,7 @@ SECTION_RATIO, SECTION_SIGMA_RATIO = 0.5, 0.22
 
 @dataclass(frozen=True, eq=False)
 class SeenSection:
-    """What the map shows across a bundle. width_m: from side to side. upper_m2: between the top and the level
+    """Seen section of a bundle. width_m: from side to side. upper_m2: between the top and the level
     of the lower side. flank_m: how far that lies under the top. misfit_m: root mean square of the mean
     section over the outline of a full hexagon. sides_seen: both sides fall to the floor, or
     end where a bundle of about its width begins.
