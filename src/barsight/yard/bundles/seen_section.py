@@ -138,7 +138,7 @@ def _mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[
     level = np.full(len(beside), np.nan)
     with np.errstate(invalid="ignore"):
         level[enough] = np.nanmedian(np.where(known, z, np.nan)[:, enough] - up[:, None], axis=0)
-    return beside, level
+    return np.asarray(beside, np.float64), np.asarray(level, np.float64)
 
 
 def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:

@@ -94,7 +94,7 @@ def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[
         pulls = np.array([own.pull_across_m for own in contact.poles])
         beside = np.abs(offset[1] - pulls) + slack[1]
         share = share * np.maximum((1 + 2 * beside / poles[:, 3]) / magnet.needed_factor, 1.0)
-    return share
+    return np.asarray(share)
 
 
 @dataclass(frozen=True)
