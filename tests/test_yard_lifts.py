@@ -23,6 +23,7 @@ from barsight.yard.identity import GIVEN
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.contact import set_down
 from barsight.yard.lifting.footprint import BundleTable, Placement, count_gripped
+from barsight.yard.lifting.holding import hold_load, pole_shares, share_vetoes, weakest_pole
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
 from barsight.yard.lifting.magnet import Beam, Magnet, Tolerance
 from barsight.yard.lifting.resting_plane import rest_plane
@@ -43,7 +44,7 @@ def test_a_free_bundle_is_offered_with_the_figures_of_geometry() -> None:
     for lift in plan.offered:
         assert lift.contact is not None
         true_kg = 7 * math.pi / 4 * 0.09**2 * 7.0 * 7850
-        assert abs(lift.mass.kg - true_kg) < 3 * lift.mass.sigma_kg < 0.1 * true_kg
+        assert abs(lift.mass.kg - true_kg) < 3 * lift.mass.sigma_kg < 0.3 * true_kg
         assert lift.count == 1 and lift.count_probability > 0.999
         assert abs(lift.contact.centre_z_m - stock[0].top_z_m) < 0.003
         assert lift.tolerance.x_m >= MAGNET.tolerance.x_m
@@ -66,8 +67,11 @@ def test_pull_is_the_table_over_the_faces() -> None:
     heights = map_of([], sigma_m=0.0)
     contact = set_down(heights, Placement(0.5, 0.0, 0.0), MAGNET, 0.003)
     assert contact is not None
-    whole = 4 * 0.9 * 0.1 * 560e3
-    assert contact.pull_n == pytest.approx(whole, rel=0.01)
+    thick = replace(record(laid(0.5)), bar_diameter_m=1.0, sigma=replace(SIGMA, bar_diameter_m=0.0))
+    pull = replace(MAGNET.pull, round_diameter_m=(), round_ratio=())
+    held = hold_load(contact, replace(MAGNET, pull=pull), (thick,), 0.0)
+    assert held.pull_n == pytest.approx(4 * 0.9 * 0.1 * 800e3 * 0.9, rel=0.02)
+    assert contact.pull_n == 0, "nothing is known to hang on the faces"
     assert contact.contact_share == 1
 
 
@@ -179,6 +183,18 @@ def test_too_little_pull() -> None:
     assert codes(judged([laid(0.3)], magnet=weak(safety_factor=8.0))) == {"weak-pull"}
 
 
+def test_the_weakest_pole_is_named() -> None:
+    # 0.28 m off the middle along the bars: arms of 2.1 and 0.7 m, sum of squares 9.8 m2.
+    lift = judged([laid(0.3)], place=Placement(0.3, 0.28, 0.0))
+    assert lift.contact is not None
+    shares = pole_shares(lift.contact, MAGNET, lift.place, (record(laid(0.3)),))
+    slack = 1.645 * SIGMA.along_m
+    assert shares[0] == pytest.approx(0.25 + 2.1 / 9.8 * (0.28 + slack), abs=0.002)
+    assert shares[3] == pytest.approx(0.25 - 2.1 / 9.8 * (0.28 - slack), abs=0.002)
+    vetoes = share_vetoes(weakest_pole(lift.contact, 120e3, MAGNET, lift.place, (record(laid(0.3)),)))
+    assert [veto.code for veto in vetoes] == ["weak-pull"] and "pole 1 pulls" in vetoes[0].reason
+
+
 def test_too_heavy_for_magnet_or_crane() -> None:
     assert codes(judged([laid(0.3)], magnet=weak(capacity_kg=2000.0))) == {"overweight"}
     assert codes(judged([laid(0.3)], magnet=weak(crane_capacity_kg=4000.0))) == {"overweight"}
@@ -188,11 +204,12 @@ def test_mass_that_cannot_be_told() -> None:
     assert "mass-unknown" in codes(judged([laid(0.3)], (record(laid(0.3), bar_diameter_m=math.nan),)))
 
 
-def test_mass_by_the_outline_agrees_with_mass_by_the_bars() -> None:
-    for bars, diameter in ((7, 0.09), (19, 0.04), (37, 0.02), (61, 0.02)):
-        one = record(Laid(0, 0, 0.2, 0, diameter, bars, 6.0))
-        known, unknown = bundle_mass(one), bundle_mass(replace(one, bars=0))
-        assert abs(unknown.kg - known.kg) < 2 * unknown.sigma_kg
+def test_a_section_that_was_seen_stands_in_for_a_count() -> None:
+    one = record(laid(0.3), bars=None, section_m2=0.04, sigma=replace(SIGMA, section_m2=0.008))
+    mass = bundle_mass(one)
+    assert mass.kg == pytest.approx(0.04 * 7.0 * 7850)
+    assert mass.sigma_kg > 0.2 * mass.kg
+    assert math.isnan(bundle_mass(replace(one, section_m2=math.nan)).kg)
 
 
 def test_a_magnet_off_the_middle_along_the_bars() -> None:

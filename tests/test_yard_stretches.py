@@ -51,7 +51,7 @@ def test_a_yard_in_stretches_has_the_same_bundles_and_lifts(monkeypatch: pytest.
             other.id, other.layer, other.on_top, other.neighbours, other.ends_open
         )  # fmt: skip
         # Which bars are doubtful is judged by the bundles of their kind, and a stretch has fewer of them.
-        assert one.bars == other.bars or 0 in (one.bars, other.bars)
+        assert one.bars == other.bars or None in (one.bars, other.bars)
         np.testing.assert_allclose(one.ends_m, other.ends_m, atol=6e-3)
         assert one.yaw_rad == pytest.approx(other.yaw_rad, abs=0.5 * other.sigma.yaw_rad)
         assert one.top_z_m == pytest.approx(other.top_z_m, abs=0.5 * other.sigma.top_z_m)

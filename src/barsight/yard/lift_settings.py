@@ -23,6 +23,8 @@ class LiftSettings:
     """A bundle less sure than this is not lifted."""
     contact_gap_m: float = 0.003
     """A face nearer than this to steel lies on it."""
+    strap_m: float = 0.0012
+    """Thickest strap, which may hold a face off the bars."""
     max_refused_ratio: float = 0.5
     """Of the frames that see the place of the lift."""
     max_age_s: float = 600.0
@@ -61,6 +63,8 @@ class LiftSettings:
         )  # fmt: skip
         if not all(0 <= share <= 1 for share in shares):
             raise ConfigError("lift shares, min_confidence and min_count_probability lie in 0...1")
+        if not 0 <= self.strap_m <= 0.05:
+            raise ConfigError(f"lift strap_m must lie in 0...0.05, not {self.strap_m}")
         if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
             raise ConfigError("lift contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
         if not 0 <= self.disturbed_reach_m <= 100:

@@ -127,6 +127,7 @@ class BundleSigma:
     width_m: float
     top_z_m: float
     bar_diameter_m: float
+    section_m2: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +138,8 @@ class Bundle:
     axis. ends_m: (2, 3) the axis at its low-y and high-y end. ends_open: (2,) True where that end was not
     seen (out of view or covered), so the bundle may be longer. ends_sigma_m: (2,) of the ends along the axis,
     NaN where open. top_z_m: the highest line at mid-length.
-    visible_bars: bars seen from above. bars: bars in the bundle by its outline, 0 where unknown.
+    visible_bars: bars seen from above. bars: bars in the bundle by its outline, None where that isn't
+    certain; section_m2: steel's section by what was seen, NaN where that isn't known either.
     layer: 0 lies on the floor or on dunnage. on_top: nothing lies on it; None where that can't be seen.
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
     confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
@@ -154,7 +156,7 @@ class Bundle:
     top_z_m: float
     bar_diameter_m: float
     visible_bars: int
-    bars: int
+    bars: int | None
     layer: int
     on_top: bool | None
     neighbours: tuple[int, ...]
@@ -164,6 +166,7 @@ class Bundle:
     reasons: tuple[str, ...]
     bar_axes: tuple[Bar, ...] = ()
     ends_sigma_m: tuple[float, float] = (float("nan"), float("nan"))
+    section_m2: float = float("nan")
 
     @property
     def direction(self) -> Float64:

@@ -9,8 +9,8 @@ from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import Bundle
 
 STEEL_KG_PER_M3 = 7850.0
-FILLED, FILLED_SIGMA = 0.76, 0.015
-"""Steel's share of the circle around a hexagonal bundle: 0.778 for 7 bars, 0.753 for 61."""
+COUNT_SIGMA_RATIO = 0.08
+"""What a full hexagon's outline leaves open of its section: bars that lie hidden under it."""
 
 
 @dataclass(frozen=True)
@@ -30,21 +30,24 @@ class Mass:
         return Mass(self.kg + other.kg, self.sigma_kg + other.sigma_kg)
 
 
-def bundle_mass(bundle: Bundle) -> Mass:
-    """Compute steel's section x length x 7850 kg/m3; NaN where width or length is unknown.
+def bundle_section(bundle: Bundle) -> tuple[float, float]:
+    """Compute steel's section and its sigma, m2: of the bars where their number is known, else as seen."""
+    diameter = bundle.bar_diameter_m
+    if bundle.bars is None or not diameter > 0:
+        return bundle.section_m2, bundle.sigma.section_m2
+    section = bundle.bars * math.pi / 4 * diameter**2
+    share = math.hypot(2 * bundle.sigma.bar_diameter_m / diameter, COUNT_SIGMA_RATIO)
+    return section, section * share
 
-    The section is the bars' number times one bar's where the number is known, else a share of the circle
-    around the bundle. Of a bundle with an open end it is the mass of what was seen.
+
+def bundle_mass(bundle: Bundle) -> Mass:
+    """Compute steel's section x length x 7850 kg/m3; NaN where the section or the length is unknown.
+
+    Of a bundle with an open end it is the mass of what was seen.
     """
-    width, diameter, sigma = bundle.width_m, bundle.bar_diameter_m, bundle.sigma
-    if not (width > 0 and diameter > 0 and bundle.length_m > 0):
+    section, sigma = bundle_section(bundle)
+    if not (section > 0 and bundle.length_m > 0):
         return Mass(math.nan, math.nan)
-    if bundle.bars > 0:
-        section = bundle.bars * math.pi / 4 * diameter**2
-        share = 2 * sigma.bar_diameter_m / diameter
-    else:
-        section = FILLED * math.pi / 4 * width**2
-        share = math.hypot(2 * sigma.width_m / width, FILLED_SIGMA / FILLED)
     kg = section * bundle.length_m * STEEL_KG_PER_M3
-    longer = sigma.length_m / bundle.length_m if math.isfinite(sigma.length_m) else 0.0
-    return Mass(kg, kg * math.hypot(share, longer))
+    longer = bundle.sigma.length_m / bundle.length_m if math.isfinite(bundle.sigma.length_m) else 0.0
+    return Mass(kg, kg * math.hypot(sigma / section, longer))

@@ -86,7 +86,7 @@ def score_bundles(found: tuple[Bundle, ...], true: tuple[TrueBundle, ...]) -> Bu
         for name, (error, sigma) in _errors(b, t).items():
             errors.setdefault(name, []).append(error)
             sigmas.setdefault(name, []).append(sigma)
-    counted = [(b.bars, t.bars) for b, t in pairs if b.bars > 0]
+    counted = [(b.bars, t.bars) for b, t in pairs if b.bars is not None]
     return BundleErrors(
         errors={name: np.array(values) for name, values in errors.items()},
         sigmas={name: np.array(values) for name, values in sigmas.items()},

@@ -26,6 +26,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours
+from barsight.yard.bundles.seen_section import SeenSection, estimate_section, is_no_hexagon, seen_section
 from barsight.yard.sections import MapStretch
 from barsight.yard.types import Bundle, BundleSigma
 
@@ -66,8 +67,12 @@ def describe_bundles(
     return tuple(out)
 
 
-def make_bundle(reading: Reading, settings: BundleSettings) -> Bundle:
-    """Make a bundle of the chosen reading, without its number and what follows from its neighbours."""
+def make_bundle(
+    reading: Reading, others: list[FittedOutline], settings: BundleSettings, floor_m: float | None
+) -> Bundle:
+    """Make a bundle of the chosen reading, without its number, layer and what lies on it. others: all that
+    were chosen.
+    """
     sheet, fit = reading.found.sheet, reading.found.fit
     ends = [find_end(sheet, fit, step, settings) for step in (-1, 1)]
     outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), 0.0)
@@ -79,9 +84,11 @@ def make_bundle(reading: Reading, settings: BundleSettings) -> Bundle:
         axis, ends = axis[::-1], ends[::-1]
     centre = axis.mean(axis=0)
     rows = fit.state[fit.first : fit.last + 1]
-    bars, doubt = _count(reading)
+    seen = seen_section(reading.found, others, settings.smoothing_m)
+    bars, doubt = _count(reading, seen, floor_m)
     reasons = doubt + _doubts(reading, rows, ends, sheet)
     top = float(np.nanmax(outline.exact_m))
+    section, section_sigma = estimate_section(seen, fit, float(centre[2]) + top, floor_m)
     return Bundle(
         id=0,
         centre_m=centre,
@@ -98,12 +105,13 @@ def make_bundle(reading: Reading, settings: BundleSettings) -> Bundle:
         layer=0,
         on_top=True,
         neighbours=(),
-        sigma=_sigma(fit, ends, top, settings, sheet),
+        sigma=replace(_sigma(fit, ends, top, settings, sheet), section_m2=section_sigma),
         known_share=float((rows != 0).mean()),
         confidence=_confidence(reading, rows),
         reasons=reasons,
         bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
+        section_m2=section,
     )
 
 
@@ -144,13 +152,18 @@ def _top_changes(fit: Fit, top: float) -> tuple[float, float]:
     return (rolled - top) / step, top / diameter
 
 
-def _count(reading: Reading) -> tuple[int, tuple[str, ...]]:
-    """Count bars by the outline; 0 and a sentence where another packing explains its kind as well."""
+def _count(
+    reading: Reading, seen: SeenSection | None, floor_m: float | None
+) -> tuple[int | None, tuple[str, ...]]:
+    """Count bars by the outline; None and a sentence where it is no full hexagon, or another packing explains
+    its kind as well.
+    """
     fit, other = reading.found.fit, reading.other_packing
     if other is None:
-        return fit.bars, ()
+        why_not = is_no_hexagon(seen, fit, floor_m)
+        return (None, (f"its bars can't be counted: {why_not}",)) if why_not else (fit.bars, ())
     diameter = fit.width_m / (2 * LOOSENESS * other + 1)
-    return 0, (
+    return None, (
         f"{fit.bars} bars of {1e3 * fit.values[DIAMETER]:.0f} mm or {BARS_OF_RINGS[other]} of "
         f"{1e3 * diameter:.0f} mm: the outline fits both",
     )

@@ -94,7 +94,8 @@ def _search(
         found += [one for one in across if not is_beam(one.sheet, one.fit, settings)]
     places += [_claims(one, settings) for one in found[len(places) :]]
     readings = _settled(found, without_slivers(places, _SLIVER_RATIO), height_map, settings)
-    return [make_bundle(reading, settings) for reading in readings]
+    chosen_ones = [reading.found for reading in readings]
+    return [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
 
 
 def _found(

@@ -16,6 +16,7 @@ from barsight.core.sealed_json import read_sealed, write_sealed
 from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.stock_list import MatchedEntry, StockMatch
 from barsight.yard.types import Bar, Bundle, BundleSigma
+from barsight.yard.weight import bundle_mass, bundle_section
 
 SCHEMA_VERSION = 2
 REMEDY = "measure the recording again"
@@ -68,7 +69,8 @@ def read_match(path: Path) -> StockMatch | None:
 
 
 def _record(bundle: Bundle) -> dict[str, Any]:
-    sigma = bundle.sigma
+    sigma, mass = bundle.sigma, bundle_mass(bundle)
+    section, section_sigma = bundle_section(bundle)
     record = {
         "id": bundle.id,
         "axis_centre_m": bundle.centre_m,
@@ -84,6 +86,8 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "bar_diameter_m": bundle.bar_diameter_m,
         "visible_bars": bundle.visible_bars,
         "bars": bundle.bars,
+        "section_m2": section,
+        "mass_kg": mass.kg,
         "layer": bundle.layer,
         "on_top": bundle.on_top,
         "neighbours": list(bundle.neighbours),
@@ -95,6 +99,8 @@ def _record(bundle: Bundle) -> dict[str, Any]:
             "width_m": sigma.width_m,
             "top_z_m": sigma.top_z_m,
             "bar_diameter_m": sigma.bar_diameter_m,
+            "section_m2": section_sigma,
+            "mass_kg": mass.sigma_kg,
         },
         "known_share": bundle.known_share,
         "confidence": bundle.confidence,
@@ -120,6 +126,7 @@ def _bundle(record: dict[str, Any]) -> Bundle:
 
     figures = {name: figure(value) for name, value in record["sigma"].items()}
     yaw_rad = float(np.radians(figures.pop("yaw_deg")))
+    figures.pop("mass_kg", None)
     return Bundle(
         id=record["id"],
         centre_m=np.array(record["axis_centre_m"]),
@@ -132,7 +139,7 @@ def _bundle(record: dict[str, Any]) -> Bundle:
         top_z_m=record["top_z_m"],
         bar_diameter_m=record["bar_diameter_m"],
         visible_bars=record["visible_bars"],
-        bars=record["bars"],
+        bars=record["bars"] or None,
         layer=record["layer"],
         on_top=record["on_top"],
         neighbours=tuple(record["neighbours"]),
@@ -140,6 +147,7 @@ def _bundle(record: dict[str, Any]) -> Bundle:
         known_share=record["known_share"],
         confidence=record["confidence"],
         reasons=tuple(record["reasons"]),
+        section_m2=figure(record.get("section_m2")),
         ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
         bar_axes=tuple(
             Bar(

@@ -240,7 +240,7 @@ def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
             continue
         if abs(found - listed) > max(_SIGMAS * spread, 0.1 * listed):
             out.append(f"{name} {1e3 * found:.0f} mm instead of {1e3 * listed:.0f} mm")
-    if one.bars is not None and bundle.bars not in (0, one.bars):
+    if one.bars is not None and bundle.bars not in (None, one.bars):
         out.append(f"{bundle.bars} bars instead of {one.bars}")
     return tuple(out)
 

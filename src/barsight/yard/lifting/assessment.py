@@ -21,6 +21,7 @@ from barsight.yard.lifting.checks import (
 from barsight.yard.lifting.clearance import clearance_checks, resting_checks
 from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
 from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
+from barsight.yard.lifting.holding import hold_load, share_checks, weakest_pole
 from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
@@ -106,7 +107,9 @@ def assess_placement(
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
     mass, middle = _load(load)
-    needed = mass.upper_kg * NEWTON_PER_KG * magnet.safety_factor
+    needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
+    contact = hold_load(contact, magnet, load, settings.strap_m)
+    weakest = weakest_pole(contact, needed, magnet, place, load)
     away = np.array([place.x_m, place.y_m]) - middle
     offset = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
@@ -116,6 +119,7 @@ def assess_placement(
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, settings),
+        *share_checks(weakest),
         *clearance_checks(place, yard.heights, magnet, contact),
         *resting_checks(place, magnet, contact, load),
         *load_checks(load, mass, offset, overhang, magnet, settings),
@@ -130,6 +134,7 @@ def assess_placement(
     box = magnet.tolerance
     ratios = (
         contact.pull_low_n / needed if needed > 0 else 0.0,
+        weakest.ratio if weakest else 0.0,
         min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg) / mass.upper_kg
         if mass.upper_kg > 0 else 0.0,
         scale if search else math.inf,
@@ -238,7 +243,12 @@ def _change(
         contact = set_down(yard.heights, moved, magnet, settings.contact_gap_m)
         if contact is None:
             return "nothing is known under the magnet"
-        checks = [unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, settings)]
+        load = tuple(near.bundles[k] for k in held.gripped)
+        contact = hold_load(contact, magnet, load, settings.strap_m)
+        checks = [
+            unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, settings),
+            *share_checks(weakest_pole(contact, needed_n, magnet, moved, load)),
+        ]  # fmt: skip
         for veto in vetoes_of(checks):
             return veto.reason
         exact = count_gripped(moved, magnet, Tolerance(0.0, 0.0, 0.0), near, contact.z_m)

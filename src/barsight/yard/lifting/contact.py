@@ -1,4 +1,4 @@
-"""Model the magnet's contact with what is under it: contact plane, air gaps, pull.
+"""Model the magnet's contact with what is under it: contact plane and air gaps.
 
 The faces are one rigid plane. Set down, it comes to rest where its middle is lowest: on three points of the
 upper envelope around the middle, or on fewer with the suspension holding it.
@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, kernel
-from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.resting_plane import (
     ALL,
     POLE,
     SEEN,
+    SIGMA,
     U,
     V,
     Z,
@@ -35,17 +35,19 @@ NEWTON_PER_KG = 9.81
 class PoleContact:
     """One pole's face. gap_m: mean air gap, least_gap_m: where it is nearest to steel; gap_map_m: (across,
     along) air gaps, NaN where unknown. contact_share: of the face that lies on steel. unknown_share: of the
-    cells under it that were not seen. z_m: height of its centre. pull_n, pull_low_n: its part of the pull.
+    cells under it that were not seen. z_m: height of its centre. pull_n, pull_low_n: its part of the pull, 0
+    until a load is known (`holding.hold_load`). pull_across_m: where that acts, across from its centre.
     """
 
     gap_m: float
     least_gap_m: float
     contact_share: float
     unknown_share: float
-    pull_n: float
-    pull_low_n: float
     z_m: float
     gap_map_m: Float64
+    pull_n: float = 0.0
+    pull_low_n: float = 0.0
+    pull_across_m: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +56,10 @@ class Contact:
     poles'.
 
     pitch_rad: rise along the beam; roll_rad: rise across. rests_off_m: how far beside the middle the faces
-    rest, where the suspension's stop holds them, else 0. sigma_m: of the plane over the points.
-    pull_n, pull_low_n: the pull, and its lower bound (95 %). widest_gap_m: the least gap of the pole that is
-    furthest from steel. contact_share: of all faces; unknown_share: the worst pole's.
+    rest, where the suspension's stop holds them, else 0. sigma_m: of the plane's height, with the error that
+    all of the map shares; gap_sigma_m: of it over the steel. pull_n, pull_low_n: the pull, and its lower
+    bound (95 %). widest_gap_m: the least gap of the pole that is furthest from steel. contact_share: of all
+    faces; unknown_share: the worst pole's.
     """
 
     centre_z_m: float
@@ -65,6 +68,7 @@ class Contact:
     roll_rad: float
     rests_off_m: float
     sigma_m: float
+    gap_sigma_m: float
     poles: tuple[PoleContact, ...]
 
     @property
@@ -107,31 +111,35 @@ def set_down(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m
     most = np.tan(np.radians(magnet.limits.roll_deg))
     u, v, z = (np.ascontiguousarray(points[seen, k]) for k in (U, V, Z))
     height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
-    table, gaps = _gaps(
-        points, height, roll, pitch, noise, contact_gap_m + noise, poles,
-        np.array(magnet.pull.gap_m), np.array(magnet.pull.kilopascal),
-    )  # fmt: skip
+    table, gaps = _gaps(points, height, roll, pitch, contact_gap_m + noise, poles)
+    shared = float(np.median(points[seen, SIGMA]))
     faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
     found, first = [], 0
     for number, (columns, parts) in enumerate(shape):
         last = first + columns * parts
-        mean, least, share, unknown, pull, pull_low = (float(figure) for figure in table[number])
+        mean, least, share, unknown = (float(figure) for figure in table[number])
         gap_map = gaps[first:last].reshape(columns, parts)
         face = float(faces[number])
-        found.append(PoleContact(mean, least, share, unknown, pull, pull_low, face, gap_map))
+        found.append(PoleContact(mean, least, share, unknown, face, gap_map))
         first = last
-    return Contact(height, faces, math.atan(pitch), math.atan(roll), rests_off, noise, tuple(found))
+    return Contact(
+        height,
+        faces,
+        math.atan(pitch),
+        math.atan(roll),
+        rests_off,
+        math.hypot(noise, shared),
+        noise,
+        tuple(found),
+    )
 
 
 @kernel()
 def _gaps(
-    points: Float64, height: float, roll: float, pitch: float, noise: float, near: float, poles: Float64,
-    gap_m: Float64, kilopascal: Float64,
-) -> tuple[Float64, Float64]:  # fmt: skip
-    """Compute mean and least gap, ratios of contact and unknown cells, pull and its lower bound (P, 6); (N,)
-    gaps.
-    """
-    table, gaps = np.zeros((len(poles), 6)), np.empty(len(points))
+    points: Float64, height: float, roll: float, pitch: float, near: float, poles: Float64
+) -> tuple[Float64, Float64]:
+    """Compute mean and least gap, ratios of contact and unknown cells (P, 4); (N,) gaps."""
+    table, gaps = np.zeros((len(poles), 4)), np.empty(len(points))
     counts = np.zeros((len(poles), 4))
     table[:, 1] = np.inf
     for k in range(len(points)):
@@ -148,13 +156,8 @@ def _gaps(
         table[p, 0] += gaps[k]
         table[p, 1] = min(table[p, 1], gaps[k])
         table[p, 2] += gaps[k] <= near
-        table[p, 4] += np.interp(gaps[k], gap_m, kilopascal)
-        table[p, 5] += np.interp(gaps[k] + UPPER * noise, gap_m, kilopascal)
     for p in range(len(poles)):
-        area = 1e3 * poles[p, 2] * poles[p, 3] / counts[p, 0]
         table[p, 0] = table[p, 0] / counts[p, 1] if counts[p, 1] else np.nan
         table[p, 2] /= counts[p, 0]
         table[p, 3] = 1 - counts[p, 2] / counts[p, 3]
-        table[p, 4] *= area
-        table[p, 5] *= area
     return table, gaps

@@ -5,14 +5,20 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.core.errors import ConfigError
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.numbers import expect_numbers
+from barsight.yard.lifting.pull import Pull, expect
 
+MagnetType = Literal["electro", "permanent", "electro-permanent"]
+LEAST_FACTOR = 3.0
+"""Least safety factor of permanent and electro-permanent magnets [EN 13155], and of one of unknown type."""
+LEAST_FACTOR_BACKED = 2.0
+"""The same of an electromagnet that a battery holds when the mains fail [EN 13155]."""
 _EXAMPLE = resources.files("barsight.yard.lifting").joinpath("example_magnet.toml")
 
 
@@ -26,9 +32,9 @@ class Pole:
     width_m: float
 
     def __post_init__(self) -> None:
-        _expect(min(self.length_m, self.width_m) >= 0.01, "a pole must be at least 10 mm long and wide")
-        _expect(max(self.length_m, self.width_m) <= 10, "a pole can't be longer than 10 m")
-        _expect(max(abs(self.along_m), abs(self.across_m)) <= 20, "a pole lies within 20 m of the centre")
+        expect(min(self.length_m, self.width_m) >= 0.01, "a pole must be at least 10 mm long and wide")
+        expect(max(self.length_m, self.width_m) <= 10, "a pole can't be longer than 10 m")
+        expect(max(abs(self.along_m), abs(self.across_m)) <= 20, "a pole lies within 20 m of the centre")
 
 
 @dataclass(frozen=True)
@@ -40,25 +46,8 @@ class Beam:
     above_faces_m: float
 
     def __post_init__(self) -> None:
-        _expect(min(self.length_m, self.width_m) > 0, "the beam's length and width must be over 0")
-        _expect(self.above_faces_m >= 0, "the beam can't hang below the poles' faces")
-
-
-@dataclass(frozen=True)
-class Pull:
-    """Pull per area of pole at each air gap; linear between, 0 at the last and beyond."""
-
-    gap_m: tuple[float, ...]
-    kilopascal: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        same = len(self.gap_m) == len(self.kilopascal) >= 2
-        _expect(same, "pull gap_m and kilopascal must be lists of the same length, two or more")
-        rising = all(b > a for a, b in zip(self.gap_m, self.gap_m[1:], strict=False))
-        _expect(self.gap_m[0] == 0 and rising, "pull gap_m must begin at 0 and rise")
-        falling = all(b <= a for a, b in zip(self.kilopascal, self.kilopascal[1:], strict=False))
-        _expect(falling and self.kilopascal[-1] == 0, "pull kilopascal must fall with the gap and end at 0")
-        _expect(0 < self.kilopascal[0] <= 4000, "pull kilopascal must lie between 0 and 4000 without a gap")
+        expect(min(self.length_m, self.width_m) > 0, "the beam's length and width must be over 0")
+        expect(self.above_faces_m >= 0, "the beam can't hang below the poles' faces")
 
 
 @dataclass(frozen=True)
@@ -71,7 +60,7 @@ class Tolerance:
 
     def __post_init__(self) -> None:
         within = min(self.x_m, self.y_m) >= 0 and max(self.x_m, self.y_m) <= 1 and 0 <= self.yaw_deg <= 20
-        _expect(within, "tolerance x_m and y_m lie between 0 and 1, yaw_deg between 0 and 20")
+        expect(within, "tolerance x_m and y_m lie between 0 and 1, yaw_deg between 0 and 20")
 
 
 @dataclass(frozen=True)
@@ -88,15 +77,19 @@ class Limits:
 
     def __post_init__(self) -> None:
         angles = min(self.pitch_deg, self.roll_deg) > 0 and max(self.pitch_deg, self.roll_deg) <= 45
-        _expect(angles, "limits pitch_deg and roll_deg lie between 0 and 45")
+        expect(angles, "limits pitch_deg and roll_deg lie between 0 and 45")
         lengths = min(self.offset_along_m, self.offset_across_m, self.overhang_m, self.gap_m)
-        _expect(lengths > 0, "limits offset_along_m, offset_across_m, overhang_m and gap_m must be over 0")
-        _expect(0 <= self.contact_share < 1, "limits contact_share lies between 0 and 1")
+        expect(lengths > 0, "limits offset_along_m, offset_across_m, overhang_m and gap_m must be over 0")
+        expect(0 <= self.contact_share < 1, "limits contact_share lies between 0 and 1")
 
 
 @dataclass(frozen=True)
 class Magnet:
-    """A magnet, or several on a beam whose faces lie in one plane. Masses in kg."""
+    """A magnet, or several on a beam whose faces lie in one plane. Masses in kg.
+
+    type: None where the file doesn't say, which counts as the worst. battery_backup: it holds the load when
+    the mains fail.
+    """
 
     name: str
     own_mass_kg: float
@@ -108,17 +101,36 @@ class Magnet:
     pull: Pull
     tolerance: Tolerance
     limits: Limits
+    type: MagnetType | None = None
+    battery_backup: bool = False
 
     def __post_init__(self) -> None:
         expect_numbers(asdict(self))
-        _expect(len(self.poles) >= 1, "there must be at least one pole")
-        _expect(min(self.own_mass_kg, self.capacity_kg) > 0, "own_mass_kg and capacity_kg must be over 0")
-        _expect(
+        expect(len(self.poles) >= 1, "there must be at least one pole")
+        expect(min(self.own_mass_kg, self.capacity_kg) > 0, "own_mass_kg and capacity_kg must be over 0")
+        expect(
             self.crane_capacity_kg > self.own_mass_kg,
             f"crane_capacity_kg {self.crane_capacity_kg:g} leaves nothing beside own_mass_kg "
             f"{self.own_mass_kg:g}",
         )
-        _expect(2 <= self.safety_factor <= 20, "safety_factor lies between 2 and 20")
+        expect(2 <= self.safety_factor <= 20, "safety_factor lies between 2 and 20")
+        kind = f"{self.type} magnet" + (" without battery_backup" if self.type == "electro" else "")
+        expect(
+            self.type is None or self.safety_factor >= self.least_factor,
+            f"safety_factor {self.safety_factor:g} is less than {self.least_factor:g}, the least of "
+            f"{'an' if kind[0] == 'e' else 'a'} {kind}",
+        )
+
+    @property
+    def least_factor(self) -> float:
+        """Return the least safety factor of its type."""
+        backed = self.type == "electro" and self.battery_backup
+        return LEAST_FACTOR_BACKED if backed else LEAST_FACTOR
+
+    @property
+    def needed_factor(self) -> float:
+        """Return the factor that lifts are held to: where the file names no type, at least the worst's."""
+        return max(self.safety_factor, self.least_factor)
 
     @property
     def reach_m(self) -> float:
@@ -151,8 +163,3 @@ def load_magnet(path: Path | None) -> Magnet:
         return read_settings(path, Magnet, help_at, "--magnet")
     with resources.as_file(_EXAMPLE) as example:
         return read_settings(example, Magnet, help_at, "--magnet")
-
-
-def _expect(holds: bool, sentence: str) -> None:
-    if not holds:
-        raise ConfigError(f"magnet: {sentence}")

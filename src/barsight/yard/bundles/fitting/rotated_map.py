@@ -36,6 +36,12 @@ class AlignedMap:
         turned: Float64 = uv_m @ np.array([[c, s], [-s, c]])
         return turned
 
+    def from_map(self, xy_m: Float64) -> Float64:
+        """Convert places x, y of the map (N, 2) to u, v."""
+        c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
+        turned: Float64 = xy_m @ np.array([[c, -s], [s, c]])
+        return turned
+
 
 def align_map(height_map: HeightMap, heading_rad: float, stock_over_m: float = -np.inf) -> AlignedMap:
     """Rotate the map's measured heights into a frame whose v axis is (-sin heading, cos heading); nearest

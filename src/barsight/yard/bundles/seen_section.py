@@ -1,0 +1,173 @@
+"""Measure a bundle's section by what is seen from above: its width, its top, and how deep it may reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float64, Int64
+from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
+from barsight.yard.bundles.fitting.outline_fit import (
+    AGREES,
+    DIAMETER,
+    ROLL,
+    SLOPE_U,
+    SLOPE_Z,
+    Fit,
+    FittedOutline,
+    U,
+    Z,
+)
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
+
+_ROWS_ENOUGH = 120
+_GULLY_RATIO = 0.95
+"""Of a bar's diameter: a dip this deep between two crests parts two bundles."""
+_REACH_RATIO = 1.5
+"""Of the outline's width: how far from its axis a bundle is looked for."""
+_MISFIT_M, _SINGLE_MISFIT_M = 0.008, 0.004
+"""The mean section of a full hexagon, of a single bar, lies no further from its outline, root mean square."""
+_GULLIES_APART = 0.8
+"""Share of the places that are judged: a map smooths gullies each time differently."""
+_SUNKEN_M = 0.015
+"""How deep a full hexagon may reach under the floor by errors of the map."""
+_WIDER_RATIO, _WIDER_M = 0.5, 0.045
+"""Of a bar's diameter, and beside it: how much wider than a full hexagon a map shows it."""
+_PIECE_RATIO = 1.5
+"""Of the outline's width: of what is seen wider than this the outline is a piece."""
+_ALIKE_LOG = 0.35
+"""Neighbours whose widths differ by a larger factor's logarithm may be pieces of one irregular pack."""
+SECTION_RATIO, SECTION_SIGMA_RATIO = 0.5, 0.22
+"""Steel's section over width times depth, and its standard deviation, of packs drawn with seeds 0 to 99."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSection:
+    """Seen section of a bundle. width_m: from side to side. upper_m2: between the top and the level
+    of the lower side. flank_m: how far that lies under the top. misfit_m: root mean square of the mean
+    section over the outline of a full hexagon. sides_seen: both sides fall to the floor, or
+    end where a bundle of about its width begins.
+    """
+
+    width_m: float
+    upper_m2: float
+    flank_m: float
+    misfit_m: float
+    sides_seen: bool
+
+
+def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
+    """Measure the mean section along the rows that agree; None where there are none."""
+    sheet, fit = one.sheet, one.fit
+    rows = np.flatnonzero(fit.state[fit.first : fit.last + 1] == AGREES) + fit.first
+    rows = rows[:: max(len(rows) // _ROWS_ENOUGH, 1)]
+    if rows.size < 3:
+        return None
+    half = round(_REACH_RATIO * fit.width_m / sheet.cell_m)
+    beside, level = _mean_section(sheet, fit, rows, half)
+    crest = half + round(0.3 * fit.width_m / sheet.cell_m) * np.array([-1, 1])
+    middle = int(crest[0] + np.argmax(np.nan_to_num(level[crest[0] : crest[1] + 1], nan=-np.inf)))
+    deep_m = _GULLY_RATIO * float(fit.values[DIAMETER])
+    others_begin = _is_neighbour(one, beside, others)
+    ends = [_edge(level, others_begin, middle, step, deep_m) for step in (-1, 1)]
+    own = level[ends[0][0] : ends[1][0] + 1]
+    if not np.isfinite(own).any():
+        return None
+    top = float(np.nanmax(own))
+    sides = [float(side) for side in own[np.isfinite(own)][[0, -1]]]
+    flank = min(sides)
+    filled = np.nan_to_num(own, nan=flank)
+    outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), smoothing_m)
+    at = (np.arange(outline.seen_m.size) - outline.seen_m.size // 2) * STEP_M
+    expected = np.interp(beside, at, outline.seen_m, left=np.nan, right=np.nan)
+    within = np.abs(beside) < 0.42 * fit.width_m
+    misfit = (level - expected)[within]
+    misfit = np.sort(np.abs(misfit[np.isfinite(misfit)]))
+    misfit = misfit[: round(_GULLIES_APART * misfit.size)]
+    return SeenSection(
+        width_m=sheet.cell_m * (len(own) - 1),
+        upper_m2=float(np.maximum(filled - flank, 0).sum()) * sheet.cell_m,
+        flank_m=top - flank,
+        misfit_m=float(np.sqrt(np.mean(misfit**2))) if misfit.size else np.inf,
+        sides_seen=ends[0][1] and ends[1][1],
+    )
+
+
+def is_no_hexagon(seen: SeenSection | None, fit: Fit, floor_m: float | None) -> str:
+    """Say why a section is not that of the full hexagon that was fitted; empty where it may be."""
+    if seen is None or not seen.sides_seen:
+        return "its sides were not seen"
+    if floor_m is not None and fit.values[Z] - fit.width_m / 2 < floor_m - _SUNKEN_M:
+        return f"a full bundle of {fit.bars} would reach under the floor"
+    wider = seen.width_m - fit.width_m
+    if wider > _WIDER_RATIO * fit.values[DIAMETER] + _WIDER_M:
+        return f"it is {1e3 * wider:.0f} mm wider than a full bundle of {fit.bars}"
+    if seen.misfit_m > (_MISFIT_M if fit.rings else _SINGLE_MISFIT_M):
+        return f"its surface lies {1e3 * seen.misfit_m:.0f} mm off that of a full bundle of {fit.bars}"
+    return ""
+
+
+def estimate_section(
+    seen: SeenSection | None, fit: Fit, top_m: float, floor_m: float | None
+) -> tuple[float, float]:
+    """Estimate steel's section and its sigma, m2, of an irregular pack; NaN where its sides were not seen, or
+    where the outline follows a small piece of it only.
+
+    What lies under the widest place isn't seen: a pack is as deep as it is wide, or as the floor lets it.
+    """
+    if seen is None or not seen.sides_seen or seen.width_m > _PIECE_RATIO * fit.width_m + _WIDER_M:
+        return np.nan, np.nan
+    deep = seen.width_m if floor_m is None else float(np.clip(top_m - floor_m, 0.0, seen.width_m))
+    section = SECTION_RATIO * seen.width_m * float(np.sqrt(deep * seen.width_m))
+    return section, SECTION_SIGMA_RATIO * section
+
+
+def _mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
+    """Average the heights over the axis at places (N,) across from it; NaN where half are unknown."""
+    v = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+    axis = fit.values[U] + fit.values[SLOPE_U] * v
+    up = fit.values[Z] + fit.values[SLOPE_Z] * v
+    beside = sheet.cell_m * np.arange(-half, half + 1)
+    column = np.rint((axis[:, None] + beside - sheet.u0_m) / sheet.cell_m).astype(np.int64)
+    inside = (column >= 0) & (column < sheet.z_m.shape[1])
+    z = np.where(inside, sheet.z_m[rows[:, None], np.clip(column, 0, sheet.z_m.shape[1] - 1)], np.nan)
+    z = np.where(z > sheet.stock_over_m, z, -np.inf if np.isfinite(sheet.stock_over_m) else z)
+    known = np.isfinite(z) | (z == -np.inf)
+    enough = 2 * known.sum(axis=0) >= len(rows)
+    level = np.full(len(beside), np.nan)
+    with np.errstate(invalid="ignore"):
+        level[enough] = np.nanmedian(np.where(known, z, np.nan)[:, enough] - up[:, None], axis=0)
+    return np.asarray(beside, np.float64), np.asarray(level, np.float64)
+
+
+def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:
+    """Check which places (N,) beside a bundle's axis, at mid-length, lie in another of about its width."""
+    u = one.fit.values[U] + beside_m
+    places = one.sheet.to_map(np.column_stack([u, np.full(len(u), one.fit.v_m)]))
+    taken = np.zeros(len(u), bool)
+    for other in others:
+        fit = other.fit
+        if other is one or abs(np.log(fit.width_m / one.fit.width_m)) > _ALIKE_LOG:
+            continue
+        away = other.sheet.from_map(places) - [fit.values[U], fit.v_m]
+        taken |= np.abs(away[:, 0] - fit.values[SLOPE_U] * away[:, 1]) < fit.width_m / 2
+    return taken
+
+
+def _edge(level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float) -> tuple[int, bool]:
+    """Walk from the middle to the last place that belongs to the bundle; whether it falls to the floor, or
+    another begins, there.
+    """
+    last, lowest, lowest_at = middle, level[middle], middle
+    for k in range(middle, len(level) if step > 0 else -1, step):
+        if not level[k] > -np.inf:
+            return last, bool(level[k] == -np.inf)
+        if others_begin[k]:
+            return last, True
+        if level[k] < lowest:
+            lowest, lowest_at = level[k], k
+        if level[k] - lowest > deep_m:
+            return max(lowest_at - step, middle) if step > 0 else min(lowest_at - step, middle), False
+        last = k
+    return last, False

@@ -1,0 +1,137 @@
+"""Hold a load: what each face pulls on its bars, and what each pole must carry by the load's moments.
+
+A map is a mean over its smoothing, and pull falls ever less the wider the gap: the sum over a smoothed
+surface is no more than that over the steel, as soon as the faces' plane is not too low [Jensen's inequality].
+So the lower bound takes the plane as high as it may be: on the bars' crests that smoothing has cut, on a
+strap, and the noise on top.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.yard.lift_settings import UPPER
+from barsight.yard.lifting.contact import Contact, PoleContact
+from barsight.yard.lifting.footprint import Placement
+from barsight.yard.lifting.magnet import Magnet, Pole
+from barsight.yard.types import Bundle
+from barsight.yard.vetoes import Check, check_least
+
+SMOOTHING_M = 0.016
+"""Standard deviation of a map's smoothing across the bars, at most."""
+MOST_CUT_RATIO = 0.12
+"""Of a bar's diameter: how far its crest may stand over the mean of it and its neighbours."""
+
+
+def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
+    """Add the pull on the load's bars; nothing pulls on no load.
+
+    strap_m: thickness of a strap that may hold the faces off.
+    """
+    if not load:
+        return contact
+    diameter = min(_least_diameter(bundle) for bundle in load)
+    cut = min(SMOOTHING_M**2 / diameter, MOST_CUT_RATIO * diameter)
+    higher = cut + strap_m + UPPER * contact.gap_sigma_m
+    return replace(
+        contact,
+        poles=tuple(
+            _pull(own, pole, magnet, diameter, cut / 2, higher)
+            for own, pole in zip(contact.poles, magnet.poles, strict=True)
+        ),
+    )
+
+
+def _pull(
+    own: PoleContact, pole: Pole, magnet: Magnet, diameter_m: float, likely_m: float, higher_m: float
+) -> PoleContact:
+    """Sum the pull over a face whose plane lies so much higher, likely and at most, than over the map."""
+    likely, low = magnet.pull.on_bars(diameter_m, min(pole.length_m, pole.width_m))
+    gaps = np.where(np.isnan(own.gap_map_m), np.inf, own.gap_map_m)
+    newton = 1e3 * pole.length_m * pole.width_m / gaps.size
+    across = pole.width_m * ((np.arange(len(gaps)) + 0.5) / len(gaps) - 0.5)
+    held = np.interp(gaps + higher_m, magnet.pull.gap_m, low, right=0.0)
+    total = float(held.sum())
+    return replace(
+        own,
+        pull_n=newton * float(np.interp(gaps + likely_m, magnet.pull.gap_m, likely, right=0.0).sum()),
+        pull_low_n=newton * total,
+        pull_across_m=float(across @ held.sum(axis=1)) / total if total > 0 else 0.0,
+    )
+
+
+def _least_diameter(bundle: Bundle) -> float:
+    """Compute the lower bound of a bundle's bars; with a packing that isn't settled they may be thinner."""
+    sigma = float(np.nan_to_num(bundle.sigma.bar_diameter_m, nan=0.25 * bundle.bar_diameter_m))
+    return max(bundle.bar_diameter_m - UPPER * sigma, 0.25 * bundle.bar_diameter_m)
+
+
+def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> Float64:
+    """Share the needed pull among the poles (P,), each as much as it may have to carry; 1 is all of it.
+
+    Magnet and load are rigid: a pole's share grows along the load's offset from all poles' middle in line
+    with its own. Across, where the poles stand in one row, a load that hangs beside the pull pries the face
+    off about its edge: that may use the safety factor up, and no more. The offsets are upper bounds by the
+    sigmas of the load's centre.
+    """
+    weights = np.array([np.nan_to_num(bundle.length_m * bundle.width_m**2, nan=1.0) for bundle in load])
+    centres = np.array([bundle.centre_m[:2] for bundle in load])
+    away = weights @ centres / weights.sum() - (place.x_m, place.y_m)
+    slack = UPPER * np.max([
+        np.nan_to_num((bundle.sigma.along_m, bundle.sigma.lateral_m), nan=0.05) for bundle in load
+    ], axis=0)  # fmt: skip
+    offset = np.array([away @ place.along, away @ place.across])
+    poles = magnet.pole_table
+    arms = poles[:, :2] - poles[:, :2].mean(axis=0)
+    offset = offset - poles[:, :2].mean(axis=0)
+    spread = np.linalg.eigvalsh(arms.T @ arms) if len(arms) > 1 else np.zeros(2)
+    slope = arms @ np.linalg.pinv(arms.T @ arms, rcond=1e-6)
+    share = 1 / len(poles) + slope @ offset + np.abs(slope) @ slack
+    if spread.min() < 1e-6:
+        pulls = np.array([own.pull_across_m for own in contact.poles])
+        beside = np.abs(offset[1] - pulls) + slack[1]
+        share = share * np.maximum((1 + 2 * beside / poles[:, 3]) / magnet.needed_factor, 1.0)
+    return np.asarray(share)
+
+
+@dataclass(frozen=True)
+class WeakestPole:
+    """The pole whose pull, lower bound, is least over its share of what is needed. number: from 1."""
+
+    number: int
+    pull_low_n: float
+    share_n: float
+
+    @property
+    def ratio(self) -> float:
+        """Return its pull over its share."""
+        return self.pull_low_n / self.share_n
+
+
+def weakest_pole(
+    contact: Contact, needed_n: float, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]
+) -> WeakestPole | None:
+    """Find the pole that is worst off; None where no load, or no weight, is known."""
+    if not load or not needed_n > 0:
+        return None
+    shares = np.maximum(pole_shares(contact, magnet, place, load), 1e-3) * needed_n
+    pulls = np.array([own.pull_low_n for own in contact.poles])
+    worst = int(np.argmin(pulls / shares))
+    return WeakestPole(worst + 1, float(pulls[worst]), float(shares[worst]))
+
+
+def share_checks(weakest: WeakestPole | None) -> list[Check]:
+    """Check that the pole that is worst off carries its share."""
+    if weakest is None:
+        return []
+    pull, share = weakest.pull_low_n / 1e3, weakest.share_n / 1e3
+    return [
+        check_least(
+            "weak-pull", "lower bound of the worst pole's pull over its share", weakest.ratio, 1.0,
+            "", f"pole {weakest.number} pulls at least {pull:.1f} kN, its share of what is needed is "
+            f"{share:.1f} kN",
+        )
+    ]  # fmt: skip
