@@ -14,16 +14,16 @@ from collections import Counter
 from dataclasses import asdict, replace
 
 import numpy as np
+from barsight.benchmarks.yard.known_yards import SIGMA, seen_heights
 from digging_judge import CELL_M, Bars, Beam, World, judge_set_down, judge_way, undermined
 
-from barsight.benchmarks.yard.known_yards import SIGMA, seen_heights
 from barsight.core.errors import Failed
 from barsight.simulation.settings import SimulationSettings, YardSettings
 from barsight.simulation.stock import stack_yard
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.magnet import load_magnet
 from barsight.yard.lifting.order import order_lifts
 from barsight.yard.lifting.targets import plan_lifts
+from barsight.yard.magnet.description import load_magnet
 from barsight.yard.types import Bundle, HeightMap
 
 KINDS = ("90mm:7", "60mm:7", "40mm:19", "60mm:19", "40mm:37", "90mm:7,40mm:19")

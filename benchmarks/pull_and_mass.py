@@ -16,10 +16,10 @@ from drawn_packs import HEXAGONS, draw_pack, edges, gaps, rest_on, seen_map
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.contact import set_down
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.holding import hold_load
-from barsight.yard.lifting.magnet import load_magnet
+from barsight.yard.magnet.contact import set_down
+from barsight.yard.magnet.description import load_magnet
+from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.holding import hold_load
 from barsight.yard.types import Bundle, BundleSigma
 from barsight.yard.weight import bundle_mass
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
-from barsight.yard.lifting.footprint import BundleTable, Placement
-from barsight.yard.lifting.magnet import Magnet, load_magnet
+from barsight.yard.magnet.description import Magnet, load_magnet
+from barsight.yard.magnet.footprint import BundleTable, Placement
 from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle, BundleSigma, HeightMap
 from yard_maps import Laid, draw

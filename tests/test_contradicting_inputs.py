@@ -22,7 +22,7 @@ from barsight.recording.open import open_recording
 from barsight.recording.plausibility import clock_faults, doubts
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
-from barsight.yard.lifting.magnet import example_magnet
+from barsight.yard.magnet.description import example_magnet
 from barsight.yard.vetoes import VETOES
 from contradicting_inputs import AGES, CONTRADICTIONS
 from drawn_steps import DrawnSteps, drawn_steps

@@ -17,7 +17,7 @@ import tyro
 
 from barsight.cli import main
 from barsight.core.settings.file import read_settings
-from barsight.yard.lifting.magnet import Magnet, example_magnet
+from barsight.yard.magnet.description import Magnet, example_magnet
 from cli_runs import FAST
 
 ROOT = Path(__file__).parents[1]

@@ -31,10 +31,10 @@ ROOMS = {
     ),
     "core": (".", "linalg", "settings"),
     "mapping": (".", "surface"),
-    "yard": (".", "bundles.fitting", "bundles", "stability", "lifting", "inventory"),
+    "yard": (".", "bundles.fitting", "bundles", "stability", "magnet", "lifting", "inventory"),
     "report": (".", "calibration"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
-    "cli": (".", "calibrate", "bench"),
+    "cli": (".", "calibrate", "bench", "yard"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {
@@ -45,9 +45,11 @@ APART = {
     ("yard.stability", "yard.bundles"), ("yard.stability", "yard.bundles.fitting"),
     ("yard.lifting", "yard.bundles"), ("yard.lifting", "yard.bundles.fitting"),
     ("yard.inventory", "yard.bundles"), ("yard.inventory", "yard.bundles.fitting"),
-    ("yard.inventory", "yard.lifting"),
+    ("yard.magnet", "yard.bundles"), ("yard.magnet", "yard.bundles.fitting"),
+    ("yard.inventory", "yard.lifting"), ("yard.inventory", "yard.magnet"),
     ("benchmarks.yard", "benchmarks.stereo"), ("benchmarks.yard", "benchmarks.motion"),
     ("benchmarks.motion", "benchmarks.stereo"), ("cli.bench", "cli.calibrate"),
+    ("cli.yard", "cli.calibrate"), ("cli.yard", "cli.bench"),
 }  # fmt: skip
 """Rooms of which the first doesn't import the second either."""
 MAX_MODULES = 16

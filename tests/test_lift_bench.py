@@ -18,7 +18,7 @@ from barsight.simulation.sensors import heights
 from barsight.simulation.simulate import World
 from barsight.simulation.stock import Stock
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.magnet import example_magnet, load_magnet
+from barsight.yard.magnet.description import example_magnet, load_magnet
 
 
 @pytest.mark.parametrize("seed", [5, 7])

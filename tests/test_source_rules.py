@@ -20,15 +20,11 @@ MAX_PARAMETERS = 10
 WIDE = {
     "calibration.camera_imu.residual_kernels.frame_rows",
     "calibration.camera_imu.residual_kernels.imu_rows",
-    "motion.linear.reprojection_kernels._error",
-    "motion.linear.reprojection_kernels.whitened_rows",
-    "motion.linear.schur_complement._add_pose",
-    "motion.linear.schur_complement._take_out",
     "simulation.rays.trace",
     "simulation.render.shade",
     "yard.bundles.fitting.growth._row_states",
-    "yard.lifting.footprint._grip",
-    "yard.lifting.resting_plane._profile",
+    "yard.magnet.footprint._grip",
+    "yard.magnet.resting_plane._profile",
 }
 """Kernels that still have more parameters. Group them, then take it off; nothing is added."""
 REPEATED: set[str] = set()

@@ -12,9 +12,9 @@ from barsight.core.arrays import Float64
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.magnet import Tolerance
 from barsight.yard.lifting.targets import plan_lifts
+from barsight.yard.magnet.description import Tolerance
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.pile_sides import pile_sides
 from barsight.yard.stability.stability import footings, turn_between
 from barsight.yard.types import Bundle, HeightMap

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from barsight.yard.events import YardEvent, corners, gap_between
-from barsight.yard.lifting.contact import set_down
-from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.lifting.travel_accuracy import target_covariance
+from barsight.yard.magnet.contact import set_down
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import interpolate_heights
 from barsight.yard.vetoes import check_least, check_most, check_true, vetoes_of
 from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.types import HeightSource
-from barsight.yard.lifting.footprint import Placement
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, SIGMA, codes, judged, laid, map_of, record
 

@@ -21,14 +21,14 @@ from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.identity import GIVEN
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.contact import set_down
-from barsight.yard.lifting.footprint import BundleTable, Placement, count_gripped
-from barsight.yard.lifting.holding import hold_load, pole_shares, share_vetoes, weakest_pole
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
-from barsight.yard.lifting.magnet import Beam, Magnet, Tolerance
-from barsight.yard.lifting.resting_plane import rest_plane
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.magnet.contact import set_down
+from barsight.yard.magnet.description import Beam, Magnet, Tolerance
+from barsight.yard.magnet.footprint import BundleTable, Placement, count_gripped
+from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, weakest_pole
+from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.vetoes import VETOES, Veto
 from barsight.yard.weight import bundle_mass
 from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
@@ -191,8 +191,9 @@ def test_the_weakest_pole_is_named() -> None:
     slack = 1.645 * SIGMA.along_m
     assert shares[0] == pytest.approx(0.25 + 2.1 / 9.8 * (0.28 + slack), abs=0.002)
     assert shares[3] == pytest.approx(0.25 - 2.1 / 9.8 * (0.28 - slack), abs=0.002)
-    vetoes = share_vetoes(weakest_pole(lift.contact, 120e3, MAGNET, lift.place, (record(laid(0.3)),)))
-    assert [veto.code for veto in vetoes] == ["weak-pull"] and "pole 1 pulls" in vetoes[0].reason
+    checks = share_checks(weakest_pole(lift.contact, 120e3, MAGNET, lift.place, (record(laid(0.3)),)))
+    assert [(one.code, one.result) for one in checks] == [("weak-pull", "failed")]
+    assert "pole 1 pulls" in checks[0].reason
 
 
 def test_too_heavy_for_magnet_or_crane() -> None:

@@ -11,10 +11,10 @@ import barsight
 from barsight.cli.main import run
 from barsight.core.errors import BarsightError, ConfigError, InputError
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.magnet import load_magnet
-from barsight.yard.lifting.pull import Pull, ThinPlate
+from barsight.yard.magnet.description import load_magnet
+from barsight.yard.magnet.pull import Pull, ThinPlate
 
-EXAMPLE = (Path(barsight.__file__).parent / "yard" / "lifting" / "example_magnet.toml").read_text(
+EXAMPLE = (Path(barsight.__file__).parent / "yard" / "magnet" / "example_magnet.toml").read_text(
     encoding="utf-8"
 )
 

@@ -11,14 +11,15 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.types import HeightSource
+from barsight.yard.identity import GIVEN
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content, schema
 from barsight.yard.lifting.order import LiftOrder, order_lifts
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.stability.blockers import find_blocked
-from barsight.yard.stability.stability import footings
+from barsight.yard.stability.stability import footing_checks, footings
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Veto
+from barsight.yard.vetoes import Veto, vetoes_of
 from lift_yards import LENGTH_M, MAGNET, SETTINGS, SIGMA, laid, map_of, record
 from yard_maps import Laid
 
@@ -112,26 +113,24 @@ def test_lifts_json_says_the_order_and_what_is_in_the_way() -> None:
     plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, ())
     order = order_lifts(3, heights, bundles, plan)
     assert isinstance(order, LiftOrder)
-    content = json.loads(json.dumps(lifts_content(plan, "yard", order)))
-    jsonschema.validate(content, schema())
+    content = json.loads(json.dumps(lifts_content(plan, "yard", GIVEN, "0", order=order)))
+    jsonschema.validate(content | {"content_sha256": ""}, schema())
     assert [step["bundle"] for step in content["fetch"]["steps"]] == [5, 3]
     assert content["blocked"][1] == {"bundle": 1, "blockers": [3, 4, 5]}
     assert content["lifts"][0]["set_down"]["z_m"] < 0.02
-    assert lifts_content(plan, "yard")["fetch"] is None
+    assert lifts_content(plan, "yard", GIVEN, "0")["fetch"] is None
 
 
 def test_a_bundle_nested_against_another_vetoes_it() -> None:
-    from barsight.yard.stability.stability import footing_vetoes
-
     low = record(laid(0.3), 0, neighbours=(1,))
     high = record(laid(0.3 + 0.235, z=0.335), 1, neighbours=(0,))
     stock = [laid(0.3), laid(0.535, z=0.335)]
     standing = footings(map_of(stock), (low, high), SETTINGS)
-    codes = {veto.code for veto in footing_vetoes(low, (low, high), standing, SETTINGS)}
+    codes = {veto.code for veto in vetoes_of(footing_checks(low, (low, high), standing, SETTINGS))}
     assert codes == {"unstable-side"}
     level = replace(high, centre_m=np.array([0.3 + 0.28, 0.0, 0.2]), top_z_m=low.top_z_m, sigma=SIGMA)
     assert "unstable-side" not in {
-        veto.code for veto in footing_vetoes(low, (low, level), standing, SETTINGS)
+        veto.code for veto in vetoes_of(footing_checks(low, (low, level), standing, SETTINGS))
     }
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
-from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.travel_accuracy import Travel, travel_checks
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.vetoes import vetoes_of
 from lift_yards import MAGNET, SETTINGS
 

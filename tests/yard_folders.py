@@ -14,8 +14,8 @@ from barsight.cli.main import run
 from barsight.core.stamps import NS_PER_S
 from barsight.result_folder import seal_map
 from barsight.yard.inventory.bundle_file import write_bundles
-from barsight.yard.lifting.magnet import example_magnet
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.magnet.description import example_magnet
 from lift_yards import laid, map_of, record
 from result_folders import summary
 from yard_maps import Laid

@@ -18,7 +18,7 @@ from barsight.recording.open import open_recording
 from barsight.report.page import write_report
 from barsight.report.result_files import RESULT_FILES, summary, write_results, write_summary, write_surface
 from barsight.result_folder import seal_map
-from barsight.yard.lifting.magnet import load_magnet
+from barsight.yard.magnet.description import load_magnet
 
 
 def unheard(stage: str, done: int, total: int) -> None:

@@ -41,9 +41,9 @@ from barsight.yard.inventory.stock_list import (
     stock_warnings,
 )
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.magnet import Magnet, load_magnet
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
 

@@ -18,7 +18,7 @@ from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
-from barsight.yard.lifting.magnet import example_magnet
+from barsight.yard.magnet.description import example_magnet
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -32,7 +32,15 @@ COMMANDS = {
 }
 GROUPS = ("bench", "calibrate")
 """Commands that are packages: `command.py` in them finds the second word."""
+OF_A_YARD = ("lifts", "explain", "compare")
+"""Commands in the package `yard`."""
 INTERRUPTED = 130
+
+
+def home(name: str) -> str:
+    """Return the module that runs a command."""
+    room = "yard." if name in OF_A_YARD else ""
+    return f"barsight.cli.{room}{name}" + (".command" if name in GROUPS else "")
 
 
 def main() -> None:
@@ -56,8 +64,7 @@ def run(arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
     try:
-        module = importlib.import_module(f"barsight.cli.{name}" + (".command" if name in GROUPS else ""))
-        module.run(rest)
+        importlib.import_module(home(name)).run(rest)
     except BarsightError as error:
         return _refuse(str(error), error.exit_code)
     except KeyboardInterrupt:

@@ -21,9 +21,9 @@ from barsight.result_folder import open_folder, read_heights
 from barsight.yard.events import corners
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.clearance import FacePlane, find_obstacle
-from barsight.yard.lifting.footprint import Placement
 from barsight.yard.lifting.lift_file import read_lifts
-from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import lookup_heights
 from barsight.yard.types import Bundle, HeightMap, YardMap
 

@@ -22,7 +22,7 @@ SPARE_REACH_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class DrawnSurroundings:
     """The solids near a magnet, in its frame: X across, Y along the beam; drawn at 1 mm where its faces may
     come and at 5 mm under the beam. owner: of each solid.
     """
@@ -34,7 +34,7 @@ class Surroundings:
     coarse: Envelope
 
     @classmethod
-    def around(cls, yard: SolidYard, magnet: JudgedMagnet, slack_m: float) -> Surroundings:
+    def around(cls, yard: SolidYard, magnet: JudgedMagnet, slack_m: float) -> DrawnSurroundings:
         """Draw what stands around the frame's origin. slack_m: how far any point of the magnet may be off."""
         poles = magnet.poles
         across = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max()) + STRAY_M + slack_m + 0.01
@@ -95,18 +95,22 @@ class Spread:
         and the bundle NOTHING where nothing was drawn.
         """
         z, found = np.empty(len(self.u)), np.empty(len(self.u), np.int32)
-        _look(self.u, self.v, *offset, drawn.x0, drawn.y0, drawn.step, drawn.z, drawn.top, owner, z, found)
+        grid = np.array([drawn.x0, drawn.y0, drawn.step])
+        _look(self.u, self.v, np.array(offset), grid, drawn.z, drawn.top, owner, z, found)
         return z, found
 
 
 @kernel()
 def _look(
-    u: Float64, v: Float64, across: float, along: float, turn: float, x0: float, y0: float, step: float,
-    drawn: Float32, top: Int32, owner: Int32, z: Float64, found: Int32,
+    u: Float64, v: Float64, offset: Float64, grid: Float64, drawn: Float32, top: Int32, owner: Int32,
+    z: Float64, found: Int32,
 ) -> None:  # fmt: skip
-    """Look up the nearest cells of points u, v (N,), moved and turned. drawn, top: (X, Y) of an `Envelope`;
-    owner: of each solid. Fills z, m, and found, the bundle (N,).
+    """Look up the nearest cells of points u, v (N,), moved by `offset`: across, along and a turn. grid: x0,
+    y0 and step of drawn, top: (X, Y) of an `Envelope`; owner: of each solid. Fills z, m, and found, the
+    bundle (N,).
     """
+    across, along, turn = offset
+    x0, y0, step = grid
     c, s = math.cos(turn), math.sin(turn)
     for k in range(len(u)):
         i = math.floor((across + c * u[k] - s * v[k] - x0) / step + 0.5)
@@ -147,7 +151,7 @@ class Standing:
 class MagnetOnSolids:
     """Sets one magnet down at places around the origin of its surroundings."""
 
-    def __init__(self, magnet: JudgedMagnet, around: Surroundings) -> None:
+    def __init__(self, magnet: JudgedMagnet, around: DrawnSurroundings) -> None:
         self._magnet, self._around = magnet, around
         beam = np.array([[0.0, 0.0, magnet.beam[0], magnet.beam[1]]])
         self._faces = Spread.over(magnet.poles, 0.0, STEP_M)

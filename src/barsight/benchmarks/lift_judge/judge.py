@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from barsight.benchmarks.lift_judge.faces import MagnetOnSolids, Standing, Surroundings
+from barsight.benchmarks.lift_judge.faces import DrawnSurroundings, MagnetOnSolids, Standing
 from barsight.benchmarks.lift_judge.lowering import Rest
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.benchmarks.lift_judge.solids import (
@@ -105,7 +105,7 @@ class Judge:
         magnet = self._magnet
         yard = self._yard.seen_from(target.x_m, target.y_m, target.yaw_rad)
         slack = math.hypot(*target.box[:2]) + target.box[2] * (magnet.half_span_m + 0.3)
-        around = Surroundings.around(yard, magnet, slack)
+        around = DrawnSurroundings.around(yard, magnet, slack)
         set_down = MagnetOnSolids(magnet, around)
         load = set_down.loads(self._wanted)
         if len(load) < self._wanted:

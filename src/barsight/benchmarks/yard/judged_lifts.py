@@ -23,9 +23,9 @@ from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, assess_placement
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.targets import plan_lifts
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 
 TWO_SIDED = 1.96
 SPREAD = (0.1, 0.012, math.radians(0.1))

@@ -10,8 +10,8 @@ from barsight.benchmarks.yard.bundle_detection import drawn_map, drawn_yards
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.targets import plan_lifts
+from barsight.yard.magnet.description import Magnet
 
 LENGTH_M = 35.0
 

@@ -32,7 +32,7 @@ from barsight.simulation.simulate import simulate
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.inventory.bundle_file import read_bundles
-from barsight.yard.lifting.magnet import load_magnet
+from barsight.yard.magnet.description import load_magnet
 
 Json = Annotated[Path | None, tyro.conf.arg(name="json")]
 

@@ -26,7 +26,7 @@ from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.magnet import example_magnet, load_magnet
+from barsight.yard.magnet.description import example_magnet, load_magnet
 
 SPAN_M = 3.0
 """Of the drawn stacks, across their bars."""

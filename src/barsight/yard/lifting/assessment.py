@@ -19,13 +19,13 @@ from barsight.yard.lifting.checks import (
     unknown_check,
 )
 from barsight.yard.lifting.clearance import clearance_checks, resting_checks
-from barsight.yard.lifting.contact import NEWTON_PER_KG, Contact, set_down
-from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
-from barsight.yard.lifting.holding import hold_load, share_checks, weakest_pole
-from barsight.yard.lifting.magnet import Magnet, Tolerance
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
+from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, set_down
+from barsight.yard.magnet.description import Magnet, Tolerance
+from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
+from barsight.yard.magnet.holding import hold_load, share_checks, weakest_pole
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_least, check_true, vetoes_of

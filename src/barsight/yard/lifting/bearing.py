@@ -13,8 +13,8 @@ from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.load import Load, axes_of
-from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.lifting.resting_plane import rest_plane
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.sections import part_about
 from barsight.yard.stability.stability import nearest_cells
 from barsight.yard.types import YardMap

@@ -10,9 +10,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64, frozen
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.lifting.contact import Contact
-from barsight.yard.lifting.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
-from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.magnet.contact import Contact
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.stability.stability import interpolate_heights
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_least, check_most, check_true

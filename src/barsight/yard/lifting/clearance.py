@@ -14,9 +14,9 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.lifting.contact import Contact
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.magnet.contact import Contact
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import lookup_heights, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_most

@@ -14,7 +14,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load
-from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.magnet.description import Magnet
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
 

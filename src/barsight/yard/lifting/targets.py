@@ -14,13 +14,13 @@ from barsight.core.notices import FORBIDS
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
-from barsight.yard.lifting.footprint import BundleTable, Placement
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load
-from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.set_down import find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import age_checks
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import BundleTable, Placement
 from barsight.yard.sections import split_map
 from barsight.yard.stability.blockers import Blocked, find_blocked
 from barsight.yard.stability.pile_sides import PileSide, pile_sides

@@ -17,8 +17,8 @@ from barsight.core.pose import skew
 from barsight.core.types import CraneSamples, RectifiedCamera, Trajectory
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.magnet import Magnet
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_most, check_true
 

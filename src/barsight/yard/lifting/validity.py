@@ -11,9 +11,9 @@ import numpy as np
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.magnet import Magnet
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_least, check_most, check_true
 

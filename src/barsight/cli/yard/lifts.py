@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -26,15 +27,16 @@ from barsight.result_folder import (
     read_heights,
 )
 from barsight.yard.events import YardEvent, lift_of, merged, read_events, write_events
+from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.bundle_file import read_bundles, read_match
 from barsight.yard.inventory.stock_list import contradicted_bundles
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import write_lifts
-from barsight.yard.lifting.magnet import load_magnet
 from barsight.yard.lifting.order import LiftOrder, order_lifts
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.types import Bundle
+from barsight.yard.magnet.description import load_magnet
+from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto
 
 FETCH_REMEDY = "fetch another one, or measure again once its cause is gone"
@@ -69,45 +71,19 @@ def run(arguments: Sequence[str]) -> None:
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             fetch: Id of a bundle: also print the lifts that dig it out, in order.
         """
-        described = load_magnet(magnet)
-        summary, identity = open_folder(out, lifts=False)
-        bundles = read_bundles(out / "bundles.json")
-        if identity is None:
-            raise InputError(out / "result.json", "has no map_id: an earlier version wrote it", REMEDY)
-        happened = _events(out, bundles, lifted, events)
-        warnings = [(str(w.get("code")), str(w.get("message"))) for w in summary.get("warnings") or []]
-        reference = str(summary.get("reference", "world"))
-        travel = Travel.read(summary)
-        captured_to_ns = travel.captured_ns[1] if travel and travel.captured_ns else None
-        now_ns = captured_to_ns if at == "end" and captured_to_ns is not None else time.time_ns()
-        vetoes = map_vetoes(
-            warnings, reference, captured_to_ns, now_ns, settings, has_magnet=magnet is not None
-        )
-        if travel is None:
-            unknown = "result.json doesn't say how sure the trajectory is: measure again"
-            vetoes = (*vetoes, Veto("trajectory-degraded", unknown))
-        changed = changed_inputs(summary)
-        if changed:
-            vetoes = (*vetoes, Veto("calibration-changed", f"{changed} was changed since: measure again"))
-        stock = read_match(out / "bundles.json")
-        listed = {} if stock is None else contradicted_bundles(stock)
-        heights, console = read_heights(out), Console(stderr=True)
+        described, folder = load_magnet(magnet), _open(out)
+        happened = _events(out, folder.bundles, lifted, events)
+        now_ns = folder.captured_to_ns if at == "end" and folder.captured_to_ns else time.time_ns()
         plan = plan_lifts(
-            heights,
-            bundles,
-            described,
-            settings,
-            vetoes,
-            travel,
-            now_ns,
-            events=happened,
-            contradicted=listed,
-        )
-        order = None if fetch is None else order_lifts(fetch, heights, bundles, plan)
+            folder.heights, folder.bundles, described, settings,
+            _vetoes(folder, settings, now_ns, has_magnet=magnet is not None), folder.travel, now_ns,
+            events=happened, contradicted=folder.contradicted,
+        )  # fmt: skip
+        order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
         found = None if isinstance(order, Failed) else order
-        target = out / "lifts.json"
-        digest, sequence = bundles_digest(out), next_sequence(target, identity)
-        write_lifts(plan, reference, identity, digest, target, sequence, found)
+        target, console = out / "lifts.json", Console(stderr=True)
+        digest, sequence = bundles_digest(out), next_sequence(target, folder.identity)
+        write_lifts(plan, folder.reference, folder.identity, digest, target, sequence, found)
         if happened:
             write_events(happened, out / "events.csv")
         write_report(out, out / "report.html")
@@ -118,6 +94,53 @@ def run(arguments: Sequence[str]) -> None:
             print_order(order, console)
 
     call(command, "lifts", arguments)
+
+
+@dataclass(frozen=True, eq=False)
+class _MeasuredFolder:
+    """A measured folder, opened. captured_to_ns: stamp of the last frame; contradicted: of `plan_lifts`."""
+
+    summary: dict[str, Any]
+    identity: MapIdentity
+    heights: YardMap
+    bundles: tuple[Bundle, ...]
+    travel: Travel | None
+    contradicted: dict[int, str]
+
+    @property
+    def reference(self) -> str:
+        return str(self.summary.get("reference", "world"))
+
+    @property
+    def captured_to_ns(self) -> int | None:
+        return self.travel.captured_ns[1] if self.travel and self.travel.captured_ns else None
+
+
+def _open(out: Path) -> _MeasuredFolder:
+    summary, identity = open_folder(out, lifts=False)
+    bundles = read_bundles(out / "bundles.json")
+    if identity is None:
+        raise InputError(out / "result.json", "has no map_id: an earlier version wrote it", REMEDY)
+    stock = read_match(out / "bundles.json")
+    listed = {} if stock is None else contradicted_bundles(stock)
+    return _MeasuredFolder(summary, identity, read_heights(out), bundles, Travel.read(summary), listed)
+
+
+def _vetoes(
+    folder: _MeasuredFolder, settings: LiftSettings, now_ns: int, *, has_magnet: bool
+) -> tuple[Veto, ...]:
+    """Gather what forbids every lift of the map."""
+    warnings = [(str(w.get("code")), str(w.get("message"))) for w in folder.summary.get("warnings") or []]
+    vetoes = map_vetoes(
+        warnings, folder.reference, folder.captured_to_ns, now_ns, settings, has_magnet=has_magnet
+    )
+    if folder.travel is None:
+        unknown = "result.json doesn't say how sure the trajectory is: measure again"
+        vetoes = (*vetoes, Veto("trajectory-degraded", unknown))
+    changed = changed_inputs(folder.summary)
+    if changed:
+        vetoes = (*vetoes, Veto("calibration-changed", f"{changed} was changed since: measure again"))
+    return vetoes
 
 
 def print_order(order: LiftOrder, console: Console) -> None:

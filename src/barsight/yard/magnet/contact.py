@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, kernel
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.magnet import Magnet
-from barsight.yard.lifting.resting_plane import (
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.resting_plane import (
     ALL,
     POLE,
     SEEN,

@@ -14,9 +14,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.lifting.contact import Contact, PoleContact
-from barsight.yard.lifting.footprint import Placement
-from barsight.yard.lifting.magnet import Magnet, Pole
+from barsight.yard.magnet.contact import Contact, PoleContact
+from barsight.yard.magnet.description import Magnet, Pole
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_least
 

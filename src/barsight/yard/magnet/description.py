@@ -12,14 +12,14 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.numbers import expect_numbers
-from barsight.yard.lifting.pull import Pull, expect
+from barsight.yard.magnet.pull import Pull, expect
 
 MagnetType = Literal["electro", "permanent", "electro-permanent"]
 LEAST_FACTOR = 3.0
 """Least safety factor of permanent and electro-permanent magnets [EN 13155], and of one of unknown type."""
 LEAST_FACTOR_BACKED = 2.0
 """The same of an electromagnet that a battery holds when the mains fail [EN 13155]."""
-_EXAMPLE = resources.files("barsight.yard.lifting").joinpath("example_magnet.toml")
+_EXAMPLE = resources.files("barsight.yard.magnet").joinpath("example_magnet.toml")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, kernel
-from barsight.yard.lifting.magnet import Magnet, Tolerance
+from barsight.yard.magnet.description import Magnet, Tolerance
 from barsight.yard.types import Bundle
 
 BEYOND_OPEN_END_M = 20.0

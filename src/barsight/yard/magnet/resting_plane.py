@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
 from barsight.core.types import HeightSource
-from barsight.yard.lifting.footprint import Placement
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 
 SEGMENT_M = 0.45

@@ -1,0 +1,1 @@
+"""Commands on a measured yard: lifts, their reasons, changes between two."""
