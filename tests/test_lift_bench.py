@@ -10,7 +10,7 @@ import pytest
 from barsight.benchmarks.lift_judge.magnet import magnet_of, read_magnet
 from barsight.benchmarks.lift_judge.solids import envelope
 from barsight.benchmarks.lift_judge.worlds import draw_world
-from barsight.benchmarks.yard.drawn_worlds import noisy_scene, recording_settings, scene_of
+from barsight.benchmarks.yard.drawn_worlds import noisy_world, recording_settings, scene_of
 from barsight.benchmarks.yard.judged_lifts import JudgedBench, bench_table, judge_yard, upper_bound
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.core.errors import ConfigError
@@ -39,8 +39,8 @@ def test_the_bench_tells_what_was_judged(tmp_path: Path) -> None:
     described.write_text(example_magnet(), encoding="utf-8")
     magnet, settings = read_magnet(described), LiftSettings()
     world = draw_world(4, 2 * magnet.half_span_m + 0.3, 1.2)
-    scene = noisy_scene(world, settings)
-    judged = tuple(judge_yard(world, scene, load_magnet(described), magnet, settings, 4))
+    mapped = noisy_world(world, settings)
+    judged = tuple(judge_yard(world, mapped, load_magnet(described), magnet, settings, 4))
     masses = [world.yard.load(bundle)[0] for bundle in world.yard.bundles]
     assert len(judged) >= 4 and all(not one.vetoes for one in judged if one.offered)
     for one in judged:

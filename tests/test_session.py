@@ -1,5 +1,6 @@
 """Packets pushed one by one: snapshots on the way, and at the end the bytes of the batch."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from barsight.motion.frontend.tracking import Tracker
 
 SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
 
-FILES = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply", "bundles.json")
+FILES = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
 
 
 def counted(patch: pytest.MonkeyPatch, owner: type, name: str) -> list[str]:
@@ -58,6 +59,8 @@ def test_packets_with_snapshots_end_as_the_batch(
     assert len(rectified) <= 2 * pictures + 1
     for name in FILES:
         assert (yard.folder / name).read_bytes() == (batch.folder / name).read_bytes(), name
+    found, expected = (json.loads((one.folder / "bundles.json").read_text()) for one in (yard, batch))
+    assert found["bundles"] == expected["bundles"]
     assert [lift.record for lift in yard.lifts.refused] == [lift.record for lift in batch.lifts.refused]
     heights, final = last.height_map, yard.height_map
     assert heights is not None

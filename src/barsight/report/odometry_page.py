@@ -83,7 +83,7 @@ def odometry_summary(result: OdometryResult) -> dict[str, Any]:
         "sensors": list(trajectory.sensors),
         "frames_total": result.frames,
         "refused": [dataclasses.asdict(frame) for frame in trajectory.refused],
-        "warnings": list(trajectory.warnings),
+        "warnings": [*trajectory.doubts, *trajectory.warnings],
         "length_m": trajectory.length_m,
         "seconds": _seconds(trajectory.stamp_ns[-1:], trajectory)[0],
         "drift": None if result.drift is None else json_value(dataclasses.asdict(result.drift)),

@@ -210,7 +210,6 @@ class BatchPoses:
     ) -> None:  # fmt: skip
         """Raise InputError where the pictures show that a sensor or the cameras' stamps are wrong."""
         shift = recording.rig.timeshift_cam_imu_ns
-        refuse_contradictions(recording.path, sightings, imu, stated, rectifier, shift)
         late = frames_off(sightings, imu, crane, rectifier, shift)
         if late:
             raise InputError(
@@ -219,6 +218,7 @@ class BatchPoses:
                 "against gyro and encoders",
                 "repair the stamps, or use the pictures alone (--use stereo)",
             )
+        refuse_contradictions(recording.path, sightings, imu, stated, rectifier, shift)
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
