@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
@@ -105,8 +106,8 @@ def read_document(path: Path) -> Document:
         raise CalibrationError(path, f"can't be read ({error})", "take the original file") from None
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
     try:
-        values = yaml.safe_load("\n".join(lines))
-    except yaml.YAMLError as error:
+        values = YAML(typ="safe", pure=True).load("\n".join(lines))
+    except YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}: " if mark else ""
         problem = getattr(error, "problem", None) or "not readable"
@@ -121,8 +122,11 @@ def write_document(path: Path, values: dict[str, Any], *, block_lists: bool = Fa
 
     block_lists: a line per number instead of `[a, b, ...]`.
     """
-    style = False if block_lists else None
-    path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=style), encoding="utf-8")
+    yaml = YAML(typ="safe", pure=True)
+    yaml.sort_base_mapping_type_on_output = False
+    yaml.default_flow_style = False if block_lists else None  # type: ignore[assignment]
+    with path.open("w", encoding="utf-8") as stream:
+        yaml.dump(values, stream)
 
 
 def canonical_pose(target: str, source: str, matrix: Float64, *, inverted: bool = False) -> Pose:
