@@ -123,8 +123,8 @@ def write_document(path: Path, values: dict[str, Any], *, block_lists: bool = Fa
     block_lists: a line per number instead of `[a, b, ...]`.
     """
     yaml = YAML(typ="safe", pure=True)
-    yaml.sort_base_mapping_type_on_output = False
-    yaml.default_flow_style = False if block_lists else None  # type: ignore[assignment]
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.default_flow_style = False if block_lists else None
     with path.open("w", encoding="utf-8") as stream:
         yaml.dump(values, stream)
 
