@@ -146,7 +146,7 @@ def assess_placement(
         Tolerance(box.x_m * scale, box.y_m * scale, min(box.yaw_deg * scale, 20.0)),
         float(np.nan_to_num(min(ratios))), tuple(checks), valid,
         target_covariance(
-            place, load, contact.sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
+            place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
         ),
     )  # fmt: skip
 

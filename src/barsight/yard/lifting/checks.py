@@ -87,7 +87,7 @@ def probability_check(probability: float, count: int, settings: LiftSettings, wh
 
 def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: LiftSettings) -> list[Check]:
     """Check how the faces lie and pull."""
-    limits, sigma = magnet.limits, contact.sigma_m
+    limits, sigma = magnet.limits, contact.gap_sigma_m
     pitch, roll = (abs(math.degrees(angle)) for angle in (contact.pitch_rad, contact.roll_rad))
     narrowest = min(pole.width_m for pole in magnet.poles)
     gap, share = contact.widest_gap_m, contact.contact_share

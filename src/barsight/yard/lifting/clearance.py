@@ -50,7 +50,7 @@ class FacePlane:
     @classmethod
     def of(cls, contact: Contact) -> FacePlane:
         """Take it from a contact."""
-        return cls(contact.centre_z_m, contact.pitch_rad, contact.roll_rad, contact.sigma_m)
+        return cls(contact.centre_z_m, contact.pitch_rad, contact.roll_rad, contact.gap_sigma_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def clearance_checks(place: Placement, heights: HeightMap, magnet: Magnet, conta
     """
     faces = FacePlane.of(contact)
     obstacle = find_obstacle(place, heights, magnet, faces)
-    sigma = 1e3 * contact.sigma_m
+    sigma = 1e3 * contact.gap_sigma_m
     checks = []
     for code, what, bound_mm in (
         ("obstructed", "what stands highest above the faces' plane, under the magnet or beside it",
