@@ -113,7 +113,7 @@ class PacketRecording:
         return tuple(self._laser)
 
     def digests(self) -> dict[str, str]:
-        """Nothing: no input is a file."""
+        """Return none: no input is a file."""
         return {}
 
     def _read(self, stamp_ns: int) -> StereoFrame:

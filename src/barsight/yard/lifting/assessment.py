@@ -57,11 +57,12 @@ class Lift:
     that are too many. contact: how the faces lie, None where nothing is known there. needed_n: weight upper
     bound times safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
     overhang_m: bars beyond the outermost pole. tolerance: half sides of the box within which all this holds.
-    safety: the smallest of pull over needed, capacity over load and tolerance over the crane's; at least 1
-    where nothing is vetoed. checks: all that were made; a check that isn't passed is a veto. validity: in
-    time, None where no frame is known to have seen the place. covariance: (4, 4) of the target's x, y,
-    z and yaw, None without a contact. map_vetoes: those that forbid every lift of the map. set_down: where
-    the load can be put, None where no place is known or none was looked for.
+    safety: the smallest of pull over needed, of all and of each pole's share, capacity over load and
+    tolerance over the crane's; at least 1 where nothing is vetoed. checks: all that were made; a check that
+    isn't passed is a veto. validity: in time, None where no frame is known to have seen the place.
+    covariance: (4, 4) of the target's x, y, z and yaw, None without a contact. map_vetoes: those that forbid
+    every lift of the map. set_down: where the load can be put, None where no place is known or none was
+    looked for.
     """
 
     place: Placement
