@@ -18,7 +18,7 @@ from barsight.yard.lifting.checks import (
     probability_check,
     unknown_check,
 )
-from barsight.yard.lifting.clearance import clearance_checks, resting_checks
+from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
@@ -253,11 +253,14 @@ def _change(
         checks = [
             unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, settings),
             *share_checks(weakest_pole(contact, needed_n, magnet, moved, load)),
-            *clearance_checks(moved, yard.heights, exact, contact),
             *resting_checks(moved, magnet, contact, load),
         ]  # fmt: skip
         for veto in vetoes_of(checks):
             return veto.reason
+        # The whole box was held against the limits with their sigmas: here only how the faces rest is new.
+        obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), careful=False)
+        if obstacle is not None:
+            return obstacle.reason
         there = count_gripped(moved, magnet, exact.tolerance, near, contact.z_m)
         if there.gripped != held.gripped:
             return f"it takes {len(there.gripped)} bundles"
