@@ -14,8 +14,8 @@ from collections import Counter
 from dataclasses import asdict, replace
 
 import numpy as np
-from barsight.benchmarks.yard.known_yards import SIGMA, seen_heights
 from digging_judge import CELL_M, Bars, Beam, World, judge_set_down, judge_way, undermined
+from drawn_errors import SIGMA, seen_heights
 
 from barsight.core.errors import Failed
 from barsight.simulation.settings import SimulationSettings, YardSettings

@@ -16,7 +16,7 @@ from drawn_packs import HEXAGONS, draw_pack, edges, gaps, rest_on, seen_map
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet.contact import set_down
+from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import load_magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import hold_load
@@ -36,7 +36,7 @@ def pulls(first: int, last: int) -> Iterator[tuple[float, ...]]:
         pack = draw_pack(rng, irregular=seed % 2 == 1)
         heights = seen_map([pack], (-0.6, 0.6), (-3.9, 3.9), rng)
         x, y, yaw = rng.normal(0, [0.01, 0.1, 0.002])
-        contact = set_down(heights, Placement(x, y, yaw), magnet, settings.contact_gap_m)
+        contact = rest_magnet(heights, Placement(x, y, yaw), magnet, settings.contact_gap_m)
         assert contact is not None
         bar = pack.diameter_m
         width = float(np.ptp(pack.axes_m[:, 0])) + bar

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from barsight.cli.main import run
+from barsight.core.stamps import NS_PER_S
 from barsight.report.explanation import BGR, PIXELS_PER_M, explain
 from yard_folders import lifts, write_folder
 
@@ -35,6 +37,15 @@ def test_every_check_is_told(
     assert "data:image/png;base64," in page and "http" not in page
     if which != "1":
         assert "obstructed" in said and "something stands" in page
+
+
+def test_a_lift_that_was_valid_once_is_said_to_be_too_old(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert explain(folder, "1").title.endswith("is offered at rank 1")
+    later_ns = time.time_ns() + 3600 * NS_PER_S
+    monkeypatch.setattr(time, "time_ns", lambda: later_ns)
+    assert explain(folder, "1").title.endswith("too old now")
 
 
 def test_the_block_is_marked_where_it_stands(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """Packets pushed one by one: snapshots on the way, and at the end the bytes of the batch."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,3 +85,30 @@ def test_a_late_packet_is_refused(whole: Path) -> None:
     with pytest.raises(bs.BarsightError, match="comes late; push packets in time's order"):
         session.push(first)
     assert session.snapshot().surface is None
+
+
+def test_samples_that_say_nothing_are_refused_and_empty_packets_wait(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    session, imu = bs.Session(recording.rig), recording.imu()
+    assert imu is not None
+    part = replace(imu, **{name: getattr(imu, name)[:4] for name in ("stamp_ns", "gyro_radps", "accel_mps2")})
+    session.push(replace(part, stamp_ns=part.stamp_ns[:0]))
+    with pytest.raises(bs.BarsightError, match="NaN"):
+        session.push(replace(part, gyro_radps=np.full((4, 3), np.nan)))
+    with pytest.raises(bs.BarsightError, match="comes late"):
+        session.push(replace(part, stamp_ns=part.stamp_ns[::-1]))
+    session.push(part)
+    for frame, _ in zip(recording.frames(), range(2), strict=False):
+        session.push(frame)
+    assert session.snapshot().frames <= 2
+
+
+def test_a_finished_session_takes_no_more(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    session = bs.Session(recording.rig, with_settings(bs.MeasureSettings(), SETTINGS))
+    frames = list(recording.frames())
+    session.push(frames[0])
+    session.finish()
+    for call in (session.finish, lambda: session.push(frames[1])):
+        with pytest.raises(bs.BarsightError, match="is finished"):
+            call()

@@ -11,7 +11,7 @@ import pytest
 from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.lifting.travel_accuracy import target_covariance
-from barsight.yard.magnet.contact import set_down
+from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import interpolate_heights
 from barsight.yard.vetoes import check_least, check_most, check_true, vetoes_of
@@ -57,7 +57,7 @@ def test_heights_between_cells_are_those_of_a_slope() -> None:
 @pytest.mark.parametrize("x_m", [0.3, 0.305])
 def test_a_micrometre_moves_a_contact_by_no_more(x_m: float) -> None:
     heights = map_of([laid(0.3, roll_deg=20.0)])
-    one, other = (set_down(heights, Placement(x_m + d, 0.0, 0.0), MAGNET, 0.003) for d in (-1e-6, 1e-6))
+    one, other = (rest_magnet(heights, Placement(x_m + d, 0.0, 0.0), MAGNET, 0.003) for d in (-1e-6, 1e-6))
     assert one is not None and other is not None
     assert abs(one.centre_z_m - other.centre_z_m) < 1e-5
     assert one.pull_low_n == pytest.approx(other.pull_low_n, rel=5e-3)

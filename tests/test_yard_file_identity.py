@@ -13,6 +13,7 @@ import pytest
 import barsight as bs
 from barsight.cli.main import run
 from barsight.core.errors import InputError
+from barsight.result_folder import file_digest
 from barsight.yard.inventory.bundle_file import schema as bundle_schema
 from barsight.yard.lifting.lift_file import schema
 from lift_yards import laid
@@ -116,6 +117,28 @@ def test_a_calibration_changed_since_forbids_every_lift(tmp_path: Path) -> None:
     assert found["lifts"] == []
 
 
+def test_a_calibration_changed_since_forbids_the_lifts_that_are_there(tmp_path: Path) -> None:
+    rig = tmp_path / "recording" / "body.yaml"
+    rig.parent.mkdir()
+    rig.write_text("old", encoding="utf-8")
+    inputs = {"body.yaml": file_digest(rig)}
+    hashes = {"calibration": "ca1b", "configuration": "c0f1", "inputs": inputs}
+    told = {"recording": {"path": str(tmp_path / "recording"), "format": "euroc"}, "hashes": hashes}
+    folder = write_folder(tmp_path / "out", **told)  # type: ignore[arg-type]
+    assert lifts(folder) == 0
+    assert len(bs.load(folder).lifts) == 2
+    rig.write_text("new", encoding="utf-8")
+    found = bs.load(folder).lifts
+    assert len(found) == 0 and [code for code, _ in found.vetoes] == ["calibration-changed"]
+    assert {veto[0] for lift in found.refused for veto in lift.vetoes} == {"calibration-changed"}
+
+
+def test_a_free_tif_that_the_map_never_had_is_refused(folder: Path) -> None:
+    shutil.copyfile(folder / "height.tif", folder / "free.tif")
+    with pytest.raises(InputError, match=r"free\.tif"):
+        bs.load(folder)
+
+
 HEAD = "stamp_ns,kind,x_m,y_m,yaw_deg,length_m,width_m\n"
 
 
@@ -132,7 +155,7 @@ def test_lifted_bundles_forbid_around_them_from_then_on(tmp_path: Path) -> None:
 
 def test_what_was_seen_after_an_event_is_not_disturbed_by_it(tmp_path: Path) -> None:
     folder, file = write_folder(tmp_path / "out"), tmp_path / "events.csv"
-    for stamp, offered in ((1, 2), (2 * 10**18, 0)):
+    for stamp, offered in ((10**17, 2), (2 * 10**18, 0)):
         file.write_text(f"{HEAD}{stamp},set-down,0.5,0,0,7,0.3\n", encoding="utf-8")
         assert lifts(folder, "--events", str(file)) == 0
         assert len(content(folder / "lifts.json")["lifts"]) == offered
@@ -145,6 +168,7 @@ def test_what_was_seen_after_an_event_is_not_disturbed_by_it(tmp_path: Path) -> 
         (["--events", "FILE"], "x,y\n1,2\n", 3, "stamp_ns,kind"),
         (["--events", "FILE"], f"{HEAD}1,push,0,0,0,1,1\n", 3, "line 2"),
         (["--events", "FILE"], f"{HEAD}1,lift,nan,0,0,1,1\n", 3, "line 2"),
+        (["--events", "FILE"], f"{HEAD}1764000000,lift,0,0,0,1,1\n", 3, "isn't ns"),
         (["--events", "FILE"], None, 3, "no such file"),
     ],
 )

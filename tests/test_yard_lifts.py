@@ -24,7 +24,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.magnet.contact import set_down
+from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Beam, Magnet, Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Placement, count_gripped
 from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, weakest_pole
@@ -65,7 +65,7 @@ def test_the_plane_rests_as_the_linear_program_says() -> None:
 
 def test_pull_is_the_table_over_the_faces() -> None:
     heights = map_of([], sigma_m=0.0)
-    contact = set_down(heights, Placement(0.5, 0.0, 0.0), MAGNET, 0.003)
+    contact = rest_magnet(heights, Placement(0.5, 0.0, 0.0), MAGNET, 0.003)
     assert contact is not None
     thick = replace(record(laid(0.5)), bar_diameter_m=1.0, sigma=replace(SIGMA, bar_diameter_m=0.0))
     pull = replace(MAGNET.pull, round_diameter_m=(), round_ratio=())

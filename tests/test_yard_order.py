@@ -11,6 +11,7 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.types import HeightSource
+from barsight.yard.events import YardEvent
 from barsight.yard.identity import GIVEN
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content, schema
@@ -136,3 +137,17 @@ def test_a_bundle_nested_against_another_vetoes_it() -> None:
 
 def test_the_pile_is_laid_as_told() -> None:
     assert isinstance(STOCK[0], Laid) and STOCK[5].z_m > STOCK[3].top_z_m
+
+
+def test_nothing_is_set_down_or_carried_over_where_something_happened_since() -> None:
+    heights, bundles = pile()
+    plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, ())
+    place = plan.offered[0].set_down
+    assert place is not None
+    event = YardEvent(1, "set-down", place.x_m, place.y_m, place.yaw_deg, LENGTH_M, 0.3)
+    wary = replace(SETTINGS, disturbed_reach_m=0.3)
+    since = plan_lifts(heights, bundles, MAGNET, wary, (), events=(event,))
+    moved = since.offered[0].set_down
+    assert moved is not None and abs(moved.x_m - place.x_m) > 0.3 + 0.3
+    refused = order_lifts(5, heights, bundles, since)
+    assert isinstance(refused, Failed) and "not seen" in refused.reason

@@ -16,7 +16,14 @@ from barsight.core.files import atomic_directory
 from barsight.core.types import Contour
 from barsight.report.page import write_report
 from barsight.report.result_files import RESULT_FILES
-from barsight.result_folder import CameraPath, open_folder, read_contours, read_heights, read_path
+from barsight.result_folder import (
+    CameraPath,
+    changed_inputs,
+    open_folder,
+    read_contours,
+    read_heights,
+    read_path,
+)
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle, HeightMap
@@ -103,14 +110,18 @@ class Yard:
         """Return the lifts, and what forbids them."""
         content = read_lifts(self.folder / "lifts.json")
         offered, refused = (tuple(map(_target, content[name])) for name in ("lifts", "refused"))
+        vetoes = _vetoes(content)
+        if changed := changed_inputs(self.summary):
+            since = ("calibration-changed", f"{changed} was changed since: measure again")
+            refused += tuple(_vetoed(lift, since) for lift in offered)
+            return Lifts((), refused, (*(veto for veto in vetoes if veto[0] != since[0]), since))
         if not content.get("looks_back"):
             now_ns = time.time_ns()
+            late = ("map-too-old", "the lift was valid once, it isn't any more")
             fresh = tuple(lift for lift in offered if (lift.valid_until_ns or 0) >= now_ns)
-            aged = (lift for lift in offered if lift not in fresh)
-            late = (("map-too-old", "the lift was valid once, it isn't any more"),)
-            refused += tuple(replace(lift, rank=None, vetoes=(*lift.vetoes, *late)) for lift in aged)
+            refused += tuple(_vetoed(lift, late) for lift in offered if lift not in fresh)
             offered = fresh
-        return Lifts(offered, refused, _vetoes(content))
+        return Lifts(offered, refused, vetoes)
 
     @property
     def warnings(self) -> tuple[tuple[str, str], ...]:
@@ -155,6 +166,10 @@ def _target(record: dict[str, Any]) -> LiftTarget:
         tuple(record["bundles"]), record["mass_kg"], record["mass_sigma_kg"], record["valid_until_ns"],
         _vetoes(record), record,
     )  # fmt: skip
+
+
+def _vetoed(lift: LiftTarget, veto: tuple[str, str]) -> LiftTarget:
+    return replace(lift, rank=None, vetoes=(*lift.vetoes, veto))
 
 
 def _vetoes(record: dict[str, Any]) -> tuple[tuple[str, str], ...]:

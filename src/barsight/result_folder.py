@@ -116,8 +116,8 @@ def open_folder(
     identity = identify_map(summary)
     if identity.map_id != summary["map_id"]:
         raise InputError(path, "was changed after it was written", REMEDY)
-    for name, digest in summary["files"].items():
-        file = folder / name
+    for name in MAP_FILES:
+        file, digest = folder / name, summary["files"].get(name)
         if file.is_file() and (cloud or name != "cloud.ply") and file_digest(file) != digest:
             raise InputError(file, "is not the one that result.json was written with", REMEDY)
     if bundles.is_file():

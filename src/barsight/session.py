@@ -51,6 +51,7 @@ class Session:
         self._asked, self._magnet = settings or MeasureSettings(), magnet
         self._settings = self._asked.chosen()
         self._folder = Path(tempfile.mkdtemp(prefix="barsight."))
+        self._yard = self._folder / "yard"
         weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._recording = PacketRecording(rig, self._folder, imu_noise, is_simulated=is_simulated)
         self._source = SelectedSensors(self._recording, self._settings.use)
@@ -66,8 +67,9 @@ class Session:
 
     def push(self, packet: Packet) -> None:
         """Take the next packet, a pair after all readings before it; it enters the map once those are there
-        that place it.
+        that place it. Raises MeasurementError after `finish`.
         """
+        self._expect_open()
         self._recording.add(packet)
         if isinstance(packet, StereoFrame):
             self._waiting.append(self._pairs.rectify(packet))
@@ -81,19 +83,27 @@ class Session:
         return Snapshot(None, 0) if self._map is None else self._map.snapshot(self)
 
     def finish(self) -> Yard:
-        """Return the yard from all packets, as `measure` has it of the same recording."""
+        """Return the yard from all packets, as `measure` has it of the same recording.
+
+        Raises MeasurementError where it did already.
+        """
+        self._expect_open()
         if make_estimator(self._settings.motion).begins_early:
             while self._waiting:
                 self._place(self._waiting.popleft())
             if self._poses is not None:
                 checkpointed(self._kept, "trajectory", self._poses.finish)
-        out = self._folder / "yard"
         write_measured(
-            self._recording, out, self._asked, keep=self._kept.parent, magnet=self._magnet, report=False
-        )
-        yard = Yard(out)
+            self._recording, self._yard, self._asked, keep=self._kept.parent, magnet=self._magnet,
+            report=False,
+        )  # fmt: skip
+        yard = Yard(self._yard)
         yard.keep(self)
         return yard
+
+    def _expect_open(self) -> None:
+        if self._yard.exists():
+            raise MeasurementError("the session is finished: begin another one")
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Check whether all readings that place a frame have come, or won't come any more."""

@@ -37,7 +37,8 @@ def packets(recording: Recording) -> Iterator[Packet]:
 class PacketRecording:
     """A `Recording` of the packets that came so far; `folder` takes the pictures' pixels.
 
-    Raises InputError for a packet that is older than the last of its kind.
+    Raises InputError for a packet that is older than the last of its kind, or whose samples aren't finite or
+    not in time's order. One without samples says nothing.
     """
 
     path, format = Path("session"), "packets"
@@ -58,11 +59,9 @@ class PacketRecording:
         if isinstance(packet, LaserProfile):
             self._laser.append(packet)
         elif isinstance(packet, ImuSamples):
-            self._expect_later(packet.stamp_ns, self._imu.last_ns)
-            self._imu.add(packet)
+            self._add_samples(packet, self._imu)
         elif isinstance(packet, CraneSamples):
-            self._expect_later(packet.stamp_ns, self._crane.last_ns)
-            self._crane.add(packet)
+            self._add_samples(packet, self._crane)
         else:
             self._expect_later([packet.stamp_ns], self.last_frame_ns)
             self.last_frame_ns = packet.stamp_ns
@@ -70,8 +69,18 @@ class PacketRecording:
                 np.savez(self._file(packet.stamp_ns), left=packet.left, right=packet.right)
             self._frames[packet.stamp_ns] = packet if isinstance(packet, RefusedFrame) else None
 
+    def _add_samples(self, packet: Samples, held: _Grown[Samples]) -> None:
+        if not len(packet.stamp_ns):
+            return
+        self._expect_later(packet.stamp_ns, held.last_ns)
+        if not all(np.isfinite(getattr(packet, name)).all() for name in _ARRAYS[type(packet)]):
+            problem = f"a packet of {packet.stamp_ns[0]} ns holds NaN or infinite values"
+            raise InputError(self.path, problem, "leave such samples out")
+        held.add(packet)
+
     def _expect_later(self, stamps_ns: Sequence[int] | Int64, last_ns: int | None) -> None:
-        if len(stamps_ns) and last_ns is not None and stamps_ns[0] <= last_ns:
+        late = last_ns is not None and stamps_ns[0] <= last_ns
+        if late or (np.diff(stamps_ns) <= 0).any():
             raise InputError(
                 self.path, f"a packet of {stamps_ns[0]} ns comes late", "push packets in time's order"
             )
@@ -104,7 +113,7 @@ class PacketRecording:
         return tuple(self._laser)
 
     def digests(self) -> dict[str, str]:
-        """Nothing: no input is a file."""
+        """Return none: no input is a file."""
         return {}
 
     def _read(self, stamp_ns: int) -> StereoFrame:

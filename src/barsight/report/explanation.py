@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import re
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,10 @@ def explain(folder: Path, which: str) -> Explanation:
     record = _find(lifts, which, folder)
     ids = ", ".join(str(number) for number in record["bundles"]) or "no bundle"
     rank = record["rank"]
-    state = f"is offered at rank {rank}" if rank is not None else "is refused"
+    state = "is refused"
+    if rank is not None:
+        aged = not lifts["looks_back"] and (record["valid_until_ns"] or 0) < time.time_ns()
+        state = f"was offered at rank {rank}, and is too old now" if aged else f"is offered at rank {rank}"
     picture = None
     if record["target"]["z_m"] is not None:
         picture = draw_place(

@@ -90,6 +90,11 @@ def merged(first: Iterable[YardEvent], more: Iterable[YardEvent]) -> tuple[YardE
     return tuple(sorted({*first, *more}, key=lambda event: tuple(asdict(event).values())))
 
 
+def events_since(events: tuple[YardEvent, ...], captured_ns: tuple[int, int] | None) -> tuple[YardEvent, ...]:
+    """Select the events that a map may not show: those after its first frame; all, where that isn't known."""
+    return tuple(event for event in events if captured_ns is None or event.stamp_ns > captured_ns[0])
+
+
 def corners(centre: tuple[float, float], yaw_rad: float, width_m: float, length_m: float) -> Float64:
     """Compute the corners (4, 2) of a rectangle whose length runs along yaw."""
     across = width_m / 2 * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])

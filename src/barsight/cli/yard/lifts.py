@@ -39,6 +39,8 @@ from barsight.yard.magnet.description import load_magnet
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto
 
+OTHER_UNIT = 500
+"""An event whose stamp is so many times smaller than the first frame's is stamped in us, ms or s."""
 FETCH_REMEDY = "fetch another one, or measure again once its cause is gone"
 
 
@@ -72,7 +74,7 @@ def run(arguments: Sequence[str]) -> None:
             fetch: Id of a bundle: also print the lifts that dig it out, in order.
         """
         described, folder = load_magnet(magnet), _open(out)
-        happened = _events(out, folder.bundles, lifted, events)
+        happened = _events(out, folder, lifted, events)
         now_ns = folder.captured_to_ns if at == "end" and folder.captured_to_ns else time.time_ns()
         plan = plan_lifts(
             folder.heights, folder.bundles, described, settings,
@@ -112,8 +114,12 @@ class _MeasuredFolder:
         return str(self.summary.get("reference", "world"))
 
     @property
+    def captured_ns(self) -> tuple[int, int] | None:
+        return self.travel.captured_ns if self.travel else None
+
+    @property
     def captured_to_ns(self) -> int | None:
-        return self.travel.captured_ns[1] if self.travel and self.travel.captured_ns else None
+        return self.captured_ns[1] if self.captured_ns else None
 
 
 def _open(out: Path) -> _MeasuredFolder:
@@ -159,10 +165,10 @@ def print_order(order: LiftOrder, console: Console) -> None:
 
 
 def _events(
-    out: Path, bundles: tuple[Bundle, ...], ids: tuple[int, ...], file: Path | None
+    out: Path, folder: _MeasuredFolder, ids: tuple[int, ...], file: Path | None
 ) -> tuple[YardEvent, ...]:
     """Gather what OUT/events.csv, a file and the ids of lifted bundles tell."""
-    by_id = {bundle.id: bundle for bundle in bundles}
+    by_id, captured_ns = {bundle.id: bundle for bundle in folder.bundles}, folder.captured_ns
     missing = [number for number in ids if number not in by_id]
     if missing:
         raise ConfigError(
@@ -171,6 +177,11 @@ def _events(
     kept = out / "events.csv"
     known = read_events(kept) if kept.is_file() else ()
     told = read_events(file) if file is not None else ()
+    for path, events in ((kept, known), (file, told)):
+        for event in events:
+            if captured_ns is not None and event.stamp_ns < captured_ns[0] / OTHER_UNIT:
+                problem = f"stamp {event.stamp_ns} isn't ns on the frames' clock, which said {captured_ns[0]}"
+                raise InputError(path or out, problem, "give stamps in ns, by the clock of the frames")
     return merged(known, (*told, *(lift_of(by_id[number], time.time_ns()) for number in ids)))
 
 
@@ -180,18 +191,11 @@ def print_lifts(plan: LiftPlan, console: Console) -> None:
     for veto in plan.vetoes:
         console.print(f"[red]{veto.code}:[/red] {escape(veto.reason)}", highlight=False)
     if plan.offered:
-        table = Table(title="Lifts, safest first", box=SIMPLE_HEAD)
-        for head in (
-            "rank",
-            "bundle",
-            "x m",
-            "y m",
-            "yaw deg",
-            "kg",
-            "pull/needed",
-            "tolerance mm",
-            "safety",
-        ):
+        table = Table(title="Lifts, safest first", box=SIMPLE_HEAD, pad_edge=False)
+        heads = (
+            "rank", "bundle", "x m", "y m", "yaw deg", "kg", "pull/needed", "± mm", "safety",
+        )  # fmt: skip
+        for head in heads:
             table.add_column(head, justify="right", no_wrap=True)
         for rank, lift in enumerate(plan.offered, start=1):
             assert lift.contact is not None

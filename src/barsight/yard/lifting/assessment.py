@@ -18,11 +18,11 @@ from barsight.yard.lifting.checks import (
     probability_check,
     unknown_check,
 )
-from barsight.yard.lifting.clearance import clearance_checks, resting_checks
+from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
-from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, set_down
+from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
 from barsight.yard.magnet.description import Magnet, Tolerance
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
 from barsight.yard.magnet.holding import hold_load, share_checks, weakest_pole
@@ -57,11 +57,12 @@ class Lift:
     that are too many. contact: how the faces lie, None where nothing is known there. needed_n: weight upper
     bound times safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
     overhang_m: bars beyond the outermost pole. tolerance: half sides of the box within which all this holds.
-    safety: the smallest of pull over needed, capacity over load and tolerance over the crane's; at least 1
-    where nothing is vetoed. checks: all that were made; a check that isn't passed is a veto. validity: in
-    time, None where no frame is known to have seen the place. covariance: (4, 4) of the target's x, y,
-    z and yaw, None without a contact. map_vetoes: those that forbid every lift of the map. set_down: where
-    the load can be put, None where no place is known or none was looked for.
+    safety: the smallest of pull over needed, of all and of each pole's share, capacity over load and
+    tolerance over the crane's; at least 1 where nothing is vetoed. checks: all that were made; a check that
+    isn't passed is a veto. validity: in time, None where no frame is known to have seen the place.
+    covariance: (4, 4) of the target's x, y, z and yaw, None without a contact. map_vetoes: those that forbid
+    every lift of the map. set_down: where the load can be put, None where no place is known or none was
+    looked for.
     """
 
     place: Placement
@@ -96,7 +97,7 @@ def assess_placement(
 ) -> Lift:
     """Judge a placement. Without `search` the tolerance is not looked for (and not vetoed)."""
     near = nearby_bundles(yard.table, place, magnet)
-    contact = set_down(yard.heights, place, magnet, settings.contact_gap_m)
+    contact = rest_magnet(yard.heights, place, magnet, settings.contact_gap_m)
     if contact is None:
         nothing = Tolerance(0.0, 0.0, 0.0)
         nan = math.nan
@@ -131,7 +132,6 @@ def assess_placement(
         reason = f"within the crane's tolerance {end}"
         what = "the box within which the lift stays as checked, over the crane's tolerance"
         checks.append(check_least("narrow-tolerance", what, scale, SCALES[0], "", reason))
-    box = magnet.tolerance
     ratios = (
         contact.pull_low_n / needed if needed > 0 else 0.0,
         weakest.ratio if weakest else 0.0,
@@ -143,7 +143,7 @@ def assess_placement(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
         contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
-        Tolerance(box.x_m * scale, box.y_m * scale, min(box.yaw_deg * scale, 20.0)),
+        _scaled(magnet.tolerance, scale),
         float(np.nan_to_num(min(ratios))), tuple(checks), valid,
         target_covariance(
             place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
@@ -212,10 +212,7 @@ def _tolerance(
     """
     found = 0.0
     for scale in SCALES:
-        box = Tolerance(
-            min(magnet.tolerance.x_m * scale, 1.0), min(magnet.tolerance.y_m * scale, 1.0),
-            min(magnet.tolerance.yaw_deg * scale, 20.0),
-        )  # fmt: skip
+        box = _scaled(magnet.tolerance, scale)
         sure = count_gripped(place, magnet, box, near, contact.z_m).probability
         unsure = vetoes_of([probability_check(sure, len(held.gripped), settings)])
         if unsure:
@@ -230,28 +227,41 @@ def _tolerance(
     return found, ""
 
 
+def _scaled(tolerance: Tolerance, scale: float) -> Tolerance:
+    """Scale the crane's tolerance, up to the most that a tolerance may be."""
+    return Tolerance(
+        min(tolerance.x_m * scale, 1.0), min(tolerance.y_m * scale, 1.0), min(tolerance.yaw_deg * scale, 20.0)
+    )
+
+
 def _change(
     place: Placement, box: Tolerance, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip,
     needed_n: float, settings: LiftSettings,
 ) -> str:  # fmt: skip
-    """Find what changes at a corner of the box; empty where nothing does."""
+    """Find what changes at a corner of the box, by how the faces rest there; empty where nothing does."""
+    load = tuple(near.bundles[k] for k in held.gripped)
+    exact = replace(magnet, tolerance=Tolerance(0.0, 0.0, 0.0))
     for dx, dy, dyaw in itertools.product((-1, 1), repeat=3):
         moved = replace(
             place, x_m=place.x_m + dx * box.x_m, y_m=place.y_m + dy * box.y_m,
             yaw_rad=place.yaw_rad + dyaw * math.radians(box.yaw_deg),
         )  # fmt: skip
-        contact = set_down(yard.heights, moved, magnet, settings.contact_gap_m)
+        contact = rest_magnet(yard.heights, moved, magnet, settings.contact_gap_m)
         if contact is None:
             return "nothing is known under the magnet"
-        load = tuple(near.bundles[k] for k in held.gripped)
         contact = hold_load(contact, magnet, load, settings.strap_m)
         checks = [
             unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, settings),
             *share_checks(weakest_pole(contact, needed_n, magnet, moved, load)),
+            *resting_checks(moved, magnet, contact, load),
         ]  # fmt: skip
         for veto in vetoes_of(checks):
             return veto.reason
-        exact = count_gripped(moved, magnet, Tolerance(0.0, 0.0, 0.0), near, contact.z_m)
-        if exact.gripped != held.gripped:
-            return f"it takes {len(exact.gripped)} bundles"
+        # The whole box was held against the limits with their sigmas: here only how the faces rest is new.
+        obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), careful=False)
+        if obstacle is not None:
+            return obstacle.reason
+        there = count_gripped(moved, magnet, exact.tolerance, near, contact.z_m)
+        if there.gripped != held.gripped:
+            return f"it takes {len(there.gripped)} bundles"
     return ""

@@ -10,6 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.types import HeightSource
+from barsight.yard.events import YardEvent
 from barsight.yard.lifting.load import Load, axes_of
 from barsight.yard.sections import patches
 from barsight.yard.types import HeightMap, YardMap
@@ -77,8 +78,8 @@ class Ground:
             top_m=self.top_m[cut], unknown=self.unknown[cut], barred=self.barred[cut],
         )  # fmt: skip
 
-    def inside(self, load: Load, x_m: float, y_m: float, yaw_rad: float, margin_m: float) -> Bool:
-        """Mark the cells under a load of this outline at a place, and so far around it."""
+    def inside(self, size: Load | YardEvent, x_m: float, y_m: float, yaw_rad: float, margin_m: float) -> Bool:
+        """Mark the cells under an outline of this size at a place, and so far around it."""
         rows, columns = self.top_m.shape
         xx, yy = np.meshgrid(
             self.x0_m + self.cell_m * np.arange(columns) - x_m,
@@ -86,11 +87,16 @@ class Ground:
         )
         across, along = axes_of(yaw_rad)
         to_side, to_end = (np.abs(xx * axis[0] + yy * axis[1]) for axis in (across, along))
-        return np.asarray((to_side < load.width_m / 2 + margin_m) & (to_end < load.length_m / 2 + margin_m))
+        return np.asarray((to_side < size.width_m / 2 + margin_m) & (to_end < size.length_m / 2 + margin_m))
 
     def barring(self, cells: Bool) -> Ground:
         """Return the same with nothing to be put down on these cells."""
         return replace(self, barred=self.barred | cells)
+
+    def forgetting(self, cells: Bool) -> Ground:
+        """Return the same with nothing known of these cells."""
+        top = np.where(cells, np.float32(np.inf), self.top_m)
+        return replace(self, top_m=top, unknown=self.unknown | cells)
 
     def with_load(self, cells: Bool, top_m: float) -> Ground:
         """Return the same with a load up to top_m on these cells."""

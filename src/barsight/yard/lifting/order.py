@@ -13,6 +13,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.yard.events import events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load, axes_of
@@ -57,7 +58,8 @@ def order_lifts(
     queue = _sequence(bundle_id, by_id, blockers, _offered(plan))
     if isinstance(queue, Failed):
         return queue
-    ground = sound_ground(Ground.of(yard), bundles, plan.footings, plan.settings)
+    since = events_since(plan.events, plan.captured_ns)
+    ground = sound_ground(Ground.of(yard), bundles, plan.footings, plan.settings, since)
     for bundle in queue:
         own = Load.of((bundle,))
         ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))

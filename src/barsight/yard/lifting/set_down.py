@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing
 from barsight.yard.lifting.ground import Ground
@@ -69,9 +70,12 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
 
 
 def sound_ground(
-    ground: Ground, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
-) -> Ground:
-    """Bar what should not be loaded: bundles that lean or stand over an edge, and doubtful ones."""
+    ground: Ground, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings,
+    events: tuple[YardEvent, ...] = (),
+) -> Ground:  # fmt: skip
+    """Bar what should not be loaded: bundles that lean or stand over an edge, and doubtful ones. What lies
+    within reach of an event in the yard isn't known any more.
+    """
     footings = {footing.bundle: footing for footing in standing}
     for bundle in bundles:
         footing = footings[bundle.id]
@@ -79,6 +83,9 @@ def sound_ground(
         if leans or bundle.confidence < settings.min_confidence:
             own = Load.of((bundle,))
             ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))
+    for event in events:
+        yaw_rad, reach_m = math.radians(event.yaw_deg), settings.disturbed_reach_m
+        ground = ground.forgetting(ground.inside(event, event.x_m, event.y_m, yaw_rad, reach_m))
     return ground
 
 

@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from barsight.core.notices import FORBIDS
-from barsight.yard.events import YardEvent
+from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.ground import Ground
@@ -35,8 +35,9 @@ ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", 
 SAME_TOP_M = 0.03
 SAME_YAW_RAD = np.radians(2.0)
 RULE = (
-    "Offered lifts come safest first: by the smallest of pull over needed pull, capacity over load, and "
-    "tolerance over the crane's tolerance; the higher bundle first where two are equal."
+    "Offered lifts come safest first: by the smallest of pull over needed pull, the worst pole's pull over "
+    "its share, capacity over load, and tolerance over the crane's tolerance; the higher bundle first where "
+    "two are equal."
 )
 
 
@@ -118,9 +119,9 @@ def plan_lifts(
             offered.append(lift)
     top = {b.id: b.top_z_m for b in bundles}
     offered.sort(key=lambda lift: (-round(lift.safety, 2), -max(top[i] for i in lift.bundles)))
-    standing = tuple(stands[bundle.id] for bundle in bundles)
+    standing, captured_ns = tuple(stands[b.id] for b in bundles), travel.captured_ns if travel else None
     if offered:
-        ground = sound_ground(Ground.of(yard), bundles, standing, settings)
+        ground = sound_ground(Ground.of(yard), bundles, standing, settings, events_since(events, captured_ns))
         by_id = {bundle.id: bundle for bundle in bundles}
         loads = (Load.of(tuple(by_id[k] for k in lift.bundles)) for lift in offered)
         places = (find_set_down(ground, load, magnet, settings) for load in loads)
@@ -135,7 +136,7 @@ def plan_lifts(
         pile_sides(bundles, standing),
         find_blocked(bundles, standing, settings),
         now_ns,
-        travel.captured_ns if travel else None,
+        captured_ns,
         events,
     )
 

@@ -97,7 +97,7 @@ class Contact:
         return max(pole.least_gap_m for pole in self.poles)
 
 
-def set_down(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
+def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
     """Set the magnet down on the map; None where nothing at all is known under it.
 
     contact_gap_m: a face nearer than this to steel lies on it.
