@@ -23,10 +23,11 @@ LAID = [
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.7])
-def test_the_picture_counts_bars_that_the_surface_does_not_show(aside: float) -> None:
+def test_the_picture_tells_bars_that_the_surface_does_not_show(aside: float) -> None:
     heights = photographed(draw(LAID), LAID, aside)
     found = find_bundles(heights, SETTINGS)
-    assert [b.bars for b in found] == [one.bars for one in LAID]
+    # Over the floor as they lie, more bars may hang below.
+    assert [b.bars for b in found] == [None] * len(LAID)
     for bundle, one in zip(found, LAID, strict=True):
         sigma = bundle.sigma
         assert abs(bundle.bar_diameter_m - one.diameter_m) < min(
@@ -37,7 +38,8 @@ def test_the_picture_counts_bars_that_the_surface_does_not_show(aside: float) ->
         axes = np.array([bar.centre_m for bar in bundle.bar_axes])
         assert len(axes) == bundle.visible_bars
     blind = find_bundles(replace(heights, grey=None), SETTINGS)
-    assert sum(b.bars == one.bars for b, one in zip(blind, LAID, strict=True)) < len(LAID)
+    off = [b.bar_diameter_m / one.diameter_m - 1 for b, one in zip(blind, LAID, strict=True)]
+    assert max(np.abs(off)) > 0.2
 
 
 def test_a_picture_without_lines_counts_nothing() -> None:

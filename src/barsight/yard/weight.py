@@ -10,7 +10,7 @@ from barsight.yard.types import Bundle
 
 STEEL_KG_PER_M3 = 7850.0
 COUNT_SIGMA_RATIO = 0.08
-"""What a full hexagon's outline leaves open of its section: bars that lie hidden under it."""
+"""What the outline of counted bars leaves open of their section."""
 
 
 @dataclass(frozen=True)

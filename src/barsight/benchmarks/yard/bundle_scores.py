@@ -219,7 +219,8 @@ def _errors(found: Bundle, true: TrueBundle) -> dict[str, tuple[float, float]]:
         "width": (found.width_m - true.width_m, sigma.width_m),
         "diameter": (found.bar_diameter_m - true.bar_diameter_m, sigma.bar_diameter_m),
     }
-    if found.bars != true.bars:
+    across = [round(one.width_m / one.bar_diameter_m) for one in (found, true)]
+    if across[0] != across[1]:  # another packing
         out["diameter"] = (float("nan"), float("nan"))
     for k, name in enumerate(("low end", "high end")):
         side = (-1, 1)[k] * flip

@@ -85,10 +85,11 @@ def make_bundle(
     centre = axis.mean(axis=0)
     rows = fit.state[fit.first : fit.last + 1]
     seen = seen_section(reading.found, others, settings.smoothing_m)
-    bars, doubt = _count(reading, seen, floor_m)
-    reasons = doubt + _doubts(reading, rows, ends, sheet)
     top = float(np.nanmax(outline.exact_m))
-    section, section_sigma = estimate_section(seen, fit, float(centre[2]) + top, floor_m)
+    top_z = float(centre[2]) + top
+    bars, doubt = _count(reading, seen, top_z, floor_m)
+    reasons = doubt + _doubts(reading, rows, ends, sheet)
+    section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
     return Bundle(
         id=0,
         centre_m=centre,
@@ -98,7 +99,7 @@ def make_bundle(
         ends_m=axis,
         ends_open=(ends[0].is_open, ends[1].is_open),
         width_m=fit.width_m,
-        top_z_m=float(centre[2]) + top,
+        top_z_m=top_z,
         bar_diameter_m=float(fit.values[DIAMETER]),
         visible_bars=len(visible_bars(fit)),
         bars=bars,
@@ -153,14 +154,16 @@ def _top_changes(fit: Fit, top: float) -> tuple[float, float]:
 
 
 def _count(
-    reading: Reading, seen: SeenSection | None, floor_m: float | None
+    reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
 ) -> tuple[int | None, tuple[str, ...]]:
-    """Count bars by the outline; None and a sentence where it is no full hexagon, or another packing explains
-    its kind as well.
+    """Count bars by the outline; None and a sentence where it is not surely a full hexagon, where another
+    packing explains its kind as well, or where one bar may as well be many thin ones.
     """
     fit, other = reading.found.fit, reading.other_packing
     if other is None:
-        why_not = is_no_hexagon(seen, fit, floor_m)
+        why_not = is_no_hexagon(seen, fit, top_m, floor_m)
+        if not why_not and fit.rings == 0 and reading.found.shades is None:
+            why_not = "many thin bars may look like one"
         return (None, (f"its bars can't be counted: {why_not}",)) if why_not else (fit.bars, ())
     diameter = fit.width_m / (2 * LOOSENESS * other + 1)
     return None, (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
-from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
+from barsight.yard.bundles.fitting.outline import STEP_M, make_outline, turned_hexagon
 from barsight.yard.bundles.fitting.outline_fit import (
     AGREES,
     DIAMETER,
@@ -20,34 +20,40 @@ from barsight.yard.bundles.fitting.outline_fit import (
     Z,
 )
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
+from barsight.yard.lift_settings import UPPER
 
 _ROWS_ENOUGH = 120
 _GULLY_RATIO = 0.95
 """Of a bar's diameter: a dip this deep between two crests parts two bundles."""
 _REACH_RATIO = 1.5
 """Of the outline's width: how far from its axis a bundle is looked for."""
-_MISFIT_M, _SINGLE_MISFIT_M = 0.008, 0.004
-"""The mean section of a full hexagon, of a single bar, lies no further from its outline, root mean square."""
 _GULLIES_APART = 0.8
 """Share of the places that are judged: a map smooths gullies each time differently."""
-_SUNKEN_M = 0.015
-"""How deep a full hexagon may reach under the floor by errors of the map."""
-_WIDER_RATIO, _WIDER_M = 0.5, 0.045
-"""Of a bar's diameter, and beside it: how much wider than a full hexagon a map shows it."""
-_PIECE_RATIO = 1.5
-"""Of the outline's width: of what is seen wider than this the outline is a piece."""
+_MISFIT_RATIO, _HEIGHT_RATIO, _WIDTH_RATIO = 0.05, 0.1, 0.2
+"""Of a bar's diameter: how far surface (root mean square), height and width of counted bars may be off."""
+_WIDER_M = 0.045
+_LEAST_PIECE_RATIO, _PIECE_RATIO = 0.7, 1.5
+"""Of the outline's width: what is seen narrower, or (by _WIDER_M besides) wider, is not its section."""
 _ALIKE_LOG = 0.35
 """Neighbours whose widths differ by a larger factor's logarithm may be pieces of one irregular pack."""
-SECTION_RATIO, SECTION_SIGMA_RATIO = 0.5, 0.22
-"""Steel's section over width times depth, and its standard deviation, of packs drawn with seeds 0 to 99."""
+_PARTED_RATIO, _PARTED_DIAMETER_M = 0.3, 0.04
+"""Two bundles lie side by side where the surface sinks so far, of the outline's width, between them and their
+bars are this thick; else they may be pieces of one pack."""
+_HEIGHT_RATIOS = 0.45, 1.25
+"""Least and greatest height of a bundle over its width."""
+_FILLED_RATIOS, _BAR_FILLED_RATIO = (0.54, 0.73), 0.79
+"""Least and greatest share of steel in the box round a bundle, and the greatest in that round what looks like
+one bar. Heights and shares are by packs drawn with seeds 0 to 99."""
+_WIDTH_ERRORS_M = 0.02, 0.01
+"""How much wider, and how much narrower, than its bars a map may show a bundle."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenSection:
     """Seen section of a bundle. width_m: from side to side. upper_m2: between the top and the level
     of the lower side. flank_m: how far that lies under the top. misfit_m: root mean square of the mean
-    section over the outline of a full hexagon. sides_seen: both sides fall to the floor, or
-    end where a bundle of about its width begins.
+    section over the outline of a full hexagon. sides_seen: both sides fall to the floor, or sink deep
+    before a bundle of about its width begins. sides_free: both fall to the floor.
     """
 
     width_m: float
@@ -55,6 +61,7 @@ class SeenSection:
     flank_m: float
     misfit_m: float
     sides_seen: bool
+    sides_free: bool
 
 
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
@@ -70,7 +77,9 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     middle = int(crest[0] + np.argmax(np.nan_to_num(level[crest[0] : crest[1] + 1], nan=-np.inf)))
     deep_m = _GULLY_RATIO * float(fit.values[DIAMETER])
     others_begin = _is_neighbour(one, beside, others)
-    ends = [_edge(level, others_begin, middle, step, deep_m) for step in (-1, 1)]
+    resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
+    parted_m = _PARTED_RATIO * fit.width_m if resolved else np.inf
+    ends = [_edge(level, others_begin, middle, step, deep_m, parted_m) for step in (-1, 1)]
     own = level[ends[0][0] : ends[1][0] + 1]
     if not np.isfinite(own).any():
         return None
@@ -90,20 +99,32 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
         upper_m2=float(np.maximum(filled - flank, 0).sum()) * sheet.cell_m,
         flank_m=top - flank,
         misfit_m=float(np.sqrt(np.mean(misfit**2))) if misfit.size else np.inf,
-        sides_seen=ends[0][1] and ends[1][1],
+        sides_seen=all(seen for _, seen, _ in ends),
+        sides_free=all(free for _, _, free in ends),
     )
 
 
-def is_no_hexagon(seen: SeenSection | None, fit: Fit, floor_m: float | None) -> str:
-    """Say why a section is not that of the full hexagon that was fitted; empty where it may be."""
-    if seen is None or not seen.sides_seen:
-        return "its sides were not seen"
-    if floor_m is not None and fit.values[Z] - fit.width_m / 2 < floor_m - _SUNKEN_M:
-        return f"a full bundle of {fit.bars} would reach under the floor"
-    wider = seen.width_m - fit.width_m
-    if wider > _WIDER_RATIO * fit.values[DIAMETER] + _WIDER_M:
-        return f"it is {1e3 * wider:.0f} mm wider than a full bundle of {fit.bars}"
-    if seen.misfit_m > (_MISFIT_M if fit.rings else _SINGLE_MISFIT_M):
+def is_no_hexagon(seen: SeenSection | None, fit: Fit, top_m: float, floor_m: float | None) -> str:
+    """Say why a section is not surely that of the full hexagon that was fitted; empty where it is.
+
+    From above its lower half isn't seen: only where it stands on the floor its height says what is there.
+    """
+    if seen is None or not seen.sides_free:
+        return "its sides were not seen down to the floor"
+    if floor_m is None:
+        return "no floor was seen to measure its height from"
+    diameter = float(fit.values[DIAMETER])
+    axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
+    width, height = (float(size) + diameter for size in np.ptp(axes, axis=0))
+    higher = top_m - floor_m - height
+    if abs(higher) > _HEIGHT_RATIO * diameter:
+        more = "higher" if higher > 0 else "lower"
+        return f"it stands {1e3 * abs(higher):.0f} mm {more} over the floor than a full bundle of {fit.bars}"
+    wider = seen.width_m - width
+    if abs(wider) > _WIDTH_RATIO * diameter:
+        more = "wider" if wider > 0 else "narrower"
+        return f"it is {1e3 * abs(wider):.0f} mm {more} than a full bundle of {fit.bars}"
+    if seen.misfit_m > _MISFIT_RATIO * diameter:
         return f"its surface lies {1e3 * seen.misfit_m:.0f} mm off that of a full bundle of {fit.bars}"
     return ""
 
@@ -111,16 +132,22 @@ def is_no_hexagon(seen: SeenSection | None, fit: Fit, floor_m: float | None) -> 
 def estimate_section(
     seen: SeenSection | None, fit: Fit, top_m: float, floor_m: float | None
 ) -> tuple[float, float]:
-    """Estimate steel's section and its sigma, m2, of an irregular pack; NaN where its sides were not seen, or
-    where the outline follows a small piece of it only.
+    """Estimate steel's section and its sigma, m2, of a bundle whose bars can't be counted; NaN where its
+    sides were not seen, or where what is seen is not the outline's section.
 
-    What lies under the widest place isn't seen: a pack is as deep as it is wide, or as the floor lets it.
+    What lies under the widest place isn't seen. The estimate is the middle between the least that may be
+    there and the most, down to the floor, and its upper 95 % bound is the most.
     """
-    if seen is None or not seen.sides_seen or seen.width_m > _PIECE_RATIO * fit.width_m + _WIDER_M:
+    if seen is None or not seen.sides_seen:
         return np.nan, np.nan
-    deep = seen.width_m if floor_m is None else float(np.clip(top_m - floor_m, 0.0, seen.width_m))
-    section = SECTION_RATIO * seen.width_m * float(np.sqrt(deep * seen.width_m))
-    return section, SECTION_SIGMA_RATIO * section
+    if not _LEAST_PIECE_RATIO * fit.width_m < seen.width_m < _PIECE_RATIO * fit.width_m + _WIDER_M:
+        return np.nan, np.nan
+    over_m = np.inf if floor_m is None else max(top_m - floor_m, 0.0)
+    heights = [min(ratio * seen.width_m, over_m) for ratio in _HEIGHT_RATIOS]
+    narrow, wide = max(seen.width_m - _WIDTH_ERRORS_M[0], 0.0), seen.width_m + _WIDTH_ERRORS_M[1]
+    least = _FILLED_RATIOS[0] * narrow * heights[0]
+    most = (_FILLED_RATIOS[1] if fit.rings else _BAR_FILLED_RATIO) * wide * heights[1]
+    return (least + most) / 2, (most - least) / 2 / UPPER
 
 
 def _mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
@@ -155,19 +182,23 @@ def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutl
     return taken
 
 
-def _edge(level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float) -> tuple[int, bool]:
-    """Walk from the middle to the last place that belongs to the bundle; whether it falls to the floor, or
-    another begins, there.
+def _edge(
+    level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float, parted_m: float
+) -> tuple[int, bool, bool]:
+    """Walk from the middle to the last place that belongs to the bundle; whether it falls to the floor there,
+    or sinks by parted_m before another begins; whether it falls to the floor.
     """
     last, lowest, lowest_at = middle, level[middle], middle
     for k in range(middle, len(level) if step > 0 else -1, step):
         if not level[k] > -np.inf:
-            return last, bool(level[k] == -np.inf)
+            floor = bool(level[k] == -np.inf)
+            return last, floor, floor
         if others_begin[k]:
-            return last, True
+            return last, bool(level[middle] - min(lowest, level[k]) >= parted_m), False
         if level[k] < lowest:
             lowest, lowest_at = level[k], k
         if level[k] - lowest > deep_m:
-            return max(lowest_at - step, middle) if step > 0 else min(lowest_at - step, middle), False
+            own = max(lowest_at - step, middle) if step > 0 else min(lowest_at - step, middle)
+            return own, False, False
         last = k
-    return last, False
+    return last, False, False
