@@ -191,9 +191,9 @@ def print_lifts(plan: LiftPlan, console: Console) -> None:
     for veto in plan.vetoes:
         console.print(f"[red]{veto.code}:[/red] {escape(veto.reason)}", highlight=False)
     if plan.offered:
-        table = Table(title="Lifts, safest first", box=SIMPLE_HEAD, pad_edge=False)
+        table = Table(title="Lifts, safest first", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
         heads = (
-            "rank", "bundle", "x m", "y m", "yaw deg", "kg", "pull/needed", "± mm", "safety",
+            "rank", "bundle", "x m", "y m", "yaw deg", "kg", "pull/need", "± mm", "safety",
         )  # fmt: skip
         for head in heads:
             table.add_column(head, justify="right", no_wrap=True)
