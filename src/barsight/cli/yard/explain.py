@@ -47,9 +47,9 @@ def _print(told: Explanation, console: Console) -> None:
     console.print(told.title, highlight=False)
     for veto in told.map_vetoes:
         console.print(f"[red]{veto['code']}:[/red] {escape(veto['reason'])}", highlight=False)
-    table = Table(box=SIMPLE_HEAD)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("result", "what is checked", "figure", "bound", "veto"):
-        table.add_column(head, overflow="fold")
+        table.add_column(head, overflow="fold", no_wrap=head != "what is checked")
     for check in told.checks:
         figure, bound = format_check(check)
         what = check["what"] + (f"\n{check['reason']}" if check["reason"] else "")
