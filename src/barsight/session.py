@@ -114,8 +114,7 @@ class Session:
         if self._poses is None:
             return False
         due_ns = stamp_ns + shift_ns + (self._poses.delay_ns or 0)
-        known = [one for one in (self._source.imu(), self._source.crane()) if one is not None]
-        return all(one.stamp_ns[-1] >= due_ns for one in known)
+        return all(last >= due_ns for last in self._recording.last_readings_ns(self._settings.use))
 
     def _place(self, pair: RectifiedPair | RefusedFrame) -> None:
         if self._poses is None:

@@ -85,6 +85,11 @@ class PacketRecording:
                 self.path, f"a packet of {stamps_ns[0]} ns comes late", "push packets in time's order"
             )
 
+    def last_readings_ns(self, use: Container[str]) -> tuple[int, ...]:
+        """Return the stamp of the last reading of each sensor in `use` (`imu`, `crane`) that has any."""
+        last = (held.last_ns for name, held in (("imu", self._imu), ("crane", self._crane)) if name in use)
+        return tuple(stamp for stamp in last if stamp is not None)
+
     @property
     def index(self) -> FrameIndex:
         """Return the index; see `Recording.index`."""
