@@ -50,7 +50,7 @@ from barsight.yard.types import Bundle, YardMap
 LEAST_DOWN = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
 MAX_BELOW_FLOOR_RATIO = 0.3
-"""What lies this share of the working distance under the floor isn't there; depths of one pair are rough."""
+"""Depth under the floor over the working distance, at most; depths of one pair are rough."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ MAP_FIELDS = (
     "captured_from_ns", "captured_to_ns", "is_simulated", "reference", "hashes", "calibration_id",
     "yard_frame_id", "travel", "warnings", "map", "files",
 )  # fmt: skip
-"""What of result.json the map's lifts depend on."""
+"""Keys of result.json on which the map's lifts depend."""
 PROPERTIES = ("x", "y", "z", "intensity", "sigma_z", "views")
 
 

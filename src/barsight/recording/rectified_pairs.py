@@ -17,7 +17,7 @@ from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.recording.base import Recording
 
 MAX_STORED_BYTES = 8 << 30
-"""What may lie in the folder; pairs beyond are decoded again where they are asked for again."""
+"""Capacity of the folder; pairs beyond it are decoded again where they are asked for again."""
 
 
 class RectifiedPairs:

@@ -30,7 +30,7 @@ from barsight.yard.types import Bundle, HeightMap, YardMap
 
 PIXELS_PER_M = 180.0
 BEYOND_M = 0.5
-"""How much of the place is shown around the magnet."""
+"""Margin shown around the magnet."""
 LOW_M, HIGH_M = -0.3, 0.1
 """Heights from the faces' plane that the colours span."""
 BGR = {

@@ -36,7 +36,7 @@ class LiftSettings:
     max_lean_deg: float = 5.0
     """How far a side of the pile may lean outwards."""
     max_turn_deg: float = 5.0
-    """How far the crane can turn a load before it sets it down; from 90 on places across count."""
+    """Largest turn of a load by the crane before it is set down; from 90 on places across count."""
     set_down_clear_m: float = 0.1
     """What stands higher must be this far from a load that is set down, beyond the crane's tolerance."""
     dunnage_m: float = 0.0

@@ -34,7 +34,7 @@ CELL_M, MARGIN_M = 0.01, 0.6
 WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
 """Noise of `noisy_world`: of each cell, and alike over cells."""
 ASIDE_M = 1.3
-"""How far beside a yard the trolley travels that is to hide a part of it."""
+"""Offset of the trolley from a yard's middle where a part of it is to be hidden."""
 
 
 def scene_of(yard: SolidYard, rng: np.random.Generator) -> Scene:

@@ -31,7 +31,7 @@ from barsight.yard.magnet.description import example_magnet, load_magnet
 SPAN_M = 3.0
 """Of the drawn stacks, across their bars."""
 OVER_MAGNET_M = 0.3
-"""How much longer the drawn bars are than the magnet."""
+"""Length of the drawn bars beyond the magnet's."""
 
 
 def bench_lift_targets(

@@ -190,11 +190,11 @@ class BatchPoses:
 
     def _inputs(self) -> _Inputs:
         """Gather what was tracked and the checked sensors. Raises InputError where they contradict."""
-        recording, crane, imu = self._recording, self._crane, self._imu
+        recording, crane = self._recording, self._crane
         sightings, refused = tuple(self._sightings), tuple(self._refused)
         if isinstance(recording, CornerRecording):
             sightings = split_tracks(sightings)
-        self._refuse_wrong_sensors(recording, self._rectifier, sightings, imu, self._stated, crane)
+        self._refuse_wrong_sensors(sightings)
         level, checked = None if crane else align_with_gravity(recording), self._checked
         warnings, doubts = level.warnings if level else (), checked.warnings if checked else ()
         if self._spoiled:
@@ -202,23 +202,20 @@ class BatchPoses:
         if self.reads_pictures and crane is not None:
             few, most = _untied(sightings, refused)
             warnings, doubts = warnings + few, doubts + most
-        return _Inputs(crane, imu, sightings, refused, level, warnings, doubts)
+        return _Inputs(crane, self._imu, sightings, refused, level, warnings, doubts)
 
-    def _refuse_wrong_sensors(
-        self, recording: Recording, rectifier: Rectifier, sightings: tuple[Sighting, ...],
-        imu: ImuSamples | None, stated: CraneSamples | None, crane: CraneSamples | None,
-    ) -> None:  # fmt: skip
+    def _refuse_wrong_sensors(self, sightings: tuple[Sighting, ...]) -> None:
         """Raise InputError where the pictures show that a sensor or the cameras' stamps are wrong."""
-        shift = recording.rig.timeshift_cam_imu_ns
-        late = frames_off(sightings, imu, crane, rectifier, shift)
+        path, shift = self._recording.path, self._recording.rig.timeshift_cam_imu_ns
+        late = frames_off(sightings, self._imu, self._crane, self._rectifier, shift)
         if late:
             raise InputError(
-                recording.path,
+                path,
                 f"the cameras' stamps are {abs(late)} frame(s) {'late' if late > 0 else 'early'} "
                 "against gyro and encoders",
                 "repair the stamps, or use the pictures alone (--use stereo)",
             )
-        refuse_contradictions(recording.path, sightings, imu, stated, rectifier, shift)
+        refuse_contradictions(path, sightings, self._imu, self._stated, self._rectifier, shift)
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int

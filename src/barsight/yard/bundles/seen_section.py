@@ -45,7 +45,7 @@ _FILLED_RATIOS, _BAR_FILLED_RATIO = (0.54, 0.73), 0.79
 """Least and greatest share of steel in the box round a bundle, and the greatest in that round what looks like
 one bar. Heights and shares are by packs drawn with seeds 0 to 99."""
 _WIDTH_ERRORS_M = 0.02, 0.01
-"""How much wider, and how much narrower, than its bars a map may show a bundle."""
+"""Largest errors of a bundle's width in a map, too wide and too narrow."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.stability.stability import turn_between, underside_m
+from barsight.yard.stability.stability import mean_yaw, underside_m
 from barsight.yard.types import Bundle
 
 UNKNOWN_SIGMA_M = 0.05
@@ -35,8 +35,7 @@ class Load:
     @classmethod
     def of(cls, bundles: tuple[Bundle, ...]) -> Load:
         """Build from the bundles of one lift, which lie side by side."""
-        first = bundles[0].yaw_rad
-        yaw = first + float(np.mean([turn_between(first, b.yaw_rad) for b in bundles]))
+        yaw = mean_yaw(bundles)
         axes = axes_of(yaw)
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         for b in bundles:

@@ -24,7 +24,7 @@ from barsight.yard.magnet.footprint import BundleTable, Placement
 from barsight.yard.sections import split_map
 from barsight.yard.stability.blockers import Blocked, find_blocked
 from barsight.yard.stability.pile_sides import PileSide, pile_sides
-from barsight.yard.stability.stability import Footing, footings, high_side, turn_between
+from barsight.yard.stability.stability import Footing, footings, high_side, mean_yaw, turn_between
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto, check_true, vetoes_of
 
@@ -210,8 +210,7 @@ def _offset_across(group: tuple[Bundle, ...], place: Placement) -> float:
 
 def _place(group: tuple[Bundle, ...], along: float, across: float) -> Placement:
     centre = np.mean([b.centre_m[:2] for b in group], axis=0)
-    first = group[0].yaw_rad
-    yaw = first + float(np.mean([turn_between(first, b.yaw_rad) for b in group]))
+    yaw = mean_yaw(group)
     place = Placement(float(centre[0]), float(centre[1]), yaw)
     moved = centre + along * place.along + across * place.across
     return Placement(float(moved[0]), float(moved[1]), yaw)

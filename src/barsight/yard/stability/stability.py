@@ -74,6 +74,12 @@ def turn_between(yaw_rad: float, other_rad: float) -> float:
     return (other_rad - yaw_rad + math.pi / 2) % math.pi - math.pi / 2
 
 
+def mean_yaw(bundles: tuple[Bundle, ...]) -> float:
+    """Average the bundles' yaws as axes, about the first one's."""
+    first = bundles[0].yaw_rad
+    return first + float(np.mean([turn_between(first, bundle.yaw_rad) for bundle in bundles]))
+
+
 def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> tuple[Footing, ...]:
     """Assess how each bundle stands, in the bundles' order."""
     return tuple(_footing(heights, bundle, settings) for bundle in bundles)

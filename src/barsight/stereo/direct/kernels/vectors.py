@@ -108,10 +108,6 @@ class Vectors:
         """Of floats."""
         return self.builder.fadd(one, other, flags=_FAST)
 
-    def not_negative(self, vector: Any) -> Any:
-        """Floats, zero in place of what is less."""
-        return self.at_least(vector, 0.0)
-
     def at_least(self, vector: Any, least: float) -> Any:
         """Floats, `least` in place of what is less."""
         kind = ir.FunctionType(self.floats, [self.floats, self.floats])
