@@ -27,20 +27,21 @@ _ALL_CORES = threading.Lock()
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
-def kernel(*, parallel: bool = False, fastmath: bool = False, inline: bool = False) -> Callable[[F], F]:
+def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[F], F]:
     """Compile a function with Numba, cached on disk so that a second run starts at once.
 
     Where no folder may be written (a read-only installation and home), every run compiles anew.
-    `fastmath` lets the compiler reorder sums; never set it where NaN marks the invalid. A division by zero
-    gives inf or NaN as in NumPy: the check for it would keep loops from being vectorised. A `parallel` kernel
-    takes all cores, and calls from several threads take turns (Numba's plainest threading layer aborts when
-    two enter it); other kernels can't call it. It compiles several times as long as a plain one, which
-    `core.parallel.in_bands` spreads over the cores as well.
+    No kernel reorders sums (Numba's `fastmath`): their order would follow the processor's vector length and
+    whether a function that it calls came from the cache, so that two runs of one recording could differ.
+    A division by zero gives inf or NaN as in NumPy: the check for it would keep loops from being vectorised.
+    A `parallel` kernel takes all cores, and calls from several threads take turns (Numba's plainest threading
+    layer aborts when two enter it); other kernels can't call it. It compiles several times as long as a plain
+    one, which `core.parallel.in_bands` spreads over the cores as well.
     `inline` copies a short function into the kernels that call it: a call hands over each array as nine
     numbers and hides from the compiler which of them overlap, which can cost more than the sums inside.
     """
     options = {
-        "parallel": parallel, "fastmath": fastmath, "nogil": True, "error_model": "numpy",
+        "parallel": parallel, "nogil": True, "error_model": "numpy",
         "inline": "always" if inline else "never",
     }  # fmt: skip
 

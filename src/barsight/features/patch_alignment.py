@@ -116,7 +116,7 @@ def _coefficients(image: UInt8) -> Float32:
     return result
 
 
-@kernel(fastmath=True)
+@kernel()
 def _weights(t: float, weights: Float32) -> None:
     """Compute the four B-spline weights at a fraction t of a pixel."""
     t2, rest = t * t, 1 - t
@@ -126,7 +126,7 @@ def _weights(t: float, weights: Float32) -> None:
     weights[2] = 1 - weights[0] - weights[1] - weights[3]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _inside(image: Float32, x: float, y: float, reach: float) -> bool:
     """Check that the spline can be read from x - reach to x + reach and likewise in y, px.
 
@@ -140,7 +140,7 @@ def _inside(image: Float32, x: float, y: float, reach: float) -> bool:
     )
 
 
-@kernel(fastmath=True)
+@kernel()
 def _read(
     image: Float32, x: float, y: float, half: int, step: float, patch: Float32, rows: Float32, room: Float32
 ) -> None:
@@ -172,7 +172,7 @@ def _read(
             )  # fmt: skip
 
 
-@kernel(fastmath=True)
+@kernel()
 def _read_whole(image: Float32, x: float, y: float, patch: Float32, rows: Float32, room: Float32) -> None:
     """Sample a whole patch at full size: all its pixels share their weights, so rows go before columns.
 
@@ -193,7 +193,7 @@ def _read_whole(image: Float32, x: float, y: float, patch: Float32, rows: Float3
             )
 
 
-@kernel(fastmath=True)
+@kernel()
 def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
     """Build the design (5, _SIZE^2) of a patch: columns' and rows' slope, gain, offset and the patch itself;
     the normal matrix (4, 4) of the first four. Returns the patch's standard deviation.
@@ -217,7 +217,7 @@ def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
     return float(np.sqrt(normal[2, 2] / (_SIZE * _SIZE)))
 
 
-@kernel(fastmath=True)
+@kernel()
 def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
     """Compute the Gauss-Newton step (4,) from the other patch (_SIZE^2,)."""
     along, down, gain, offset = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -231,7 +231,7 @@ def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
         step[k] = inverse[k, 0] * along + inverse[k, 1] * down + inverse[k, 2] * gain + inverse[k, 3] * offset
 
 
-@kernel(fastmath=True)
+@kernel()
 def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[float, float]:
     """Sum squares over the middle (2 half + 1)^2 of the patch: what the step leaves, and the other patch
     about its mean there.
@@ -249,7 +249,7 @@ def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[
     return float(left), float(square - mean * mean / np.float32((2 * half + 1) ** 2))
 
 
-@kernel(fastmath=True)
+@kernel()
 def _middle_holds(other: Float32, design: Float32, step: Float64, variance: float) -> bool:
     """Check whether the patch's middle alone is found at that place; variance: DN^2 of a pixel's noise."""
     left, spread = _misfit(other, design, step, CORE_PX)

@@ -147,7 +147,7 @@ def gradient_of(samples: Samples, residual: Float64, count: int) -> tuple[Float6
     return gradient, np.einsum("krp,kr->p", samples.by_common, residual)
 
 
-@kernel(fastmath=True)
+@kernel()
 def _add(
     first: Int64, residual: Float64, by_chain: Float64, by_common: Float64, chain: Float64, border: Float64,
     gradient: Float64, common: Float64, common_gradient: Float64,
@@ -197,7 +197,7 @@ def _add(
                         common[p, q] += value * by_common[k, r, q]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _project(first: Int64, by_chain: Float64, through: Float64, out: Float64) -> None:
     """Subtract by_chain @ through from out (K, ROWS, P), in place: the Jacobian projected off the chain.
 
@@ -213,7 +213,7 @@ def _project(first: Int64, by_chain: Float64, through: Float64, out: Float64) ->
                         out[k, r, p] -= value * through[base + a, p]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _predict(first: Int64, by_chain: Float64, chain: Float64, out: Float64) -> None:
     """Add the Jacobian times a step of the chain (N,) to out (K, ROWS), in place.
 
@@ -228,7 +228,7 @@ def _predict(first: Int64, by_chain: Float64, chain: Float64, out: Float64) -> N
             out[k, r] += total
 
 
-@kernel(fastmath=True)
+@kernel()
 def _pull(first: Int64, by_chain: Float64, residual: Float64, gradient: Float64) -> None:
     """Add the transposed Jacobian times residual (K, ROWS) to the chain's gradient (N,), in place.
 

@@ -47,7 +47,7 @@ class Warp:
         return warped
 
 
-@kernel(fastmath=True)
+@kernel()
 def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> None:
     """Resample a picture by cubic convolution, down the columns and then along the rows [Keys 1981].
 
@@ -87,7 +87,7 @@ def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> Non
             line[j] = np.uint8(min(max(value, _ZERO), _MAX_VALUE))
 
 
-@kernel(fastmath=True)
+@kernel()
 def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Compute the cubic weights of the four pixels around a place at fraction t after the second."""
     rest = _ONE - t

@@ -51,7 +51,7 @@ def _even(n: int, width: int) -> tuple[Int64, Int64]:
     return np.maximum(index - width + 1, 0), (index + 1) * (width - 1)
 
 
-@kernel(fastmath=True)
+@kernel()
 def factorise_skyline(band: Skyline) -> bool:
     """Replace the matrix by its lower Cholesky factor; false where it isn't positive definite."""
     values, first, offset = band
@@ -73,7 +73,7 @@ def factorise_skyline(band: Skyline) -> bool:
     return True
 
 
-@kernel(fastmath=True)
+@kernel()
 def solve_forward(factor: Skyline, x: Float64) -> None:
     """Replace x (n, m), right sides beside each other so that the factor is read once for all of them, by the
     factor's inverse times these. Four rows at a time, so that the sums stay in the registers.
@@ -96,7 +96,7 @@ def solve_forward(factor: Skyline, x: Float64) -> None:
             x[i, c] *= p
 
 
-@kernel(fastmath=True)
+@kernel()
 def solve_back_dense(factor: Skyline, x: Float64) -> None:
     """Replace x (n, m) by the inverse of the factor's transpose times it."""
     values, first, offset = factor
@@ -111,7 +111,7 @@ def solve_back_dense(factor: Skyline, x: Float64) -> None:
                 x[k, c] -= share * x[i, c]
 
 
-@kernel(fastmath=True)
+@kernel()
 def inverse_blocks(
     factor: Skyline, at: Int64, diagonal: Float64, blocks: Float64, pairs: Int64, cross: Float64
 ) -> None:

@@ -106,7 +106,7 @@ def add_chain(chain: Chain, at: Int64, band: Skyline) -> None:
                     values[offset[row] + at[k - 1] + j] += link[k, i, j]
 
 
-@kernel(fastmath=True)
+@kernel()
 def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain: Chain) -> None:
     """Add the normal equations of sparse rows: row r has `right` and values[k] at unknown at[k], where
     first[r] <= k < first[r + 1]. Unknown M n, after the nodes', is the latency.

@@ -14,7 +14,7 @@ from barsight.motion.linear.reprojection_kernels import (
 )
 
 
-@kernel(fastmath=True)
+@kernel()
 def frame_equations(
     rig: Rig, sights: Observations, guess: LinearisationPoint, frame: int, normal: Float64, gradient: Float64
 ) -> None:

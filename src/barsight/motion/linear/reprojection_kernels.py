@@ -81,7 +81,7 @@ def empty_rows() -> Float64:
     return np.empty((3, SHARED + 1))
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def _error(
     lens: Float64, camera: Float64, points: Float64, stereo: Float64, given: Given, node: int, k: int, t: int,
     rows: Float64,
@@ -112,7 +112,7 @@ def _error(
     return True
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def slide_offset(points: Float64, shared: Float64, piece: Int64, t: int) -> float:
     """Subtract the piece's slide from a point's, rad."""
     off: float = points[t, 3]
@@ -121,7 +121,7 @@ def slide_offset(points: Float64, shared: Float64, piece: Int64, t: int) -> floa
     return off
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
     """Return what a point's disparity is too large by with all of its piece, px."""
     pieces = (len(shared) - 2) // 2
@@ -129,7 +129,7 @@ def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
     return off
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def given_of(rig: Rig, sights: Observations, shared: Float64, t: int) -> Given:
     """Collect the numbers that the sightings of point t share; shared: as `LinearisationPoint` has it."""
     last = len(shared) - 1
@@ -137,7 +137,7 @@ def given_of(rig: Rig, sights: Observations, shared: Float64, t: int) -> Given:
     return Given(rig.huber, sights.scale, off_px, shared[last - 1], shared[last])
 
 
-@kernel(fastmath=True)
+@kernel()
 def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result: Float64) -> float:
     """Compute residuals (N, 3) px, seen minus predicted, of the used sightings; returns their robust cost."""
     lens, camera, points, shared = rig.lens, guess.camera, guess.points, guess.shared
@@ -162,7 +162,7 @@ def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result:
     return cost
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def whitened_rows(
     lens: Float64, mount: Float64, camera: Float64, points: Float64, stereo: Float64, weight: float,
     given: Given, at: tuple[int, int, int], rows: Float64,

@@ -70,7 +70,7 @@ class Span(NamedTuple):
     size: int
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def _factorise(m: Float64, size: int) -> None:
     """Replace a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse."""
     for i in range(size):
@@ -85,7 +85,7 @@ def _factorise(m: Float64, size: int) -> None:
         m[i, i] = 1 / np.sqrt(own)
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def _add_point(rows: Float64, size: int, normal: Float64, gradient: Float64) -> None:
     """Add a sighting's part of its point's own equations (4, 4), of the matrix the lower half, and (4,)."""
     for a in range(size):
@@ -95,7 +95,7 @@ def _add_point(rows: Float64, size: int, normal: Float64, gradient: Float64) -> 
             normal[a, b] += x * rows[0, PLACE + b] + y * rows[1, PLACE + b] + z * rows[2, PLACE + b]
 
 
-@kernel(fastmath=True, inline=True)
+@kernel(inline=True)
 def _add_pose(
     rows: Float64, span: Span, node: int, band: Float64, gradient: Float64, side: Float64, bound: Float64
 ) -> None:
@@ -114,7 +114,7 @@ def _add_pose(
             bound[b, first + a] = x * rows[0, PLACE + b] + y * rows[1, PLACE + b] + z * rows[2, PLACE + b]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _take_out(
     bound: Float64, width: int, rest: Float64, factor: Float64, span: Span, result: ReducedSystem
 ) -> None:
@@ -161,7 +161,7 @@ def _take_out(
                 corner[c, d] -= rest[k, c] * rest[k, d]
 
 
-@kernel(fastmath=True)
+@kernel()
 def eliminate_points(
     rig: Rig, sights: Observations, guess: LinearisationPoint, result: ReducedSystem
 ) -> None:
@@ -209,7 +209,7 @@ def eliminate_points(
         _take_out(bound, 6 * (end - begun), rest, normal, Span(begun, own, since, begin, size), result)
 
 
-@kernel(fastmath=True)
+@kernel()
 def scatter_reduced(
     reduced: ReducedSystem, node: Int64, piece: Int64, rows: Skyline, gradient: Float64, side: Float64,
     corner: Float64, corner_gradient: Float64,
@@ -252,7 +252,7 @@ def scatter_reduced(
                         values[offset[row] + piece[p] + d] += corners[p, c, d]
 
 
-@kernel(fastmath=True)
+@kernel()
 def back_substitute(
     rig: Rig,
     sights: Observations,

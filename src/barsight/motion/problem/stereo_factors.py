@@ -76,7 +76,7 @@ def temporal_inflation(residual: Float64, seen: StereoObservations, used: Bool) 
     return float(((1 + correlation) / (1 - correlation)) ** 0.5)
 
 
-@kernel(fastmath=True)
+@kernel()
 def _shared_squares(
     residual: Float64, sigma: Float64, stereo: Float64, node: Int64, used: Bool, per_px: float
 ) -> tuple[float, float]:
@@ -99,7 +99,7 @@ def _shared_squares(
     return (sums**2).sum(), single
 
 
-@kernel(fastmath=True)
+@kernel()
 def _neighbours(
     residual: Float64, sigma: Float64, track: Int64, used: Bool
 ) -> tuple[int, float, float, float]:

@@ -91,7 +91,7 @@ def _weighted_means(
             means[row, column] = totals[column] / weights[column] if known else np.nan
 
 
-@kernel(fastmath=True)
+@kernel()
 def _add_neighbours(
     near: np.float32,
     alike: Float32,

@@ -93,7 +93,7 @@ def _grow(guide: UInt8, long: int, short: int, loose: int, tight: int, arms: Arm
                 arms[arm, row, column] = reached
 
 
-@kernel(parallel=True, fastmath=True)
+@kernel(parallel=True)
 def _aggregate(slices: Float32, arms: Arms, shares: Float32, rounds: int) -> None:
     """Average costs over the cross-shaped regions, in place [Zhang 2009].
 
@@ -112,7 +112,7 @@ def _aggregate(slices: Float32, arms: Arms, shares: Float32, rounds: int) -> Non
             _scale(slices[index], shares[turn % 2])
 
 
-@kernel(fastmath=True)
+@kernel()
 def _along_rows(cost: Float32, arms: Arms) -> None:
     """Sum over the horizontal arms, in place."""
     height, width = cost.shape
@@ -125,7 +125,7 @@ def _along_rows(cost: Float32, arms: Arms) -> None:
             costs[x] = total[x + right[x] + 1] - total[x - left[x]]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _along_columns(cost: Float32, arms: Arms, total: Float32) -> None:
     """Sum over the vertical arms, in place. total: (H + 1, W) scratch."""
     height, width = cost.shape
@@ -140,7 +140,7 @@ def _along_columns(cost: Float32, arms: Arms, total: Float32) -> None:
             costs[x] = total[row + down[x] + 1, x] - total[row - up[x], x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _scale(cost: Float32, share: Float32) -> None:
     """Scale cost (H, W) by share (H, W), in place."""
     for row in range(cost.shape[0]):

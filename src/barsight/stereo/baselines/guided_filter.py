@@ -72,7 +72,7 @@ def box_mean(image: Float32, radius_px: int) -> Float64:
     return mean
 
 
-@kernel(parallel=True, fastmath=True)
+@kernel(parallel=True)
 def _filter(slices: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
     """Filter slices (K, H, W) by the guided filter, in place [He 2010].
 
@@ -82,7 +82,7 @@ def _filter(slices: Float32, guide: Float32, mean: Float32, inverse: Float32, ra
         _filter_slice(slices[index], guide, mean, inverse, radius)
 
 
-@kernel(fastmath=True)
+@kernel()
 def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
     """Filter one slice (H, W) row by row, in place; guide, mean, inverse: (H, W), see `GuidedFilter`.
 
@@ -127,7 +127,7 @@ def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32
             _apply(windows, share, rows, guide[out], cost[out])
 
 
-@kernel(fastmath=True)
+@kernel()
 def _enter(sum_cost: Float32, sum_product: Float32, cost: Float32, kept: Float32, guide: Float32) -> None:
     """Add a row of costs to the columns' sums. All (W,).
 
@@ -139,7 +139,7 @@ def _enter(sum_cost: Float32, sum_product: Float32, cost: Float32, kept: Float32
         sum_product[x] += cost[x] * guide[x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _leave(sum_cost: Float32, sum_product: Float32, cost: Float32, guide: Float32) -> None:
     """Subtract a row of costs, which `_enter` has added, from the columns' sums. All (W,); sums in place."""
     for x in range(cost.shape[0]):
@@ -147,7 +147,7 @@ def _leave(sum_cost: Float32, sum_product: Float32, cost: Float32, guide: Float3
         sum_product[x] -= cost[x] * guide[x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _models(
     windows: Float32,
     share: Float32,
@@ -172,7 +172,7 @@ def _models(
         offset[x] = mean_cost - steep * mean[x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _apply(windows: Float32, share: Float32, rows: np.float32, guide: Float32, out: Float32) -> None:
     """Evaluate the mean linear model of a row: the filtered costs, out (W,) [He 2010].
 
@@ -185,28 +185,28 @@ def _apply(windows: Float32, share: Float32, rows: np.float32, guide: Float32, o
         out[x] = (slopes[x] * guide[x] + offsets[x]) * share[x] * per_row
 
 
-@kernel(fastmath=True)
+@kernel()
 def _add(total: Float32, row: Float32) -> None:
     """Add row (W,) to total (W,), in place."""
     for x in range(row.shape[0]):
         total[x] += row[x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _subtract(total: Float32, row: Float32) -> None:
     """Subtract row (W,) from total (W,), in place."""
     for x in range(row.shape[0]):
         total[x] -= row[x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _copy(values: Float32, out: Float32) -> None:
     """Copy the first W values to out (W,)."""
     for x in range(out.shape[0]):
         out[x] = values[x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _pairs(values: Float32, size: int, sums: Float32) -> None:
     """Sum pairs `size` places apart: sums[x] = values[x] + values[x + size], N - size of them.
 
@@ -217,7 +217,7 @@ def _pairs(values: Float32, size: int, sums: Float32) -> None:
         sums[x] = values[x] + shifted[x]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _window_sums(padded: Float32, sums: Float32, radius: int, scratch: Float32) -> None:
     """Sum over 2 r + 1 neighbours of `padded`, which has r zeros at both ends: out of sums over 1, 2, 4...
     neighbours, so that the adds are few and none waits for the one before, as in a running sum.

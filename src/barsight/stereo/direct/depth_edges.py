@@ -149,7 +149,7 @@ def _summed(v: Vectors, terms: list[Any]) -> Any:
     return terms[0]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _weighted_medians(
     disparity: Float32, grey: UInt8, wanted: Bool, near: Float32, medians: Float32, first: int,
     end: int,

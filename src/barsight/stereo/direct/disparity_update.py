@@ -63,7 +63,7 @@ def _excess(long: Float32, short: Float32, power: Float32, information: Float32,
         excess[x] = gap * gap - _SLACK * (_SUPPORT * power[x] / max(information[x], _MIN_INFORMATION))
 
 
-@kernel(fastmath=True)
+@kernel()
 def _blend(
     long_fit: Fit, short_fit: Fit, power: Float32, usable: Float32, reach: int, fitted: Float32,
     variance: Float32, first: int, end: int,
@@ -125,7 +125,7 @@ def update_disparity(fitted: Float32, axes: Float32, disparity: Float32, varianc
     parallel_bands(work, len(fitted), BAND_ROWS)
 
 
-@kernel(fastmath=True)
+@kernel()
 def _settle(
     fitted: Float32, axes: Float32, reach: int, disparity: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip

@@ -42,7 +42,7 @@ def photometric_residual(
     parallel_bands(work, len(left), BAND_ROWS)
 
 
-@kernel(fastmath=True)
+@kernel()
 def _compare(
     left: Float32, right: Float32, usable: Float32, reach: int, outlier: np.float32, residual: Float32,
     trust: Float32, first: int, end: int,
@@ -107,7 +107,7 @@ def robust_weights(
     parallel_bands(work, len(means[0]), BAND_ROWS)
 
 
-@kernel(fastmath=True)
+@kernel()
 def _weigh(
     residual: Float32, slope: Float32, trust: Float32, means: tuple[Float32, Float32], reach: int,
     samples: np.float32, gloss_trust: np.float32, evidence: tuple[Float32, Float32], first: int, end: int,
@@ -190,7 +190,7 @@ def step_gain(
     return short_of
 
 
-@kernel(fastmath=True)
+@kernel()
 def _lengthen(
     weight: Float32, trust: Float32, slope_noise: np.float32, reach: int, is_last: bool, pull: Float32,
     mean_weight: Float32, short_of: Float32, first: int, end: int,
@@ -255,7 +255,7 @@ def _blocks(pull: Float32, y: int, height: int, line: Float32, blocks: Float32) 
         blocks[x] = line[x] + line[x + 1] + line[x + 2]
 
 
-@kernel(fastmath=True)
+@kernel()
 def _noise_power(
     pull: Float32, usable: Float32, mean_usable: Float32, mean_weight: Float32, hold: np.float32, reach: int,
     power: Float32, first: int, end: int,

@@ -97,7 +97,7 @@ def _pairs(shape: SupportShape) -> _Pairs:
     return _Pairs(a, c, factors.astype(np.float32))
 
 
-@kernel(fastmath=True)
+@kernel()
 def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32, sums: Float32) -> None:
     """Sum the nine terms of a plane's normal equations for TILE_COLUMNS pixels from `middle` on: the weights
     times 1, a, c, a a, a c, c c and the pulls times 1, a, c; a along, c across the axis.
@@ -140,7 +140,7 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
             sums[8 * _LANES + i] += lean_pull * fc
 
 
-@kernel(fastmath=True)
+@kernel()
 def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
     """Solve each plane's height at its pixel and that height's information out of the sums of `_sum_pairs`.
 
@@ -161,7 +161,7 @@ def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
         information[i] = certain
 
 
-@kernel(fastmath=True)
+@kernel()
 def _add_near(evidence: Evidence, middle: int, offsets: Int64, sums: Float32) -> None:
     """Add the weights and the pulls of a few points for TILE_COLUMNS pixels from `middle` on.
 

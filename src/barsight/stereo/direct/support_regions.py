@@ -106,7 +106,7 @@ def biweight(gap: np.float32) -> np.float32:
     return rest * rest
 
 
-@kernel(fastmath=True)
+@kernel()
 def _take_means(images: AxisImages, middle: int, offsets: Int64, shares: Float32, sums: Float32) -> None:
     """Average the first and the second image for TILE_COLUMNS pixels from `middle` on.
 

@@ -70,7 +70,7 @@ def roll_square(
         column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
 
 
-@kernel(fastmath=True)
+@kernel()
 def _add_columns(column: Float64, threes: Float32, side: int, mean: Float32) -> None:
     """Average (W,) `side` columns each: three by three first, so that each is read a third as often.
 
@@ -104,7 +104,7 @@ def slide_window(column: Float64, reach: int, mean: Float32) -> None:
     _add_columns(column, np.empty(len(column) - 2, dtype=np.float32), side, mean)
 
 
-@kernel(fastmath=True)
+@kernel()
 def _window_means(
     images: Float32, weight: Float32, reach: int, every: int, sums: Float32, first: int, end: int
 ) -> None:

@@ -68,7 +68,7 @@ def value_and_slope(coefficients: Float32, disparity: Float32, margin: int = 0) 
     return value, slope
 
 
-@kernel(fastmath=True)
+@kernel()
 def _read(
     coefficients: Float32, disparity: Float32, margin: int, value: Float32, slope: Float32, first_row: int,
     end_row: int,

@@ -40,7 +40,7 @@ def upsample_update(started: Float32, moved: Float32, disparity: Float32, same_s
     return result
 
 
-@kernel(fastmath=True)
+@kernel()
 def _carry_up(
     started: Float32, moved: Float32, disparity: Float32, nearness: np.float32, result: Float32, first: int,
     end: int,

@@ -17,7 +17,6 @@ LANES = 32
 HALF_LANES = LANES // 2
 BYTE, SHORT, FLOAT = ir.IntType(8), ir.IntType(16), ir.FloatType()
 FLOAT_LANES = 16
-_FAST = ("fast",)
 
 
 def bytes_of(lanes: int) -> Any:
@@ -101,34 +100,46 @@ class Vectors:
     def product(self, one: Any, *others: Any) -> Any:
         """Of floats."""
         for other in others:
-            one = self.builder.fmul(one, other, flags=_FAST)
+            one = self.builder.fmul(one, other)
         return one
 
     def sum(self, one: Any, other: Any) -> Any:
         """Of floats."""
-        return self.builder.fadd(one, other, flags=_FAST)
+        return self.builder.fadd(one, other)
 
     def at_least(self, vector: Any, least: float) -> Any:
         """Floats, `least` in place of what is less."""
-        kind = ir.FunctionType(self.floats, [self.floats, self.floats])
-        function = cgutils.get_or_insert_function(
-            self.builder.module, kind, f"llvm.maxnum.v{self.floats.count}f32"
-        )
-        return self.builder.call(function, [vector, self.all(least, self.floats)], fastmath=_FAST)
+        floor = self.all(least, self.floats)
+        return self.builder.select(self.builder.fcmp_ordered(">", vector, floor), vector, floor)
 
     def sum_of(self, vector: Any) -> Any:
-        """Return the sum of a vector's floats."""
-        return self._call(f"llvm.vector.reduce.fadd.v{vector.type.count}f32", FLOAT, FLOAT(0.0), vector)
+        """Return the sum of a vector's floats, added by halves: the same on every processor."""
+        return self._halved(vector, self.sum)
 
     def extreme_of(self, vector: Any, which: str) -> Any:
         """Return the "min" or "max" of a vector's floats."""
-        return self._call(f"llvm.vector.reduce.f{which}.v{vector.type.count}f32", FLOAT, vector)
+        sign = {"min": "<", "max": ">"}[which]
+        return self._halved(
+            vector,
+            lambda one, other: self.builder.select(self.builder.fcmp_ordered(sign, one, other), one, other),
+        )
+
+    def _halved(self, vector: Any, join: Callable[[Any, Any], Any]) -> Any:
+        """Join the upper half of a power of two of values with the lower, until one is left."""
+        while (half := vector.type.count // 2) > 0:
+            lower, upper = (
+                self.builder.shuffle_vector(
+                    vector,
+                    vector,
+                    ir.Constant(ir.VectorType(ir.IntType(32), half), list(range(first, first + half))),
+                )
+                for first in (0, half)
+            )
+            vector = join(lower, upper)
+        return self.builder.extract_element(vector, ir.IntType(32)(0))
 
     def min_of(self, vector: Any) -> Any:
         """Return the least byte of a vector."""
-        return self._call(f"llvm.vector.reduce.umin.v{vector.type.count}i8", BYTE, vector)
-
-    def _call(self, name: str, result: Any, *values: Any) -> Any:
-        kind = ir.FunctionType(result, [value.type for value in values])
-        function = cgutils.get_or_insert_function(self.builder.module, kind, name)
-        return self.builder.call(function, values, fastmath=_FAST if result == FLOAT else ())
+        kind = ir.FunctionType(BYTE, [vector.type])
+        name = f"llvm.vector.reduce.umin.v{vector.type.count}i8"
+        return self.builder.call(cgutils.get_or_insert_function(self.builder.module, kind, name), [vector])

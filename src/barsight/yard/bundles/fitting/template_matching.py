@@ -201,7 +201,7 @@ def _bounds(profile: Float32, template: Float32) -> tuple[float, float]:
     return low, high
 
 
-@kernel(fastmath=True)
+@kernel()
 def _compare(
     surface: Float32, seen: Float32, template: Float32, known: int, low: float, high: float, agreement: float
 ) -> tuple[float, float]:
