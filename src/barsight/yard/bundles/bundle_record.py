@@ -26,11 +26,30 @@ from barsight.yard.bundles.fitting.outline_fit import (
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours
-from barsight.yard.bundles.seen_section import SeenSection, estimate_section, is_no_hexagon, seen_section
+from barsight.yard.bundles.seen_section import (
+    SeenSection,
+    estimate_section,
+    is_no_hexagon,
+    section_of_pack,
+    seen_section,
+)
+from barsight.yard.bundles.straps import Pack, contradicts
 from barsight.yard.sections import MapStretch
 from barsight.yard.types import Bundle, BundleSigma
 
 _NARROW_M = 0.3
+_SAME_RATIO, _SAME_M = 0.12, 0.005
+"""Of the width, and besides: how far an outline's edges lie off those of the pack that it describes."""
+_PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M = 0.009, 0.02, 0.006
+"""Standard deviations of a pack's middle, width and top."""
+_CREST_M = 0.006
+"""How far a map's mean section cuts the crests of bars."""
+_STRAPPED = 0.95
+"""Confidence in a bundle whose straps and flanks were seen."""
+_PIECE_M, _PIECE_HIGHER_M, _PIECE_SKEW = 0.02, 0.03, 0.05
+"""How far within the flanks a piece's axis runs, how much higher its top may be, sine of its skew."""
+_DOUBTFUL = 0.5
+"""The most where straps speak against an outline."""
 _SURE_KNOWN = 0.7
 
 
@@ -38,7 +57,8 @@ _SURE_KNOWN = 0.7
 class Reading:
     """A chosen outline with its weight (cells explained) and the strongest other reading of its place.
 
-    other_packing: rings of another packing that explains the bundles of this kind as well, if any does.
+    other_packing: rings of another packing that explains the bundles of this kind as well, if any does. pack:
+    the bars that straps hold together there, None where no straps are seen.
     """
 
     found: FittedOutline
@@ -46,6 +66,16 @@ class Reading:
     rival: FittedOutline | None
     rival_weight: float
     other_packing: int | None
+    pack: Pack | None = None
+
+    @property
+    def outlines_pack(self) -> bool:
+        """Check whether the fitted outline ends where the pack does, or no pack is seen whole."""
+        pack, width = self.pack, self.found.fit.width_m
+        if pack is None or not pack.sides_seen:
+            return True
+        off = max(abs(pack.low_m + width / 2), abs(pack.high_m - width / 2))
+        return off < _SAME_RATIO * width + _SAME_M
 
 
 def describe_bundles(
@@ -90,7 +120,7 @@ def make_bundle(
     bars, doubt = _count(reading, seen, top_z, floor_m)
     reasons = doubt + _doubts(reading, rows, ends, sheet)
     section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
-    return Bundle(
+    bundle = Bundle(
         id=0,
         centre_m=centre,
         yaw_rad=float(yaw),
@@ -113,6 +143,83 @@ def make_bundle(
         bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
         section_m2=section,
+    )
+    return bundle if reading.pack is None else _held_by_straps(bundle, reading, reading.pack, floor_m)
+
+
+def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float | None) -> Bundle:
+    """Hold a bundle to what straps show: place, width and section where the fitted outline misses the pack,
+    the section alone where both agree, a doubt where the pack is not seen whole and goes on beyond it.
+    """
+    if not pack.sides_seen:
+        lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
+        bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
+        doubt = contradicts(pack, bundle.width_m)
+        if not doubt:
+            return bundle
+        sure = min(bundle.confidence, _DOUBTFUL)
+        return replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
+    if reading.outlines_pack:
+        if bundle.bars is not None:
+            return bundle
+        section, sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
+        return replace(bundle, section_m2=section, sigma=replace(bundle.sigma, section_m2=sigma))
+    fit = reading.found.fit
+    top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
+    section, section_sigma = section_of_pack(pack.width_m, _over(top_z, floor_m))
+    aside = pack.middle_m * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
+    if abs(bundle.yaw_rad - reading.found.sheet.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
+        aside = -aside
+    down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
+    packing = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
+    return replace(
+        bundle,
+        centre_m=bundle.centre_m + aside + down,
+        ends_m=bundle.ends_m + aside + down,
+        width_m=pack.width_m,
+        top_z_m=top_z,
+        bars=None,
+        bar_axes=(),
+        section_m2=section,
+        confidence=max(bundle.confidence, _STRAPPED),
+        reasons=(*(reason for reason in bundle.reasons if "explains the surface" not in reason), packing),
+        sigma=replace(
+            bundle.sigma,
+            lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
+            width_m=_PACK_WIDTH_M,
+            top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
+            bar_diameter_m=np.nan,
+            section_m2=section_sigma,
+        ),
+    )
+
+
+def _over(top_z_m: float, floor_m: float | None) -> float:
+    return np.inf if floor_m is None else max(top_z_m - floor_m, 0.0)
+
+
+def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:
+    """Remove bundles that are pieces of one that straps hold: their axes run within its flanks."""
+    whole = [k for k, one in enumerate(readings) if not one.outlines_pack]
+    whole.sort(key=lambda k: -readings[k].weight)
+    gone: set[int] = set()
+    for k in whole:
+        if k not in gone:
+            gone |= {n for n, other in enumerate(bundles) if n != k and _is_piece(other, bundles[k])}
+    return [bundle for k, bundle in enumerate(bundles) if k not in gone]
+
+
+def _is_piece(piece: Bundle, whole: Bundle) -> bool:
+    """Check that a bundle's middle lies within another's flanks, at about its height, and along it."""
+    away = piece.centre_m[:2] - whole.centre_m[:2]
+    along = np.array([-np.sin(whole.yaw_rad), np.cos(whole.yaw_rad)])
+    beside = abs(float(away[0] * along[1] - away[1] * along[0]))
+    lower = whole.top_z_m - piece.top_z_m
+    return bool(
+        beside < whole.width_m / 2 - _PIECE_M
+        and abs(float(away @ along)) < whole.length_m / 2
+        and abs(np.sin(piece.yaw_rad - whole.yaw_rad)) < _PIECE_SKEW
+        and -_PIECE_HIGHER_M < lower < whole.width_m
     )
 
 

@@ -10,7 +10,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, reinforce_kinds
-from barsight.yard.bundles.bundle_record import Reading, describe_bundles, make_bundle
+from barsight.yard.bundles.bundle_record import Reading, describe_bundles, make_bundle, without_pieces
 from barsight.yard.bundles.crossing_bundles import OVER_M, crossing_pieces, is_beam, rise_over
 from barsight.yard.bundles.fitting.growth import grow_outline
 from barsight.yard.bundles.fitting.outline import bundle_width
@@ -36,6 +36,7 @@ from barsight.yard.bundles.gully_shading import estimate_smoothing, refit_with_p
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import same_place
 from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
+from barsight.yard.bundles.straps import strapped_pack
 from barsight.yard.sections import split_map
 from barsight.yard.types import Bundle, HeightMap, YardMap
 
@@ -95,7 +96,8 @@ def _search(
     places += [_claims(one, settings) for one in found[len(places) :]]
     readings = _settled(found, without_slivers(places, _SLIVER_RATIO), height_map, settings)
     chosen_ones = [reading.found for reading in readings]
-    return [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
+    bundles = [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
+    return without_pieces(bundles, readings)
 
 
 def _found(
@@ -143,7 +145,10 @@ def _settled(
         against = None if rival is None else found[rival]
         packing = None if one.shades is not None else one.doubt if other is None else other
         readings.append(Reading(final, float(raised[k]), against, weight, packing))
-    return readings
+    packs = ordered_map(
+        lambda reading: strapped_pack(height_map, reading.found.sheet, reading.found.fit), readings
+    )
+    return [replace(reading, pack=pack) for reading, pack in zip(readings, packs, strict=True)]
 
 
 def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> FittedOutline:

@@ -31,6 +31,10 @@ _GULLIES_APART = 0.8
 """Share of the places that are judged: a map smooths gullies each time differently."""
 _MISFIT_RATIO, _HEIGHT_RATIO, _WIDTH_RATIO = 0.05, 0.1, 0.2
 """Of a bar's diameter: how far surface (root mean square), height and width of counted bars may be off."""
+_HIDDEN_M = 0.12
+"""What stands behind a hidden side is looked for over so much."""
+_RIM, _HIGHER_M = 4, 0.03
+"""Places at a flank over which a neighbour may stand higher by so much."""
 _WIDER_M = 0.045
 _LEAST_PIECE_RATIO, _PIECE_RATIO = 0.7, 1.5
 """Of the outline's width: what is seen narrower, or (by _WIDER_M besides) wider, is not its section."""
@@ -46,6 +50,8 @@ _FILLED_RATIOS, _BAR_FILLED_RATIO = (0.54, 0.73), 0.79
 one bar. Heights and shares are by packs drawn with seeds 0 to 99."""
 _WIDTH_ERRORS_M = 0.02, 0.01
 """Largest errors of a bundle's width in a map, too wide and too narrow."""
+_STRAPPED_RATIOS, _STRAPPED_ERROR_M = (0.42, 0.90), 0.02
+"""Least and greatest section of steel over the width squared of bars that straps hold; error of the width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +73,19 @@ class SeenSection:
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
     """Measure the mean section along the rows that agree; None where there are none."""
     sheet, fit = one.sheet, one.fit
-    rows = np.flatnonzero(fit.state[fit.first : fit.last + 1] == AGREES) + fit.first
-    rows = rows[:: max(len(rows) // _ROWS_ENOUGH, 1)]
+    rows = agreeing_rows(fit)
     if rows.size < 3:
         return None
     half = round(_REACH_RATIO * fit.width_m / sheet.cell_m)
-    beside, level = _mean_section(sheet, fit, rows, half)
+    beside, level = mean_section(sheet, fit, rows, half)
     crest = half + round(0.3 * fit.width_m / sheet.cell_m) * np.array([-1, 1])
     middle = int(crest[0] + np.argmax(np.nan_to_num(level[crest[0] : crest[1] + 1], nan=-np.inf)))
     deep_m = _GULLY_RATIO * float(fit.values[DIAMETER])
     others_begin = _is_neighbour(one, beside, others)
     resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
     parted_m = _PARTED_RATIO * fit.width_m if resolved else np.inf
-    ends = [_edge(level, others_begin, middle, step, deep_m, parted_m) for step in (-1, 1)]
+    limits = deep_m, parted_m, round(_HIDDEN_M / sheet.cell_m)
+    ends = [_edge(level, others_begin, middle, step, *limits) for step in (-1, 1)]
     own = level[ends[0][0] : ends[1][0] + 1]
     if not np.isfinite(own).any():
         return None
@@ -150,7 +156,26 @@ def estimate_section(
     return (least + most) / 2, (most - least) / 2 / UPPER
 
 
-def _mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
+def section_of_pack(width_m: float, over_floor_m: float) -> tuple[float, float]:
+    """Estimate steel's section and its sigma, m2, of bars that straps hold, by the width between the flanks.
+
+    over_floor_m: height of the top over the floor, inf where none was seen: bars reach no further down.
+    """
+    least, most = (
+        ratio * (width_m + error) ** 2
+        for ratio, error in zip(_STRAPPED_RATIOS, (-_STRAPPED_ERROR_M, _STRAPPED_ERROR_M), strict=True)
+    )
+    most = min(most, _FILLED_RATIOS[1] * (width_m + _STRAPPED_ERROR_M) * over_floor_m)
+    return (least + most) / 2, max(most - least, 0.0) / 2 / UPPER
+
+
+def agreeing_rows(fit: Fit) -> Int64:
+    """Choose rows of the map that agree with a fit, no more than tell its mean section."""
+    rows = np.flatnonzero(fit.state[fit.first : fit.last + 1] == AGREES) + fit.first
+    return rows[:: max(len(rows) // _ROWS_ENOUGH, 1)]
+
+
+def mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
     """Average the heights over the axis at places (N,) across from it; NaN where half are unknown."""
     v = sheet.v0_m + sheet.cell_m * rows - fit.v_m
     axis = fit.values[U] + fit.values[SLOPE_U] * v
@@ -159,7 +184,7 @@ def _mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[
     column = np.rint((axis[:, None] + beside - sheet.u0_m) / sheet.cell_m).astype(np.int64)
     inside = (column >= 0) & (column < sheet.z_m.shape[1])
     z = np.where(inside, sheet.z_m[rows[:, None], np.clip(column, 0, sheet.z_m.shape[1] - 1)], np.nan)
-    z = np.where(z > sheet.stock_over_m, z, -np.inf if np.isfinite(sheet.stock_over_m) else z)
+    z = np.where(z <= sheet.stock_over_m, -np.inf, z)
     known = np.isfinite(z) | (z == -np.inf)
     enough = 2 * known.sum(axis=0) >= len(rows)
     level = np.full(len(beside), np.nan)
@@ -182,17 +207,27 @@ def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutl
     return taken
 
 
+def is_overhung(inwards: Float64, outwards: Float64) -> bool:
+    """Check whether a neighbour stands higher at a flank, so that it may lie over it; heights from there."""
+    own, theirs = (part[np.isfinite(part)][:_RIM] for part in (inwards, outwards))
+    return bool(theirs.size and own.size and theirs.max() > own.max() + _HIGHER_M)
+
+
 def _edge(
-    level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float, parted_m: float
+    level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float, parted_m: float, hidden: int
 ) -> tuple[int, bool, bool]:
     """Walk from the middle to the last place that belongs to the bundle; whether it falls to the floor there,
     or sinks by parted_m before another begins; whether it falls to the floor.
     """
     last, lowest, lowest_at = middle, level[middle], middle
     for k in range(middle, len(level) if step > 0 else -1, step):
+        if np.isnan(level[k]):
+            behind = level[k + step :: step][:hidden]
+            behind = behind[~np.isnan(behind)]
+            floor = bool(behind.size and behind[0] == -np.inf)
+            return last, floor or not is_overhung(level[last::-step], behind), floor
         if not level[k] > -np.inf:
-            floor = bool(level[k] == -np.inf)
-            return last, floor, floor
+            return last, True, True
         if others_begin[k]:
             return last, bool(level[middle] - min(lowest, level[k]) >= parted_m), False
         if level[k] < lowest:
