@@ -17,7 +17,7 @@ from barsight.calibration.camera_imu.arrowhead_system import (
     step,
 )
 from barsight.calibration.camera_imu.pose_spline import STATE, PoseSpline, inverse_right_jacobian, locate
-from barsight.calibration.camera_imu.spline_kernels import CUMULATIVE, DEGREE, ORDER, rotation_at, weights
+from barsight.calibration.camera_imu.spline_kernels import DEGREE, ORDER, motion_at
 
 STEP_S = 0.1
 
@@ -51,15 +51,12 @@ def test_rate_is_the_rotations_derivative() -> None:
 
 def test_jacobians_match_finite_differences() -> None:
     spline, times, e = some_spline(), np.array([0.0, 0.13, 0.333]), 1e-6
-    steps, inverse = spline.turned_steps()
+    points = spline.control_points()
     for segment, u, time in zip(*locate(times, STEP_S, spline.segments), times, strict=True):
-        share = np.empty((3, ORDER))
-        weights(u, STEP_S, CUMULATIVE, share)
-        turn_by, rate_by = np.empty((3, 3 * ORDER)), np.empty((3, 3 * ORDER))
-        own = slice(segment, segment + DEGREE)
-        rotation_at(
-            spline.rotations[segment], steps[own], inverse[own], share, np.empty((3, 3)), np.empty(3),
-            turn_by, rate_by,
+        turn_by, rate_by = np.empty((2, 3, 3 * ORDER))
+        motion_at(
+            points, segment, u, *np.empty((2, 3, ORDER)), np.empty((3, 3)), np.empty(3), turn_by, rate_by,
+            np.empty((3, 3)),
         )  # fmt: skip
         for column in range(3 * ORDER):
             change = np.zeros((len(spline.places_m), STATE))

@@ -155,9 +155,7 @@ def test_render_is_the_mean_of_its_shaded_samples(scene: Scene, lightmap: Lightm
                 ray = rotation @ [*rays[2 * v + row, 2 * u + column].astype(np.float64), 1.0]
                 t, p = slow_trace(scene, pose.translation, ray)
                 ids[row, column] = p
-                values[row, column] = shade(
-                    scene.primitives, look.lamps, lightmap, look.tile, p, *pose.translation, *(t * ray)
-                )
+                values[row, column] = shade(scene.primitives, look, p, *pose.translation, *(t * ray))
         diagonal = [(0, 0), (1, 1)]
         used = diagonal if ids[0, 0] == ids[1, 1] else list(values)
         assert image[v, u] == pytest.approx(np.mean([values[k] for k in used]), rel=1e-5, abs=1e-6)
