@@ -13,6 +13,7 @@ import pytest
 from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.bar_edges import bar_diameter, find_outlines, tangent_planes
 from barsight.benchmarks.stereo.bar_fit import BarFit, BarGuess, fit_bar
+from barsight.benchmarks.stereo.bar_outline import _FINE_PX, _basis, _misfits
 from barsight.benchmarks.stereo.bar_renderer import BAR, FLOOR, Rendered, RenderedBar, render_pair
 from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, tilted_floor
 from barsight.benchmarks.stereo.cramer_rao_bound import noise_limit_px
@@ -172,6 +173,28 @@ def test_outlines_are_found_below_a_pixel_from_a_wrong_radius(bar: tuple[PosedSc
     assert np.abs(away_px).max() < 0.2
     diameter = bar_diameter(_exact(rendered), rendered.pair, start)
     assert diameter == pytest.approx(2 * steel.radius_m, rel=0.005)
+
+
+def test_a_stretchs_misfit_is_that_of_weighted_least_squares() -> None:
+    """The basis shifted by each guess, a variance for floor and bar, twice reweighted."""
+    rng, basis = np.random.default_rng(3), _basis(30.0, 9.0)
+    away, shifts = rng.uniform(-10, 10, 150), np.array([-2.0, -0.3, 0.0, 1.7])
+    grid = _FINE_PX * (np.arange(len(basis)) - (len(basis) - 1) / 2)
+    gray = np.where(away > 0, 150.0, 60 + away) + rng.normal(0, np.where(away > 0, 9, 3))
+    misfit = np.empty(4)
+    _misfits(gray, away, shifts, basis, misfit)
+    for shift, found in zip(shifts, misfit, strict=True):
+        design = np.stack([np.interp(away - shift, grid, part) for part in basis.T], axis=1)
+        bar, variances = design[:, 2], np.ones(2)
+        for _ in range(2):
+            weight = bar / variances[0] + (1 - bar) / variances[1]
+            normal = (design.T * weight) @ design
+            normal += 1e-6 * np.trace(normal) * np.eye(5)
+            rest = gray - design @ np.linalg.solve(normal, (design.T * weight) @ gray)
+            variances = np.array([np.average(rest**2, weights=w) for w in (bar, 1 - bar)]) + 0.25
+        wanted = np.average(np.log(variances), weights=[bar.sum(), (1 - bar).sum()])
+        assert found == pytest.approx(wanted, rel=1e-6)
+    assert misfit.argmin() == 2
 
 
 def test_maps_without_floor_or_bar_fail_with_a_reason(bar: tuple[PosedScene, Rendered]) -> None:
