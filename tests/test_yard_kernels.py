@@ -135,6 +135,11 @@ def test_a_fit_from_beside_comes_to_the_outline_that_was_drawn() -> None:
     held, found, _, moments, _ = fit_outline(heights, start, rules(0.4))
     assert held and moments[0] > 500
     np.testing.assert_allclose(found, values, atol=5e-4)
+    free = np.arange(6) < 4
+    start[~free] = values[~free]
+    held, found, *_ = fit_outline(heights, start, rules(0.4)._replace(free=free))
+    np.testing.assert_allclose(found, values, atol=5e-4)
+    np.testing.assert_array_equal(found[~free], values[~free])
     assert not fit_outline(heights, start, rules(0.2))[0], "wider than allowed"
     few = heights._replace(z_m=np.where(np.arange(60) < 30, heights.z_m, np.nan)[:1].copy(), last=0)
     assert not fit_outline(few, start, rules(0.4))[0]
@@ -186,6 +191,7 @@ def test_a_bundle_goes_on_over_short_gaps_only() -> None:
     assert _walk(state, 6, -1, 2, runs) == 4
     assert _walk(state, 6, 1, 11, runs) == 7, "two rows below are too many"
     assert _walk(state, 6, 1, 11, runs + 1) == 11
+    assert _walk(np.tile([1, 4], 5).astype(np.uint8), 0, 1, 9, runs) == 8, "each gap counts by itself"
 
 
 def test_a_turned_sheet_holds_the_nearest_measured_cells() -> None:
