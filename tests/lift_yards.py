@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.magnet.description import Magnet, load_magnet
@@ -19,6 +20,8 @@ MAGNET = load_magnet(None)
 SETTINGS = LiftSettings()
 SIGMA = BundleSigma(0.003, 0.02, 0.0006, 0.03, 0.006, 0.003, 0.001)
 LENGTH_M = 7.0
+GIVEN = MapIdentity("given", False, None, None, "given", None, "")
+"""Of a map that nobody measured."""
 
 
 def laid(x: float, z: float = 0.2, **changes: Any) -> Laid:

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.rectification import Rectifier
+from barsight.calibration.geometry.remap import Warp
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
@@ -135,6 +136,30 @@ def test_pixels_are_read_between_the_raw_ones(turn: tuple[float, float, float]) 
     assert rms < 1.05 * rms_theirs
     beyond = ~warp.valid
     np.testing.assert_allclose(warp(np.full_like(raw, 90))[beyond], 90)
+
+
+def cubic(line: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Keys's convolution with -0.75 at places along a line whose ends are repeated."""
+    whole, value = np.floor(places).astype(int), np.zeros(len(places))
+    for k in range(-1, 3):
+        t = np.abs(places - whole - k)
+        near = 1.25 * t**3 - 2.25 * t**2 + 1
+        far = -0.75 * (t**3 - 5 * t**2 + 8 * t - 4)
+        value += np.where(t <= 1, near, far) * line[(whole + k).clip(0, len(line) - 1)]
+    return value
+
+
+def test_a_warp_reads_columns_then_rows() -> None:
+    """Places inside, on the border and beyond; rounded to levels."""
+    rng = np.random.default_rng(7)
+    image = rng.integers(0, 256, (24, 31), np.uint8)
+    map_x = np.sort(rng.uniform(-4, 34, (9, 20)), axis=1).astype(np.float32)
+    crossing = (rng.uniform(-3, 26, (9, 1)) + np.linspace(-2, 2, 31)).astype(np.float32)
+    warped = Warp(map_x, map_x, np.ones(map_x.shape, bool), crossing)(image)
+    for row, places, found in zip(crossing.astype(float), map_x.astype(float), warped, strict=True):
+        read = np.array([cubic(image[:, c].astype(float), row[c : c + 1])[0] for c in range(31)])
+        wanted = cubic(read, places.clip(-1, 31)).clip(0, 255)
+        np.testing.assert_allclose(found, wanted, atol=0.501)
 
 
 def test_a_rectified_pair_passes_untouched() -> None:

@@ -1,5 +1,7 @@
 """The pose spline and the arrow system against slow references: finite differences and dense algebra."""
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
@@ -17,7 +19,14 @@ from barsight.calibration.camera_imu.arrowhead_system import (
     step,
 )
 from barsight.calibration.camera_imu.pose_spline import STATE, PoseSpline, inverse_right_jacobian, locate
-from barsight.calibration.camera_imu.spline_kernels import CUMULATIVE, DEGREE, ORDER, rotation_at, weights
+from barsight.calibration.camera_imu.problem import LOWER, tangent_basis
+from barsight.calibration.camera_imu.residual_kernels import (
+    InertialReadings,
+    frame_rows,
+    imu_rows,
+    sum_corners,
+)
+from barsight.calibration.camera_imu.spline_kernels import DEGREE, ORDER, motion_at
 
 STEP_S = 0.1
 
@@ -51,15 +60,12 @@ def test_rate_is_the_rotations_derivative() -> None:
 
 def test_jacobians_match_finite_differences() -> None:
     spline, times, e = some_spline(), np.array([0.0, 0.13, 0.333]), 1e-6
-    steps, inverse = spline.turned_steps()
+    points = spline.control_points()
     for segment, u, time in zip(*locate(times, STEP_S, spline.segments), times, strict=True):
-        share = np.empty((3, ORDER))
-        weights(u, STEP_S, CUMULATIVE, share)
-        turn_by, rate_by = np.empty((3, 3 * ORDER)), np.empty((3, 3 * ORDER))
-        own = slice(segment, segment + DEGREE)
-        rotation_at(
-            spline.rotations[segment], steps[own], inverse[own], share, np.empty((3, 3)), np.empty(3),
-            turn_by, rate_by,
+        turn_by, rate_by = np.empty((2, 3, 3 * ORDER))
+        motion_at(
+            points, segment, u, *np.empty((2, 3, ORDER)), np.empty((3, 3)), np.empty(3), turn_by, rate_by,
+            np.empty((3, 3)),
         )  # fmt: skip
         for column in range(3 * ORDER):
             change = np.zeros((len(spline.places_m), STATE))
@@ -69,6 +75,86 @@ def test_jacobians_match_finite_differences() -> None:
             np.testing.assert_allclose(turn_by[:, column], turn, atol=1e-8)
             slope = (there.rate_radps - here.rate_radps)[0] / (2 * e)
             np.testing.assert_allclose(rate_by[:, column], slope, atol=1e-7)
+
+
+def differences(error: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
+    """(..., size): central differences at zero."""
+    return np.stack([(error(e) - error(-e)) / 2e-6 for e in 1e-6 * np.eye(size)], axis=-1)
+
+
+def test_rows_of_imu_readings_are_their_errors_and_slopes() -> None:
+    rng, times = np.random.default_rng(2), np.array([0.0, 0.13, 0.333])
+    spline, gravity = some_spline(), np.array([0.3, -0.2, -9.8])
+    gyro, accel, sigmas = *rng.normal(size=(2, 3, 3)), rng.uniform(0.5, 2, (2, 3))
+    matrices = np.eye(3) + rng.normal(0, 0.1, (2, 3, 3))
+    chain, width, at = spline.places_m.size // 3 * STATE, 20, 2
+
+    def errors(step: np.ndarray) -> np.ndarray:
+        motion, common = spline.moved(step[:chain].reshape(-1, STATE)).at(times), step[chain + at :]
+        down = Rotation.from_rotvec(tangent_basis(gravity) @ common[:2]).as_matrix() @ gravity
+        by_accel = matrices[1].copy()
+        by_accel[tuple(np.transpose(LOWER))] += common[2:8]
+        by_gyro = matrices[0] + common[8:17].reshape(3, 3)
+        force = np.einsum("nji,nj->ni", motion.rotation, motion.acceleration_mps2 - down)
+        rate = gyro - motion.rate_radps @ by_gyro.T - motion.gyro_bias_radps
+        return np.hstack([
+            rate / sigmas[0, :, None],
+            (accel - force @ by_accel.T - motion.accel_bias_mps2) / sigmas[1, :, None],
+        ])  # fmt: skip
+
+    segment, u = locate(times, STEP_S, spline.segments)
+    rows = imu_rows(
+        segment, u, spline.control_points(),
+        InertialReadings(gyro, spline.gyro_bias_radps, matrices[0], sigmas[0]),
+        InertialReadings(accel, spline.accel_bias_mps2, matrices[1], sigmas[1]), gravity,
+        tangent_basis(gravity), at, True, width,
+    )  # fmt: skip
+    first, residual, by_chain, by_common = rows
+    np.testing.assert_array_equal(first, segment)
+    np.testing.assert_allclose(residual, errors(np.zeros(chain + width)), rtol=1e-10)
+    slopes = -differences(errors, chain + width)
+    np.testing.assert_allclose(by_common, slopes[:, :, chain:], atol=1e-6)
+    for k, begin in enumerate(STATE * segment):
+        np.testing.assert_allclose(by_chain[k], slopes[k, :, begin : begin + LOCAL], atol=2e-5)
+
+
+def test_rows_of_frames_hold_what_the_corners_say() -> None:
+    """The rows' normal equations are the corners' own, by differences of points fixed in the world."""
+    rng, times = np.random.default_rng(5), np.array([0.07, 0.333])
+    spline, chain, lens, at, width = some_spline(), 9 * STATE, 2, 1, 11
+    mount, place = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)
+    frame, count = np.repeat([0, 1], 8), 16
+
+    def corners(step: np.ndarray) -> np.ndarray:
+        common = step[chain + at :]
+        motion = spline.moved(step[:chain].reshape(-1, STATE)).at(times + common[6])
+        there = Rotation.from_rotvec(common[:3]).as_matrix() @ mount
+        body = np.einsum("nji,nj->ni", motion.rotation[frame], fixed - motion.place_m[frame])
+        return (body - place - common[3:6]) @ there
+
+    here = spline.at(times)
+    start = rng.uniform((-1, -1, 2), (1, 1, 4), (count, 3))
+    fixed = np.einsum("nij,nj->ni", here.rotation[frame], start @ mount.T + place) + here.place_m[frame]
+    by_point, by_lens = rng.normal(size=(count, 2, 3)), rng.normal(size=(count, 2, lens))
+    residual, weight = rng.normal(size=(count, 2)), rng.uniform(0.5, 2, count)
+    whole, pull = sum_corners(frame, start, by_point, by_lens, residual, weight, 2)
+    segment, u = locate(times, STEP_S, spline.segments)
+    first, said, by_chain, by_common = frame_rows(
+        segment, u, spline.control_points(), whole, pull, mount, place, at, 8 + at, width
+    )
+    moves = by_point @ differences(corners, chain + width)
+    moves[:, :, chain + 8 + at : chain + 8 + at + lens] = by_lens
+    for k, begin in enumerate(STATE * segment):
+        own, mine = first == segment[k], frame == k
+        found = np.dstack([by_chain[own], by_common[own]]).reshape(-1, LOCAL + width)
+        columns = np.append(np.arange(begin, begin + LOCAL), np.arange(chain, chain + width))
+        wanted = (np.sqrt(weight[mine, None, None]) * moves[mine]).reshape(-1, chain + width)
+        np.testing.assert_allclose(wanted[:, : STATE * segment[k]], 0, atol=1e-7)
+        wanted = wanted[:, columns]
+        off = (np.sqrt(weight[mine, None]) * residual[mine]).ravel()
+        scale = np.abs(wanted.T @ wanted).max()
+        np.testing.assert_allclose(found.T @ found / scale, wanted.T @ wanted / scale, atol=1e-8)
+        np.testing.assert_allclose(found.T @ said[own].ravel(), wanted.T @ off, atol=1e-5)
 
 
 def test_the_inverse_jacobian_holds_for_tiny_and_large_turns() -> None:

@@ -64,23 +64,6 @@ def test_quaternion_order_is_tums() -> None:
     np.testing.assert_allclose(pose.apply(np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-15)
 
 
-@given(poses("a", "b"), poses("a", "b"), st.floats(0, 1))
-def test_interpolate(first: Pose, last: Pose, share: float) -> None:
-    assert_close(first.interpolate(last, 0.0), first)
-    assert_close(first.interpolate(last, 1.0), last)
-    between = first.interpolate(last, share)
-    assert between.angle_to(first) == pytest.approx(share * first.angle_to(last), abs=1e-7)
-    assert between.distance_to(first) == pytest.approx(share * first.distance_to(last), abs=1e-9)
-
-
-def test_interpolate_midpoint() -> None:
-    first = Pose.identity("a", "b")
-    last = Pose("a", "b", Rotation.from_rotvec([0, 0, 1.0]).as_matrix(), np.array([2.0, 4, 6]))
-    middle = first.interpolate(last, 0.5)
-    np.testing.assert_allclose(middle.translation, [1, 2, 3], atol=1e-15)
-    np.testing.assert_allclose(middle.rotation, Rotation.from_rotvec([0, 0, 0.5]).as_matrix(), atol=1e-15)
-
-
 def test_a_wrong_chain_raises() -> None:
     yard_from_body = Pose.identity("yard", "body")
     with pytest.raises(FrameMismatchError, match="yard_from_body @ cam0_from_rect0: body is not cam0"):
@@ -89,8 +72,6 @@ def test_a_wrong_chain_raises() -> None:
     for compare in (yard_from_body.angle_to, yard_from_body.distance_to):
         with pytest.raises(FrameMismatchError, match="can't be compared"):
             compare(other)
-    with pytest.raises(FrameMismatchError):
-        yard_from_body.interpolate(other, 0.5)
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.bar_edges import bar_diameter, find_outlines, tangent_planes
 from barsight.benchmarks.stereo.bar_fit import BarFit, BarGuess, fit_bar
-from barsight.benchmarks.stereo.bar_renderer import BAR, FLOOR, Rendered, RenderedBar, render_pair
+from barsight.benchmarks.stereo.bar_outline import _FINE_PX, _basis, _misfits
+from barsight.benchmarks.stereo.bar_renderer import (
+    _LAMP_HALF_WIDTH,
+    BAR,
+    FLOOR,
+    Rendered,
+    RenderedBar,
+    _light_left,
+    _spline,
+    render_pair,
+)
 from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, tilted_floor
 from barsight.benchmarks.stereo.cramer_rao_bound import noise_limit_px
 from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
@@ -172,6 +183,54 @@ def test_outlines_are_found_below_a_pixel_from_a_wrong_radius(bar: tuple[PosedSc
     assert np.abs(away_px).max() < 0.2
     diameter = bar_diameter(_exact(rendered), rendered.pair, start)
     assert diameter == pytest.approx(2 * steel.radius_m, rel=0.005)
+
+
+def test_a_stretchs_misfit_is_that_of_weighted_least_squares() -> None:
+    """The basis shifted by each guess, a variance for floor and bar, twice reweighted."""
+    rng, basis = np.random.default_rng(3), _basis(30.0, 9.0)
+    away, shifts = rng.uniform(-10, 10, 150), np.array([-2.0, -0.3, 0.0, 1.7])
+    grid = _FINE_PX * (np.arange(len(basis)) - (len(basis) - 1) / 2)
+    gray = np.where(away > 0, 150.0, 60 + away) + rng.normal(0, np.where(away > 0, 9, 3))
+    misfit = np.empty(4)
+    _misfits(gray, away, shifts, basis, misfit)
+    for shift, found in zip(shifts, misfit, strict=True):
+        design = np.stack([np.interp(away - shift, grid, part) for part in basis.T], axis=1)
+        bar, variances = design[:, 2], np.ones(2)
+        for _ in range(2):
+            weight = bar / variances[0] + (1 - bar) / variances[1]
+            normal = (design.T * weight) @ design
+            normal += 1e-6 * np.trace(normal) * np.eye(5)
+            rest = gray - design @ np.linalg.solve(normal, (design.T * weight) @ gray)
+            variances = np.array([np.average(rest**2, weights=w) for w in (bar, 1 - bar)]) + 0.25
+        wanted = np.average(np.log(variances), weights=[bar.sum(), (1 - bar).sum()])
+        assert found == pytest.approx(wanted, rel=1e-6)
+    assert misfit.argmin() == 2
+
+
+def test_a_bars_shadow_is_as_soft_as_the_lamp_is_wide() -> None:
+    """Half the light where the ray to the lamp's middle grazes the bar; behind the bar none counts."""
+    rng, lit = np.random.default_rng(4), []
+    lamp, axis, centre = np.array([0.3, -0.2, -0.93]), np.array([0.0, 0.8, 0.6]), np.array([0.1, 0.0, 5.0])
+    shape = np.zeros((4, 3))
+    shape[1, 1], shape[2], shape[3] = 0.05, centre, axis
+    for point in rng.uniform(-0.4, 0.4, (400, 3)) + centre:
+        across = np.cross(lamp, axis)
+        passing = abs((point - centre) @ across) / np.linalg.norm(across)
+        flat = lamp - (lamp @ axis) * axis
+        way = -(point - centre) @ flat / (flat @ flat)
+        soft = (passing - 0.05) / (_LAMP_HALF_WIDTH * way) if way > 0 else np.inf
+        lit.append(np.clip(0.5 + 0.5 * soft, 0, 1))
+        assert _light_left(*point, lamp, shape) == pytest.approx(lit[-1], abs=1e-9)
+    assert np.mean(np.array(lit) < 0.5) > 0.02 and np.any((np.array(lit) > 0.1) & (np.array(lit) < 0.9))
+    shape[1, 1] = 0
+    assert _light_left(*centre, lamp, shape) == 1
+
+
+def test_the_textures_weights_are_a_cubic_b_splines() -> None:
+    for t in np.linspace(0, 0.99, 12):
+        np.testing.assert_allclose(
+            _spline(t), BSpline.basis_element(np.arange(-2, 3))([t + 1, t, t - 1, t - 2])
+        )
 
 
 def test_maps_without_floor_or_bar_fail_with_a_reason(bar: tuple[PosedScene, Rendered]) -> None:

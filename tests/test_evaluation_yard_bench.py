@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 
+from barsight.benchmarks.yard.degraded_map import _opening
 from barsight.benchmarks.yard.field_test import VARIANTS
 from barsight.cli.bench.yard import Method
 from barsight.cli.main import run
@@ -16,6 +18,17 @@ from cli_runs import TINY
 def test_every_method_can_be_asked_for() -> None:
     assert tuple(VARIANTS) == get_args(Method)
     assert VARIANTS["ours"] == ()
+
+
+def test_a_cell_sees_the_sky_between_what_rises_on_either_side() -> None:
+    exact = np.random.default_rng(0).choice([0.0, 0.1, 0.5], (4, 90))
+    opening = _opening(exact, 0.01)
+    for j, i in np.ndindex(exact.shape):
+        rise, away = exact[j] - exact[j, i], np.arange(90) - i
+        tangent = np.full(90, np.inf)
+        np.divide((np.abs(away) - 0.5) * 0.01, rise, out=tangent, where=(rise > 0) & (np.abs(away) <= 40))
+        sides = (tangent[away < 0], tangent[away > 0])
+        assert opening[j, i] == pytest.approx(sum(min(side.min(initial=2.0), 2.0) for side in sides))
 
 
 def test_a_row_per_method(

@@ -14,7 +14,6 @@ from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import (
     homography_inliers,
     is_mutual,
-    match_rows,
     motion_inliers,
     nearest_neighbours,
     ratio_test,
@@ -35,7 +34,7 @@ def test_features_are_found_again_within_their_sigma(name: DetectorName) -> None
     for k, shift in enumerate([(0.3, -0.6), (2.45, 1.2), (-1.7, 3.35)]):
         first, second = detector(moved(0, 0, 2 * k), 480), detector(moved(*shift, seed=2 * k + 1), 480)
         assert 50 < len(first) <= 480
-        assert first.is_binary == (name == "orb")
+        assert (first.descriptors.dtype == np.uint8) == (name == "orb")
         forward, backward = (
             nearest_neighbours(first.descriptors, second.descriptors),
             nearest_neighbours(second.descriptors, first.descriptors),
@@ -67,16 +66,6 @@ def test_nearest_is_brute_force_for_both_distances() -> None:
         np.testing.assert_array_equal(found.index, table.argmin(axis=1))
         np.testing.assert_allclose(found.distance, np.sort(table, axis=1)[:, 0], atol=1e-5)
         np.testing.assert_allclose(found.next_distance, np.sort(table, axis=1)[:, 1], atol=1e-5)
-
-
-def test_rows_and_depth_bound_the_stereo_match() -> None:
-    """Two bars alike on one row: only the right one has a depth within the range."""
-    left = np.array([[200.0, 50], [120, 90]], np.float32)
-    right = np.array([[180.0, 50.5], [90, 50], [100, 96], [100, 90]], np.float32)
-    same = np.zeros((4, 32), np.uint8)
-    pairs = match_rows(left, same[:2], right, same, CAMERA, (4.0, 8.0))
-    assert pairs.tolist() == [[0, 0], [1, 3]]
-    assert match_rows(left, same[:2], right, same, CAMERA, (0.2, 0.3)).shape == (0, 2)
 
 
 def test_a_homography_loses_what_is_off_its_plane_and_the_trend_does_not() -> None:

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
+from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.core.types import ImuSamples
-from barsight.inertial.model import BodyState, ImuBias, integrate_reference, subtract_bias
+from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias, subtract_bias
 from barsight.inertial.preintegration import Preintegrated, Preintegrator
 from barsight.recording.formats.ground_truth import read_ground_truth
 
@@ -38,6 +39,25 @@ def between(imu: ImuSamples, first: int, last: int, bias: ImuBias = BIAS) -> Pre
     return result
 
 
+def integrate_slowly(imu: ImuSamples, start_ns: int, end_ns: int) -> BodyState:
+    """STATE at end_ns by 2000 steps of [paper Eq. 11], the readings interpolated to each step's middle."""
+    steps = 2000
+    edges = np.linspace(0, end_ns - start_ns, steps + 1)
+    middle = start_ns + ((edges[1:] + edges[:-1]) / 2).round().astype(np.int64)
+    clean = subtract_bias(imu, BIAS)
+    rate = interpolate_at(middle, imu.stamp_ns, clean.gyro_radps)
+    force = interpolate_at(middle, imu.stamp_ns, clean.accel_mps2)
+    rotation, position, velocity = STATE.rotation, STATE.position_m, STATE.velocity_mps
+    dt = (end_ns - start_ns) / NS_PER_S / steps
+    for w, a in zip(rate, force, strict=True):
+        half = rotation @ Rotation.from_rotvec(w * dt / 2).as_matrix()
+        acceleration = half @ a - [0.0, 0.0, GRAVITY_MPS2]
+        position = position + velocity * dt + acceleration * dt**2 / 2
+        velocity = velocity + acceleration * dt
+        rotation = rotation @ Rotation.from_rotvec(w * dt).as_matrix()
+    return BodyState(rotation, position, velocity)
+
+
 def error(found: BodyState, truth: BodyState) -> np.ndarray:
     """(9,) rotation, position, velocity in the true body's axes."""
     turn = Rotation.from_matrix(truth.rotation.T @ found.rotation).as_rotvec()
@@ -48,7 +68,7 @@ def error(found: BodyState, truth: BodyState) -> np.ndarray:
 @pytest.mark.parametrize(("first", "last"), [(0, 1_000_000_000), (3_700_001, 1_501_200_007)])
 def test_it_agrees_with_a_slow_integration(first: int, last: int) -> None:
     imu = lively()
-    slow = integrate_reference(imu, START + first, START + last, STATE, BIAS)
+    slow = integrate_slowly(imu, START + first, START + last)
     fast = between(imu, START + first, START + last).predict(STATE)
     np.testing.assert_allclose(error(fast, slow), 0, atol=8e-4)
 
@@ -56,7 +76,7 @@ def test_it_agrees_with_a_slow_integration(first: int, last: int) -> None:
 def test_the_slow_one_is_exact_for_a_fall() -> None:
     stamps = START + np.arange(11, dtype=np.int64) * 100_000_000
     imu = ImuSamples(stamps, np.tile(BIAS.gyro_radps, (11, 1)), np.tile(BIAS.accel_mps2, (11, 1)))
-    end = integrate_reference(imu, START, START + 1_000_000_000, STATE, BIAS)
+    end = integrate_slowly(imu, START, START + 1_000_000_000)
     np.testing.assert_allclose(end.position_m, STATE.position_m + STATE.velocity_mps - [0, 0, 9.80665 / 2])
     np.testing.assert_allclose(end.rotation, STATE.rotation, atol=1e-12)
     assert np.abs(subtract_bias(imu, BIAS).accel_mps2).max() == 0

@@ -6,11 +6,23 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
+from barsight.benchmarks.lift_judge.faces import Spread
 from barsight.benchmarks.lift_judge.judge import Judge, LiftVerdict, Target, covered_width
+from barsight.benchmarks.lift_judge.lowering import STEEPEST_PITCH, lower
 from barsight.benchmarks.lift_judge.magnet import magnet_of
 from barsight.benchmarks.lift_judge.packing import packed
-from barsight.benchmarks.lift_judge.solids import Solid, SolidYard, box, cut, cylinder, envelope
+from barsight.benchmarks.lift_judge.solids import (
+    NOTHING,
+    Envelope,
+    Solid,
+    SolidYard,
+    box,
+    cut,
+    cylinder,
+    envelope,
+)
 from barsight.benchmarks.lift_judge.worlds import KINDS, draw_world
 
 MAGNET = magnet_of(
@@ -91,6 +103,38 @@ def test_the_share_of_a_pole_follows_the_moments() -> None:
     verdict = judged(*(s.moved(0.15 * Y) for s in plate()), target=Target(0.0, 0.0, 0.0, NOWHERE))
     share = verdict.mass_kg * 9.81 * (0.5 + 0.15 / 2)
     assert verdict.figures["a pole's pull over its share"] == pytest.approx(0.08 * 400e3 / share, rel=1e-6)
+
+
+def test_the_faces_are_lowered_as_one_linear_programme_over_all_points_says() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(10):
+        v, u, z = rng.uniform(-1.5, 1.5, 400), rng.uniform(-0.1, 0.1, 400), rng.normal(0.3, 0.004, 400)
+        z[rng.random(400) < 0.1] = -np.inf
+        rest = lower(v, u, z, rng.integers(0, 16, 400), 0.1)
+        there = np.isfinite(z)
+        rows = -np.column_stack([np.ones(400), v, u])[there]
+        bounds = [(None, None), (-STEEPEST_PITCH, STEEPEST_PITCH), (-0.1, 0.1)]
+        best = linprog([1.0, 0.0, 0.0], rows, -z[there], bounds=bounds).x
+        assert rest.height == pytest.approx(best[0], abs=2e-6)
+        over = z - rest.at(v, u)
+        assert over.max() < 1e-6
+        assert set(rest.contacts) <= set(np.flatnonzero(over > -1.01e-4)) and len(rest.contacts) >= 2
+
+
+def test_points_see_the_nearest_cell_of_what_was_drawn() -> None:
+    rng = np.random.default_rng(3)
+    z, top = rng.normal(size=(30, 40)).astype(np.float32), rng.integers(-1, 5, (30, 40)).astype(np.int32)
+    assert NOTHING == -1
+    owner = np.array([7, 7, 8, -1, 9], np.int32)
+    points = Spread.over(np.array([[0.05, 0.0, 0.2, 0.1], [-0.1, 0.02, 0.1, 0.1]]), 0.01, 0.009)
+    found_z, found = points.look(Envelope(-0.15, -0.2, 0.01, z, top), owner, (0.013, -0.021, 0.3))
+    turned = (points.u + 1j * points.v) * np.exp(0.3j)
+    i = np.rint((turned.real + 0.013 + 0.15) / 0.01).astype(int).clip(0, 29)
+    j = np.rint((turned.imag - 0.021 + 0.2) / 0.01).astype(int).clip(0, 39)
+    drawn = top[i, j] >= 0
+    np.testing.assert_array_equal(found_z, np.where(drawn, z[i, j], -np.inf))
+    np.testing.assert_array_equal(found, np.where(drawn, owner[top[i, j]], NOTHING))
+    assert 0.5 < drawn.mean() < 1
 
 
 CASES = {

@@ -12,6 +12,7 @@ from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
+from barsight.mapping.surface.hole_filling import bridge_gaps
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Layers, fill_gaps, read_tile
 from barsight.mapping.tiles import TileStore
@@ -125,6 +126,8 @@ def test_nothing_is_extrapolated() -> None:
     fill_gaps(layers, 3)
     np.testing.assert_array_equal(layers.source == HeightSource.VISION, np.isfinite(z))
     assert (layers.source != HeightSource.FILLED).all()
+    z = z.astype(np.float32)
+    assert not bridge_gaps(z, np.ones_like(z), np.isfinite(z), 3).any()
 
 
 def test_gaps_are_filled_across_tile_borders(tmp_path: Path) -> None:

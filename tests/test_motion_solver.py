@@ -24,7 +24,13 @@ from barsight.motion.linear.chain_elimination import (
     eliminate_nodes,
 )
 from barsight.motion.linear.motion_only_kernel import frame_equations
-from barsight.motion.linear.reprojection_kernels import residuals
+from barsight.motion.linear.reprojection_kernels import LinearisationPoint, Observations, Rig, residuals
+from barsight.motion.linear.schur_complement import (
+    ReducedSystem,
+    back_substitute,
+    eliminate_points,
+    scatter_reduced,
+)
 from barsight.motion.problem.gauss_newton import (
     GraphState,
     cost_of,
@@ -258,6 +264,92 @@ def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
         sigma = np.sqrt(np.diag(covariance.marginalCovariance(X(k))))
         assert (np.abs(off) < 0.01 * sigma + 1e-9).all()
         np.testing.assert_allclose(np.sqrt(np.diag(found.poses[k])), sigma, rtol=0.01)
+
+
+def moved_by(step: np.ndarray) -> np.ndarray:
+    """A small turn and shift as a matrix (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
+    return matrix
+
+
+@pytest.mark.parametrize("pieces", [0, 2])
+def test_points_are_taken_out_of_the_dense_equations(pieces: int) -> None:
+    """Central differences of all errors make the dense equations. One point is used nowhere; with pieces,
+    points slide. What is shared is small: the derivatives by place and pose leave it out."""
+    rng, nodes, count, size = np.random.default_rng(4), 4, 9, 4 if pieces else 3
+    seen = [np.sort(rng.choice(nodes, rng.integers(2, nodes + 1), replace=False)) for _ in range(count)]
+    first, node = np.cumsum([0] + [len(n) for n in seen]), np.concatenate(seen)
+    used = np.ones(len(node), bool)
+    used[first[3] : first[4]], used[first[5]] = False, False
+    piece = np.arange(count) % max(pieces, 1)
+    points = np.column_stack([rng.uniform(-1, 2, count), rng.uniform(-1, 1, count), rng.uniform(4, 7, count)])
+    points = np.column_stack([points, rng.normal(0, 1e-5, count) * (pieces > 0)])
+    shared = rng.normal(0, 1e-5, 2 * pieces + 2)
+    cameras = np.array([moved_by(np.append(rng.normal(0, 0.05, 3), [-0.3 * k, 0, 0])) for k in range(nodes)])
+    mount = moved_by(np.array([0.1, -0.3, 1.5, 0.1, -0.2, 0.3]))
+    rig = Rig(np.array([600.0, 320, 240, 180, 4]), mount[:3].copy(), 1e9)
+    weight, tight = rng.uniform(2, 5, len(node)), rng.uniform(300, 900, count)
+    poses, places = 6 * nodes, 6 * nodes + size * count
+
+    def errors(step: np.ndarray, stereo: np.ndarray) -> np.ndarray:
+        turns = (np.linalg.inv(moved_by(s) @ mount) @ mount for s in step[:poses].reshape(nodes, 6))
+        there, common = points.copy(), shared + step[places:]
+        there[:, :size] += step[poses:places].reshape(count, size)
+        camera = np.array([turn @ old for turn, old in zip(turns, cameras, strict=True)])[:, :3].copy()
+        sights = Observations(first, node, used, stereo, weight, piece, tight, 1.0)
+        off = np.zeros((len(node), 3))
+        residuals(rig, sights, LinearisationPoint(camera, there, common), off)
+        held = tight * (there[:, 3] - common[piece]) if pieces else np.zeros(count)
+        held[3] = 0
+        return np.append((-off * weight[:, None] * used[:, None]).ravel(), held)
+
+    none = np.zeros(places + len(shared))
+    blank = errors(none, np.zeros((len(node), 3)))[: 3 * len(node)].reshape(-1, 3) / weight[:, None]
+    stereo = blank + rng.normal(0, 0.3, blank.shape)
+    eye = 1e-6 * np.eye(len(none))
+    jacobian = np.stack([(errors(e, stereo) - errors(-e, stereo)) / 2e-6 for e in eye], axis=1)
+    normal, right = jacobian.T @ jacobian, jacobian.T @ errors(none, stereo)
+    points_at = np.delete(np.arange(poses, places), np.arange(3 * size, 4 * size))
+    # As scattered: poses, each piece's slide and disparity, then yaw and drift.
+    mixed = places + np.append(np.arange(2 * pieces).reshape(2, pieces).T, [2 * pieces, 2 * pieces + 1])
+    kept = np.append(np.arange(poses), mixed.astype(int))
+    own, bound = normal[np.ix_(points_at, points_at)], normal[np.ix_(points_at, kept)]
+    reduced = normal[np.ix_(kept, kept)] - bound.T @ np.linalg.solve(own, bound)
+    slope = right[kept] - bound.T @ np.linalg.solve(own, right[points_at])
+
+    sights = Observations(first, node, used, stereo, weight, piece, tight, 1.0)
+    guess = LinearisationPoint(cameras[:, :3].copy(), points, shared)
+    within = np.tile([0, nodes - 1], (pieces, 1))
+    result = ReducedSystem.empty(nodes, nodes, within)
+    eliminate_points(rig, sights, guess, result)
+    n = poses + 2 * pieces
+    whole, gradient, side, corner, pull = (
+        np.zeros((n, n)),
+        np.zeros(n),
+        np.zeros((2, n)),
+        np.zeros((2, 2)),
+        np.zeros(2),
+    )
+    scatter_reduced(
+        result, np.arange(0, poses, 6), poses + 2 * np.arange(pieces), skyline.full(whole), gradient, side,
+        corner, pull,
+    )  # fmt: skip
+    scale = np.sqrt(np.diag(normal)[kept])
+    found = np.block([[np.tril(whole) + np.tril(whole, -1).T, side.T], [side, corner]])
+    np.testing.assert_allclose(found / np.outer(scale, scale), reduced / np.outer(scale, scale), atol=1e-5)
+    np.testing.assert_allclose(np.append(gradient, pull) / scale, slope / scale, atol=5e-5)
+
+    step = rng.normal(0, 1e-3, len(none))
+    moved, variance = points.copy(), np.full(count, np.nan)
+    back_substitute(rig, sights, guess, step[:poses].reshape(nodes, 6), step[places:], moved, variance)
+    wanted = -np.linalg.solve(own, right[points_at] + bound @ step[kept])
+    left = np.arange(count) != 3
+    np.testing.assert_allclose((moved - points)[left, :size].ravel(), wanted, atol=5e-6)
+    np.testing.assert_array_equal(moved[3], points[3])
+    inverse = np.diag(np.linalg.inv(own))[size - 1 :: size]
+    np.testing.assert_allclose(variance[left], inverse, rtol=1e-4)
+    assert np.isnan(variance[3])
 
 
 def test_one_frames_equations_are_its_costs_slope() -> None:

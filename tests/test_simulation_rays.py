@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
-from barsight.simulation.lighting import Lamps, Lightmap, bake, hall_lamps
+from barsight.simulation.lighting import AROUND, Lamps, Lightmap, _ceiling_directions, bake, hall_lamps
 from barsight.simulation.optics import sample_rays
 from barsight.simulation.rays import cast_rays
-from barsight.simulation.render import Shading, render_view, shade
+from barsight.simulation.render import (
+    FLOOR_ALBEDO,
+    HIGHLIGHT,
+    SPREAD_ALONG,
+    SPREAD_AROUND,
+    Shading,
+    _lightmap_place,
+    _texels,
+    render_view,
+    shade,
+)
 from barsight.simulation.scene import Primitives, Scene, build_grid, build_scene
 from barsight.simulation.settings import SimulationSettings, YardSettings
 from barsight.simulation.stock import stack_yard
-from barsight.simulation.textures import surface_tile
+from barsight.simulation.textures import TILE, surface_tile
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +152,126 @@ def test_open_floor_gets_the_light_of_the_formula(scene: Scene, lightmap: Lightm
     assert light[under] < 0.35 * light[i, j]
 
 
+def texel_slowly(scene: Scene, lightmap: Lightmap, p: int, s: int, a: int) -> tuple[Float64, Float64]:
+    """A texel's middle 1 mm off the bar or box, and the normal."""
+    own, axes = scene.primitives.shape[p], scene.primitives.shape[p, 3:12].reshape(3, 3)
+    share = (s + 0.5) / lightmap.along[p] * 2 - 1
+    if p < scene.primitives.cylinders:
+        angle = 2 * np.pi * (a + 0.5) / AROUND
+        normal = np.cos(angle) * axes[1] + np.sin(angle) * axes[2]
+        return own[:3] + share * own[13] * axes[0] + (own[12] + 1e-3) * normal, normal
+    half, face, side = own[12:15], a // 2, 2 * (a % 2) - 1
+    longest = int(half.argmax())
+    along = share * half[longest] * axes[longest] * (longest != face)
+    return own[:3] + along + side * (half[face] + 1e-3) * axes[face], side * axes[face]
+
+
+def light_slowly(
+    scene: Scene, lamps: Lamps, place: Float64, normal: Float64
+) -> tuple[float, dict[int, float]]:
+    """Irradiance, and the share of each lamp by slot, by shadow rays one by one."""
+
+    def is_open(rays: Float64, reach: float) -> np.ndarray:
+        return ~(cast_rays(scene, place[None], rays)[0] < reach)
+
+    sky = _ceiling_directions()
+    cosine = np.maximum(sky @ normal, 0)
+    total = lamps.ambient * (0.05 + 0.95 * (cosine * is_open(sky, np.inf)).sum() / sky[:, 2].sum())
+    shares = {}
+    for lamp in range(-5, 6):
+        for row, y in enumerate(lamps.rows):
+            way = np.array([lamp * lamps.spacing + lamps.offset, y, lamps.z]) - place
+            if abs(way[0]) >= 1.5 * lamps.spacing:
+                continue
+            off = np.array([[0.0, end * 0.6 * lamps.half_length, 0.0] for end in (-1, 1)])
+            r = np.linalg.norm(way)
+            share = is_open(way + off, 1.0).mean() if way @ normal / r > -0.2 else 0.0
+            shares[lamp % 3 + 3 * row] = share
+            power = lamps.power * (1 - (way[0] / (1.5 * lamps.spacing)) ** 2) ** 2
+            total += share * max(way @ normal / r, 0) * power * way[2] / r**3
+    return total, shares
+
+
+def test_bars_and_boxes_get_the_light_that_no_primitive_holds_back(scene: Scene, lightmap: Lightmap) -> None:
+    rng, lamps, cylinders = np.random.default_rng(3), hall_lamps(8.0), scene.primitives.cylinders
+    lit = []
+    for k in range(60):
+        low, high = (0, cylinders) if k % 2 else (cylinders, len(scene.primitives.shape))
+        p = int(rng.integers(low, high))
+        s, a = int(rng.integers(lightmap.along[p])), int(rng.integers(lightmap.around[p]))
+        place, normal = texel_slowly(scene, lightmap, p, s, a)
+        t = lightmap.start[p] + s * lightmap.around[p] + a
+        light, shares = light_slowly(scene, lamps, place, normal) if place[2] > 0 else (0.0, {})
+        assert lightmap.diffuse[t] == pytest.approx(light, rel=1e-5)
+        wanted = [int(255 * shares.get(slot, 0)) for slot in range(6)]
+        np.testing.assert_array_equal(lightmap.seen[t], wanted)
+        lit.append(max(wanted))
+    assert 0.2 < np.mean(np.array(lit) > 0) < 0.9
+
+
+def test_textures_and_lightmaps_are_read_between_their_texels(scene: Scene, lightmap: Lightmap) -> None:
+    rng = np.random.default_rng(4)
+    tile = rng.normal(size=(TILE, TILE, 4)).astype(np.float32)
+    places = rng.uniform(-2 * TILE, 2 * TILE, (40, 2))
+    for channel in range(4):
+        wanted = map_coordinates(tile[..., channel].astype(float), places.T, order=1, mode="grid-wrap")
+        np.testing.assert_allclose([_texels(tile, a, b)[channel] for a, b in places], wanted, atol=1e-6)
+    p = int(lightmap.along[: scene.primitives.cylinders].argmax())
+    n, values = lightmap.along[p], rng.normal(size=lightmap.diffuse.size)
+    own = values[lightmap.start[p] :][: n * AROUND].reshape(n, AROUND)
+    for share, angle in zip(rng.uniform(0, 1, 40), rng.uniform(-7, 7, 40), strict=True):
+        t00, t01, t10, t11, ws, wa = _lightmap_place(lightmap, p, share, angle)
+        found = (values[t00] * (1 - wa) + values[t01] * wa) * (1 - ws)
+        found += (values[t10] * (1 - wa) + values[t11] * wa) * ws
+        at = [[np.clip(share * n - 0.5, 0, n - 1)], [angle / (2 * np.pi) * AROUND - 0.5]]
+        wanted = map_coordinates(own, at, order=1, mode="grid-wrap")[0]
+        assert found == pytest.approx(wanted, abs=1e-9)
+
+
+def test_surfaces_shine_as_their_material_and_light_say(scene: Scene, lightmap: Lightmap) -> None:
+    """Under even light and a plain texture: bars, their ends, boxes and the floor, and a bar's highlight."""
+    rng, lamps = np.random.default_rng(5), hall_lamps(8.0)
+    tile = np.broadcast_to(np.array([1, 1, 0, 1], np.float32), (TILE, TILE, 4)).copy()
+    even = lightmap._replace(
+        diffuse=np.full_like(lightmap.diffuse, 0.5), seen=np.full_like(lightmap.seen, 255)
+    )
+    look, primitives = Shading(lamps, even, tile), scene.primitives
+    plain = primitives.material.copy()
+    plain[:, 1], plain[:, 6] = 0, 0
+    matt, glossy = primitives._replace(material=plain), primitives._replace(material=plain.copy())
+    glossy.material[:, 1] = 0.8
+    eye, floor, box = np.array([0.7, 0.2, 6.0]), len(plain), primitives.cylinders
+    assert shade(matt, look, floor, *eye, 0.1, -0.2, -6.0) == pytest.approx(FLOOR_ALBEDO * 0.5)
+    way = primitives.shape[box, :3] - eye
+    assert shade(matt, look, box, *eye, *way) == pytest.approx(plain[box, 0] * 0.5)
+    for p in rng.integers(0, primitives.cylinders, 20):
+        centre, axes, (radius, half) = (
+            primitives.shape[p, :3], primitives.shape[p, 3:12].reshape(3, 3), primitives.shape[p, 12:14]
+        )  # fmt: skip
+        assert shade(matt, look, p, *eye, *(centre + half * axes[0] - eye)) == pytest.approx(
+            plain[p, 0] * 0.35
+        )
+        angle, s = rng.uniform(0, np.pi), rng.uniform(-half, half)
+        normal = math.cos(angle) * axes[1] + math.sin(angle) * axes[2]
+        turned = math.cos(angle) * axes[2] - math.sin(angle) * axes[1]
+        point = centre + s * axes[0] + radius * normal
+        body = shade(matt, look, p, *eye, *(point - eye))
+        assert body == pytest.approx(plain[p, 0] * 0.5, rel=1e-6)
+        shine, away = 0.0, (eye - point) / np.linalg.norm(eye - point)
+        for lamp in range(-5, 6):
+            for y in lamps.rows:
+                light = np.array([lamp * lamps.spacing + lamps.offset, y, lamps.z]) - point
+                r, u = np.linalg.norm(light), light[0] / (1.5 * lamps.spacing)
+                h = light / r + away
+                if abs(u) >= 1 or h @ normal <= 0.1:
+                    continue
+                ward = (h @ axes[0] / SPREAD_ALONG) ** 2 + (h @ turned / SPREAD_AROUND) ** 2
+                ward /= (h @ normal) ** 2
+                shine += (ward <= 9) * math.exp(-ward) * lamps.power * (1 - u * u) ** 2 * light[2] / r**3
+        found = shade(glossy, look, p, *eye, *(point - eye)) - body
+        assert found == pytest.approx(HIGHLIGHT * 0.8 * shine, rel=1e-4, abs=1e-6)
+
+
 def test_render_is_the_mean_of_its_shaded_samples(scene: Scene, lightmap: Lightmap) -> None:
     look = Shading(hall_lamps(8.0), lightmap, surface_tile(np.random.default_rng(1), 0.0064))
     camera = Camera(96, 80, 120.0, 120.0, 47.5, 39.5)
@@ -155,9 +288,7 @@ def test_render_is_the_mean_of_its_shaded_samples(scene: Scene, lightmap: Lightm
                 ray = rotation @ [*rays[2 * v + row, 2 * u + column].astype(np.float64), 1.0]
                 t, p = slow_trace(scene, pose.translation, ray)
                 ids[row, column] = p
-                values[row, column] = shade(
-                    scene.primitives, look.lamps, lightmap, look.tile, p, *pose.translation, *(t * ray)
-                )
+                values[row, column] = shade(scene.primitives, look, p, *pose.translation, *(t * ray))
         diagonal = [(0, 0), (1, 1)]
         used = diagonal if ids[0, 0] == ids[1, 1] else list(values)
         assert image[v, u] == pytest.approx(np.mean([values[k] for k in used]), rel=1e-5, abs=1e-6)

@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barsight.yard.bundles.fitting.gauss_newton import Heights, _normal_equations
+from barsight.core.types import HeightSource
+from barsight.yard.bundles.fitting.gauss_newton import Heights, Rules, _normal_equations, fit_outline
+from barsight.yard.bundles.fitting.growth import _row_states, _walk
 from barsight.yard.bundles.fitting.outline import STEP_M, hexagon, make_outline, trace_with_changes
+from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, MIXED, UNKNOWN
+from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.fitting.template_matching import _KNOWN, _SPREAD_M, _match, make_templates
 from barsight.yard.bundles.set_packing import choose_readings
+from barsight.yard.types import HeightMap
 
 SMOOTHING_M = 0.006
 
@@ -104,6 +109,107 @@ def test_the_normal_equations_are_those_of_the_outlines_derivatives() -> None:
     np.testing.assert_allclose(normal, (jacobian * weight) @ jacobian.T, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(right, (jacobian * weight) @ rest, rtol=1e-4, atol=1e-3)
     assert moments[0] == pytest.approx(tukey.sum(), rel=1e-5) and usable.sum() > 100
+
+
+def drawn_heights(values: np.ndarray) -> Heights:
+    """A sheet of 40 rows about a bundle of seven bars without noise, a tenth of its cells unknown."""
+    outline = make_outline(1, values[5], values[4], SMOOTHING_M)
+    along = 0.01 * np.arange(40)[:, None] - 0.2
+    across = (0.01 * np.arange(60) - 0.3 - values[0] - values[1] * along) / np.hypot(1, values[1])
+    places = STEP_M * (np.arange(outline.seen_m.size) - outline.seen_m.size // 2)
+    z = values[2] + values[3] * along + np.interp(across, places, outline.seen_m, np.nan, np.nan)
+    z[np.random.default_rng(6).random(z.shape) < 0.1] = np.nan
+    return Heights(z.astype(np.float32), np.full(z.shape, 0.004, np.float32), -0.3, 1.0, 0.01, 0, 39, 1, 1.2)
+
+
+def rules(most_m: float) -> Rules:
+    return Rules(
+        hexagon(1), 3.006, np.ones(6, bool), 12, 0.05, 0.004, SMOOTHING_M, 1.0, (0.0, np.inf), (0.1, most_m)
+    )
+
+
+def test_a_fit_from_beside_comes_to_the_outline_that_was_drawn() -> None:
+    values = np.array([0.013, 0.02, 0.3, -0.01, 0.1, 0.09])
+    heights = drawn_heights(values)
+    start = values + np.array([0.006, -0.01, 0.004, 0.01, 0.04, -0.004])
+    held, found, _, moments, _ = fit_outline(heights, start, rules(0.4))
+    assert held and moments[0] > 500
+    np.testing.assert_allclose(found, values, atol=5e-4)
+    free = np.arange(6) < 4
+    start[~free] = values[~free]
+    held, found, *_ = fit_outline(heights, start, rules(0.4)._replace(free=free))
+    np.testing.assert_allclose(found, values, atol=5e-4)
+    np.testing.assert_array_equal(found[~free], values[~free])
+    assert not fit_outline(heights, start, rules(0.2))[0], "wider than allowed"
+    few = heights._replace(z_m=np.where(np.arange(60) < 30, heights.z_m, np.nan)[:1].copy(), last=0)
+    assert not fit_outline(few, start, rules(0.4))[0]
+
+
+def test_rows_say_what_most_of_their_cells_do() -> None:
+    values = np.array([0.013, 0.02, 0.3, -0.01, 0.1, 0.09])
+    heights, agreement = drawn_heights(values), 0.012
+    outline = make_outline(1, 0.09, 0.1, SMOOTHING_M)
+    rng, z = np.random.default_rng(7), heights.z_m
+    z += rng.normal(0, 0.004, z.shape).astype(np.float32)
+    z[5:10] += 0.05
+    z[10:15] -= 0.05
+    z[15:20] += rng.choice([-0.05, 0.0, 0.0, 0.05], (5, 60)).astype(np.float32)
+    z[20:25, ::4] = np.nan
+    z[25:30, np.arange(60) % 5 > 0] = np.nan
+    seen = outline.seen_m, outline.slope, outline.reach_m
+    state, gain = _row_states(heights._replace(first=2, last=37), values, *seen, agreement)
+    wanted, gains = np.zeros(40, int), np.zeros(40)
+    for j in range(2, 38):
+        along = 1.0 + 0.01 * j - 1.2
+        across = (-0.3 + 0.01 * np.arange(60) - values[0] - values[1] * along) / np.hypot(1, values[1])
+        k = np.floor((across + outline.reach_m) / STEP_M + 0.5).astype(int)
+        inside = (np.abs(across) <= outline.reach_m) & (
+            np.abs(outline.slope[k.clip(0, len(seen[0]) - 1)]) < 2
+        )
+        rest = z[j, inside] - values[2] - values[3] * along - outline.seen_m[k[inside]]
+        known = rest[np.isfinite(rest)]
+        agree, above, below = (
+            (np.abs(known) <= agreement).sum(), (known > agreement).sum(), (known < -agreement).sum()
+        )  # fmt: skip
+        if known.size < 0.3 * inside.sum():
+            wanted[j] = UNKNOWN
+        elif agree >= 0.55 * known.size:
+            wanted[j], gains[j] = AGREES, np.maximum(1 - (known / agreement) ** 2, -1).sum()
+        elif above > below and above >= 0.4 * known.size:
+            wanted[j] = ABOVE
+        else:
+            wanted[j] = BELOW if below >= 0.4 * known.size else MIXED
+    np.testing.assert_array_equal(state, wanted)
+    np.testing.assert_allclose(gain, gains, rtol=1e-4, atol=1e-4)
+    assert set(wanted[2:38]) == {UNKNOWN, AGREES, ABOVE, BELOW, MIXED}
+
+
+def test_a_bundle_goes_on_over_short_gaps_only() -> None:
+    state = np.array([1, 1, 0, 0, 1, 2, 1, 1, 3, 3, 1, 1], np.uint8)
+    runs = np.array([2.0, 0.0, 1.0, 1.0, 1.0])
+    assert _walk(state, 6, -1, 0, runs) == 0
+    assert _walk(state, 6, -1, 2, runs) == 4
+    assert _walk(state, 6, 1, 11, runs) == 7, "two rows below are too many"
+    assert _walk(state, 6, 1, 11, runs + 1) == 11
+    assert _walk(np.tile([1, 4], 5).astype(np.uint8), 0, 1, 9, runs) == 8, "each gap counts by itself"
+
+
+def test_a_turned_sheet_holds_the_nearest_measured_cells() -> None:
+    rng = np.random.default_rng(8)
+    z = rng.normal(size=(31, 22)).astype(np.float32)
+    source = rng.choice([0, 1, 1, 1, 3], z.shape).astype(np.uint8)
+    heights = HeightMap(-0.4, 2.1, 0.01, z, z + 1, np.ones_like(z), source)
+    sheet = align_map(heights, 0.4)
+    row, column = np.indices(sheet.z_m.shape)
+    uv = np.column_stack([sheet.u0_m + 0.01 * column.ravel(), sheet.v0_m + 0.01 * row.ravel()])
+    x, y = sheet.to_map(uv).T
+    i, j = np.rint((y - 2.1) / 0.01).astype(int), np.rint((x + 0.4) / 0.01).astype(int)
+    inside = (i >= 0) & (j >= 0) & (i < 31) & (j < 22)
+    i, j = np.where(inside, i, 0), np.where(inside, j, 0)
+    measured = inside & (source[i, j] == HeightSource.VISION)
+    np.testing.assert_array_equal(sheet.z_m.ravel(), np.where(measured, z[i, j], np.float32(np.nan)))
+    np.testing.assert_array_equal(sheet.sigma_m.ravel(), np.where(measured, z[i, j] + 1, np.float32(np.nan)))
+    assert 200 < measured.sum() < inside.sum() < inside.size
 
 
 def test_the_set_that_weighs_most_is_chosen_and_no_place_twice() -> None:

@@ -19,7 +19,6 @@ from barsight.core.stamps import NS_PER_S
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.identity import GIVEN
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
@@ -31,7 +30,7 @@ from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, w
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.vetoes import VETOES, Veto
 from barsight.yard.weight import bundle_mass
-from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
+from lift_yards import GIVEN, MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
 from yard_maps import Laid
 
 

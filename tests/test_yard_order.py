@@ -12,7 +12,6 @@ import pytest
 from barsight.core.errors import Failed
 from barsight.core.types import HeightSource
 from barsight.yard.events import YardEvent
-from barsight.yard.identity import GIVEN
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content, schema
 from barsight.yard.lifting.order import LiftOrder, order_lifts
@@ -21,7 +20,7 @@ from barsight.yard.stability.blockers import find_blocked
 from barsight.yard.stability.stability import footing_checks, footings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto, vetoes_of
-from lift_yards import LENGTH_M, MAGNET, SETTINGS, SIGMA, laid, map_of, record
+from lift_yards import GIVEN, LENGTH_M, MAGNET, SETTINGS, SIGMA, laid, map_of, record
 from yard_maps import Laid
 
 STOCK = [laid(0.3), laid(0.6), laid(0.9), laid(0.45, z=0.56), laid(0.75, z=0.56), laid(0.6, z=0.92)]

@@ -12,7 +12,6 @@ import pytest
 from barsight.core.errors import InputError
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.identity import GIVEN
 from barsight.yard.inventory.bundle_file import read_bundles, read_match, schema, write_bundles
 from barsight.yard.inventory.stock_list import (
     ListedBundle,
@@ -23,6 +22,7 @@ from barsight.yard.inventory.stock_list import (
     stock_warnings,
 )
 from barsight.yard.types import Bundle
+from lift_yards import GIVEN
 from yard_maps import Laid, draw
 
 LAID = (Laid(0.3, 0.0, 0.2, 0.2), Laid(0.9, 0.0, 0.2, -0.3), Laid(1.5, 0.1, 0.2, 0.0))

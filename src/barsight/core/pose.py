@@ -117,16 +117,6 @@ class Pose:
         self._expect_same_frames(other)
         return float(np.linalg.norm(self.translation - other.translation))
 
-    def interpolate(self, other: Pose, share: float) -> Pose:
-        """Interpolate at `share` of the way to `other` (0 here, 1 there): linear in place, slerp in
-        rotation.
-        """
-        self._expect_same_frames(other)
-        turn = Rotation.from_matrix(self.rotation.T @ other.rotation).as_rotvec()
-        rotation = self.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
-        translation = (1 - share) * self.translation + share * other.translation
-        return Pose(self.target, self.source, rotation, translation)
-
     def _expect_same_frames(self, other: Pose) -> None:
         if (self.target, self.source) != (other.target, other.source):
             raise FrameMismatchError(

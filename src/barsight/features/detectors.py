@@ -8,13 +8,12 @@ from typing import Any, Literal, Protocol, get_args
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Int64, UInt8
+from barsight.core.arrays import Float32, UInt8
 from barsight.core.extras import extra
-from barsight.features.orb import detect_orb
+from barsight.features.orb import detect_orb, spread
 
 DetectorName = Literal["sift", "surf", "orb"]
 DETECTORS: tuple[DetectorName, ...] = get_args(DetectorName)
-CELLS = (6, 8)
 WHOLE_PIXEL_SIGMA = 12**-0.5
 """Sigma of a place known to one pixel of its pyramid level."""
 SIFT_SIGMA = 0.015
@@ -34,11 +33,6 @@ class Keypoints:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    @property
-    def is_binary(self) -> bool:
-        """Check whether descriptors are compared by Hamming distance; otherwise L2."""
-        return self.descriptors.dtype == np.uint8
-
 
 class Detector(Protocol):
     """At most `count` features of an (H, W) picture, the strongest of each cell of a grid."""
@@ -51,22 +45,8 @@ def make_detector(name: DetectorName) -> Detector:
     return {"sift": _sift, "surf": _surf, "orb": _orb}[name]
 
 
-def spread(pixels: Float32, strength: Float32, shape: tuple[int, ...], count: int) -> Int64:
-    """Select the strongest features of each cell (indices, ascending), so that a bright label doesn't take
-    all.
-    """
-    height, width = shape
-    row = (pixels[:, 1] * CELLS[0] / height).astype(int).clip(0, CELLS[0] - 1)
-    column = (pixels[:, 0] * CELLS[1] / width).astype(int).clip(0, CELLS[1] - 1)
-    cell = row * CELLS[1] + column
-    order = np.lexsort((-strength, cell))
-    first = np.searchsorted(cell[order], cell[order], side="left")
-    kept: Bool = np.arange(len(order)) - first < max(1, count // (CELLS[0] * CELLS[1]))
-    return np.sort(order[kept])
-
-
 def _orb(image: UInt8, count: int) -> Keypoints:
-    found = detect_orb(image, count, CELLS)
+    found = detect_orb(image, count)
     sigma = WHOLE_PIXEL_SIGMA * found.scale
     return Keypoints(found.pixels, sigma.astype(np.float32), found.descriptors)
 

@@ -12,7 +12,6 @@ from barsight.core.types import RectifiedCamera
 from barsight.features.guided_matching import project_stereo
 from barsight.features.orb import Features
 
-ROW_PX = 1.5
 MIN_FOR_PLANE = 4
 
 
@@ -66,30 +65,6 @@ def match_mutual(first: Features, second: Features, ratio: float = 0.9) -> Int64
     backward = nearest_neighbours(second.descriptors[forward.index[clear]], first.descriptors)
     kept = clear[backward.index == clear]
     return np.column_stack([kept, forward.index[kept]])
-
-
-def match_rows(
-    left: Float32, left_descriptors: UInt8 | Float32, right: Float32, right_descriptors: UInt8 | Float32,
-    camera: RectifiedCamera, depth_m: tuple[float, float],
-) -> Int64:  # fmt: skip
-    """Match left and right features (N, 2) on one row within the depth range: mutual nearest pairs (M, 2)."""
-    disparity = left[:, None, 0] - right[None, :, 0] + camera.doffs_px
-    base = camera.focal_px * camera.baseline_m
-    fits = np.abs(left[:, None, 1] - right[None, :, 1]) < ROW_PX
-    fits &= (disparity > base / depth_m[1]) & (disparity < base / depth_m[0])
-    if not fits.any():
-        return np.empty((0, 2), np.int64)
-    row, column = np.nonzero(fits)
-    distance = np.full(fits.shape, np.inf)
-    one, other = left_descriptors[row], right_descriptors[column]
-    if one.dtype == np.uint8:
-        distance[row, column] = np.bitwise_count(np.bitwise_xor(one, other)).sum(axis=1)
-    else:
-        distance[row, column] = np.linalg.norm(one - other, axis=1)
-    best, back = distance.argmin(axis=1), distance.argmin(axis=0)
-    index = np.arange(len(left))
-    kept = np.isfinite(distance[index, best]) & (back[best] == index)
-    return np.column_stack([index[kept], best[kept]])
 
 
 def homography_inliers(first: Float64, second: Float64, reach_px: float = 3.0) -> Bool:

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.arrays import Bool, Float32, Int64, UInt8
 
 _PATCH_PX = 31
+
+CELLS = (6, 8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +30,7 @@ class Features:
         return Features(self.pixels[kept], self.descriptors[kept], self.scale[kept])
 
 
-def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Features:
+def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = CELLS) -> Features:
     """Detect at most `count` ORB features, the strongest of each cell of a (rows, columns) grid.
 
     Detection uses a low FAST threshold so that dark, dull steel yields features too; the grid keeps a bright
@@ -40,14 +42,7 @@ def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Fea
         return _no_features()
     places = np.array([k.pt for k in keypoints], dtype=np.float32)
     strength = np.array([k.response for k in keypoints], dtype=np.float32)
-    height, width = image.shape
-    row = (places[:, 1] * cells[0] / height).astype(int).clip(0, cells[0] - 1)
-    column = (places[:, 0] * cells[1] / width).astype(int).clip(0, cells[1] - 1)
-    cell = row * cells[1] + column
-    order = np.lexsort((-strength, cell))
-    first = np.searchsorted(cell[order], cell[order], side="left")
-    rank = np.arange(len(order)) - first
-    kept = np.sort(order[rank < max(1, count // (cells[0] * cells[1]))])
+    kept = spread(places, strength, image.shape, count, cells)
     described, descriptors = orb.compute(image, [keypoints[i] for i in kept])
     if descriptors is None or not described:
         return _no_features()
@@ -56,6 +51,20 @@ def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = (6, 8)) -> Fea
         descriptors,
         (np.array([k.size for k in described]) / _PATCH_PX).astype(np.float32),
     )
+
+
+def spread(
+    pixels: Float32, strength: Float32, shape: tuple[int, ...], count: int, cells: tuple[int, int] = CELLS
+) -> Int64:
+    """Select the strongest features of each of (rows, columns) cells: their indices, ascending."""
+    height, width = shape
+    row = (pixels[:, 1] * cells[0] / height).astype(int).clip(0, cells[0] - 1)
+    column = (pixels[:, 0] * cells[1] / width).astype(int).clip(0, cells[1] - 1)
+    cell = row * cells[1] + column
+    order = np.lexsort((-strength, cell))
+    first = np.searchsorted(cell[order], cell[order], side="left")
+    kept: Bool = np.arange(len(order)) - first < max(1, count // (cells[0] * cells[1]))
+    return np.sort(order[kept])
 
 
 def describe_upright(image: UInt8, places: Float32) -> Features:

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_opening
-from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64
-from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.core.types import ImuSamples
 
 GRAVITY_MPS2 = 9.80665
@@ -67,29 +65,3 @@ def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
     kept = ~wrong
     part = ImuSamples(imu.stamp_ns[kept], imu.gyro_radps[kept], imu.accel_mps2[kept])
     return part, int(wrong.sum())
-
-
-def integrate_reference(
-    imu: ImuSamples, start_ns: int, end_ns: int, state: BodyState, bias: ImuBias,
-    gravity_mps2: float = GRAVITY_MPS2, steps: int = 2000,
-) -> BodyState:  # fmt: skip
-    """Integrate the state to `end_ns` by many small steps of [paper Eq. 11] in the reference frame.
-
-    The readings between samples are interpolated linearly and taken at each step's middle. For tests: it is
-    exact as `steps` grows, and slow. Samples must enclose both stamps.
-    """
-    edges = np.linspace(0, end_ns - start_ns, steps + 1)
-    middle = start_ns + ((edges[1:] + edges[:-1]) / 2).round().astype(np.int64)
-    clean = subtract_bias(imu, bias)
-    rate = interpolate_at(middle, imu.stamp_ns, clean.gyro_radps)
-    force = interpolate_at(middle, imu.stamp_ns, clean.accel_mps2)
-    rotation, position, velocity = state.rotation, state.position_m, state.velocity_mps
-    gravity = np.array([0.0, 0.0, -gravity_mps2])
-    dt = (end_ns - start_ns) / NS_PER_S / steps
-    for w, a in zip(rate, force, strict=True):
-        half = rotation @ Rotation.from_rotvec(w * dt / 2).as_matrix()
-        acceleration = half @ a + gravity
-        position = position + velocity * dt + acceleration * dt**2 / 2
-        velocity = velocity + acceleration * dt
-        rotation = rotation @ Rotation.from_rotvec(w * dt).as_matrix()
-    return BodyState(rotation, position, velocity)

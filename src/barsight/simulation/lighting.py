@@ -13,7 +13,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int32, Int64, UInt8, kernel
 from barsight.simulation.rays import FAR, trace
-from barsight.simulation.scene import Grid, Scene
+from barsight.simulation.scene import Grid, Primitives, Scene
 
 SLOTS = 6
 TEXEL_M = 0.05
@@ -76,10 +76,7 @@ def bake(scene: Scene, lamps: Lamps, rng: np.random.Generator) -> Lightmap:
     rows = np.repeat(np.arange(count + 1, dtype=np.int32), along)
     places = np.arange(len(rows), dtype=np.int64) - np.repeat(np.cumsum(along) - along, along)
     order = rng.permutation(len(rows))
-    _bake(
-        shape, cylinders, scene.grid, lamps, lightmap, rows[order], places[order], _ceiling_directions(),
-        diffuse, seen,
-    )  # fmt: skip
+    _bake(*scene, lamps, lightmap, rows[order], places[order], _ceiling_directions(), diffuse, seen)
     return lightmap
 
 
@@ -99,24 +96,24 @@ def _ceiling_directions() -> Float64:
 
 @kernel(parallel=True)
 def _bake(
-    shape: Float64, cylinders: int, grid: Grid, lamps: Lamps, lightmap: Lightmap, rows: Int32, places: Int64,
+    primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, rows: Int32, places: Int64,
     ceiling: Float64, diffuse: Float32, seen: UInt8,
 ) -> None:  # fmt: skip
     """Bake the irradiance of each texel by shadow rays to the lamps and the hall's ceiling.
 
-    shape: (P, 15) primitives, the first `cylinders` of them bars. rows, places: (R,) each row of texels'
+    rows, places: (R,) each row of texels'
     primitive and place along it. ceiling: (16, 3) unit directions. Fills diffuse (T,) and seen (T, SLOTS, 255
     for all of a lamp), see `Lightmap`; texels at or below the floor's z = 0 stay 0.
     """
     # Writes go to plain arrays: Numba 0.68 loses what a prange writes to a named tuple's field.
     for r in numba.prange(rows.shape[0]):
-        p, s = rows[r], places[r]
+        scene, p, s = Scene(primitives, grid), rows[r], places[r]
         for a in range(lightmap.around[p]):
-            x, y, z, nx, ny, nz = _texel(shape, cylinders, lightmap, p, s, a)
+            x, y, z, nx, ny, nz = _texel(primitives, lightmap, p, s, a)
             if z <= 0.0:
                 continue
             t = lightmap.start[p] + s * lightmap.around[p] + a
-            light = _hall_light(shape, cylinders, grid, ceiling, x, y, z, nx, ny, nz) * lamps.ambient
+            light = _hall_light(scene, ceiling, x, y, z, nx, ny, nz) * lamps.ambient
             middle = int(np.floor((x - lamps.offset) / lamps.spacing + 0.5))
             for slot in range(6):
                 lamp = middle + (slot % 3 - middle + 1) % 3 - 1
@@ -130,7 +127,7 @@ def _bake(
                 share = 0.0
                 for end in range(2):
                     ey = ly + (2 * end - 1) * 0.6 * lamps.half_length
-                    _, found = trace(shape, cylinders, grid, x, y, z, lx, ey, lz, 1e-6, 1.0, True)
+                    _, found = trace(scene, x, y, z, lx, ey, lz, 1e-6, 1.0, True)
                     if found < 0:
                         share += 0.5
                 seen[t, slot] = int(255 * share)
@@ -148,9 +145,8 @@ def lamp_beam(lamps: Lamps, along_x: float) -> float:
 
 @kernel()
 def _hall_light(
-    shape: Float64, cylinders: int, grid: Grid, ceiling: Float64, x: float, y: float, z: float,
-    nx: float, ny: float, nz: float,
-) -> float:  # fmt: skip
+    scene: Scene, ceiling: Float64, x: float, y: float, z: float, nx: float, ny: float, nz: float
+) -> float:
     """Compute irradiance from the hall itself, 1 for an open level surface, with a little that bounces
     anywhere.
     """
@@ -161,7 +157,7 @@ def _hall_light(
         cosine = cx * nx + cy * ny + cz * nz
         if cosine <= 0:
             continue
-        _, found = trace(shape, cylinders, grid, x, y, z, cx, cy, cz, 1e-6, FAR, True)
+        _, found = trace(scene, x, y, z, cx, cy, cz, 1e-6, FAR, True)
         if found < 0:
             total += cosine
     return 0.05 + 0.95 * total / norm
@@ -169,15 +165,15 @@ def _hall_light(
 
 @kernel()
 def _texel(
-    shape: Float64, cylinders: int, lightmap: Lightmap, p: int, s: int, a: int
+    primitives: Primitives, lightmap: Lightmap, p: int, s: int, a: int
 ) -> tuple[float, float, float, float, float, float]:
     """Compute the middle of a texel, lifted 1 mm off the surface, and its normal."""
-    lift = 1e-3
+    shape, lift = primitives.shape, 1e-3
     if p == shape.shape[0]:
         step = lightmap.floor[2]
         return lightmap.floor[0] + (s + 0.5) * step, lightmap.floor[1] + (a + 0.5) * step, lift, 0.0, 0.0, 1.0
     share = (s + 0.5) / lightmap.along[p] * 2 - 1
-    if p < cylinders:
+    if p < primitives.cylinders:
         angle = 2 * np.pi * (a + 0.5) / lightmap.around[p]
         c, d, length = np.cos(angle), np.sin(angle), share * shape[p, 13]
         nx = c * shape[p, 6] + d * shape[p, 9]

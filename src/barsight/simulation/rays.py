@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Float64, Int32, kernel
-from barsight.simulation.scene import Grid, Scene
+from barsight.simulation.scene import Grid, Primitives, Scene
 
 FAR = 1e30
 
@@ -83,14 +83,16 @@ def _inside(
 
 @kernel()
 def trace(
-    shape: Float64, cylinders: int, grid: Grid, ox: float, oy: float, oz: float,
-    dx: float, dy: float, dz: float, near: float, far: float, any_hit: bool,
+    scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float, far: float,
+    any_hit: bool,
 ) -> tuple[float, int]:  # fmt: skip
     """Find the first hit between `near` and `far`: (ray parameter, primitive), or (FAR, -1).
 
     The floor z = 0 answers with the number of primitives as its id. With `any_hit` the first hit found is
     good enough (shadows). [Amanatides 1987]
     """
+    shape, _, cylinders = scene.primitives
+    grid = scene.grid
     best, found = far, -1
     if dz < 0.0:
         t = -oz / dz
@@ -147,7 +149,7 @@ def trace(
 
 @kernel(parallel=True)
 def _cast(
-    shape: Float64, cylinders: int, grid: Grid, origins: Float64, directions: Float64, distance: Float64,
+    primitives: Primitives, grid: Grid, origins: Float64, directions: Float64, distance: Float64,
     primitive: Int32,
 ) -> None:  # fmt: skip
     """Trace each ray to its first hit.
@@ -158,7 +160,7 @@ def _cast(
     step = 0 if origins.shape[0] == 1 else 1
     for r in numba.prange(directions.shape[0]):
         o, d = origins[r * step], directions[r]
-        t, p = trace(shape, cylinders, grid, o[0], o[1], o[2], d[0], d[1], d[2], 1e-6, FAR, False)
+        t, p = trace(Scene(primitives, grid), o[0], o[1], o[2], d[0], d[1], d[2], 1e-6, FAR, False)
         distance[r] = t if p >= 0 else np.inf
         primitive[r] = p
 
@@ -171,9 +173,5 @@ def cast_rays(scene: Scene, origins: Float64, directions: Float64) -> tuple[Floa
     """
     distance = np.empty(len(directions))
     primitive = np.empty(len(directions), dtype=np.int32)
-    shape, _, cylinders = scene.primitives
-    _cast(
-        shape, cylinders, scene.grid, np.ascontiguousarray(origins), np.ascontiguousarray(directions),
-        distance, primitive,
-    )  # fmt: skip
+    _cast(*scene, np.ascontiguousarray(origins), np.ascontiguousarray(directions), distance, primitive)
     return distance, primitive

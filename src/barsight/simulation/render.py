@@ -25,7 +25,7 @@ MASK = TILE - 1
 
 
 class Shading(NamedTuple):
-    """Shading inputs besides the geometry."""
+    """Shading inputs besides the geometry. tile: (TILE, TILE, 4), see `surface_tile`."""
 
     lamps: Lamps
     lightmap: Lightmap
@@ -40,8 +40,8 @@ def render_view(scene: Scene, look: Shading, rays: Float32, side: int, yard_from
     """
     image = np.empty((rays.shape[0] // side, rays.shape[1] // side), dtype=np.float32)
     _render(
-        scene.primitives, scene.grid, look.lamps, look.lightmap, look.tile, rays, side,
-        yard_from_cam.rotation.copy(), yard_from_cam.translation.copy(), image,
+        *scene, look.lamps, look.lightmap, look.tile, rays, side, yard_from_cam.rotation.copy(),
+        yard_from_cam.translation.copy(), image,
     )  # fmt: skip
     return image
 
@@ -53,12 +53,12 @@ def _render(
 ) -> None:  # fmt: skip
     """Render the radiance image (H, W) by ray casting, 1 about white paper under the lamps.
 
-    tile: (TILE, TILE, 4), see `surface_tile`. rays: (side H, side W, 2) directions with z = 1. R: (3, 3) and
+    rays: (side H, side W, 2) directions with z = 1. R: (3, 3) and
     centre: (3,) m, yard_from_cam. Fills image; a ray that hits nothing adds 0.
     """
-    shape, cylinders = primitives.shape, primitives.cylinders
     ox, oy, oz = centre[0], centre[1], centre[2]
     for v in numba.prange(image.shape[0]):
+        scene, look = Scene(primitives, grid), Shading(lamps, lightmap, tile)
         for u in range(image.shape[1]):
             total, taken, first, same = 0.0, 0, -2, True
             for n in range(side * side):
@@ -69,9 +69,9 @@ def _render(
                 dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
                 dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
                 dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
-                t, p = trace(shape, cylinders, grid, ox, oy, oz, dx, dy, dz, 1e-6, FAR, False)
+                t, p = trace(scene, ox, oy, oz, dx, dy, dz, 1e-6, FAR, False)
                 if p >= 0:
-                    total += shade(primitives, lamps, lightmap, tile, p, ox, oy, oz, dx * t, dy * t, dz * t)
+                    total += shade(primitives, look, p, ox, oy, oz, dx * t, dy * t, dz * t)
                 taken += 1
                 same = same and (first == -2 or first == p)
                 first = p
@@ -82,10 +82,11 @@ def _render(
 
 @kernel()
 def shade(
-    primitives: Primitives, lamps: Lamps, lightmap: Lightmap, tile: Float32, p: int,
-    ox: float, oy: float, oz: float, rx: float, ry: float, rz: float,
+    primitives: Primitives, look: Shading, p: int, ox: float, oy: float, oz: float,
+    rx: float, ry: float, rz: float,
 ) -> float:  # fmt: skip
-    """Shade radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz)."""
+    """Shade radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz), m."""
+    lamps, lightmap, tile = look
     x, y, z = ox + rx, oy + ry, oz + rz
     if p == primitives.shape.shape[0]:
         return _shade_floor(lightmap, tile, p, x, y)

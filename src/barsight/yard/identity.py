@@ -39,7 +39,3 @@ class MapIdentity:
         if content.get("map_id") != self.map_id:
             problem = f"belongs to another map ({content.get('map_id')}, this one is {self.map_id})"
             raise InputError(path, problem, remedy)
-
-
-GIVEN = MapIdentity("given", False, None, None, "given", None, "")
-"""Identity of a map that was not measured but given."""

@@ -66,7 +66,7 @@ def draw_world(seed: int, bar_length_m: float, span_m: float) -> DrawnWorld:
     kind = KINDS[seed % len(KINDS)]
     section = _stack(kind, bar_length_m, span_m, rng)
     solids = [s for number, one in enumerate(section.laid) for s in _bundle(one, number, rng)]
-    _lay_upon(section, kind, bar_length_m, rng)
+    _lay_upon(section, kind, rng)
     _stand_beside(section, kind, bar_length_m, rng)
     yaw = {"along-x": math.pi / 2, "askew": math.radians(rng.choice([-1, 1]) * rng.uniform(8, 30))}.get(
         kind, math.radians(rng.normal(0, 0.5))
@@ -202,7 +202,7 @@ def _bundle(one: _Laid, number: int, rng: np.random.Generator) -> list[Solid]:
     return solids
 
 
-def _lay_upon(section: _Section, kind: str, length: float, rng: np.random.Generator) -> None:
+def _lay_upon(section: _Section, kind: str, rng: np.random.Generator) -> None:
     """Lay beams, single bars and blocks on some of the free bundles."""
     free = [k for k in range(len(section.laid)) if k not in section.covered]
     share = 0.6 if kind == "beams" else 0.12

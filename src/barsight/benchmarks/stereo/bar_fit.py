@@ -41,12 +41,11 @@ class BarGuess:
 
 @dataclass(frozen=True, eq=False)
 class BarFit:
-    """The cylinder found. residual_px: the map's median absolute residual near the bar."""
+    """The cylinder found."""
 
     centre_m: Float64
     axis: Float64
     radius_m: float
-    residual_px: float
 
 
 def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> BarFit | Failed:
@@ -71,21 +70,18 @@ def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> B
     frame = _frame(guess)
     scale_px = camera.focal_px * camera.baseline_m
     place = np.zeros(5)
-    kappa = 1.0
-    residual = np.abs(found - _predict(place, frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px))
     for _ in range(_ROUNDS):
+        predicted = _predict(place, frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px)
+        residual = np.abs(found - predicted)
         kappa = max(1.4826 * float(np.median(residual / sigma)), 1e-3)
         weight = 1 / (_CAUCHY_SIGMAS * kappa * sigma)
         place = _descend(
             place, (frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px, found, weight)
         )
-        residual = np.abs(
-            found - _predict(place, frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px)
-        )
     centre, axis, radius = _placed(place, frame, guess.radius_m)
     if not 0.3 < radius / guess.radius_m < 3:
         return Failed("diverged", f"the fit ends at a radius of {1000 * radius:.1f} mm")
-    return BarFit(centre, axis, radius, float(np.median(residual)))
+    return BarFit(centre, axis, radius)
 
 
 def _beside_the_axis(camera: RectifiedCamera, guess: BarGuess) -> Float64:

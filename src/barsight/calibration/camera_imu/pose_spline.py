@@ -11,15 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.camera_imu.spline_kernels import (
-    BLENDING,
-    CUMULATIVE,
-    DEGREE,
-    ORDER,
-    place_at,
-    rotation_at,
-    weights,
-)
+from barsight.calibration.camera_imu.spline_kernels import DEGREE, ORDER, ControlPoints, motion_at
 from barsight.core.arrays import Float64, Int64, kernel
 
 STATE = 12
@@ -47,12 +39,10 @@ class PoseSpline:
         """Return the number of segments."""
         return len(self.places_m) - DEGREE
 
-    def turned_steps(self) -> tuple[Float64, Float64]:
-        """Compute the control points' turns d_j (M - 1, 3) and their inverse right Jacobians (M -
-        1, 3, 3).
-        """
+    def control_points(self) -> ControlPoints:
+        """Compute the turns between the control points, for the compiled evaluation."""
         steps = Rotation.from_matrix(self.rotations[:-1].transpose(0, 2, 1) @ self.rotations[1:]).as_rotvec()
-        return steps, inverse_right_jacobian(steps)
+        return ControlPoints(self.step_s, self.rotations, self.places_m, steps, inverse_right_jacobian(steps))
 
     def moved(self, step: Float64) -> PoseSpline:
         """Retract a step (M, STATE) of the unknowns."""
@@ -65,11 +55,8 @@ class PoseSpline:
 
     def at(self, times_s: Float64) -> SplineMotion:
         """Evaluate the motion at times within the spline (those outside are moved to its ends)."""
-        steps, inverse = self.turned_steps()
         segment, u = locate(times_s, self.step_s, self.segments)
-        rotation, rate, place = _evaluate(
-            segment, u, self.step_s, self.rotations, self.places_m, steps, inverse
-        )
+        rotation, rate, place = _evaluate(segment, u, self.control_points())
         k, share = segment + BIAS_AT, u[:, None]
         biases = [
             (1 - share) * bias[k] + share * bias[k + 1]
@@ -132,28 +119,16 @@ def inverse_right_jacobian(turns: Float64) -> Float64:
 
 
 @kernel()
-def _evaluate(
-    segment: Int64, u: Float64, step_s: float, rotations: Float64, places: Float64, steps: Float64,
-    inverse: Float64,
-) -> tuple[Float64, Float64, Float64]:  # fmt: skip
+def _evaluate(segment: Int64, u: Float64, points: ControlPoints) -> tuple[Float64, Float64, Float64]:
     """Evaluate the pose spline and its time derivatives at K times [Furgale 2013].
 
-    segment: (K,); u: (K,) place within it, 0...1. rotations: (M, 3, 3) and places: (M, 3) m of the control
-    points; steps: (M - 1, 3) rad between them, inverse: (M - 1, 3, 3) their inverse right Jacobians. Returns
-    rotation (K, 3, 3), turn rate (K, 3) rad/s in body axes, and (K, 3, 3) place, velocity, acceleration, m
-    and s.
+    segment: (K,); u: (K,) place within it, 0...1. Returns rotation (K, 3, 3), turn rate (K, 3) rad/s in body
+    axes, and (K, 3, 3) place, velocity, acceleration, m and s.
     """
     count = segment.size
     rotation, rate, place = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3, 3))
     weight, share = np.empty((3, ORDER)), np.empty((3, ORDER))
     turn_by, rate_by = np.empty((3, 3 * ORDER)), np.empty((3, 3 * ORDER))
     for n in range(count):
-        i = segment[n]
-        weights(u[n], step_s, BLENDING, weight)
-        weights(u[n], step_s, CUMULATIVE, share)
-        rotation_at(
-            rotations[i], steps[i : i + DEGREE], inverse[i : i + DEGREE], share, rotation[n], rate[n],
-            turn_by, rate_by,
-        )  # fmt: skip
-        place_at(places[i : i + ORDER], weight, place[n])
+        motion_at(points, segment[n], u[n], weight, share, rotation[n], rate[n], turn_by, rate_by, place[n])
     return rotation, rate, place

@@ -14,7 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.camera_imu.arrowhead_system import RandomWalks, Samples
 from barsight.calibration.camera_imu.pose_spline import PoseSpline, locate
-from barsight.calibration.camera_imu.residual_kernels import frame_rows, imu_rows, sum_corners
+from barsight.calibration.camera_imu.residual_kernels import (
+    InertialReadings,
+    frame_rows,
+    imu_rows,
+    sum_corners,
+)
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.projection import Lens, project_lens
 from barsight.core.arrays import Float64, Int64
@@ -140,14 +145,13 @@ def linearise_camera_imu(problem: CameraImuProblem, state: CameraImuState, huber
     """
     spline, sigmas = state.spline, problem.sigmas
     width = len(problem.parameter_names)
-    steps, inverse = spline.turned_steps()
-    chain = (spline.step_s, spline.rotations, spline.places_m, steps, inverse)
+    points = spline.control_points()
     parts, residuals = [], []
     cost = 0.0
     for number, (sightings, mount) in enumerate(zip(problem.sightings, state.mounts, strict=True)):
-        points, residual = corner_residuals(sightings, mount, spline)
+        corners, residual = corner_residuals(sightings, mount, spline)
         lens, parameters = lens_of(sightings.camera)
-        seen = project_lens(lens, parameters, points)
+        seen = project_lens(lens, parameters, corners)
         by_lens = seen.by_lens if problem.lenses else seen.by_lens[:, :, :0]
         length = np.linalg.norm(residual, axis=1) / sigmas.corner_px
         weight = np.ones_like(length) if huber is None else np.minimum(1, huber / np.maximum(length, 1e-9))
@@ -156,21 +160,26 @@ def linearise_camera_imu(problem: CameraImuProblem, state: CameraImuState, huber
         cost += float((inner**2).sum()) + outer
         frames = sightings.stamp_s.size
         whole, pull = sum_corners(
-            sightings.frame, points, seen.by_point, by_lens, residual, weight / sigmas.corner_px**2, frames
+            sightings.frame, corners, seen.by_point, by_lens, residual, weight / sigmas.corner_px**2, frames
         )
         segment, u = locate(sightings.stamp_s + mount.shift_s, spline.step_s, spline.segments)
         parts.append(frame_rows(
-            segment, u, *chain, whole, pull, mount.rotation, mount.place_m, number * MOUNT,
+            segment, u, points, whole, pull, mount.rotation, mount.place_m, number * MOUNT,
             problem.lens_at[number], width,
         ))  # fmt: skip
         residuals.append(residual)
-    segment, u = locate(problem.imu.time_s, spline.step_s, spline.segments)
-    gravity_at = MOUNT * len(problem.sightings)
+    imu = problem.imu
+    segment, u = locate(imu.time_s, spline.step_s, spline.segments)
     rows = imu_rows(
-        segment, u, *chain, spline.gyro_bias_radps, spline.accel_bias_mps2, problem.imu.gyro_radps,
-        problem.imu.accel_mps2, state.gravity_mps2, tangent_basis(state.gravity_mps2), state.gyro_matrix,
-        state.accel_matrix, sigmas.gyro_radps * problem.imu.gyro_loose,
-        sigmas.accel_mps2 * problem.imu.accel_loose, gravity_at, problem.scales, width,
+        segment, u, points,
+        InertialReadings(
+            imu.gyro_radps, spline.gyro_bias_radps, state.gyro_matrix, sigmas.gyro_radps * imu.gyro_loose
+        ),
+        InertialReadings(
+            imu.accel_mps2, spline.accel_bias_mps2, state.accel_matrix, sigmas.accel_mps2 * imu.accel_loose
+        ),
+        state.gravity_mps2, tangent_basis(state.gravity_mps2), MOUNT * len(problem.sightings), problem.scales,
+        width,
     )  # fmt: skip
     parts.append(rows)
     samples = Samples(*(np.concatenate([part[k] for part in parts]) for k in range(4)))

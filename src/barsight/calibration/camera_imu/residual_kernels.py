@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from barsight.calibration.camera_imu.arrowhead_system import LOCAL, ROWS
 from barsight.calibration.camera_imu.pose_spline import BIAS_AT, STATE
-from barsight.calibration.camera_imu.spline_kernels import (
-    BLENDING,
-    CUMULATIVE,
-    DEGREE,
-    ORDER,
-    place_at,
-    rotation_at,
-    weights,
-)
+from barsight.calibration.camera_imu.spline_kernels import ORDER, ControlPoints, motion_at
 from barsight.core.arrays import Float64, Int64, kernel
 
 Rows = tuple[Int64, Float64, Float64, Float64]
+
+
+class InertialReadings(NamedTuple):
+    """Readings of a gyro (rad/s) or an accelerometer (m/s^2): values (K, 3) = matrix @ truth + bias.
+
+    bias: (M, 3) at the control points. matrix: (3, 3). sigma: (K,).
+    """
+
+    values: Float64
+    bias: Float64
+    matrix: Float64
+    sigma: Float64
 
 
 @kernel()
@@ -84,9 +90,8 @@ def _whiten(whole: Float64, pull: Float64, factor: Float64, residual: Float64) -
 
 @kernel()
 def frame_rows(
-    segment: Int64, u: Float64, step_s: float, rotations: Float64, places: Float64, steps: Float64,
-    inverse: Float64, whole: Float64, pull: Float64, mount: Float64, mount_place: Float64, at: int,
-    lens_at: int, width: int,
+    segment: Int64, u: Float64, points: ControlPoints, whole: Float64, pull: Float64, mount: Float64,
+    mount_place: Float64, at: int, lens_at: int, width: int,
 ) -> Rows:  # fmt: skip
     """Form the rows of one camera's frames; `at`, `lens_at`: indices of its parameters among the common ones.
 
@@ -107,13 +112,7 @@ def frame_rows(
     arm = back @ lever
     for k in range(count):
         i = segment[k]
-        weights(u[k], step_s, BLENDING, weight)
-        weights(u[k], step_s, CUMULATIVE, share)
-        rotation_at(
-            rotations[i], steps[i : i + DEGREE], inverse[i : i + DEGREE], share, rotation, rate, turn_by,
-            rate_by,
-        )  # fmt: skip
-        place_at(places[i : i + ORDER], weight, motion)
+        motion_at(points, i, u[k], weight, share, rotation, rate, turn_by, rate_by, motion)
         to_camera = back @ rotation.T
         turned, armed = back @ turn_by, arm @ turn_by
         for j in range(ORDER):
@@ -144,12 +143,15 @@ def frame_rows(
 
 @kernel()
 def imu_rows(
-    segment: Int64, u: Float64, step_s: float, rotations: Float64, places: Float64, steps: Float64,
-    inverse: Float64, gyro_bias: Float64, accel_bias: Float64, gyro: Float64, accel: Float64,
-    gravity: Float64, axes: Float64, gyro_matrix: Float64, accel_matrix: Float64, gyro_sigmas: Float64,
-    accel_sigmas: Float64, at: int, scales: bool, width: int,
+    segment: Int64, u: Float64, points: ControlPoints, gyro: InertialReadings, accel: InertialReadings,
+    gravity: Float64, axes: Float64, at: int, scales: bool, width: int,
 ) -> Rows:  # fmt: skip
-    """Form the rows of the IMU's readings: three of the gyro, then three of the accelerometer [Eq. 9-10]."""
+    """Form the rows of the IMU's readings: three of the gyro, then three of the accelerometer [Eq. 9-10].
+
+    segment, u: (K,) each reading's place on the spline. gravity: (3,) in the board's frame; axes: (3, 2)
+    about which it turns. `at`: index of gravity's two parameters among the `width` common ones; with `scales`
+    those of the accelerometer's and the gyro's matrix follow.
+    """
     count = segment.size
     residual, by_chain = np.zeros((count, ROWS)), np.zeros((count, ROWS, LOCAL))
     by_common = np.zeros((count, ROWS, width))
@@ -161,29 +163,23 @@ def imu_rows(
     gravity_by = -(cross @ axes)
     for k in range(count):
         i = segment[k]
-        gyro_sigma, accel_sigma = gyro_sigmas[k], accel_sigmas[k]
-        weights(u[k], step_s, BLENDING, weight)
-        weights(u[k], step_s, CUMULATIVE, share)
-        rotation_at(
-            rotations[i], steps[i : i + DEGREE], inverse[i : i + DEGREE], share, rotation, rate, turn_by,
-            rate_by,
-        )  # fmt: skip
-        place_at(places[i : i + ORDER], weight, motion)
+        gyro_sigma, accel_sigma = gyro.sigma[k], accel.sigma[k]
+        motion_at(points, i, u[k], weight, share, rotation, rate, turn_by, rate_by, motion)
         force = rotation.T @ (motion[2] - gravity)
         _cross(force, cross)
-        seen_rate, seen_force = gyro_matrix @ rate_by, accel_matrix @ (cross @ turn_by)
-        to_body = accel_matrix @ rotation.T
+        seen_rate, seen_force = gyro.matrix @ rate_by, accel.matrix @ (cross @ turn_by)
+        to_body = accel.matrix @ rotation.T
         fall = to_body @ gravity_by
         here, there = i + BIAS_AT, i + BIAS_AT + 1
         for r in range(3):
             rate_seen, force_seen = 0.0, 0.0
             for c in range(3):
-                rate_seen += gyro_matrix[r, c] * rate[c]
-                force_seen += accel_matrix[r, c] * force[c]
-            rate_seen += (1 - u[k]) * gyro_bias[here, r] + u[k] * gyro_bias[there, r]
-            force_seen += (1 - u[k]) * accel_bias[here, r] + u[k] * accel_bias[there, r]
-            residual[k, r] = (gyro[k, r] - rate_seen) / gyro_sigma
-            residual[k, 3 + r] = (accel[k, r] - force_seen) / accel_sigma
+                rate_seen += gyro.matrix[r, c] * rate[c]
+                force_seen += accel.matrix[r, c] * force[c]
+            rate_seen += (1 - u[k]) * gyro.bias[here, r] + u[k] * gyro.bias[there, r]
+            force_seen += (1 - u[k]) * accel.bias[here, r] + u[k] * accel.bias[there, r]
+            residual[k, r] = (gyro.values[k, r] - rate_seen) / gyro_sigma
+            residual[k, 3 + r] = (accel.values[k, r] - force_seen) / accel_sigma
             for j in range(ORDER):
                 for c in range(3):
                     by_chain[k, r, STATE * j + c] = seen_rate[r, 3 * j + c] / gyro_sigma

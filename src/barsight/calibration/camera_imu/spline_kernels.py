@@ -8,6 +8,7 @@ rate and all derivatives by small turns R_m Exp(x) follow by the recursion of [S
 from __future__ import annotations
 
 from math import comb, factorial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,19 @@ ORDER = 6
 """Control points per segment. Six, as Kalibr: the acceleration is a cubic, the jerk smooth."""
 DEGREE = ORDER - 1
 SMALL = 1e-5
+
+
+class ControlPoints(NamedTuple):
+    """M control points, step_s apart: rotations (M, 3, 3) and places_m (M, 3) of world_from_body.
+
+    steps: (M - 1, 3) turns d_j between them, rad; inverse: (M - 1, 3, 3) their inverse right Jacobians.
+    """
+
+    step_s: float
+    rotations: Float64
+    places_m: Float64
+    steps: Float64
+    inverse: Float64
 
 
 def _blending() -> Float64:
@@ -151,3 +165,22 @@ def place_at(places: Float64, weight: Float64, out: Float64) -> None:
             for j in range(ORDER):
                 total += weight[derivative, j] * places[j, i]
             out[derivative, i] = total
+
+
+@kernel()
+def motion_at(
+    points: ControlPoints, i: int, u: float, weight: Float64, share: Float64, rotation: Float64,
+    rate: Float64, turn_by: Float64, rate_by: Float64, motion: Float64,
+) -> None:  # fmt: skip
+    """Evaluate the motion at u in segment i.
+
+    Filled: weight and share (3, ORDER), the blending and cumulative weights; rotation, rate, turn_by and
+    rate_by as by `rotation_at`; motion (3, 3) as by `place_at`.
+    """
+    weights(u, points.step_s, BLENDING, weight)
+    weights(u, points.step_s, CUMULATIVE, share)
+    rotation_at(
+        points.rotations[i], points.steps[i : i + DEGREE], points.inverse[i : i + DEGREE], share, rotation,
+        rate, turn_by, rate_by,
+    )  # fmt: skip
+    place_at(points.places_m[i : i + ORDER], weight, motion)

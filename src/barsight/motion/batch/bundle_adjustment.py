@@ -173,14 +173,19 @@ def relative_covariances(
     return result
 
 
+def robust_noise(residual: Float64, seen: StereoObservations, used: Bool) -> tuple[float, Bool]:
+    """Estimate the factor on the sightings' sigmas from their residuals (N, 3) px, and drop outliers."""
+    share = np.abs(residual) / seen.sigma_px[:, None]
+    factor = max(MIN_FACTOR, 1.4826 * float(np.median(share[used])) * dof_correction(seen, used))
+    return factor, well_observed(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+
+
 def _with_seen_noise(
     problem: Problem, seen: StereoObservations, state: GraphState, used: Bool
 ) -> tuple[Problem, GraphState, System, Bool]:
     """Re-solve with the sightings' sigma estimated from their residuals, and without outliers."""
     residual = sighting_residuals(problem, state, used)
-    share = np.abs(residual) / seen.sigma_px[:, None]
-    factor = max(MIN_FACTOR, 1.4826 * float(np.median(share[used])) * dof_correction(seen, used))
-    used = well_observed(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+    factor, used = robust_noise(residual, seen, used)
     seen = replace(seen, sigma_px=factor * seen.sigma_px)
     problem, state, system = solve_with_slides(replace(problem, sightings=seen), state, used)
     residual = sighting_residuals(problem, state, used)

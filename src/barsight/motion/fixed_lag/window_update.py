@@ -16,7 +16,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg import dense
 from barsight.core.pose import Pose
-from barsight.motion.batch.bundle_adjustment import FARTHEST_OUTLIER_SIGMAS, MIN_AGREEING, MIN_FACTOR
+from barsight.motion.batch.bundle_adjustment import MIN_AGREEING, robust_noise
 from barsight.motion.fixed_lag.sliding_window import Window
 from barsight.motion.fixed_lag.window_equations import (
     DenseEquations,
@@ -39,7 +39,6 @@ from barsight.motion.problem.gauss_newton import (
 )
 from barsight.motion.problem.problem import MarginalPrior, Problem
 from barsight.motion.problem.stereo_factors import (
-    dof_correction,
     spatial_inflation,
     temporal_inflation,
     well_observed,
@@ -79,9 +78,7 @@ def solve_window(window: Window, held: int) -> tuple[Window, MarginalisedPart | 
     if stated is not None and used.any():
         state = _placed_by_points(problem, state, used)
         residual = sighting_residuals(problem, state, used)
-        share = np.abs(residual) / stated.sigma_px[:, None]
-        factor = max(MIN_FACTOR, 1.4826 * float(np.median(share[used])) * dof_correction(stated, used))
-        used = well_observed(stated, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+        factor, used = robust_noise(residual, stated, used)
         shown = replace(stated, sigma_px=factor * stated.sigma_px)
         now = factor * temporal_inflation(residual, shown, used) * spatial_inflation(residual, shown, used)
         noise = now if noise is None else (1 - NOISE_RATIO) * noise + NOISE_RATIO * now

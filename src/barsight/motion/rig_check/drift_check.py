@@ -96,7 +96,7 @@ def check_rig(
         raise MeasurementError(f"{recording.path}: nothing to check by: {rows.reason}; {drift.reason}")
     range_m = settings.range_m or (drift.range_m if isinstance(drift, RigDrift) else np.nan)
     lines = _row_lines(rows, rectifier.camera, range_m, settings)
-    lines += _travel_lines(drift, rows, rectifier.camera, range_m, settings)
+    lines += _travel_lines(drift, rows, range_m, settings)
     return RigCheck(tuple(lines), rows, drift, range_m)
 
 
@@ -145,9 +145,8 @@ def _row_lines(
 
 
 def _travel_lines(
-    drift: RigDrift | Failed, rows: RowDrift | Failed, camera: RectifiedCamera, range_m: float,
-    settings: CheckSettings,
-) -> list[CheckLine]:  # fmt: skip
+    drift: RigDrift | Failed, rows: RowDrift | Failed, range_m: float, settings: CheckSettings
+) -> list[CheckLine]:
     if isinstance(drift, Failed):
         return [_unseen("yaw", "deg", drift.reason), _unseen("baseline", "%", drift.reason)]
     yaw, sigma = np.degrees([drift.yaw_rad, drift.yaw_sigma_rad])

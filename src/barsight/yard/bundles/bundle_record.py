@@ -136,7 +136,7 @@ def make_bundle(
         layer=0,
         on_top=True,
         neighbours=(),
-        sigma=replace(_sigma(fit, ends, top, settings, sheet), section_m2=section_sigma),
+        sigma=replace(_sigma(fit, ends, top, settings), section_m2=section_sigma),
         known_share=float((rows != 0).mean()),
         confidence=_confidence(reading, rows),
         reasons=reasons,
@@ -228,7 +228,7 @@ def _in_map(sheet: AlignedMap, fit: Fit, v_m: float) -> Float64:
     return np.append(sheet.to_map(np.array([[u, v_m]]))[0], z)
 
 
-def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings, sheet: AlignedMap) -> BundleSigma:
+def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings) -> BundleSigma:
     """Propagate the fit's covariance to each figure, with the parts that the whole map shares."""
     along = (ends[0].v_m + ends[1].v_m) / 2 - fit.v_m
     covariance = fit.covariance

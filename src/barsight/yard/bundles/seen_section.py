@@ -56,15 +56,12 @@ _STRAPPED_RATIOS, _STRAPPED_ERROR_M = (0.42, 0.90), 0.02
 
 @dataclass(frozen=True, eq=False)
 class SeenSection:
-    """Seen section of a bundle. width_m: from side to side. upper_m2: between the top and the level
-    of the lower side. flank_m: how far that lies under the top. misfit_m: root mean square of the mean
-    section over the outline of a full hexagon. sides_seen: both sides fall to the floor, or sink deep
-    before a bundle of about its width begins. sides_free: both fall to the floor.
+    """Seen section of a bundle. width_m: from side to side. misfit_m: root mean square of the mean section
+    over the outline of a full hexagon. sides_seen: both sides fall to the floor, or sink deep before a bundle
+    of about its width begins. sides_free: both fall to the floor.
     """
 
     width_m: float
-    upper_m2: float
-    flank_m: float
     misfit_m: float
     sides_seen: bool
     sides_free: bool
@@ -89,10 +86,6 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     own = level[ends[0][0] : ends[1][0] + 1]
     if not np.isfinite(own).any():
         return None
-    top = float(np.nanmax(own))
-    sides = [float(side) for side in own[np.isfinite(own)][[0, -1]]]
-    flank = min(sides)
-    filled = np.nan_to_num(own, nan=flank)
     outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), smoothing_m)
     at = (np.arange(outline.seen_m.size) - outline.seen_m.size // 2) * STEP_M
     expected = np.interp(beside, at, outline.seen_m, left=np.nan, right=np.nan)
@@ -102,8 +95,6 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     misfit = misfit[: round(_GULLIES_APART * misfit.size)]
     return SeenSection(
         width_m=sheet.cell_m * (len(own) - 1),
-        upper_m2=float(np.maximum(filled - flank, 0).sum()) * sheet.cell_m,
-        flank_m=top - flank,
         misfit_m=float(np.sqrt(np.mean(misfit**2))) if misfit.size else np.inf,
         sides_seen=all(seen for _, seen, _ in ends),
         sides_free=all(free for _, _, free in ends),

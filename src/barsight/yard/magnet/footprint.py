@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -121,21 +122,39 @@ def count_gripped(
     if not table.bundles:
         return Grip((), 1.0, np.empty(0))
     slack = np.array([tolerance.x_m, tolerance.y_m, np.radians(tolerance.yaw_deg)])
-    flips, taken = _grip(
-        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, face_z_m - magnet.reach_m, slack,
+    rectangles = Rectangles(
         table.centre, table.along, table.half, table.top, table.slope, table.sigma, table.sigma_top,
         table.open_ends,
     )  # fmt: skip
+    flips, taken = _grip(
+        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, face_z_m - magnet.reach_m, slack, rectangles
+    )
     return Grip(tuple(np.flatnonzero(taken).tolist()), float(np.prod(1 - flips)), flips)
+
+
+class Rectangles(NamedTuple):
+    """Bundles from above with their tops: the arrays of a `BundleTable`."""
+
+    centre: Float64
+    along: Float64
+    half: Float64
+    top: Float64
+    slope: Float64
+    sigma: Float64
+    sigma_top: Float64
+    open_ends: Bool
 
 
 @kernel()
 def _grip(
-    x: float, y: float, yaw: float, poles: Float64, reach_z: Float64, slack: Float64, centre: Float64,
-    along: Float64, half: Float64, top: Float64, slope: Float64, sigma: Float64, sigma_top: Float64,
-    open_ends: Bool,
-) -> tuple[Float64, Bool]:  # fmt: skip
-    """Compute the probability (B,) of a wrong count, and whether each bundle is taken."""
+    x: float, y: float, yaw: float, poles: Float64, reach_z: Float64, slack: Float64, bundles: Rectangles
+) -> tuple[Float64, Bool]:
+    """Compute the probability (B,) of a wrong count, and whether each bundle is taken.
+
+    x, y, yaw: the magnet's place, m and rad. poles: (P, 4) along, across, length, width, m. reach_z: (P,) the
+    lowest top that a pole takes, m. slack: (3,) bounds on the crane's x, y (m) and yaw (rad).
+    """
+    centre, along, half, top, slope, sigma, sigma_top, open_ends = bundles
     count = len(centre)
     flips, taken = np.zeros(count), np.zeros(count, np.bool_)
     cos, sin = np.cos(yaw), np.sin(yaw)

@@ -5,6 +5,8 @@ The noise of a map would hold the plane up: heights are medians along the bars, 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
@@ -32,6 +34,20 @@ _STEEPEST = 0.35
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
+class MapCells(NamedTuple):
+    """The arrays of a `HeightMap`: unknown and filled cells (see `HeightSource`) aren't seen.
+
+    z_m, sigma_m, source: (rows, columns). x0_m, y0_m: the first cell's centre.
+    """
+
+    z_m: Float32
+    sigma_m: Float32
+    source: UInt8
+    x0_m: float
+    y0_m: float
+    cell_m: float
+
+
 def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list[tuple[int, int]], Float64]:
     """Sample columns across and parts along of each pole; (N, COLUMNS) of all: place across and along, median
     height, scatter, cells seen and in all, the cells' mean sigma, the pole.
@@ -41,13 +57,12 @@ def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list
     ]
     points = np.empty((sum(a * b for a, b in shape), COLUMNS))
     first = 0
+    cells = MapCells(heights.z_m, heights.sigma_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m)
+    cos, sin = np.cos(place.yaw_rad), np.sin(place.yaw_rad)
     for number, (pole, (columns, parts)) in enumerate(zip(poles, shape, strict=True)):
-        points[first : first + columns * parts, POLE] = number
-        _profile(
-            heights.z_m, heights.sigma_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m,
-            place.x_m, place.y_m, np.cos(place.yaw_rad), np.sin(place.yaw_rad), pole, parts, STEP_M,
-            points[first : first + columns * parts],
-        )  # fmt: skip
+        own = points[first : first + columns * parts]
+        own[:, POLE] = number
+        _profile(cells, place.x_m, place.y_m, cos, sin, pole, parts, own)
         first += columns * parts
     return shape, points
 
@@ -124,20 +139,18 @@ def rest_faces(
 
 @kernel()
 def _profile(
-    z: Float32, sigma: Float32, source: UInt8, x0: float, y0: float, cell: float, x: float, y: float,
-    cos: float, sin: float, pole: Float64, parts: int, step: float, out: Float64,
-) -> None:  # fmt: skip
+    cells: MapCells, x: float, y: float, cos: float, sin: float, pole: Float64, parts: int, out: Float64
+) -> None:
     """Sample the map's median heights under one pole.
 
-    z, sigma: maps (rows, columns), m; source: `HeightSource`, of which unknown and filled cells aren't seen.
-    x0, y0: the first cell's centre, m; cell: m. x, y, cos, sin: the magnet's place (m) and yaw. pole: (4,)
-    along, across, length, width, m. parts: along the pole, sampled every `step` m. Fills out (columns *
-    parts, COLUMNS) but for POLE; height and scatter are NaN where fewer than half of a part's samples are
-    seen.
+    x, y, cos, sin: the magnet's place (m) and yaw. pole: (4,) along, across, length, width, m. parts: along
+    the pole, sampled every STEP_M. Fills out (columns * parts, COLUMNS) but for POLE; height and scatter are
+    NaN where fewer than half of a part's samples are seen.
     """
+    z, source, cell = cells.z_m, cells.source, cells.cell_m
     along, across, length, width = pole[0], pole[1], pole[2], pole[3]
     columns = out.shape[0] // parts
-    samples = max(int(length / parts / step), 1)
+    samples = max(int(length / parts / STEP_M), 1)
     values = np.empty(samples)
     for i in range(columns):
         u = across + width * ((i + 0.5) / columns - 0.5)
@@ -145,7 +158,10 @@ def _profile(
             count, unsure, weight = 0, 0.0, 0.0
             for m in range(samples):
                 v = along + length * ((k + (m + 0.5) / samples) / parts - 0.5)
-                column, row = (x + u * cos - v * sin - x0) / cell, (y + u * sin + v * cos - y0) / cell
+                column, row = (
+                    (x + u * cos - v * sin - cells.x0_m) / cell,
+                    (y + u * sin + v * cos - cells.y0_m) / cell,
+                )
                 left, low = int(np.floor(column)), int(np.floor(row))
                 total, spread, found = 0.0, 0.0, 0.0
                 for c, share_c in ((left, 1 - (column - left)), (left + 1, column - left)):
@@ -155,7 +171,7 @@ def _profile(
                         if source[r, c] == _UNKNOWN or source[r, c] == _FILLED:
                             continue
                         total += share_c * share_r * z[r, c]
-                        spread += share_c * share_r * sigma[r, c]
+                        spread += share_c * share_r * cells.sigma_m[r, c]
                         found += share_c * share_r
                 weight += found
                 if found >= 0.5:

@@ -14,7 +14,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from barsight.core.arrays import Float64
-from barsight.yard.stability.stability import MIN_LEDGE_M, STEP_M, Footing, high_side, turn_between
+from barsight.yard.stability.stability import (
+    MIN_LEDGE_M,
+    STEP_M,
+    Footing,
+    gaps_between,
+    high_side,
+    turn_between,
+)
 from barsight.yard.types import Bundle
 
 NEAR_M = 0.3
@@ -75,11 +82,8 @@ def _near(one: Bundle, other: Bundle) -> bool:
     """Check whether two parallel bundles come nearer than NEAR_M sideways and overlap along."""
     if abs(turn_between(one.yaw_rad, other.yaw_rad)) > PARALLEL_RAD:
         return False
-    away = other.centre_m[:2] - one.centre_m[:2]
-    cos, sin = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
-    beside = abs(away @ (cos, sin)) - (one.width_m + other.width_m) / 2
-    beyond = abs(away @ (-sin, cos)) - (one.length_m + other.length_m) / 2
-    return bool(beside < NEAR_M and beyond < 0)
+    beside, beyond = gaps_between(one, other)
+    return beside < NEAR_M and beyond < 0
 
 
 def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Footing]) -> PileSide:

@@ -305,8 +305,13 @@ def _sure(sigma: float) -> float:
 
 def _beside(one: Bundle, other: Bundle) -> bool:
     """Check whether the outlines come nearer than BESIDE_M sideways and overlap along."""
+    beside, beyond = gaps_between(one, other)
+    return beside < BESIDE_M and beyond < 0
+
+
+def gaps_between(one: Bundle, other: Bundle) -> tuple[float, float]:
+    """Compute the gaps between two outlines, m, sideways and along the first; negative is an overlap."""
     away = other.centre_m[:2] - one.centre_m[:2]
     cos, sin = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
-    clear = abs(away @ (cos, sin)) - (one.width_m + other.width_m) / 2
-    along = (one.length_m + other.length_m) / 2 - abs(away @ (-sin, cos))
-    return bool(clear < BESIDE_M and along > 0)
+    beside = abs(away @ (cos, sin)) - (one.width_m + other.width_m) / 2
+    return float(beside), float(abs(away @ (-sin, cos)) - (one.length_m + other.length_m) / 2)

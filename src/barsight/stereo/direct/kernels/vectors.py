@@ -91,11 +91,10 @@ class Vectors:
         """Return the lesser of both, unsigned."""
         return self.builder.select(self.builder.icmp_unsigned("<", one, other), one, other)
 
-    def apart(self, one: Any, other: Any, *, signed: bool = False) -> Any:
-        """Return the absolute difference."""
-        compare = self.builder.icmp_signed if signed else self.builder.icmp_unsigned
+    def apart(self, one: Any, other: Any) -> Any:
+        """Return the absolute difference of whole numbers without sign."""
         forth, back = self.builder.sub(one, other), self.builder.sub(other, one)
-        return self.builder.select(compare("<", one, other), back, forth)
+        return self.builder.select(self.builder.icmp_unsigned("<", one, other), back, forth)
 
     def product(self, one: Any, *others: Any) -> Any:
         """Of floats."""

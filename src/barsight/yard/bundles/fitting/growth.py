@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
+from barsight.yard.bundles.fitting.gauss_newton import Heights
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
 from barsight.yard.bundles.fitting.outline_fit import (
     ABOVE,
@@ -39,10 +40,10 @@ def extend_rows(sheet: AlignedMap, fit: Fit, settings: BundleSettings, reach_m: 
     )
     more = int(reach_m / sheet.cell_m)
     bounds = max(fit.first - more, 0), min(fit.last + more, sheet.z_m.shape[0] - 1)
+    heights = Heights(sheet.z_m, sheet.sigma_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, 1, fit.v_m)
     state, gain = _row_states(
-        sheet.z_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, fit.v_m, fit.values,
-        outline.seen_m, outline.slope, outline.reach_m, settings.agreement_m,
-    )  # fmt: skip
+        heights, fit.values, outline.seen_m, outline.slope, outline.reach_m, settings.agreement_m
+    )
     runs = np.array([_MAX_UNKNOWN_M, 0.0, _MAX_ABOVE_M, _MAX_BELOW_M, _MAX_MIXED_M]) / sheet.cell_m
     agreeing = np.flatnonzero(state[fit.first : fit.last + 1] == AGREES)
     if agreeing.size < 0.5 * (fit.last + 1 - fit.first):
@@ -74,16 +75,20 @@ def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int
 
 @kernel()
 def _row_states(
-    z: Float32, u0: float, v0: float, cell: float, first: int, last: int, v_middle: float, values: Float64,
-    seen: Float64, slope: Float64, reach: float, agreement: float,
-) -> tuple[UInt8, Float32]:  # fmt: skip
-    """Classify each row and count the cells it explains, over the parts of the outline that aren't steep."""
+    heights: Heights, values: Float64, seen: Float64, slope: Float64, reach: float, agreement: float
+) -> tuple[UInt8, Float32]:
+    """Classify each row and count the cells it explains, over the parts of the outline that aren't steep.
+
+    values: (6,) of the fit. seen, slope: of the outline at -reach ... reach, m. agreement: m. Returns state
+    and gain of all the sheet's rows, 0 outside of first ... last.
+    """
+    z, cell, u0 = heights.z_m, heights.cell_m, heights.u0_m
     rows, columns = z.shape
     state, gain = np.zeros(rows, np.uint8), np.zeros(rows, np.float32)
     cosine = 1.0 / np.sqrt(1.0 + values[1] * values[1])
     size = seen.size
-    for j in range(first, last + 1):
-        along = v0 + cell * j - v_middle
+    for j in range(heights.first, heights.last + 1):
+        along = heights.v0_m + cell * j - heights.v_m
         u = values[0] + values[1] * along
         base = values[2] + values[3] * along
         low = int(np.ceil((u - reach / cosine - u0) / cell))

@@ -1,0 +1,163 @@
+"""Heights under the poles, and the plane that rests on them, against plain NumPy and exact cases."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from barsight.core.types import HeightSource
+from barsight.yard.magnet.footprint import Placement, overlap
+from barsight.yard.magnet.resting_plane import (
+    ALL,
+    COLUMNS,
+    POLE,
+    SCATTER,
+    SEEN,
+    SEGMENT_M,
+    SIGMA,
+    STEP_M,
+    STRAIGHT_M,
+    U,
+    V,
+    Z,
+    _likely,
+    _straight,
+    profiles,
+    rest_faces,
+)
+from barsight.yard.stability.stability import interpolate_heights, lookup_heights
+from barsight.yard.types import HeightMap
+
+POLES = np.array([[-0.3, 0.02, 0.9, 0.1], [0.7, -0.02, 0.5, 0.12]])
+
+
+def some_map() -> HeightMap:
+    rng = np.random.default_rng(2)
+    z = rng.normal(0.5, 0.01, (150, 60)).astype(np.float32)
+    source = rng.choice([0, 1, 1, 1, 1, 1, 2, 3], z.shape).astype(np.uint8)
+    source[120:] = HeightSource.UNKNOWN
+    z[source == HeightSource.UNKNOWN] = np.nan
+    sigma = rng.uniform(0.003, 0.006, z.shape).astype(np.float32)
+    return HeightMap(-0.3, -0.75, 0.01, z, sigma, np.ones_like(z), source)
+
+
+def was_seen(heights: HeightMap) -> np.ndarray:
+    return (heights.source != HeightSource.UNKNOWN) & (heights.source != HeightSource.FILLED)
+
+
+def test_profiles_are_medians_of_what_was_seen() -> None:
+    heights, place = some_map(), Placement(0.03, -0.05, 0.07)
+    seen = was_seen(heights)
+
+    def read(field: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        where = np.array([(y - heights.y0_m) / 0.01, (x - heights.x0_m) / 0.01])
+        return map_coordinates(np.where(seen, field, 0.0), where, order=1, mode="grid-constant", cval=0.0)
+
+    shape, points = profiles(heights, place, POLES)
+    assert shape == [(10, 2), (12, 1)] and points.shape == (32, COLUMNS)
+    c, s = math.cos(place.yaw_rad), math.sin(place.yaw_rad)
+    first = 0
+    for number, ((columns, parts), (along, across, length, width)) in enumerate(
+        zip(shape, POLES, strict=True)
+    ):
+        assert parts == max(round(length / SEGMENT_M), 1)
+        samples = int(length / parts / STEP_M)
+        for i, k in np.ndindex(columns, parts):
+            own = points[first + i * parts + k]
+            u = across + width * ((i + 0.5) / columns - 0.5)
+            v = along + length * ((k + (np.arange(samples) + 0.5) / samples) / parts - 0.5)
+            x, y = place.x_m + c * u - s * v, place.y_m + s * u + c * v
+            weight = read(np.ones(seen.shape), x, y)
+            known = weight >= 0.5
+            z = read(heights.z_m, x, y)[known] / weight[known]
+            np.testing.assert_allclose(interpolate_heights(heights, x, y)[known], z, atol=1e-6)
+            assert (own[POLE], own[ALL]) == (number, samples)
+            assert own[[U, V, SEEN]] == pytest.approx((u, v.mean(), weight.sum()))
+            if 2 * known.sum() < samples:
+                assert np.isnan(own[[Z, SCATTER]]).all()
+                continue
+            sigma = read(heights.sigma_m, x, y)[known] / weight[known]
+            spread = 1.4826 * np.median(np.abs(z - np.median(z)))
+            assert own[[Z, SCATTER, SIGMA]] == pytest.approx((np.median(z), spread, sigma.mean()), abs=1e-6)
+        first += columns * parts
+    assert 0 < np.isnan(points[:, Z]).sum() < 16
+
+
+def test_heights_are_looked_up_in_the_nearest_seen_cell() -> None:
+    heights = some_map()
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-0.4, 0.4, 500), rng.uniform(-0.9, 0.9, 500)
+    column, row = (np.floor((a - a0) / 0.01 + 0.5).astype(int) for a, a0 in ((x, -0.3), (y, -0.75)))
+    inside = (column >= 0) & (row >= 0) & (column < 60) & (row < 150)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    seen = inside & was_seen(heights)[row, column]
+    np.testing.assert_array_equal(
+        lookup_heights(heights, x, y), np.where(seen, heights.z_m[row, column].astype(float), np.nan)
+    )
+    assert 0.2 < seen.mean() < 0.8
+
+
+def test_a_departure_counts_by_how_far_it_is_from_straight() -> None:
+    sigma = 0.003
+    shrunk = STRAIGHT_M**2 / (STRAIGHT_M**2 + sigma**2)
+    limit = 3 * math.hypot(STRAIGHT_M, sigma)
+    assert _likely(0.5 * limit, sigma) == pytest.approx(0.5 * limit * shrunk)
+    assert _likely(-1.5 * limit, sigma) == pytest.approx(-1.5 * limit)
+    assert _likely(0.9 * limit, sigma) == pytest.approx(0.9 * limit * (0.5 + 0.5 * shrunk))
+
+
+def test_a_straight_load_stays_and_what_departs_is_drawn_to_it() -> None:
+    """A section of five columns that slopes along; then a pole and a point of it are raised."""
+    rng = np.random.default_rng(4)
+    pole, column, part = (a.ravel() for a in np.mgrid[:3, :5, :9])
+    known = np.zeros((pole.size, COLUMNS))
+    known[:, V] = 1.5 * (pole - 1) + 0.1 * (part - 4)
+    section = rng.normal(0.4, 0.02, 5)
+    known[:, Z] = section[column] + 0.01 * known[:, V]
+    known[:, SIGMA], known[:, POLE] = 0.003, pole
+    straight = known[:, Z].copy()
+    np.testing.assert_allclose(_straight(known, column, 0.001), straight, atol=1e-12)
+    middle, point = pole == 1, 3 * 45 // 2
+    known[middle, Z] += 0.004
+    known[point, Z] += 0.002
+    wanted = straight + np.where(middle, _likely(0.004, 0.003), 0.0)
+    wanted[point] += _likely(0.002, 0.001)
+    np.testing.assert_allclose(_straight(known, column, 0.001), wanted, atol=2e-5)
+
+
+def test_faces_rest_off_the_middle_only_where_the_suspension_holds_them() -> None:
+    u, v = (a.ravel() for a in np.meshgrid(np.linspace(-0.05, 0.05, 11), np.linspace(-1, 1, 5)))
+    noise = 0.001
+    height, roll, pitch, off = rest_faces(u, v, 0.3 + 0.02 * u + 0.003 * v, noise, 0.1)
+    assert (height, roll, pitch, off) == pytest.approx((0.3 - noise, 0.02, 0.003, 0.0), abs=1e-5)
+    _, roll, _, off = rest_faces(u, v, 0.3 + 0.5 * u, noise, 0.1)
+    assert roll == 0.1 and off == pytest.approx(0.05, abs=0.005)
+
+
+def test_poles_and_bundles_overlap_where_their_rectangles_meet() -> None:
+    rng, met = np.random.default_rng(5), []
+    nothing, pole = np.zeros(5), np.array([0.0, 0.0, 0.9, 0.1])
+    for _ in range(300):
+        dx, dy = rng.uniform(-1, 1, 2)
+        yaw, turn = rng.uniform(-1.5, 1.5, 2)
+        half_width, half_length = rng.uniform(0.02, 0.3), rng.uniform(0.2, 0.8)
+        along = np.array([-math.sin(turn), math.cos(turn)])
+        depth, sigma, slack = overlap(
+            dx, dy, math.cos(yaw), math.sin(yaw), pole, along, half_width, half_length, nothing, np.zeros(3)
+        )
+        one = ((dx, dy), (0.1, 0.9), math.degrees(yaw))
+        other = ((0.0, 0.0), (2 * half_width, 2 * half_length), math.degrees(turn))
+        met.append(cv2.rotatedRectangleIntersection(one, other)[0] != cv2.INTERSECT_NONE)
+        assert (depth > 0) == met[-1] or abs(depth) < 1e-6
+        assert (sigma, slack) == (0.001, 0.0)
+    assert 0.2 < np.mean(met) < 0.8
+    # Pole along the bundle's side: across counts the place's sigma, the half width's, and the yaw's by 0.3 m.
+    sides = overlap(
+        0.1, 0.3, 1.0, 0.0, pole, np.array([0.0, 1.0]), 0.1, 1.0,
+        np.array([0.003, 0.05, 0.01, 0.004, 0.05]), np.array([0.02, 0.5, 0.0]),
+    )  # fmt: skip
+    assert sides == pytest.approx((0.05, math.sqrt(9e-6 + 9e-6 + 16e-6 + 1e-6), 0.02))
