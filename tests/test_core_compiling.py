@@ -1,17 +1,20 @@
 """Machine code on disk: it follows every source that it was compiled from, and is compiled ahead."""
 
+import inspect
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
-from numba import typeof, types
 
 import barsight
+from barsight.core.arrays import kernel
 from barsight.core.compiling import ahead, signatures
-from barsight.core.compiling.cache import KernelCache
+from barsight.core.compiling.signatures import Listed, listed
+from barsight.core.linalg.skyline import Skyline
 
 SOURCE = Path(barsight.__file__).parents[1]
 CALLER = """
@@ -65,3 +68,70 @@ def test_a_change_in_a_called_file_is_compiled_anew(tmp_path: Path) -> None:
     assert answer("constants", "STEP = 1", "STEP = 2") == "103.0 0"
     assert answer("called", "value + STEP", "value - STEP") == "99.0 0"
     assert answer("called", "first: float\n    second", "second: float\n    first") == "199.0 0"
+
+
+@kernel()
+def doubled(value: float) -> float:
+    return 2 * value
+
+
+def test_the_list_names_kernels_with_all_their_arguments() -> None:
+    found = listed("simulate", "measure")
+    assert len(found) > 100 and len(listed("simulate")) > 5
+    for one in found:
+        assert len(one.types()) == len(inspect.signature(one.kernel().py_func).parameters)
+
+
+def test_types_are_read_as_they_were_written() -> None:
+    frozen = np.zeros(2)
+    frozen.flags.writeable = False
+    row = Skyline(np.zeros(1), np.zeros(1, np.int64), np.zeros(1, np.int64))
+    for value in (1, 1.5, True, np.float32(1), np.zeros((2, 3)).T, frozen, (1, 2), (1, (2.0, row)), row):
+        kind = numba.typeof(value)
+        assert Listed("", "", [signatures.written(kind)]).types() == (kind,)
+
+
+def test_what_the_cache_holds_or_cannot_hold_is_not_compiled_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = Listed(__name__, "doubled", ["float32"])
+    doubled(1.0)
+    assert one.missing() and not Listed(__name__, "doubled", ["float64"]).missing()
+    monkeypatch.setattr(doubled, "_cache", numba.core.caching.NullCache())
+    assert not one.missing()
+
+
+def only_the_last_few(monkeypatch: pytest.MonkeyPatch) -> list[Listed]:
+    """Let few kernels be missing, those that compile fastest."""
+    few = listed("measure")[-3:]
+    monkeypatch.setattr(Listed, "missing", lambda self: self in few)
+    monkeypatch.setattr(ahead, "FEWEST_KERNELS", len(few))
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    return few
+
+
+def test_processes_compile_into_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(SOURCE))
+    few = only_the_last_few(monkeypatch)
+    told: list[tuple[str, int, int]] = []
+    ahead.compile_ahead(lambda *one: told.append(one), "measure")
+    assert told == [("compile", done, len(few)) for done in range(len(few) + 1)]
+    written = {path.name.split("-")[0].split(".")[-1] for path in tmp_path.rglob("*.nbi")}
+    assert {one.name for one in few} <= written
+
+
+def test_an_interrupt_ends_the_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Kept(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: object, **options: object) -> None:
+            super().__init__(*arguments, **options)  # type: ignore[call-overload]
+            started.append(self)
+
+    def interrupt(stage: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    only_the_last_few(monkeypatch)
+    monkeypatch.setattr(subprocess, "Popen", Kept)
+    with pytest.raises(KeyboardInterrupt):
+        ahead.compile_ahead(interrupt, "measure")
+    assert len(started) == 2 and all(one.returncode for one in started)

@@ -1,11 +1,13 @@
 """Write the list of kernels that are compiled ahead: `python tools/signatures.py`.
 
-Runs the demo in a folder of its own, with an empty cache, and lists the kernels that it called, those first
-that took longest to compile with all that they call.
+Runs the demo in a folder of its own, with an empty cache, and lists the kernels that it called: those first
+that call no others, so that no process compiles what another is about to, of these the longest first.
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
 import os
 import sys
@@ -21,7 +23,7 @@ os.environ["NUMBA_CACHE_DIR"] = FOLDER.name
 from numba.core import event  # noqa: E402
 from numba.core.dispatcher import Dispatcher  # noqa: E402
 
-from barsight.core.compiling import ahead, signatures  # noqa: E402
+from barsight.core.compiling import ahead, cache, signatures  # noqa: E402
 
 
 class Durations(event.Listener):  # type: ignore[misc]
@@ -33,12 +35,19 @@ class Durations(event.Listener):  # type: ignore[misc]
 
     def on_start(self, event: Any) -> None:
         """Note when."""
-        self._begun.append(time.perf_counter())
+        self._begun.append(time.thread_time())
 
     def on_end(self, event: Any) -> None:
         """Note how long."""
         key = (event.data["dispatcher"].py_func, event.data["args"])
-        self.seconds[key] = time.perf_counter() - self._begun.pop()
+        self.seconds[key] = time.thread_time() - self._begun.pop()
+
+
+@functools.cache
+def depth(function: Any) -> int:
+    """Return the longest chain of kernels below one."""
+    called = [inspect.unwrap(value) for _, value in cache.named(function) if callable(value)]
+    return max((1 + depth(one) for one in called if inspect.isfunction(one) and one != function), default=0)
 
 
 def compiled() -> Iterator[tuple[str, str, Any, tuple[Any, ...]]]:
@@ -60,21 +69,20 @@ def main() -> None:
     ahead.MOST_PROCESSES = 1
     with tempfile.TemporaryDirectory() as folder:
         demo.run(["--out", f"{folder}/demo"])
-    groups: dict[str, list[tuple[float, list[Any]]]] = {"simulate": [], "measure": []}
+    groups: dict[str, list[tuple[int, float, list[Any]]]] = {"simulate": [], "measure": []}
     for module, name, function, arguments in compiled():
         group = "simulate" if module.startswith("barsight.simulation.") else "measure"
         entry = [module, name, [signatures.written(one) for one in arguments]]
-        groups[group].append((-durations.seconds.get((function, arguments), 0), entry))
-    text = {
-        group: [entry for _, entry in sorted(found, key=lambda one: one[0])]
-        for group, found in groups.items()
-    }
+        groups[group].append((depth(function), -durations.seconds[function, arguments], entry))
+    for found in groups.values():
+        found.sort(key=lambda one: one[:2])
+    text = {group: [entry for *_, entry in found] for group, found in groups.items()}
     lines = ",\n".join(
         f'"{group}": [\n' + ",\n".join(map(json.dumps, entries)) + "\n]" for group, entries in text.items()
     )
     Path(signatures.__file__).with_suffix(".json").write_text("{" + lines + "}\n", encoding="utf-8")
     for group, found in groups.items():
-        for seconds, entry in sorted(found, key=lambda one: one[0]):
+        for _, seconds, entry in found:
             sys.stdout.write(f"{-seconds:7.2f} s {group} {entry[0]}.{entry[1]}\n")
 
 

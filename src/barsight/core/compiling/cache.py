@@ -55,7 +55,7 @@ def sources_digest(function: Any) -> str:
     waiting, reached, facts = [function], {function}, set()
     for one in waiting:
         facts.add(_digest(one.__code__.co_filename))
-        for name, value in _named(one):
+        for name, value in named(one):
             inner = inspect.unwrap(value) if callable(value) else value
             if isinstance(inner, FunctionType):
                 if inner not in reached and not _is_library(inner):
@@ -69,7 +69,7 @@ def sources_digest(function: Any) -> str:
     return hashlib.sha256("\n".join(sorted(facts)).encode()).hexdigest()
 
 
-def _named(function: FunctionType) -> Iterator[tuple[str, Any]]:
+def named(function: FunctionType) -> Iterator[tuple[str, Any]]:
     """The globals that a function or its annotations name, and what it closes over."""
     names = set(re.findall(r"\w+", " ".join(map(str, function.__annotations__.values()))))
     codes = [function.__code__]

@@ -10,6 +10,7 @@ from importlib.resources import files
 from typing import Any
 
 from numba import types
+from numba.core.dispatcher import Dispatcher
 
 from barsight.core.compiling.cache import KernelCache
 
@@ -35,7 +36,7 @@ class Listed:
     def kernel(self) -> Any:
         """Return Numba's dispatcher; imports the module."""
         found = getattr(importlib.import_module(self.module), self.name)
-        return found if hasattr(found, "targetctx") else found.__wrapped__
+        return found if isinstance(found, Dispatcher) else found.__wrapped__
 
     def types(self) -> tuple[types.Type, ...]:
         """Return the types of the arguments, Numba's."""
@@ -50,9 +51,11 @@ def listed(*groups: str) -> list[Listed]:
 
 
 def written(kind: types.Type) -> Any:
-    """Convert a type to a JSON value: a number's name, an array's element, dimensions and layout, or members
-    behind "tuple" or the class of a named tuple.
+    """Convert a type to a JSON value: a number's name, a constant behind "literal", an array's element,
+    dimensions and layout, or members behind "tuple" or the class of a named tuple.
     """
+    if isinstance(kind, types.Literal):
+        return ["literal", kind.literal_value]
     if isinstance(kind, types.Array):
         return [str(kind.dtype), kind.ndim, kind.layout] + ([] if kind.mutable else ["readonly"])
     if isinstance(kind, types.BaseNamedTuple):
@@ -67,6 +70,8 @@ def _read(value: Any) -> types.Type:
     if isinstance(value, str):
         return types.boolean if value == "bool" else getattr(types, value)
     head, *rest = value
+    if head == "literal":
+        return types.literal(*rest)
     if head == "tuple":
         return types.BaseTuple.from_types(tuple(map(_read, rest)))
     if ":" in head:

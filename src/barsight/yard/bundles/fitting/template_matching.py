@@ -163,7 +163,9 @@ def _match(
     )  # fmt: skip
     known = ~np.isnan(profile)
     known_before = np.concatenate([[0], np.cumsum(known)])
-    _match_blocks(profile, known.astype(np.float32), known_before, heights, offsets, lengths, of_class, agreement, best)
+    _match_blocks(
+        profile, known.astype(np.float32), known_before, heights, offsets, lengths, of_class, agreement, best
+    )
     return best
 
 
