@@ -162,24 +162,25 @@ def _match(
         np.full(shape, -np.inf, np.float32), np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int64),
     )  # fmt: skip
     known = ~np.isnan(profile)
+    surface = np.where(known, profile, np.float32(0.0))
     known_before = np.concatenate([[0], np.cumsum(known)])
     _match_blocks(
-        profile, known.astype(np.float32), known_before, heights, offsets, lengths, of_class, agreement, best
-    )
+        profile, surface, known.astype(np.float32), known_before, heights, offsets, lengths, of_class,
+        agreement, best,
+    )  # fmt: skip
     return best
 
 
 @kernel(parallel=True)
 def _match_blocks(
-    profile: Float32, seen: Float32, known_before: Int64, heights: Float32, offsets: Int64, lengths: Int64,
-    of_class: Int64, agreement: float, best: tuple[Float32, Float32, Int64],
+    profile: Float32, surface: Float32, seen: Float32, known_before: Int64, heights: Float32, offsets: Int64,
+    lengths: Int64, of_class: Int64, agreement: float, best: tuple[Float32, Float32, Int64],
 ) -> None:  # fmt: skip
-    """Match as `_match` does, into `best`. seen: 1 where known, else 0; known_before: its sums from 0 on."""
+    """Match as `_match` does, into `best`. surface: the profile, 0 where unknown; seen: 1 where known, else
+    0; known_before: its sums from 0 on.
+    """
     gain, height, which = best
     columns = profile.size
-    surface = np.empty_like(profile)
-    for i in range(columns):
-        surface[i] = profile[i] if seen[i] > 0 else np.float32(0.0)
     for block in numba.prange((columns + _BLOCK - 1) // _BLOCK):
         for t in range(offsets.size - 1, -1, -1):
             k, n, template = of_class[t], lengths[t], heights[t]
