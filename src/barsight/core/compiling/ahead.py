@@ -13,7 +13,7 @@ import numba
 from barsight.core.compiling.signatures import listed
 
 MOST_PROCESSES = 4
-"""Each takes 400 MB, and the more there are, the more compile what another is compiling."""
+"""Each takes some hundred MB, and the more there are, the more compile what another is compiling."""
 FEWEST_KERNELS = 8
 """For fewer the processes take longer to start than they save."""
 _PLACE_BYTES = 4
@@ -26,7 +26,7 @@ def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> Non
     kernel is compiled at its first call, as it is on one core.
     """
     cores = min(numba.config.NUMBA_NUM_THREADS, MOST_PROCESSES)
-    if cores < 2 or not sys.executable:
+    if cores < 2 or numba.config.DISABLE_JIT or not sys.executable:
         return
     missing = [place for place, one in enumerate(listed(*groups)) if one.missing()]
     if len(missing) < FEWEST_KERNELS:

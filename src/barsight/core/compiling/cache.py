@@ -44,7 +44,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         return self._index_key(sig, target_context.codegen()) in self._cache_file._load_index()
 
     def _stamp(self) -> None:
-        """Only now: what the kernel calls may be defined after it."""
+        """Stamp the index, only now: what the kernel calls may be defined after it."""
         self._cache_file._source_stamp = (*self._own, sources_digest(self._py_func))
 
 
@@ -63,14 +63,14 @@ def sources_digest(function: Any) -> str:
                     waiting.append(inner)
             elif isinstance(inner, type):
                 if not _is_library(inner):
-                    facts.add(_digest(getattr(sys.modules[inner.__module__], "__file__", None) or name))
+                    facts.add(_digest(getattr(sys.modules.get(inner.__module__), "__file__", None) or name))
             else:
                 facts.add(f"{name} = {_text(inner)}")
     return hashlib.sha256("\n".join(sorted(facts)).encode()).hexdigest()
 
 
 def named(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """The globals that a function or its annotations name, and what it closes over."""
+    """Yield the globals that a function or its annotations name, and what it closes over."""
     names = set(re.findall(r"\w+", " ".join(map(str, function.__annotations__.values()))))
     codes = [function.__code__]
     for code in codes:
@@ -88,7 +88,7 @@ def named(function: FunctionType) -> Iterator[tuple[str, Any]]:
 
 
 def _is_library(value: Any) -> bool:
-    home = value.__name__ if isinstance(value, ModuleType) else value.__module__
+    home = value.__name__ if isinstance(value, ModuleType) else value.__module__ or ""
     return home.partition(".")[0] in _LIBRARIES or home == "builtins"
 
 
