@@ -13,7 +13,7 @@ import numba
 from barsight.core.compiling.signatures import listed
 
 MOST_PROCESSES = 4
-"""Each takes some hundred MB, and the more there are, the more compile what another is compiling."""
+"""Each takes half a gigabyte, and the more there are, the more compile what another is compiling."""
 FEWEST_KERNELS = 8
 """For fewer the processes take longer to start than they save."""
 _PLACE_BYTES = 4
