@@ -29,7 +29,7 @@ ROOMS = {
         ".", "crane", "frontend", "frame_to_frame", "linear", "problem", "batch", "fixed_lag", "rig_check",
         "settings",
     ),
-    "core": (".", "linalg", "settings"),
+    "core": ("compiling", ".", "linalg", "settings"),
     "mapping": (".", "surface"),
     "yard": (".", "bundles.fitting", "bundles", "stability", "magnet", "lifting", "inventory"),
     "report": (".", "calibration"),

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any, Literal
 
+from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.parallel import in_background
@@ -74,6 +75,7 @@ def write_measured(
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
+        compile_ahead(advance, "measure")
         mapped = map_yard(recording, settings, scratch, advance, keep)
         with in_background(lambda: write_surface(mapped.surface, mapped.built.free, staging)):
             measured = find_lifts(mapped, described, judged_at)

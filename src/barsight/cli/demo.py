@@ -12,6 +12,7 @@ from rich.console import Console
 from barsight.cli.arguments import call
 from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
+from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_path
 from barsight.measure_folder import measure_into
@@ -38,6 +39,7 @@ def run(arguments: Sequence[str]) -> None:
                 raise OutputError(f"{folder}: exists already; remove it or name another folder with -o")
         console.print("Simulating a small yard ...")
         with stages(console) as advance:
+            compile_ahead(advance, "simulate", "measure")
             simulate(recording, SimulationSettings.demo(), lambda n, total: advance("render", n, total))
         with atomic_path(magnet) as path:
             path.write_text(example_magnet(), encoding="utf-8")

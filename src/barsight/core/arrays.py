@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import threading
@@ -11,6 +12,8 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from barsight.core.compiling.cache import KernelCache
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -30,6 +33,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[F], F]:
     """Compile a function with Numba, cached on disk so that a second run starts at once.
 
+    The cache holds until the kernel or anything that it calls changes (`core.compiling.cache`).
     Where no folder may be written (a read-only installation and home), every run compiles anew.
     No kernel reorders sums (Numba's `fastmath`): their order would follow the processor's vector length and
     whether a function that it calls came from the cache, so that two runs of one recording could differ.
@@ -46,11 +50,9 @@ def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[F], F]:
     }  # fmt: skip
 
     def decorate(function: F) -> F:
-        compiled: Any
-        try:
-            compiled = numba.njit(cache=True, **options)(function)
-        except RuntimeError:
-            compiled = numba.njit(**options)(function)
+        compiled: Any = numba.njit(**options)(function)
+        with contextlib.suppress(RuntimeError):
+            compiled._cache = KernelCache(function, options)
         return cast(F, _in_turn(compiled) if parallel else compiled)
 
     return decorate

@@ -49,4 +49,6 @@ def fit_parabola(time: Float64, values: Float64, length: float, result: Float64)
                     off = off * time[n] + result[a, c]
                 square += (values[n, c] - off) ** 2
             weight[n] = 1 / (1 + square / length**2)
-    result[:, 3] *= (weight**2).sum() / weight.sum()
+    scale = (weight**2).sum() / weight.sum()
+    for a in range(size):
+        result[a, 3] *= scale

@@ -107,8 +107,9 @@ def _step(normal: Float64, right: Float64, free: Bool) -> Float64:
             table[:, k] = 0.0
             table[k, k] = 1.0
             wanted[k] = 0.0
-    change = np.empty(6)
-    change[:] = np.linalg.solve(table, wanted)
+    found, change = np.linalg.solve(table, wanted), np.empty(6)
+    for k in range(6):
+        change[k] = found[k]
     return change
 
 

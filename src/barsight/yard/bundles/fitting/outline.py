@@ -89,9 +89,10 @@ def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64
             if not exact[i] >= height:
                 exact[i] = height
     reach = int(3 * sigma / STEP_M)
-    there = np.where(np.isnan(exact), 0.0, 1.0)
-    height = np.where(np.isnan(exact), 0.0, exact)
-    total, share = np.zeros(size), np.zeros(size)
+    there, height, total, share = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+    for i in range(size):
+        if not np.isnan(exact[i]):
+            there[i], height[i] = 1.0, exact[i]
     for k in range(-reach, reach + 1):
         weight = np.exp(-0.5 * (STEP_M * k / sigma) ** 2) if k != 0 else 1.0
         for i in range(max(-k, 0), min(size - k, size)):

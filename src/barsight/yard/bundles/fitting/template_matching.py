@@ -148,7 +148,6 @@ def _peaks(gain: Float32) -> list[int]:
     return np.flatnonzero((gain > 0) & (gain >= best)).tolist()
 
 
-@kernel(parallel=True)
 def _match(
     profile: Float32, heights: Float32, offsets: Int64, lengths: Int64, of_class: Int64, classes: int,
     agreement: float,
@@ -158,14 +157,30 @@ def _match(
 
     Each known cell gains 1 - (misfit / agreement)^2, at least -1.
     """
+    shape = classes, profile.size
+    best = (
+        np.full(shape, -np.inf, np.float32), np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int64),
+    )  # fmt: skip
+    known = ~np.isnan(profile)
+    surface = np.where(known, profile, np.float32(0.0))
+    known_before = np.concatenate([[0], np.cumsum(known)])
+    _match_blocks(
+        profile, surface, known.astype(np.float32), known_before, heights, offsets, lengths, of_class,
+        agreement, best,
+    )  # fmt: skip
+    return best
+
+
+@kernel(parallel=True)
+def _match_blocks(
+    profile: Float32, surface: Float32, seen: Float32, known_before: Int64, heights: Float32, offsets: Int64,
+    lengths: Int64, of_class: Int64, agreement: float, best: tuple[Float32, Float32, Int64],
+) -> None:  # fmt: skip
+    """Match as `_match` does, into `best`. surface: the profile, 0 where unknown; seen: 1 where known, else
+    0; known_before: its sums from 0 on.
+    """
+    gain, height, which = best
     columns = profile.size
-    gain = np.full((classes, columns), -np.inf, np.float32)
-    height = np.full((classes, columns), np.nan, np.float32)
-    which = np.full((classes, columns), -1, np.int64)
-    seen = np.where(np.isnan(profile), np.float32(0.0), np.float32(1.0))
-    surface = np.where(np.isnan(profile), np.float32(0.0), profile)
-    known_before = np.zeros(columns + 1, np.int64)
-    known_before[1:] = np.cumsum(seen)
     for block in numba.prange((columns + _BLOCK - 1) // _BLOCK):
         for t in range(offsets.size - 1, -1, -1):
             k, n, template = of_class[t], lengths[t], heights[t]
@@ -186,7 +201,6 @@ def _match(
                     gain[k, column] = score
                     height[k, column] = z
                     which[k, column] = t
-    return gain, height, which
 
 
 @kernel()

@@ -1,0 +1,69 @@
+"""Compile kernels ahead, in several processes: one process compiles a single kernel at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numba
+
+from barsight.core.compiling.signatures import listed
+
+MOST_PROCESSES = 4
+"""Each takes half a gigabyte, and the more there are, the more compile what another is compiling."""
+FEWEST_KERNELS = 8
+"""For fewer the processes take longer to start than they save."""
+_PLACE_BYTES = 4
+
+
+def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> None:
+    """Compile those kernels of some groups ("simulate", "measure") that the cache lacks, on all cores.
+
+    advance: told of progress (stage, done, total). Where processes can't be started, or can't write, each
+    kernel is compiled at its first call, as it is on one core.
+    """
+    cores = min(numba.config.NUMBA_NUM_THREADS, MOST_PROCESSES)
+    if cores < 2 or numba.config.DISABLE_JIT or not sys.executable:
+        return
+    missing = [place for place, one in enumerate(listed(*groups)) if one.missing()]
+    if len(missing) < FEWEST_KERNELS:
+        return
+    read_place, write_place = os.pipe()
+    read_done, write_done = os.pipe()
+    os.write(write_place, b"".join(place.to_bytes(_PLACE_BYTES) for place in missing))
+    os.close(write_place)
+    command = [sys.executable, "-P", "-m", __name__, *groups]
+    workers = [
+        subprocess.Popen(command, stdin=read_place, stdout=write_done, stderr=subprocess.DEVNULL)
+        for _ in range(cores)
+    ]
+    os.close(read_place)
+    os.close(write_done)
+    try:
+        done = 0
+        advance("compile", done, len(missing))
+        while os.read(read_done, _PLACE_BYTES):
+            done += 1
+            advance("compile", done, len(missing))
+    finally:
+        os.close(read_done)
+        for worker in workers:
+            worker.terminate()
+        for worker in workers:
+            worker.wait()
+
+
+def main() -> None:
+    """Compile the kernels whose places in the list stand in the standard input, and tell which are done."""
+    kernels = listed(*sys.argv[1:])
+    while place := os.read(0, _PLACE_BYTES):
+        with contextlib.suppress(Exception):  # the first call says what is wrong
+            kernels[int.from_bytes(place)].compile()
+        os.write(1, place)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""Cache a kernel's machine code for as long as everything that it was compiled from stays the same."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+from numba.core.caching import FunctionCache
+
+_LIBRARIES = ("numba", "numpy", "llvmlite")
+"""Not followed: the compiler's version is part of every cache already."""
+_SCALARS = (bool, int, float, complex, str, bytes, type(None), np.generic)
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """Cache on disk of one kernel, keyed to its options and to all sources that it reaches.
+
+    Numba keys it to the kernel's own file. The code of functions that it calls is copied into its own, and
+    would stay the old one after a change of their files.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+        """Find the folder; raises RuntimeError where none may be written."""
+        super().__init__(function)
+        self._own = (self._cache_file._source_stamp, sorted(options.items()))
+        _digest(function.__code__.co_filename)  # of what is imported now, not of what may replace it later
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the code for a signature, None if there is none or something in it has changed."""
+        self._stamp()
+        return super().load_overload(sig, target_context)
+
+    def holds(self, sig: Any, target_context: Any) -> bool:
+        """Return whether the code for a signature is there."""
+        self._stamp()
+        return self._index_key(sig, target_context.codegen()) in self._cache_file._load_index()
+
+    def _stamp(self) -> None:
+        """Stamp the index, only now: what the kernel calls may be defined after it."""
+        self._cache_file._source_stamp = (*self._own, sources_digest(self._py_func))
+
+
+def sources_digest(function: Any) -> str:
+    """Hash the files of all functions and classes that a function reaches by its globals, and the values of
+    the constants among them.
+    """
+    waiting, reached, facts = [function], {function}, set()
+    for one in waiting:
+        facts.add(_digest(one.__code__.co_filename))
+        for name, value in named(one):
+            inner = inspect.unwrap(value) if callable(value) else value
+            if isinstance(inner, FunctionType):
+                if inner not in reached and not _is_library(inner):
+                    reached.add(inner)
+                    waiting.append(inner)
+            elif isinstance(inner, type):
+                if not _is_library(inner):
+                    facts.add(_digest(getattr(sys.modules.get(inner.__module__), "__file__", None) or name))
+            else:
+                facts.add(f"{name} = {_text(inner)}")
+    return hashlib.sha256("\n".join(sorted(facts)).encode()).hexdigest()
+
+
+def named(function: FunctionType) -> Iterator[tuple[str, Any]]:
+    """Yield the globals that a function or its annotations name, and what it closes over."""
+    names = set(re.findall(r"\w+", " ".join(map(str, function.__annotations__.values()))))
+    codes = [function.__code__]
+    for code in codes:
+        names.update(code.co_names)
+        codes += [part for part in code.co_consts if isinstance(part, CodeType)]
+    for name in names & function.__globals__.keys():
+        value = function.__globals__[name]
+        if isinstance(value, ModuleType):
+            yield name, value.__name__
+            if not _is_library(value):
+                yield from ((one, getattr(value, one)) for one in names & vars(value).keys())
+        else:
+            yield name, value
+    yield from inspect.getclosurevars(function).nonlocals.items()
+
+
+def _is_library(value: Any) -> bool:
+    home = value.__name__ if isinstance(value, ModuleType) else value.__module__ or ""
+    return home.partition(".")[0] in _LIBRARIES or home == "builtins"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, _SCALARS):
+        return repr(value)
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_text, value))})"
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+    return type(value).__qualname__
+
+
+@functools.cache
+def _digest(path: str) -> str:
+    """Hash a source file as it was when it was first asked for; of what is no file, the name alone."""
+    file = Path(path)
+    return f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else path}"

@@ -1,0 +1,137 @@
+"""Machine code on disk: it follows every source that it was compiled from, and is compiled ahead."""
+
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+import barsight
+from barsight.core.arrays import kernel
+from barsight.core.compiling import ahead, signatures
+from barsight.core.compiling.signatures import Listed, listed
+from barsight.core.linalg.skyline import Skyline
+
+SOURCE = Path(barsight.__file__).parents[1]
+CALLER = """
+from barsight.core.arrays import kernel
+from yards.called import Rule, through
+
+@kernel()
+def answer(rule: Rule, value: float) -> float:
+    return later(value) + rule.first
+
+@kernel()
+def later(value: float) -> float:
+    return through(value)
+
+if __name__ == "__main__":
+    print(answer(Rule(100.0, 200.0), 1.0), len(answer.stats.cache_hits))
+"""
+CALLED = """
+from typing import NamedTuple
+from barsight.core.arrays import kernel
+from yards.constants import STEP
+
+class Rule(NamedTuple):
+    first: float
+    second: float
+
+@kernel()
+def through(value: float) -> float:
+    return value + STEP
+"""
+
+
+def test_a_change_in_a_called_file_is_compiled_anew(tmp_path: Path) -> None:
+    package = tmp_path / "yards"
+    package.mkdir()
+    texts = {"__init__": "", "caller": CALLER, "called": CALLED, "constants": "STEP = 1.0\nOTHER = 1.0\n"}
+
+    def answer(module: str, old: str, new: str) -> str:
+        texts[module] = texts[module].replace(old, new)
+        for name, text in texts.items():
+            (package / f"{name}.py").write_text(text, encoding="utf-8")
+        run = [sys.executable, "-B", "-m", "yards.caller"]
+        homes = {"PYTHONPATH": str(SOURCE), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        ran = subprocess.run(
+            run, cwd=tmp_path, env={**os.environ, **homes}, capture_output=True, text=True, check=True
+        )
+        return ran.stdout.strip()
+
+    assert answer("caller", "", "") == "102.0 0"
+    assert answer("constants", "OTHER = 1", "OTHER = 2") == "102.0 1"
+    assert answer("constants", "STEP = 1", "STEP = 2") == "103.0 0"
+    assert answer("called", "value + STEP", "value - STEP") == "99.0 0"
+    assert answer("called", "first: float\n    second", "second: float\n    first") == "199.0 0"
+
+
+@kernel()
+def doubled(value: float) -> float:
+    return 2 * value
+
+
+def test_the_list_names_kernels_with_all_their_arguments() -> None:
+    found = listed("simulate", "measure")
+    assert len(found) > 100 and len(listed("simulate")) > 5
+    for one in found:
+        assert len(one.types()) == len(inspect.signature(one.kernel().py_func).parameters)
+
+
+def test_types_are_read_as_they_were_written() -> None:
+    frozen = np.zeros(2)
+    frozen.flags.writeable = False
+    row = Skyline(np.zeros(1), np.zeros(1, np.int64), np.zeros(1, np.int64))
+    for value in (1, 1.5, True, np.float32(1), np.zeros((2, 3)).T, frozen, (1, 2), (1, (2.0, row)), row):
+        kind = numba.typeof(value)
+        assert Listed("", "", [signatures.written(kind)]).types() == (kind,)
+
+
+def test_what_the_cache_holds_or_cannot_hold_is_not_compiled_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = Listed(__name__, "doubled", ["float32"])
+    doubled(1.0)
+    assert one.missing() and not Listed(__name__, "doubled", ["float64"]).missing()
+    monkeypatch.setattr(doubled, "_cache", numba.core.caching.NullCache())
+    assert not one.missing()
+
+
+def only_the_last_few(monkeypatch: pytest.MonkeyPatch) -> list[Listed]:
+    """Let few kernels be missing, those that compile fastest."""
+    few = listed("measure")[-3:]
+    monkeypatch.setattr(Listed, "missing", lambda self: self in few)
+    monkeypatch.setattr(ahead, "FEWEST_KERNELS", len(few))
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    return few
+
+
+def test_processes_compile_into_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(SOURCE))
+    few = only_the_last_few(monkeypatch)
+    told: list[tuple[str, int, int]] = []
+    ahead.compile_ahead(lambda *one: told.append(one), "measure")
+    assert told == [("compile", done, len(few)) for done in range(len(few) + 1)]
+    written = {path.name.split("-")[0].split(".")[-1] for path in tmp_path.rglob("*.nbi")}
+    assert {one.name for one in few} <= written
+
+
+def test_an_interrupt_ends_the_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Kept(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: object, **options: object) -> None:
+            super().__init__(*arguments, **options)  # type: ignore[call-overload]
+            started.append(self)
+
+    def interrupt(stage: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    only_the_last_few(monkeypatch)
+    monkeypatch.setattr(subprocess, "Popen", Kept)
+    with pytest.raises(KeyboardInterrupt):
+        ahead.compile_ahead(interrupt, "measure")
+    assert len(started) == 2 and all(one.returncode for one in started)
