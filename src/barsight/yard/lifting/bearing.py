@@ -13,6 +13,7 @@ from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.sections import part_about
@@ -85,9 +86,7 @@ def find_bearing(
     slack[0] += load.length_m / 2 * math.radians(magnet.tolerance.yaw_deg)
     around = _surroundings(yard, load, (x_m, y_m), yaw_rad, slack + settings.set_down_clear_m, magnet)
     clear = _within(around, load, slack + settings.set_down_clear_m)
-    square = np.ones((MAX_UNSEEN_CELLS, MAX_UNSEEN_CELLS), np.uint8)
-    wide = cv2.morphologyEx(around.unseen.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
-    if (wide & clear).any():
+    if (wide_parts(around.unseen, MAX_UNSEEN_CELLS) & clear).any():
         return None
     carrying = around.z_m
     if settings.dunnage_m > 0:

@@ -53,7 +53,7 @@ def count_checks(
     elif near.bundles:
         why = f": bundle {near.bundles[int(np.argmax(held.flips))].id} may be in or out"
         checks.append(probability_check(held.probability, count, settings, why))
-    shares = [_unexplained(place, heights, magnet, near, contact, sigmas) for sigmas in (3.0, 2.0)]
+    shares = _unexplained(place, heights, magnet, near, contact)
     checks.append(
         check_most(
             "unexplained-surface", "part within the poles' reach that belongs to no known bundle", shares[0],
@@ -225,10 +225,10 @@ def _in_yard(place: Placement, grid: Float64) -> Float64:
 
 
 def _unexplained(
-    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, sigmas: float
-) -> float:
+    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact
+) -> tuple[float, float]:
     """Compute the fraction of the places under the poles, within reach, that lie outside all bundles'
-    outlines, made wider by so many sigmas.
+    outlines, made wider by three sigmas and by two.
     """
     across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
     grid = _face_grid(magnet, math.ceil(1e3 * float(across)))
@@ -236,13 +236,17 @@ def _unexplained(
     z = interpolate_heights(heights, points[:, 0], points[:, 1])
     over = z - (contact.z_m[grid[:, 2].astype(np.int64)] - magnet.reach_m)
     reached = np.nan_to_num(np.clip(over / EDGE_M + 0.5, 0, 1))
-    if not reached.any():
-        return 0.0
     away = points[:, None, :] - near.centre
     beside = np.abs(away[..., 0] * near.along[:, 1] - away[..., 1] * near.along[:, 0])
     beyond = np.abs((away * near.along).sum(axis=-1))
-    wide = near.half[:, 0] + MARGIN_M + sigmas * np.hypot(near.sigma[:, 0], near.sigma[:, 3])
-    long = near.half[:, 1] + MARGIN_M + sigmas * np.hypot(near.sigma[:, 1], near.sigma[:, 4])
-    long = long + near.open_ends.any(axis=1) * BEYOND_OPEN_END_M
-    outside = np.maximum(beside - wide, beyond - long).min(axis=1, initial=np.inf)
-    return float((reached * np.clip(outside / EDGE_M + 0.5, 0, 1)).mean())
+    long = near.half[:, 1] + MARGIN_M + near.open_ends.any(axis=1) * BEYOND_OPEN_END_M
+
+    def share(sigmas: float) -> float:
+        to_side = beside - (
+            near.half[:, 0] + MARGIN_M + sigmas * np.hypot(near.sigma[:, 0], near.sigma[:, 3])
+        )
+        to_end = beyond - (long + sigmas * np.hypot(near.sigma[:, 1], near.sigma[:, 4]))
+        outside = np.maximum(to_side, to_end).min(axis=1, initial=np.inf)
+        return float((reached * np.clip(outside / EDGE_M + 0.5, 0, 1)).mean())
+
+    return share(3.0), share(2.0)

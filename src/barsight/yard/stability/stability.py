@@ -163,21 +163,31 @@ def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Flo
 
 
 def interpolate_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
-    """Interpolate heights between the four cells about each place; NaN where less than half was seen."""
+    """Interpolate heights between the four cells about each place (N,); NaN where less than half was seen."""
     columns, rows = (x - heights.x0_m) / heights.cell_m, (y - heights.y0_m) / heights.cell_m
-    left, low = np.floor(columns), np.floor(rows)
-    total, weight = np.zeros(x.shape), np.zeros(x.shape)
-    for right in (0, 1):
-        for up in (0, 1):
-            part = np.abs(1 - right - (columns - left)) * np.abs(1 - up - (rows - low))
-            z = lookup_heights(
-                heights, heights.x0_m + (left + right) * heights.cell_m,
-                heights.y0_m + (low + up) * heights.cell_m,
-            )  # fmt: skip
-            seen = np.isfinite(z)
-            total += np.where(seen, part * z, 0)
-            weight += np.where(seen, part, 0)
-    return np.where(weight >= 0.5, total / np.maximum(weight, 0.5), np.nan)
+    return _interpolate(heights.z_m, heights.source, columns, rows)
+
+
+@kernel()
+def _interpolate(z: Float32, source: UInt8, columns: Float64, rows: Float64) -> Float64:
+    """Interpolate the heights (N,) at columns and rows (N,), in cells; NaN where less than half was seen."""
+    found = np.full(columns.size, np.nan)
+    for k in range(columns.size):
+        left, low = int(np.floor(columns[k])), int(np.floor(rows[k]))
+        total, weight = 0.0, 0.0
+        for column, near in ((left, 1 - (columns[k] - left)), (left + 1, columns[k] - left)):
+            for row, high in ((low, 1 - (rows[k] - low)), (low + 1, rows[k] - low)):
+                if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
+                    continue
+                if source[row, column] == _UNKNOWN or source[row, column] == _FILLED:
+                    continue
+                if np.isnan(z[row, column]):
+                    continue
+                total += near * high * z[row, column]
+                weight += near * high
+        if weight >= 0.5:
+            found[k] = total / weight
+    return found
 
 
 def _side(profile: Float64, bundle: Bundle) -> Side:
