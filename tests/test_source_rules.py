@@ -24,7 +24,6 @@ WIDE = {
     "simulation.render.shade",
     "yard.bundles.fitting.growth._row_states",
     "yard.magnet.footprint._grip",
-    "yard.magnet.resting_plane._profile",
 }
 """Kernels that still have more parameters. Group them, then take it off; nothing is added."""
 REPEATED: set[str] = set()

@@ -100,10 +100,19 @@ def test_a_bundle_is_fetched_by_name_or_said_why_not(
     assert "Lifts that fetch bundle 1" in told and "Measure again after every lift" in told
     (step,) = read_lifts(folder / "lifts.json")["fetch"]["steps"]
     assert step["bundle"] == 1 and step["is_offered"] and step["travel_z_m"] == pytest.approx(3.5)
-    for flags, why in (("1",), "not seen"), (("7",), "no bundle 7"):
-        assert lifts(folder, "--fetch", *flags) != 0
-        assert why in capsys.readouterr().err
-        assert read_lifts(folder / "lifts.json")["fetch"] is None
+    assert lifts(folder, "--fetch", "1") != 0
+    assert "not seen" in capsys.readouterr().err
+    assert read_lifts(folder / "lifts.json")["fetch"] is None
+
+
+def test_fetching_a_bundle_that_there_is_not_is_one_line_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "out")
+    assert lifts(folder, "--fetch", "7", "--lifted", "0") == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "--fetch 7" in said and "it has 2" in said
+    assert not {"lifts.json", "report.html", "events.csv"} & {path.name for path in folder.iterdir()}
 
 
 def test_an_empty_yard_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

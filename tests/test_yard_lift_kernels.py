@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 
 from barsight.core.types import HeightSource
+from barsight.yard.lifting.checks import _stray_shares
 from barsight.yard.lifting.clearance import (
     MAX_NARROW_RISE_M,
     MAX_RISE_M,
@@ -19,7 +20,8 @@ from barsight.yard.lifting.clearance import (
 )
 from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.stability.stability import interpolate_heights
+from barsight.yard.magnet.holding import _sum_pull
+from barsight.yard.stability.stability import interpolate_height
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, map_of
 
@@ -122,4 +124,48 @@ def test_heights_between_cells_are_weighed_where_half_is_seen() -> None:
         if weight.sum() >= 0.5:
             plain[k] = (weight * np.nan_to_num(heights.z_m[near])).sum() / weight.sum()
     assert 10 < np.isnan(plain).sum() < 100
-    np.testing.assert_allclose(interpolate_heights(heights, x, y), plain, atol=1e-6)
+    cells = (x - heights.x0_m) / heights.cell_m, (y - heights.y0_m) / heights.cell_m
+    found = [interpolate_height(heights.z_m, heights.source, *at) for at in zip(*cells, strict=True)]
+    np.testing.assert_allclose(found, plain, atol=1e-6)
+
+
+def test_what_lies_outside_all_outlines_is_the_share_that_arrays_give() -> None:
+    heights, rng = rough_yard(1), np.random.default_rng(4)
+    place = Placement(0.2, -0.3, 0.3)
+    grid = np.column_stack([rng.uniform(-2, 2, 300), rng.uniform(-0.5, 0.5, 300), rng.integers(0, 2, 300)])
+    turn = rng.uniform(-3, 3, 4)
+    outlines = np.column_stack(
+        [rng.uniform(-1, 1, (4, 2)), -np.sin(turn), np.cos(turn), rng.uniform(0.1, 0.8, (4, 4))]
+    )
+    reach_z = np.array([0.12, 0.14])
+    frame = np.array([(place.x_m, place.y_m), place.along, place.across])
+    points = frame[0] + grid[:, :2] @ frame[1:]
+    at = np.array([heights.x0_m, heights.y0_m, heights.cell_m])
+    columns, rows = ((points - at[:2]) / at[2]).T
+    z = np.array(
+        [interpolate_height(heights.z_m, heights.source, c, r) for c, r in zip(columns, rows, strict=True)]
+    )
+    reached = np.nan_to_num(np.clip((z - reach_z[grid[:, 2].astype(int)]) / 0.01 + 0.5, 0, 1))
+    away = points[:, None] - outlines[:, :2]
+    along, across = outlines[:, 2:4], np.column_stack([outlines[:, 3], -outlines[:, 2]])
+    to = np.stack([abs((away * across).sum(axis=2)), abs((away * along).sum(axis=2))], axis=2)
+    plain = [
+        (reached * np.clip((to - outlines[:, k : k + 2]).max(axis=2).min(axis=1) / 0.01 + 0.5, 0, 1)).mean()
+        for k in (4, 6)
+    ]  # fmt: skip
+    assert min(plain) > 0.05 and max(plain) < 0.95 * reached.mean()
+    found = _stray_shares(heights.z_m, heights.source, at, frame, grid, reach_z, outlines)
+    np.testing.assert_allclose(found, plain, atol=1e-9)
+
+
+def test_a_faces_pull_is_the_sum_over_its_cells() -> None:
+    rng = np.random.default_rng(2)
+    gaps = rng.uniform(0, 0.05, (10, 3))
+    gaps[4] = np.nan
+    gap_m = np.array([0.0, 0.002, 0.01, 0.04])
+    likely, low = np.array([800.0, 700, 300, 0]), np.array([600.0, 500, 200, 0])
+    held = np.interp(np.nan_to_num(gaps, nan=np.inf) + 0.003, gap_m, low, right=0.0)
+    total = np.interp(np.nan_to_num(gaps, nan=np.inf) + 0.001, gap_m, likely, right=0.0).sum()
+    moment = ((np.arange(10) + 0.5) / 10 - 0.5) @ held.sum(axis=1)
+    found = _sum_pull(gaps, gap_m, likely, low, 0.001, 0.003)
+    np.testing.assert_allclose(found, (total, held.sum(), moment), rtol=1e-12)

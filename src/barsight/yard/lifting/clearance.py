@@ -226,7 +226,9 @@ def _unseen(blocked: UInt8, region: Region) -> Obstacle | None:
     """Find places, unproven or standing, that are wide enough to hide what stands. blocked: (V, U); a few
     cells free among them, as wrong matches are, prove nothing.
     """
-    if not blocked.any():
+    # Three to either side prove something: with what is narrower closed over, the most is hidden.
+    most = wide_parts(cv2.morphologyEx(blocked, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), _HOLE_CELLS)
+    if not (most & region.under).any():
         return None
     _, patch, boxes, _ = cv2.connectedComponentsWithStats(1 - blocked, connectivity=4)
     unproven = blocked.astype(np.bool_) | (boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS)[patch]
@@ -257,7 +259,7 @@ class Region:
     under: UInt8
 
     def places(self, cells: tuple[Any, ...]) -> tuple[Float64, Float64]:
-        """Return the places (N, 2) of cells, their rows and columns given: yard axes, and along and across."""
+        """Return the places (N, 2) of cells, given as rows and columns: yard axes, and along and across."""
         xy = np.stack([np.atleast_1d(self.x_m[cells[1]]), np.atleast_1d(self.y_m[cells[0]])], axis=1)
         return xy, (xy - self.frame[0]) @ self.frame[1:].T
 

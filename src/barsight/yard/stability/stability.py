@@ -162,32 +162,22 @@ def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Flo
     return found
 
 
-def interpolate_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
-    """Interpolate heights between the four cells about each place (N,); NaN where less than half was seen."""
-    columns, rows = (x - heights.x0_m) / heights.cell_m, (y - heights.y0_m) / heights.cell_m
-    return _interpolate(heights.z_m, heights.source, columns, rows)
-
-
 @kernel()
-def _interpolate(z: Float32, source: UInt8, columns: Float64, rows: Float64) -> Float64:
-    """Interpolate the heights (N,) at columns and rows (N,), in cells; NaN where less than half was seen."""
-    found = np.full(columns.size, np.nan)
-    for k in range(columns.size):
-        left, low = int(np.floor(columns[k])), int(np.floor(rows[k]))
-        total, weight = 0.0, 0.0
-        for column, near in ((left, 1 - (columns[k] - left)), (left + 1, columns[k] - left)):
-            for row, high in ((low, 1 - (rows[k] - low)), (low + 1, rows[k] - low)):
-                if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
-                    continue
-                if source[row, column] == _UNKNOWN or source[row, column] == _FILLED:
-                    continue
-                if np.isnan(z[row, column]):
-                    continue
-                total += near * high * z[row, column]
-                weight += near * high
-        if weight >= 0.5:
-            found[k] = total / weight
-    return found
+def interpolate_height(z: Float32, source: UInt8, column: float, row: float) -> float:
+    """Interpolate the height between the four cells about a place in cells; NaN where less than half of it
+    was seen. z, source: maps (rows, columns).
+    """
+    left, low = int(np.floor(column)), int(np.floor(row))
+    total, weight = 0.0, 0.0
+    for c, share_c in ((left, 1 - (column - left)), (left + 1, column - left)):
+        for r, share_r in ((low, 1 - (row - low)), (low + 1, row - low)):
+            if r < 0 or c < 0 or r >= z.shape[0] or c >= z.shape[1]:
+                continue
+            if source[r, c] == _UNKNOWN or source[r, c] == _FILLED or np.isnan(z[r, c]):
+                continue
+            total += share_c * share_r * z[r, c]
+            weight += share_c * share_r
+    return total / weight if weight >= 0.5 else np.nan
 
 
 def _side(profile: Float64, bundle: Bundle) -> Side:
