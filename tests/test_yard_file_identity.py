@@ -156,13 +156,13 @@ def test_a_lift_is_offered_no_longer_than_it_is_valid(
 
 
 def test_a_lift_is_not_offered_after_an_event_beside_it(tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "out", more=(laid(3.5),))
+    folder = write_folder(tmp_path / "out", more=(laid(2.8),))
     assert lifts(folder) == 0
     yard = bs.load(folder)
     assert len(yard.lifts) == 3
     seen_ns = max(lift.record["valid_from_ns"] for lift in yard.lifts)
     for stamp_ns, offered in ((seen_ns - 10**9, 3), (seen_ns + 1, 2)):
-        line = f"{stamp_ns},set-down,4.0,0,0,1,0.3\n"
+        line = f"{stamp_ns},set-down,3.3,0,0,1,0.3\n"
         (folder / "events.csv").write_text(f"{HEAD}{line}", encoding="utf-8")
         assert len(yard.lifts) == len(bs.load(folder).lifts) == offered
     assert [(lift.rank, lift.bundles) for lift in yard.lifts.refused] == [(None, (2,))]
@@ -179,7 +179,7 @@ HEAD = "stamp_ns,kind,x_m,y_m,yaw_deg,length_m,width_m\n"
 
 
 def test_lifted_bundles_forbid_around_them_from_then_on(tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "out", more=(laid(3.5),))
+    folder = write_folder(tmp_path / "out", more=(laid(2.8),))
     assert lifts(folder, "--lifted", "0") == 0
     for _ in range(2):
         found = content(folder / "lifts.json")

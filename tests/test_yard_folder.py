@@ -19,7 +19,7 @@ from barsight.result_folder import open_folder, read_heights
 from barsight.viewer.yard_lines import yard_lines
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.lifting.lift_file import read_lifts
-from lift_yards import map_of
+from lift_yards import laid, map_of
 from mapping_views import block, fused, view
 from yard_folders import STOCK, lifts, write_folder
 
@@ -73,6 +73,17 @@ def test_what_result_says_vetoes_every_lift(
     assert written["lifts"] == [] and len(written["refused"]) == 2
     assert code in [veto["code"] for veto in written["vetoes"]]
     assert "No lift is offered" in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_place_that_no_frame_surely_saw_is_not_lifted_from(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "out", more=(laid(3.5),))
+    assert lifts(folder) == 0
+    written = read_lifts(folder / "lifts.json")
+    assert sorted(lift["bundles"] for lift in written["lifts"]) == [[0], [1]]
+    (refused,) = written["refused"]
+    assert refused["valid_until_ns"] is None and {veto["code"] for veto in refused["vetoes"]} == {
+        "map-too-old"
+    }
 
 
 def test_without_a_magnet_nothing_is_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,8 @@ from rich.table import Table
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.geotiff import REMEDY
-from barsight.report.page import write_report
+from barsight.core.parallel import in_background
+from barsight.report.page import draw_pictures, write_report
 from barsight.result_folder import (
     bundles_digest,
     changed_inputs,
@@ -78,19 +79,20 @@ def run(arguments: Sequence[str]) -> None:
         _expect_bundles(out, folder, "--fetch", () if fetch is None else (fetch,))
         happened = _events(out, folder, lifted, events)
         now_ns = folder.captured_to_ns if at == "end" and folder.captured_to_ns else time.time_ns()
-        plan = plan_lifts(
-            folder.heights, folder.bundles, described, settings,
-            _vetoes(folder, settings, now_ns, has_magnet=magnet is not None), folder.travel, now_ns,
-            events=happened, contradicted=folder.contradicted,
-        )  # fmt: skip
-        order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
+        with in_background(lambda: draw_pictures(out)) as pictures:
+            plan = plan_lifts(
+                folder.heights, folder.bundles, described, settings,
+                _vetoes(folder, settings, now_ns, has_magnet=magnet is not None), folder.travel, now_ns,
+                events=happened, contradicted=folder.contradicted,
+            )  # fmt: skip
+            order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
         found = None if isinstance(order, Failed) else order
         target, console = out / "lifts.json", Console(stderr=True)
         digest, sequence = bundles_digest(out), next_sequence(target, folder.identity)
         write_lifts(plan, folder.reference, folder.identity, digest, target, sequence, found)
         if happened:
             write_events(happened, out / "events.csv")
-        write_report(out, out / "report.html")
+        write_report(out, out / "report.html", pictures.result())
         print_lifts(plan, console)
         if isinstance(order, Failed):
             raise InputError(out, f"bundle {fetch} can't be fetched: {order.reason}", FETCH_REMEDY)

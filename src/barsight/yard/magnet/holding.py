@@ -20,6 +20,7 @@ from barsight.yard.magnet.description import Magnet, Pole
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_least
+from barsight.yard.weight import load_centre
 
 SMOOTHING_M = 0.016
 """Standard deviation of a map's smoothing across the bars, at most."""
@@ -104,9 +105,7 @@ def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[
     off about its edge: that may use the safety factor up, and no more. The offsets are upper bounds by the
     sigmas of the load's centre.
     """
-    weights = np.array([np.nan_to_num(bundle.length_m * bundle.width_m**2, nan=1.0) for bundle in load])
-    centres = np.array([bundle.centre_m[:2] for bundle in load])
-    away = weights @ centres / weights.sum() - (place.x_m, place.y_m)
+    away = load_centre(load) - (place.x_m, place.y_m)
     slack = UPPER * np.max([
         np.nan_to_num((bundle.sigma.along_m, bundle.sigma.lateral_m), nan=0.05) for bundle in load
     ], axis=0)  # fmt: skip

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
+from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
@@ -82,7 +83,7 @@ def mean_yaw(bundles: tuple[Bundle, ...]) -> float:
 
 def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> tuple[Footing, ...]:
     """Assess how each bundle stands, in the bundles' order."""
-    return tuple(_footing(heights, bundle, settings) for bundle in bundles)
+    return tuple(ordered_map(lambda bundle: _footing(heights, bundle, settings), bundles))
 
 
 def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Footing:
