@@ -66,4 +66,4 @@ def load_centre(bundles: tuple[Bundle, ...]) -> Float64:
     if not np.isfinite(weights).all():
         weights = np.array([bundle.length_m * bundle.width_m**2 for bundle in bundles])
     centres = np.array([bundle.centre_m[:2] for bundle in bundles])
-    return np.asarray(weights / weights.sum() @ centres)
+    return np.asarray(weights @ centres / weights.sum())
