@@ -13,7 +13,6 @@ from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.lifting.travel_accuracy import target_covariance
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.stability.stability import interpolate_heights
 from barsight.yard.vetoes import check_least, check_most, check_true, vetoes_of
 from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 
@@ -44,14 +43,6 @@ def test_a_lift_is_offered_where_all_checks_pass_and_has_a_veto_for_each_that_do
     wrong = [check for check in refused.checks if check.result != "passed"]
     assert {(v.code, v.reason) for v in refused.vetoes} == {(c.code, c.reason) for c in wrong}
     assert {c.code: c.result for c in wrong} == {"end-open": "unknown", "bundle-doubtful": "failed"}
-
-
-def test_heights_between_cells_are_those_of_a_slope() -> None:
-    heights = map_of([], sigma_m=0.0)
-    heights.z_m[:] = 0.1 * heights.x_m + 0.2 * heights.y_m[:, None]
-    x, y = np.array([0.123, 0.4567]), np.array([-0.3141, 1.2])
-    np.testing.assert_allclose(interpolate_heights(heights, x, y), 0.1 * x + 0.2 * y, atol=1e-6)
-    assert np.isnan(interpolate_heights(heights, np.array([99.0]), np.array([0.0]))).all()
 
 
 @pytest.mark.parametrize("x_m", [0.3, 0.305])

@@ -133,6 +133,42 @@ def test_a_calibration_changed_since_forbids_the_lifts_that_are_there(tmp_path: 
     assert {veto[0] for lift in found.refused for veto in lift.vetoes} == {"calibration-changed"}
 
 
+def test_lifts_that_look_back_are_never_offered(tmp_path: Path) -> None:
+    for name, age_s in (("fresh", 60.0), ("old", 3e7)):
+        folder = write_folder(tmp_path / name, age_s=age_s)
+        assert lifts(folder, "--at", "end") == 0
+        found = bs.load(folder).lifts
+        assert len(found) == 0 and [lift.bundles for lift in found.past] == [(0,), (1,)]
+
+
+def test_a_lift_is_offered_no_longer_than_it_is_valid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_folder(tmp_path / "out")
+    assert lifts(folder) == 0
+    yard = bs.load(folder)
+    until_ns = yard.lifts.offered[0].valid_until_ns
+    assert until_ns is not None
+    monkeypatch.setattr("time.time_ns", lambda: until_ns + 1)
+    found = yard.lifts
+    assert len(found) == 0 and not found.past
+    assert {code for lift in found.refused for code, _ in lift.vetoes} == {"map-too-old"}
+
+
+def test_a_lift_is_not_offered_after_an_event_beside_it(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "out", more=(laid(2.8),))
+    assert lifts(folder) == 0
+    yard = bs.load(folder)
+    assert len(yard.lifts) == 3
+    seen_ns = max(lift.record["valid_from_ns"] for lift in yard.lifts)
+    for stamp_ns, offered in ((seen_ns - 10**9, 3), (seen_ns + 1, 2)):
+        line = f"{stamp_ns},set-down,3.3,0,0,1,0.3\n"
+        (folder / "events.csv").write_text(f"{HEAD}{line}", encoding="utf-8")
+        assert len(yard.lifts) == len(bs.load(folder).lifts) == offered
+    assert [(lift.rank, lift.bundles) for lift in yard.lifts.refused] == [(None, (2,))]
+    assert [code for code, _ in yard.lifts.refused[0].vetoes] == ["disturbed"]
+
+
 def test_a_free_tif_that_the_map_never_had_is_refused(folder: Path) -> None:
     shutil.copyfile(folder / "height.tif", folder / "free.tif")
     with pytest.raises(InputError, match=r"free\.tif"):
@@ -143,7 +179,7 @@ HEAD = "stamp_ns,kind,x_m,y_m,yaw_deg,length_m,width_m\n"
 
 
 def test_lifted_bundles_forbid_around_them_from_then_on(tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "out", more=(laid(3.5),))
+    folder = write_folder(tmp_path / "out", more=(laid(2.8),))
     assert lifts(folder, "--lifted", "0") == 0
     for _ in range(2):
         found = content(folder / "lifts.json")

@@ -19,7 +19,7 @@ from barsight.result_folder import open_folder, read_heights
 from barsight.viewer.yard_lines import yard_lines
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.lifting.lift_file import read_lifts
-from lift_yards import map_of
+from lift_yards import laid, map_of
 from mapping_views import block, fused, view
 from yard_folders import STOCK, lifts, write_folder
 
@@ -75,6 +75,17 @@ def test_what_result_says_vetoes_every_lift(
     assert "No lift is offered" in (folder / "report.html").read_text(encoding="utf-8")
 
 
+def test_a_place_that_no_frame_surely_saw_is_not_lifted_from(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "out", more=(laid(3.5),))
+    assert lifts(folder) == 0
+    written = read_lifts(folder / "lifts.json")
+    assert sorted(lift["bundles"] for lift in written["lifts"]) == [[0], [1]]
+    (refused,) = written["refused"]
+    assert refused["valid_until_ns"] is None and {veto["code"] for veto in refused["vetoes"]} == {
+        "map-too-old"
+    }
+
+
 def test_without_a_magnet_nothing_is_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "out")
     assert run(["lifts", str(folder)]) == 0
@@ -100,10 +111,19 @@ def test_a_bundle_is_fetched_by_name_or_said_why_not(
     assert "Lifts that fetch bundle 1" in told and "Measure again after every lift" in told
     (step,) = read_lifts(folder / "lifts.json")["fetch"]["steps"]
     assert step["bundle"] == 1 and step["is_offered"] and step["travel_z_m"] == pytest.approx(3.5)
-    for flags, why in (("1",), "not seen"), (("7",), "no bundle 7"):
-        assert lifts(folder, "--fetch", *flags) != 0
-        assert why in capsys.readouterr().err
-        assert read_lifts(folder / "lifts.json")["fetch"] is None
+    assert lifts(folder, "--fetch", "1") != 0
+    assert "not seen" in capsys.readouterr().err
+    assert read_lifts(folder / "lifts.json")["fetch"] is None
+
+
+def test_fetching_a_bundle_that_there_is_not_is_one_line_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "out")
+    assert lifts(folder, "--fetch", "7", "--lifted", "0") == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "--fetch 7" in said and "it has 2" in said
+    assert not {"lifts.json", "report.html", "events.csv"} & {path.name for path in folder.iterdir()}
 
 
 def test_an_empty_yard_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

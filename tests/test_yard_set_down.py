@@ -15,6 +15,7 @@ from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.set_down import find_set_down
 from barsight.yard.types import HeightMap
+from barsight.yard.weight import load_centre
 from lift_yards import LENGTH_M, MAGNET, SETTINGS, laid, map_of, record
 
 LOAD = Load.of((record(laid(0.3)),))
@@ -148,3 +149,21 @@ def test_a_single_round_bar_rolls() -> None:
     assert bar.rolls and find_set_down(Ground.of(yard()), bar, MAGNET, SETTINGS) is None
     assert not LOAD.rolls and LOAD.height_m == pytest.approx(laid(0).top_z_m * 2 - 0.4, abs=1e-9)
     assert math.isclose(LOAD.x_m, 0.3)
+
+
+def test_a_load_settles_about_its_centre_of_mass() -> None:
+    """Two bundles, the second a quarter heavier: supports count from their common centre of mass."""
+    light, heavy = (
+        record(laid(x), k, section_m2=area, bars=None)
+        for k, (x, area) in enumerate(((0.3, 0.04), (0.6, 0.05)))
+    )
+    load = Load.of((light, heavy))
+    assert (load.x_m, load.off_across_m, load.off_along_m) == pytest.approx((0.45, 0.05 / 3, 0.0))
+    np.testing.assert_allclose(load_centre((light, heavy)), (1.4 / 3, 0.0), atol=1e-12)
+    unknown = replace(heavy, section_m2=float("nan"))
+    np.testing.assert_allclose(load_centre((light, unknown)), (0.45, 0.0), atol=1e-12)
+    middle = find_bearing(yard(), replace(load, off_across_m=0.0), *FREE, 0.0, MAGNET, SETTINGS)
+    found = find_bearing(yard(), load, *FREE, 0.0, MAGNET, SETTINGS)
+    assert middle is not None and found is not None
+    assert middle.margin_across_m - found.margin_across_m == pytest.approx(0.05 / 3, abs=0.01)
+    assert found.z_m == pytest.approx(middle.z_m, abs=2e-3)

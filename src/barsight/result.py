@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Iterator
@@ -10,6 +11,8 @@ from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import Any
+
+import cattrs
 
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_directory
@@ -24,9 +27,15 @@ from barsight.result_folder import (
     read_heights,
     read_path,
 )
+from barsight.yard.events import YardEvent, read_events
 from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts
+from barsight.yard.lifting.validity import Validity, disturbed_checks
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.vetoes import vetoes_of
 
 
 @dataclass(frozen=True)
@@ -54,12 +63,14 @@ class LiftTarget:
 @dataclass(frozen=True)
 class Lifts:
     """offered: safest first, which iterating and `len` see. refused: one of each other bundle. vetoes: (code,
-    sentence) that forbid every lift of the map.
+    sentence) that forbid every lift of the map. past: what was offered as of the recording's end, where the
+    lifts look back (`at="end"`): never for a crane, and then nothing is offered.
     """
 
     offered: tuple[LiftTarget, ...]
     refused: tuple[LiftTarget, ...]
     vetoes: tuple[tuple[str, str], ...]
+    past: tuple[LiftTarget, ...] = ()
 
     def __iter__(self) -> Iterator[LiftTarget]:
         return iter(self.offered)
@@ -106,22 +117,44 @@ class Yard:
         return read_bundles(self.folder / "bundles.json")
 
     @cached_property
+    def _chosen(self) -> dict[str, Any]:
+        return read_lifts(self.folder / "lifts.json")
+
+    @property
     def lifts(self) -> Lifts:
-        """Return the lifts, and what forbids them."""
-        content = read_lifts(self.folder / "lifts.json")
+        """Return the lifts as they hold now: what is too old, or was disturbed since, is refused."""
+        content = self._chosen
         offered, refused = (tuple(map(_target, content[name])) for name in ("lifts", "refused"))
         vetoes = _vetoes(content)
         if changed := changed_inputs(self.summary):
             since = ("calibration-changed", f"{changed} was changed since: measure again")
             refused += tuple(_vetoed(lift, since) for lift in offered)
             return Lifts((), refused, (*(veto for veto in vetoes if veto[0] != since[0]), since))
-        if not content.get("looks_back"):
-            now_ns = time.time_ns()
-            late = ("map-too-old", "the lift was valid once, it isn't any more")
-            fresh = tuple(lift for lift in offered if (lift.valid_until_ns or 0) >= now_ns)
-            refused += tuple(_vetoed(lift, late) for lift in offered if lift not in fresh)
-            offered = fresh
-        return Lifts(offered, refused, vetoes)
+        if content["looks_back"]:
+            return Lifts((), refused, vetoes, offered)
+        said = [(lift, self._happened_to(lift)) for lift in offered]
+        refused += tuple(_vetoed(lift, *found) for lift, found in said if found)
+        return Lifts(tuple(lift for lift, found in said if not found), refused, vetoes)
+
+    def _happened_to(self, lift: LiftTarget) -> list[tuple[str, str]]:
+        """Tell by vetoes what has forbidden an offered lift since it was chosen: age, events in the yard."""
+        found = []
+        if (lift.valid_until_ns or 0) < time.time_ns():
+            found.append(("map-too-old", "the lift was valid once, it isn't any more"))
+        seen_ns = lift.record["valid_from_ns"]
+        checks = disturbed_checks(
+            self._events, Placement(lift.x_m, lift.y_m, math.radians(lift.yaw_deg)),
+            cattrs.structure(self._chosen["magnet"], Magnet),
+            tuple(bundle for bundle in self.bundles if bundle.id in lift.bundles),
+            None if seen_ns is None else Validity(seen_ns, lift.valid_until_ns or seen_ns),
+            cattrs.structure(self._chosen["settings"], LiftSettings),
+        )  # fmt: skip
+        return found + [(veto.code, veto.reason) for veto in vetoes_of(checks)]
+
+    @property
+    def _events(self) -> tuple[YardEvent, ...]:
+        path = self.folder / "events.csv"
+        return read_events(path) if path.is_file() else ()
 
     @property
     def warnings(self) -> tuple[tuple[str, str], ...]:
@@ -168,8 +201,8 @@ def _target(record: dict[str, Any]) -> LiftTarget:
     )  # fmt: skip
 
 
-def _vetoed(lift: LiftTarget, veto: tuple[str, str]) -> LiftTarget:
-    return replace(lift, rank=None, vetoes=(*lift.vetoes, veto))
+def _vetoed(lift: LiftTarget, *vetoes: tuple[str, str]) -> LiftTarget:
+    return replace(lift, rank=None, vetoes=(*lift.vetoes, *vetoes))
 
 
 def _vetoes(record: dict[str, Any]) -> tuple[tuple[str, str], ...]:

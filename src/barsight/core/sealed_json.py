@@ -16,10 +16,18 @@ SEAL = "content_sha256"
 def write_sealed(content: dict[str, Any], target: Path) -> str:
     """Write JSON's own values and their digest, whole or not at all; return the digest."""
     digest = json_digest(content)
-    text = json.dumps(content | {SEAL: digest}, indent=1, allow_nan=False)
+    sealed = content | {SEAL: digest}
+    text = ",\n".join(f"{json.dumps(name)}: {_lines(value)}" for name, value in sealed.items())
     with atomic_path(target) as path:
-        path.write_text(text + "\n", encoding="utf-8")
+        path.write_text(f"{{\n{text}\n}}\n", encoding="utf-8")
     return digest
+
+
+def _lines(value: Any) -> str:
+    """Write a list with an item a line, for people and diffs; indenting everything is far slower."""
+    if isinstance(value, list) and value:
+        return "[\n " + ",\n ".join(json.dumps(item, allow_nan=False) for item in value) + "\n]"
+    return json.dumps(value, allow_nan=False)
 
 
 def read_sealed(path: Path, version: int, remedy: str) -> dict[str, Any]:

@@ -72,8 +72,11 @@ def explain(folder: Path, which: str) -> Explanation:
     rank = record["rank"]
     state = "is refused"
     if rank is not None:
-        aged = not lifts["looks_back"] and (record["valid_until_ns"] or 0) < time.time_ns()
-        state = f"was offered at rank {rank}, and is too old now" if aged else f"is offered at rank {rank}"
+        state = f"is offered at rank {rank}"
+        if lifts["looks_back"]:
+            state = f"would have been offered at rank {rank} at the recording's end"
+        elif (record["valid_until_ns"] or 0) < time.time_ns():
+            state = f"was offered at rank {rank}, and is too old now"
     picture = None
     if record["target"]["z_m"] is not None:
         picture = draw_place(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -11,6 +9,7 @@ from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.features.guided_matching import GATE_SIGMAS
 from barsight.motion.frontend.matching_example import MatchingExample
 from barsight.report.map_images import data_uri
+from barsight.report.plots import Picture
 
 LONGEST_PX = 1280
 ZOOM = 4
@@ -18,16 +17,6 @@ CROP_PX = (200, 320)
 GREEN, RED, ORANGE, BLUE = (57, 211, 83), (255, 90, 79), (242, 177, 52), (96, 190, 255)
 SHIFT = 4
 """OpenCV draws at fractions of a pixel in 16ths."""
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A picture for the page: `name` is its id, uri its data, alt says what it shows."""
-
-    name: str
-    title: str
-    caption: str
-    uri: str
 
 
 def match_pictures(example: MatchingExample) -> tuple[Picture, ...]:

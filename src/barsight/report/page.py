@@ -16,11 +16,10 @@ from plotly.offline import get_plotlyjs
 from barsight.core.files import atomic_path
 from barsight.core.parallel import in_background
 from barsight.report.map_images import preview_uri, read_raster
-from barsight.report.match_images import Picture
 from barsight.report.page_maps import MapFigure, map_figures
 from barsight.report.page_trajectory import path_plots
-from barsight.report.page_yard import yard_part
-from barsight.report.plots import Plot, contour_plot, histogram_plot, limits_plot, pair_with_laser
+from barsight.report.page_yard import yard_part, yard_pictures
+from barsight.report.plots import Picture, Plot, contour_plot, histogram_plot, limits_plot, pair_with_laser
 from barsight.result_folder import open_folder, read_contours, read_laser, read_path
 
 NONE = "–"
@@ -41,13 +40,35 @@ class KeyFigure:
     note: str = ""
 
 
-def write_report(out_dir: Path, target: Path) -> None:
+@dataclass(frozen=True, eq=False)
+class PagePictures:
+    """Pictures of the height map, and those that bundles and lifts are drawn on; none without height.tif."""
+
+    maps: tuple[MapFigure, ...] = ()
+    yard: tuple[MapFigure, ...] = ()
+
+
+def draw_pictures(out_dir: Path) -> PagePictures:
+    """Draw what of the page doesn't depend on the lifts and takes longest. Raises InputError as
+    `write_report`.
+    """
+    height = out_dir / "height.tif"
+    if not height.is_file():
+        return PagePictures()
+    raster = read_raster(height)
+    with in_background(lambda: yard_pictures(out_dir, raster)) as yard:
+        maps = map_figures(raster, read_laser(out_dir))
+    return PagePictures(maps, yard.result())
+
+
+def write_report(out_dir: Path, target: Path, pictures: PagePictures | None = None) -> None:
     """Write the page of the folder `out_dir` to `target`, whole or not at all.
 
-    result.json must be there; a section whose file is missing says so in a sentence. Raises InputError for
-    a missing or torn file, OutputError where `target` can't be written.
+    pictures: those of the folder, where they are drawn already. result.json must be there; a section whose
+    file is missing says so in a sentence. Raises InputError for a missing or torn file, OutputError where
+    `target` can't be written.
     """
-    page = render_page(out_dir)
+    page = render_page(out_dir, pictures)
     with atomic_path(target) as path:
         # A path may hold bytes that are no text; the page shows a question mark there.
         path.write_text(page, encoding="utf-8", errors="replace")
@@ -75,16 +96,13 @@ def write_summary_page(
         path.write_text(page, encoding="utf-8")
 
 
-def render_page(out_dir: Path) -> str:
+def render_page(out_dir: Path, pictures: PagePictures | None = None) -> str:
     """Render the page's HTML; see `write_report`."""
     result, _ = open_folder(out_dir)
     laser = read_laser(out_dir)
     compared = pair_with_laser(read_contours(out_dir), laser)
     path = read_path(out_dir)
-    height = out_dir / "height.tif"
-    raster = read_raster(height) if height.is_file() else None
-    with in_background(lambda: yard_part(out_dir, raster)) as drawn:
-        maps: tuple[MapFigure, ...] = map_figures(raster, laser) if raster else ()
+    drawn = pictures or draw_pictures(out_dir)
     contours = [contour_plot(item) for item in compared]
     agreement = [
         found
@@ -96,8 +114,8 @@ def render_page(out_dir: Path) -> str:
     return template.render(
         result=result,
         figures=key_figures(result),
-        maps=maps,
-        yard=drawn.result(),
+        maps=drawn.maps,
+        yard=yard_part(out_dir, drawn.yard),
         contours=contours,
         agreement_plots=agreement,
         ways=ways,

@@ -29,15 +29,12 @@ class YardPart:
     lifts: dict[str, Any] | None
 
 
-def yard_part(out_dir: Path, raster: Raster | None) -> YardPart | None:
-    """Collect bundles, lifts and their pictures; None where the folder has no bundles.json."""
+def yard_pictures(out_dir: Path, raster: Raster) -> tuple[MapFigure, ...]:
+    """Draw the orthophoto, where there is one, and the height map, as yet without bundles and lifts; none
+    where the folder has no bundles.json.
+    """
     if not (out_dir / "bundles.json").is_file():
-        return None
-    bundles = read_bundles(out_dir / "bundles.json")
-    lifts = read_lifts(out_dir / "lifts.json") if (out_dir / "lifts.json").is_file() else None
-    if raster is None:
-        return YardPart((), bundles, lifts)
-    shapes = (*bundle_shapes(bundles), *(lift_shapes(lifts) if lifts else ()))
+        return ()
     keys = (
         Key("bundle, free", FREE_RGB), Key("bundle, covered or not known", COVERED_RGB),
         Key("magnet of an offered lift, its rank", LIFT_RGB),
@@ -51,13 +48,23 @@ def yard_part(out_dir: Path, raster: Raster | None) -> YardPart | None:
         "Outline and axis of each bundle with its number, an open end dashed; the magnet's poles where a "
         "lift is offered. The coordinates are those of lifts.json."
     )
+    return tuple(
+        MapFigure(name, title, caption, draw_map(picture, raster, (), LARGE_TEXT), None, keys)
+        for name, title, picture in pictures
+    )
+
+
+def yard_part(out_dir: Path, pictures: tuple[MapFigure, ...]) -> YardPart | None:
+    """Collect bundles and lifts and draw them on the pictures; None where the folder has no bundles.json."""
+    if not (out_dir / "bundles.json").is_file():
+        return None
+    bundles = read_bundles(out_dir / "bundles.json")
+    lifts = read_lifts(out_dir / "lifts.json") if (out_dir / "lifts.json").is_file() else None
+    shapes = (*bundle_shapes(bundles), *(lift_shapes(lifts) if lifts else ()))
     figures = tuple(
-        MapFigure(
-            name, title, caption,
-            tuple(_with(drawing, shapes) for drawing in draw_map(picture, raster, (), LARGE_TEXT)),
-            None, keys,
-        ) for name, title, picture in pictures
-    )  # fmt: skip
+        replace(figure, drawings=tuple(_with(drawing, shapes) for drawing in figure.drawings))
+        for figure in pictures
+    )
     return YardPart(figures, bundles, lifts)
 
 

@@ -21,6 +21,16 @@ SERIES = ("--series-0", "--series-1", "--series-2", "--series-3", "--series-4", 
 Trace = dict[str, Any]
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A picture for the page: `name` is its id, uri its data, alt says what it shows."""
+
+    name: str
+    title: str
+    caption: str
+    uri: str
+
+
 @dataclass(frozen=True, eq=False)
 class Plot:
     """One figure: `name` is its id on the page, `height_px` its height, `caption` says how to read it."""

@@ -21,7 +21,8 @@ middle is its own lies in it whole if it is not over 13 m long, with a metre to 
 
 
 class PartedMap:
-    """A `YardMap` of which parts are read when they are wanted; the last one is kept.
+    """A `YardMap` of which parts are read when they are wanted; the last one read is kept, and smaller ones
+    are cut from it.
 
     read: gives the part of these rows and columns.
     """
@@ -36,10 +37,17 @@ class PartedMap:
 
     def part(self, rows: slice, columns: slice) -> HeightMap:
         """Read a rectangle of the map, by cells from start to stop."""
-        if self._last is None or self._last[:2] != (rows, columns):
-            self._last = None
-            self._last = rows, columns, self._read(rows, columns)
-        return self._last[2]
+        held = self._last
+        if held is None or not all(
+            have.start <= want.start and want.stop <= have.stop
+            for have, want in zip(held[:2], (rows, columns), strict=True)
+        ):
+            held = self._last = None
+            held = self._last = rows, columns, self._read(rows, columns)
+        below, left = held[0].start, held[1].start
+        return held[2].part(
+            slice(rows.start - below, rows.stop - below), slice(columns.start - left, columns.stop - left)
+        )
 
 
 def surface_map(surface: Surface, free: FreeSpace | None = None) -> PartedMap:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
+from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import Bundle
 
@@ -51,3 +54,16 @@ def bundle_mass(bundle: Bundle) -> Mass:
     kg = section * bundle.length_m * STEEL_KG_PER_M3
     longer = bundle.sigma.length_m / bundle.length_m if math.isfinite(bundle.sigma.length_m) else 0.0
     return Mass(kg, kg * math.hypot(sigma / section, longer))
+
+
+def load_centre(bundles: tuple[Bundle, ...]) -> Float64:
+    """Compute the centre of mass (2,), x and y, of bundles lifted together, NaN of none: by their masses, or
+    all by their outlines where one of those can't be told.
+    """
+    if not bundles:
+        return np.full(2, np.nan)
+    weights = np.array([bundle_mass(bundle).kg for bundle in bundles])
+    if not np.isfinite(weights).all():
+        weights = np.array([bundle.length_m * bundle.width_m**2 for bundle in bundles])
+    centres = np.array([bundle.centre_m[:2] for bundle in bundles])
+    return np.asarray(weights @ centres / weights.sum())

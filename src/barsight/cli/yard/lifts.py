@@ -18,7 +18,8 @@ from rich.table import Table
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.geotiff import REMEDY
-from barsight.report.page import write_report
+from barsight.core.parallel import in_background
+from barsight.report.page import draw_pictures, write_report
 from barsight.result_folder import (
     bundles_digest,
     changed_inputs,
@@ -74,21 +75,24 @@ def run(arguments: Sequence[str]) -> None:
             fetch: Id of a bundle: also print the lifts that dig it out, in order.
         """
         described, folder = load_magnet(magnet), _open(out)
+        _expect_bundles(out, folder, "--lifted", lifted)
+        _expect_bundles(out, folder, "--fetch", () if fetch is None else (fetch,))
         happened = _events(out, folder, lifted, events)
         now_ns = folder.captured_to_ns if at == "end" and folder.captured_to_ns else time.time_ns()
-        plan = plan_lifts(
-            folder.heights, folder.bundles, described, settings,
-            _vetoes(folder, settings, now_ns, has_magnet=magnet is not None), folder.travel, now_ns,
-            events=happened, contradicted=folder.contradicted,
-        )  # fmt: skip
-        order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
+        with in_background(lambda: draw_pictures(out)) as pictures:
+            plan = plan_lifts(
+                folder.heights, folder.bundles, described, settings,
+                _vetoes(folder, settings, now_ns, has_magnet=magnet is not None), folder.travel, now_ns,
+                events=happened, contradicted=folder.contradicted,
+            )  # fmt: skip
+            order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
         found = None if isinstance(order, Failed) else order
         target, console = out / "lifts.json", Console(stderr=True)
         digest, sequence = bundles_digest(out), next_sequence(target, folder.identity)
         write_lifts(plan, folder.reference, folder.identity, digest, target, sequence, found)
         if happened:
             write_events(happened, out / "events.csv")
-        write_report(out, out / "report.html")
+        write_report(out, out / "report.html", pictures.result())
         print_lifts(plan, console)
         if isinstance(order, Failed):
             raise InputError(out, f"bundle {fetch} can't be fetched: {order.reason}", FETCH_REMEDY)
@@ -164,16 +168,20 @@ def print_order(order: LiftOrder, console: Console) -> None:
     console.print("Measure again after every lift: the next one is a plan, not an offer.", highlight=False)
 
 
+def _expect_bundles(out: Path, folder: _MeasuredFolder, flag: str, ids: tuple[int, ...]) -> None:
+    """Raise ConfigError for an id that no bundle has."""
+    known = {bundle.id for bundle in folder.bundles}
+    for number in ids:
+        if number not in known:
+            problem = f"{out / 'bundles.json'} has no such bundle; it has {len(known)}, from 0"
+            raise ConfigError(f"{flag} {number}: {problem}")
+
+
 def _events(
     out: Path, folder: _MeasuredFolder, ids: tuple[int, ...], file: Path | None
 ) -> tuple[YardEvent, ...]:
     """Gather what OUT/events.csv, a file and the ids of lifted bundles tell."""
     by_id, captured_ns = {bundle.id: bundle for bundle in folder.bundles}, folder.captured_ns
-    missing = [number for number in ids if number not in by_id]
-    if missing:
-        raise ConfigError(
-            f"--lifted {missing[0]}: {out / 'bundles.json'} has no such bundle; it has {len(by_id)}, from 0"
-        )
     kept = out / "events.csv"
     known = read_events(kept) if kept.is_file() else ()
     told = read_events(file) if file is not None else ()

@@ -29,7 +29,7 @@ from barsight.yard.magnet.holding import hold_load, share_checks, weakest_pole
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_least, check_true, vetoes_of
-from barsight.yard.weight import Mass, bundle_mass
+from barsight.yard.weight import Mass, bundle_mass, load_centre
 
 SCALES = (1.0, 1.5, 2.5)
 """Multiples of the crane's tolerance that are tried for the box within which a lift stays as checked."""
@@ -107,16 +107,16 @@ def assess_placement(
     held = count_gripped(place, magnet, magnet.tolerance, near, contact.z_m)
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
-    mass, middle = _load(load)
+    mass = _load_mass(load)
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
     contact = hold_load(contact, magnet, load, settings.strap_m)
     weakest = weakest_pole(contact, needed, magnet, place, load)
-    away = np.array([place.x_m, place.y_m]) - middle
+    away = np.array([place.x_m, place.y_m]) - load_centre(load)
     offset = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
     checks = [
         *(travel_checks(yard.travel, place, magnet, settings) if yard.travel else ()),
-        *(age_checks(valid.from_ns, yard.now_ns, settings) if valid else ()),
+        *(age_checks(valid.from_ns if valid else None, yard.now_ns, settings) if yard.travel else ()),
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, settings),
@@ -166,17 +166,10 @@ def nearby_bundles(table: BundleTable, place: Placement, magnet: Magnet) -> Bund
     )  # fmt: skip
 
 
-def _load(load: tuple[Bundle, ...]) -> tuple[Mass, Float64]:
-    """Sum the load's mass and its centre (x, y); bundles of unknown mass weigh alike."""
-    if not load:
-        return Mass(math.nan, math.nan), np.full(2, np.nan)
+def _load_mass(load: tuple[Bundle, ...]) -> Mass:
+    """Sum the load's mass; NaN where one isn't known, or nothing is taken."""
     masses = [bundle_mass(bundle) for bundle in load]
-    total = masses[0]
-    for more in masses[1:]:
-        total = total + more
-    weights = np.nan_to_num([m.kg for m in masses], nan=1.0)
-    centres = np.array([b.centre_m[:2] for b in load])
-    return total, np.asarray(weights @ centres / weights.sum())
+    return sum(masses[1:], masses[0]) if masses else Mass(math.nan, math.nan)
 
 
 def _map_sigma(heights: HeightMap, place: Placement, magnet: Magnet) -> float:

@@ -13,6 +13,7 @@ from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.sections import part_about
@@ -27,9 +28,9 @@ NEAR_M = 0.02
 LEVEL_M = 0.01
 """So level a station must be across the load to hold it upright."""
 MIN_ACROSS_RATIO = 1 / 6
-"""Of the width, to either side of the middle, that a station must carry."""
+"""Of the width, to either side of the centre of mass, that a station must carry."""
 MIN_ALONG_RATIO = 0.2
-"""Of the length, to either side of the middle, that the supports must reach."""
+"""Of the length, to either side of the centre of mass, that the supports must reach."""
 MAX_SPAN_RATIO = 0.65
 """Of the length between one support and the next."""
 MAX_ALONG_DEG, MAX_ACROSS_DEG = 2.0, 3.0
@@ -48,8 +49,8 @@ MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.1, 6
 @dataclass(frozen=True)
 class Bearing:
     """A load's rest at a place. z_m: its underside at the middle, over its dunnage. slope_deg: of the
-    underside. support_m: from the first support to the last. margin_along_m, margin_across_m: from the middle
-    to the nearer end and side of what carries it, the least within the crane's tolerance.
+    underside. support_m: from the first support to the last. margin_along_m, margin_across_m: from the load's
+    centre of mass to the nearer end and side of what carries it, the least within the crane's tolerance.
     """
 
     z_m: float
@@ -85,9 +86,7 @@ def find_bearing(
     slack[0] += load.length_m / 2 * math.radians(magnet.tolerance.yaw_deg)
     around = _surroundings(yard, load, (x_m, y_m), yaw_rad, slack + settings.set_down_clear_m, magnet)
     clear = _within(around, load, slack + settings.set_down_clear_m)
-    square = np.ones((MAX_UNSEEN_CELLS, MAX_UNSEEN_CELLS), np.uint8)
-    wide = cv2.morphologyEx(around.unseen.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
-    if (wide & clear).any():
+    if (wide_parts(around.unseen, MAX_UNSEEN_CELLS) & clear).any():
         return None
     carrying = around.z_m
     if settings.dunnage_m > 0:
@@ -153,8 +152,9 @@ def _rest(around: Surroundings, carrying: Float32, load: Load, du: float, dv: fl
     first = int(np.argmax(rows))
     strip = carrying[first : first + count * STATION_STEPS][:, columns]
     stations = strip.reshape(count, STATION_STEPS, -1).max(axis=1).astype(np.float64)
-    v = around.v_m[first : first + count * STATION_STEPS].reshape(count, -1).mean(axis=1) - dv
-    u = around.u_m[columns] - du
+    # The load settles about its centre of mass.
+    v = around.v_m[first : first + count * STATION_STEPS].reshape(count, -1).mean(axis=1)
+    v, u = v - dv - load.off_along_m, around.u_m[columns] - du - load.off_across_m
     vv, uu = np.meshgrid(v, u, indexing="ij")
     height, roll, pitch = rest_plane(uu.ravel(), vv.ravel(), stations.ravel(), math.tan(math.radians(10)))
     if (
@@ -175,6 +175,7 @@ def _rest(around: Surroundings, carrying: Float32, load: Load, du: float, dv: fl
     if margin < MIN_ALONG_RATIO * load.length_m or span > MAX_SPAN_RATIO * load.length_m:
         return None
     slope = math.degrees(math.atan(math.hypot(roll, pitch)))
+    height -= roll * load.off_across_m + pitch * load.off_along_m
     return Bearing(height, slope, float(at[-1] - at[0]), margin, float(across[carries].min()))
 
 

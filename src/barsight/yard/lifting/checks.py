@@ -8,12 +8,12 @@ from statistics import NormalDist
 
 import numpy as np
 
-from barsight.core.arrays import Float64, frozen
+from barsight.core.arrays import Float32, Float64, UInt8, frozen, kernel
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
-from barsight.yard.stability.stability import interpolate_heights
+from barsight.yard.stability.stability import interpolate_height
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_least, check_most, check_true
 from barsight.yard.weight import Mass
@@ -53,7 +53,7 @@ def count_checks(
     elif near.bundles:
         why = f": bundle {near.bundles[int(np.argmax(held.flips))].id} may be in or out"
         checks.append(probability_check(held.probability, count, settings, why))
-    shares = [_unexplained(place, heights, magnet, near, contact, sigmas) for sigmas in (3.0, 2.0)]
+    shares = _unexplained(place, heights, magnet, near, contact)
     checks.append(
         check_most(
             "unexplained-surface", "part within the poles' reach that belongs to no known bundle", shares[0],
@@ -91,7 +91,7 @@ def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: Lif
     pitch, roll = (abs(math.degrees(angle)) for angle in (contact.pitch_rad, contact.roll_rad))
     narrowest = min(pole.width_m for pole in magnet.poles)
     gap, share = contact.widest_gap_m, contact.contact_share
-    low, high = (_contact_share(contact, settings.contact_gap_m + k * sigma) for k in (0.0, 1.0))
+    low, high = _contact_shares(contact, (settings.contact_gap_m, settings.contact_gap_m + sigma))
     held = roll >= (1 - 1e-3) * limits.roll_deg
     aside = (
         f"the faces rest {1e3 * contact.rests_off_m:.0f} mm beside their middle and "
@@ -199,11 +199,16 @@ def _known(sigma: float) -> float:
     return sigma if math.isfinite(sigma) else 0.05
 
 
-def _contact_share(contact: Contact, near_m: float) -> float:
-    """Compute the part of all faces nearer to steel than `near_m`, by gaps blurred by half a millimetre."""
+def _contact_shares(contact: Contact, near_m: tuple[float, float]) -> tuple[float, float]:
+    """Compute the part of all faces nearer to steel than each of `near_m`, by gaps blurred by half a
+    millimetre; poles count alike.
+    """
     blur = 0.0005
-    shares = [np.clip((near_m - pole.gap_map_m) / blur + 0.5, 0, 1) for pole in contact.poles]
-    return float(np.mean([np.nan_to_num(share).mean() for share in shares]))
+    gaps = np.concatenate([pole.gap_map_m.ravel() for pole in contact.poles])
+    weights = np.concatenate([np.full(p.gap_map_m.size, 1 / p.gap_map_m.size) for p in contact.poles])
+    near = np.clip((np.array(near_m)[:, None] - gaps) / blur + 0.5, 0, 1)
+    low, high = np.where(np.isnan(gaps), 0, near) @ weights / len(contact.poles)
+    return float(low), float(high)
 
 
 @lru_cache(maxsize=64)
@@ -219,30 +224,53 @@ def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
     return frozen(np.concatenate(points))
 
 
-def _in_yard(place: Placement, grid: Float64) -> Float64:
-    """Convert places given along and across the beam to x and y (N, 2)."""
-    return np.array([place.x_m, place.y_m]) + grid[:, :1] * place.along + grid[:, 1:2] * place.across
-
-
 def _unexplained(
-    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, sigmas: float
-) -> float:
+    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact
+) -> tuple[float, float]:
     """Compute the fraction of the places under the poles, within reach, that lie outside all bundles'
-    outlines, made wider by so many sigmas.
+    outlines, made wider by three sigmas and by two.
     """
     across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
-    grid = _face_grid(magnet, math.ceil(1e3 * float(across)))
-    points = _in_yard(place, grid)
-    z = interpolate_heights(heights, points[:, 0], points[:, 1])
-    over = z - (contact.z_m[grid[:, 2].astype(np.int64)] - magnet.reach_m)
-    reached = np.nan_to_num(np.clip(over / EDGE_M + 0.5, 0, 1))
-    if not reached.any():
-        return 0.0
-    away = points[:, None, :] - near.centre
-    beside = np.abs(away[..., 0] * near.along[:, 1] - away[..., 1] * near.along[:, 0])
-    beyond = np.abs((away * near.along).sum(axis=-1))
-    wide = near.half[:, 0] + MARGIN_M + sigmas * np.hypot(near.sigma[:, 0], near.sigma[:, 3])
-    long = near.half[:, 1] + MARGIN_M + sigmas * np.hypot(near.sigma[:, 1], near.sigma[:, 4])
-    long = long + near.open_ends.any(axis=1) * BEYOND_OPEN_END_M
-    outside = np.maximum(beside - wide, beyond - long).min(axis=1, initial=np.inf)
-    return float((reached * np.clip(outside / EDGE_M + 0.5, 0, 1)).mean())
+    outlines = np.empty((len(near.bundles), 8))
+    outlines[:, :2], outlines[:, 2:4] = near.centre, near.along
+    open_m = near.open_ends.any(axis=1) * BEYOND_OPEN_END_M
+    for first, sigmas in ((4, 3.0), (6, 2.0)):
+        wider = MARGIN_M + sigmas * np.hypot(near.sigma[:, :2], near.sigma[:, 3:])
+        outlines[:, first : first + 2] = near.half + wider
+        outlines[:, first + 1] += open_m
+    return _stray_shares(
+        heights.z_m, heights.source, np.array([heights.x0_m, heights.y0_m, heights.cell_m]),
+        np.array([(place.x_m, place.y_m), place.along, place.across]),
+        _face_grid(magnet, math.ceil(1e3 * float(across))), contact.z_m - magnet.reach_m, outlines,
+    )  # fmt: skip
+
+
+@kernel()
+def _stray_shares(
+    z: Float32, source: UInt8, at: Float64, frame: Float64, grid: Float64, reach_z: Float64, outlines: Float64
+) -> tuple[float, float]:
+    """Compute the fractions of places within reach that lie outside the outlines' wider and narrower form.
+
+    z, source: maps (rows, columns). at: x and y of the first cell, and its size. frame: (3, 2) the magnet's
+    place, unit vectors along and across. grid: (N, 3) along, across and pole. reach_z: (P,) heights from
+    which on a pole reaches. outlines: (B, 8) centre, unit vector along, half width and length of both forms.
+    """
+    wider, narrower = 0.0, 0.0
+    for n in range(len(grid)):
+        x = frame[0, 0] + grid[n, 0] * frame[1, 0] + grid[n, 1] * frame[2, 0]
+        y = frame[0, 1] + grid[n, 0] * frame[1, 1] + grid[n, 1] * frame[2, 1]
+        height = interpolate_height(z, source, (x - at[0]) / at[2], (y - at[1]) / at[2])
+        if np.isnan(height):
+            continue
+        reached = min(max((height - reach_z[int(grid[n, 2])]) / EDGE_M + 0.5, 0.0), 1.0)
+        if reached == 0:
+            continue
+        out_of_wider, out_of_narrower = np.inf, np.inf
+        for own in outlines:
+            dx, dy = x - own[0], y - own[1]
+            beside, beyond = abs(dx * own[3] - dy * own[2]), abs(dx * own[2] + dy * own[3])
+            out_of_wider = min(out_of_wider, max(beside - own[4], beyond - own[5]))
+            out_of_narrower = min(out_of_narrower, max(beside - own[6], beyond - own[7]))
+        wider += reached * min(max(out_of_wider / EDGE_M + 0.5, 0.0), 1.0)
+        narrower += reached * min(max(out_of_narrower / EDGE_M + 0.5, 0.0), 1.0)
+    return wider / len(grid), narrower / len(grid)

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Float32, Float64, UInt8, kernel
+from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER
+from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.stability.stability import lookup_heights, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_most
 
@@ -36,6 +38,9 @@ EDGE_SIGMA_M = 0.003
 """How well a cell of STEP_M tells the edge of what it shows."""
 MAX_HOLE_M = 0.08
 """An unseen place narrower than this is taken to hide nothing that stands."""
+_HOLE_CELLS = round(MAX_HOLE_M / STEP_M)
+_UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
+_NO_BOUNDS = np.empty((0, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -101,23 +106,67 @@ def find_obstacle(
     careful: what is within its sigma of a limit obstructs too.
     """
     region = _region(place, heights, magnet, EDGE_SIGMA_M if careful else 0.0)
-    slope = np.array([math.tan(faces.pitch_rad), math.tan(faces.roll_rad)])
-    plane = faces.centre_z_m + region.grid @ slope
-    if careful:
-        plane = plane - faces.sigma_m
-    rise = lookup_heights(heights, region.xy_m[..., 0], region.xy_m[..., 1]) - plane
-    unseen = np.isnan(rise)
-    allowed = np.where(region.faces, MAX_RISE_M, max(magnet.beam.above_faces_m / 2, MAX_RISE_M))
-    most = _free_up_to(heights, region.xy_m) - plane
-    blocked = np.where(unseen, ~(most <= allowed), rise > allowed)
+    plane = np.array([
+        faces.centre_z_m, math.tan(faces.pitch_rad), math.tan(faces.roll_rad),
+        faces.sigma_m if careful else 0.0,
+    ])  # fmt: skip
+    rise, most, blocked = _look(
+        heights.z_m, heights.source, _NO_BOUNDS if heights.free_m is None else heights.free_m,
+        np.array([heights.x0_m, heights.y0_m, heights.cell_m]), region.x_m, region.y_m, region.frame, plane,
+        region.parts, region.under,
+    )  # fmt: skip
     return _obstructed(_filled(rise, most), region) or _unseen(blocked, region)
 
 
-def _filled(rise: Float64, most: Float64) -> Float64:
+@kernel()
+def _look(
+    z: Float32, source: UInt8, free: Float32, at: Float64, x: Float64, y: Float64, frame: Float64,
+    plane: Float64, parts: Float64, under: UInt8,
+) -> tuple[Float32, Float32, UInt8]:  # fmt: skip
+    """Look up how high what was seen (-1 or more), and what lines of sight allow, stands over the faces'
+    plane (V, U), NaN where unknown, and which cells are not proven free (1).
+
+    z, source, free: maps (rows, columns); free is empty where there is none. at: x and y of the first cell,
+    and its size. x, y: (U,), (V,) of the cells. frame: (3, 2) the magnet's place, unit vectors along and
+    across. plane: height at the place, rise along and across, what it may lie lower. parts: (P + 1, 5) poles
+    and beam: middle along and across, reach to either side, rise that is allowed over it. Fills under (V, U):
+    1 under a part.
+    """
+    rise, most = np.empty((y.size, x.size), np.float32), np.empty((y.size, x.size), np.float32)
+    blocked = np.empty((y.size, x.size), np.uint8)
+    columns = np.floor((x - at[0]) / at[2] + 0.5).astype(np.int64)
+    rows = np.floor((y - at[1]) / at[2] + 0.5).astype(np.int64)
+    for i in range(y.size):
+        row, dy = rows[i], y[i] - frame[0, 1]
+        for k in range(x.size):
+            column, dx = columns[k], x[k] - frame[0, 0]
+            v = dx * frame[1, 0] + dy * frame[1, 1]
+            u = dx * frame[2, 0] + dy * frame[2, 1]
+            level = plane[0] + (v * plane[1] + u * plane[2]) - plane[3]
+            allowed = parts[-1, 4]
+            under[i, k] = 0
+            for p in range(len(parts)):
+                if abs(u - parts[p, 1]) <= parts[p, 3] and abs(v - parts[p, 0]) <= parts[p, 2]:
+                    under[i, k], allowed = 1, parts[p, 4]
+                    break
+            height, bound = np.nan, np.inf
+            if 0 <= row < z.shape[0] and 0 <= column < z.shape[1]:
+                if source[row, column] != _UNKNOWN and source[row, column] != _FILLED:
+                    height = z[row, column] - level
+                if free.size:
+                    bound = free[row, column] - level
+            rise[i, k], most[i, k] = max(height, -1.0) if height == height else np.nan, bound
+            blocked[i, k] = height > allowed if height == height else not bound <= allowed
+    return rise, most, blocked
+
+
+def _filled(rise: Float32, most: Float32) -> Float32:
     """Fill unseen cells (V, U) with the highest seen one two cells about, up to what lines of sight allow."""
-    seen = np.maximum(np.nan_to_num(rise, nan=-1.0), -1.0)
-    highest = cv2.dilate(seen, np.ones((5, 5), np.uint8))
-    return np.where(np.isnan(rise), np.fmin(highest, most), seen)
+    unseen = np.isnan(rise)
+    if not unseen.any():
+        return rise
+    highest = cv2.dilate(np.where(unseen, np.float32(-1), rise), np.ones((5, 5), np.uint8))
+    return np.where(unseen, np.fmin(highest, most), rise)
 
 
 def resting_checks(
@@ -143,102 +192,96 @@ def resting_checks(
     ]  # fmt: skip
 
 
-def _free_up_to(heights: HeightMap, xy: Float64) -> Float64:
-    """Upper bounds (m) of what may stand at places (..., 2), by lines of sight; inf where there are none."""
-    if heights.free_m is None:
-        return np.full(xy.shape[:-1], np.inf)
-    column, row, inside = nearest_cells(heights, xy[..., 0], xy[..., 1])
-    return np.where(inside, heights.free_m[row, column], np.inf).astype(np.float64)
-
-
-def _obstructed(rise: Float64, region: Region) -> Obstacle | None:
+def _obstructed(rise: Float32, region: Region) -> Obstacle | None:
     """Find the highest connected patch over the plane. rise: (V, U)."""
-    known = rise.astype(np.float32)
     for side, allowed_m, cells in (
         (5, MAX_RISE_M, MIN_PATCH_CELLS),
         (3, MAX_NARROW_RISE_M, MIN_PATCH_CELLS),
         (1, MAX_THIN_RISE_M, MIN_THIN_CELLS),
     ):
-        smooth = cv2.medianBlur(known, side)
-        over = (region.faces | region.beam) & (smooth > allowed_m)
-        _, patch, boxes, _ = cv2.connectedComponentsWithStats(over.astype(np.uint8), connectivity=8)
-        large = np.isin(patch, np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= cells) + 1)
+        # The median is over a limit where most of the cells are.
+        high = (rise > allowed_m).astype(np.uint8)
+        count = cv2.boxFilter(high, -1, (side, side), normalize=False, borderType=cv2.BORDER_REPLICATE)
+        over = (count > side * side // 2) & region.under
+        if not over.any():
+            continue
+        _, patch, boxes, _ = cv2.connectedComponentsWithStats(over, connectivity=8)
+        large = (over > 0) & (boxes[:, cv2.CC_STAT_AREA] >= cells)[patch]
         if large.any():
-            highest = np.where(large, smooth, -np.inf)
-            at = np.unravel_index(int(np.argmax(highest)), highest.shape)
-            along, across = region.grid[at]
+            smooth = cv2.medianBlur(rise, side)
+            at = np.unravel_index(int(np.argmax(np.where(large, smooth, -np.inf))), smooth.shape)
+            _, ((along, across),) = region.places(at)
             reason = (
-                f"something stands {1e3 * highest[at]:.0f} mm above the faces' plane, {along:+.2f} m along "
+                f"something stands {1e3 * smooth[at]:.0f} mm above the faces' plane, {along:+.2f} m along "
                 f"and {across:+.2f} m across the beam, {1e3 * allowed_m:.0f} mm are allowed"
             )
-            rise_mm = 1e3 * float(highest[at])
-            return Obstacle("obstructed", reason, rise_mm, 1e3 * allowed_m, region.xy_m[large])
+            rise_mm = 1e3 * float(smooth[at])
+            return Obstacle(
+                "obstructed", reason, rise_mm, 1e3 * allowed_m, region.places(np.nonzero(large))[0]
+            )
     return None
 
 
-def _unseen(blocked: Bool, region: Region) -> Obstacle | None:
+def _unseen(blocked: UInt8, region: Region) -> Obstacle | None:
     """Find places, unproven or standing, that are wide enough to hide what stands. blocked: (V, U); a few
     cells free among them, as wrong matches are, prove nothing.
     """
-    _, patch, boxes, _ = cv2.connectedComponentsWithStats((~blocked).astype(np.uint8), connectivity=4)
-    unproven = blocked | (boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS)[patch]
-    side = round(MAX_HOLE_M / STEP_M)
-    wide = cv2.morphologyEx(unproven.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
-    hidden = wide & (region.faces | region.beam)
+    # Three to either side prove something: with what is narrower closed over, the most is hidden.
+    most = wide_parts(cv2.morphologyEx(blocked, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), _HOLE_CELLS)
+    if not (most & region.under).any():
+        return None
+    _, patch, boxes, _ = cv2.connectedComponentsWithStats(1 - blocked, connectivity=4)
+    unproven = blocked.astype(np.bool_) | (boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS)[patch]
+    hidden = wide_parts(unproven, _HOLE_CELLS) & region.under
     if not hidden.any():
         return None
-    along, across = region.grid[hidden].mean(axis=0)
-    area_m2 = STEP_M**2 * float(hidden.sum())
+    xy, grid = region.places(np.nonzero(hidden))
+    along, across = grid.mean(axis=0)
+    area_m2 = STEP_M**2 * len(xy)
     reason = (
         f"{1e4 * area_m2:.0f} cm2 under the magnet or beside it were not seen, around "
         f"{along:+.2f} m along and {across:+.2f} m across the beam: what is not known counts as an obstacle"
     )
     width_mm = 1e3 * max(MAX_HOLE_M, math.sqrt(area_m2))
-    return Obstacle("unknown-under-footprint", reason, width_mm, 1e3 * MAX_HOLE_M, region.xy_m[hidden])
+    return Obstacle("unknown-under-footprint", reason, width_mm, 1e3 * MAX_HOLE_M, xy)
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """xy_m: (V, U, 2) places on the map's own grid, yard axes; grid: the same along and across the beam, m.
-    faces, beam: (V, U) cells of each, with margin.
+    """Cells (V, U) on the map's own grid about the magnet. x_m: (U,), y_m: (V,) of their centres, yard axes.
+    frame, parts: of `_look`, with margin. under: (V, U) 1 under a part, once looked at.
     """
 
-    xy_m: Float64
-    grid: Float64
-    faces: Bool
-    beam: Bool
+    x_m: Float64
+    y_m: Float64
+    frame: Float64
+    parts: Float64
+    under: UInt8
+
+    def places(self, cells: tuple[Any, ...]) -> tuple[Float64, Float64]:
+        """Return the places (N, 2) of cells, given as rows and columns: yard axes, and along and across."""
+        xy = np.stack([np.atleast_1d(self.x_m[cells[1]]), np.atleast_1d(self.y_m[cells[0]])], axis=1)
+        return xy, (xy - self.frame[0]) @ self.frame[1:].T
 
 
 def _region(place: Placement, heights: HeightMap, magnet: Magnet, wider_m: float) -> Region:
     """Lay the grid, a hole's width wider than the region, for a crane that may miss by its tolerance and
     `wider_m`. It lies on the map's cells: none comes or goes as the place moves, but at the region's edge.
     """
-    slack = np.array([magnet.tolerance.x_m, magnet.tolerance.y_m])
-    more_v, more_u = (float(np.abs(axis) @ slack) for axis in (place.along, place.across))
-    poles = [(pole.along_m, pole.across_m, pole.length_m / 2, pole.width_m / 2) for pole in magnet.poles]
-    beam = (0.0, 0.0, magnet.beam.length_m / 2, magnet.beam.width_m / 2)
-    long = max(abs(part[0]) + part[2] for part in (*poles, beam))
-    wide = max(abs(part[1]) + part[3] for part in (*poles, beam))
-    turned = math.radians(magnet.tolerance.yaw_deg)
-    more_v += STRAY_FIELD_M + wider_m + turned * wide
-    more_u += STRAY_FIELD_M + wider_m + turned * long
-    reach = np.array([long + more_v + MAX_HOLE_M, wide + more_u + MAX_HOLE_M])
+    beam, slack = magnet.beam, np.array([magnet.tolerance.x_m, magnet.tolerance.y_m])
+    frame = np.array([[place.x_m, place.y_m], place.along, place.across])
+    more = np.abs(frame[1:]) @ slack
+    parts = np.empty((len(magnet.poles) + 1, 5))
+    parts[:-1, :4] = magnet.pole_table * (1, 1, 0.5, 0.5)
+    parts[:-1, 4] = MAX_RISE_M
+    parts[-1] = 0, 0, beam.length_m / 2, beam.width_m / 2, max(beam.above_faces_m / 2, MAX_RISE_M)
+    long, wide = (np.abs(parts[:, :2]) + parts[:, 2:4]).max(axis=0)
+    more += STRAY_FIELD_M + wider_m + math.radians(magnet.tolerance.yaw_deg) * np.array([wide, long])
+    parts[:, 2:4] += more
+    reach = np.array([long, wide]) + more + MAX_HOLE_M
     axes = []
-    for centre, first, unit in (
-        (place.x_m, heights.x0_m, (place.along[0], place.across[0])),
-        (place.y_m, heights.y0_m, (place.along[1], place.across[1])),
-    ):
-        half = float(np.abs(unit) @ reach)
-        steps = np.arange(
-            math.floor((centre - half - first) / STEP_M), math.ceil((centre + half - first) / STEP_M) + 1
-        )
-        axes.append(first + STEP_M * steps)
-    xy = np.stack(np.meshgrid(*axes), axis=-1)
-    grid = (xy - (place.x_m, place.y_m)) @ np.stack([place.along, place.across], axis=1)
-
-    v, u = (np.ascontiguousarray(grid[..., k]) for k in (0, 1))
-
-    def covered(part: tuple[float, float, float, float]) -> Bool:
-        return (np.abs(v - part[0]) <= part[2] + more_v) & (np.abs(u - part[1]) <= part[3] + more_u)
-
-    return Region(xy, grid, np.any([covered(pole) for pole in poles], axis=0), covered(beam))
+    for k, first in ((0, heights.x0_m), (1, heights.y0_m)):
+        half = float(np.abs(frame[1:, k]) @ reach)
+        low, high = ((frame[0, k] + side * half - first) / STEP_M for side in (-1, 1))
+        axes.append(first + STEP_M * np.arange(math.floor(low), math.ceil(high) + 1))
+    return Region(axes[0], axes[1], frame, parts, np.empty((axes[1].size, axes[0].size), np.uint8))

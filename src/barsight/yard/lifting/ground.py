@@ -12,6 +12,7 @@ from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.types import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.sections import patches
 from barsight.yard.types import HeightMap, YardMap
 
@@ -49,12 +50,11 @@ class Ground:
         for patch in patches(yard, _PATCH_CELLS * step):
             blocks = tuple(slice(cut.start // step, cut.stop // step) for cut in patch)
             top[blocks], share[blocks] = _coarse(yard.part(*patch), step)
-        square = np.ones((MAX_HOLE_CELLS, MAX_HOLE_CELLS), np.uint8)
         unseen = (share < MIN_KNOWN).astype(np.uint8)
         # What lies beyond the map is unseen, too: a narrow strip at its edge is no hole.
         rim = MAX_HOLE_CELLS
         framed = cv2.copyMakeBorder(unseen, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=1)
-        unknown = cv2.morphologyEx(framed, cv2.MORPH_OPEN, square)[rim:-rim, rim:-rim] > 0
+        unknown = wide_parts(framed, MAX_HOLE_CELLS)[rim:-rim, rim:-rim] > 0
         narrow = (unseen > 0) & ~unknown
         around = cv2.dilate(np.where(unseen > 0, np.float32(-1e3), top), np.ones((3, 3), np.uint8))
         top = np.where(narrow, around, top).astype(np.float32)

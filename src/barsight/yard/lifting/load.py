@@ -11,6 +11,7 @@ from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.stability.stability import mean_yaw, underside_m
 from barsight.yard.types import Bundle
+from barsight.yard.weight import load_centre
 
 UNKNOWN_SIGMA_M = 0.05
 
@@ -19,8 +20,8 @@ UNKNOWN_SIGMA_M = 0.05
 class Load:
     """Outline of the load as it lies, m and rad, upper 95 % bounds of its sizes.
 
-    x_m, y_m: its middle, which is taken for its centre of mass. yaw_rad: as a bundle's. height_m: from its
-    underside to its top. rolls: nothing but its roundness would hold it on level ground.
+    x_m, y_m: its middle. off_across_m, off_along_m: its centre of mass from there. yaw_rad: as a bundle's.
+    height_m: from its underside to its top. rolls: nothing but its roundness would hold it on level ground.
     """
 
     bundles: tuple[int, ...]
@@ -31,6 +32,8 @@ class Load:
     length_m: float
     height_m: float
     rolls: bool
+    off_across_m: float = 0.0
+    off_along_m: float = 0.0
 
     @classmethod
     def of(cls, bundles: tuple[Bundle, ...]) -> Load:
@@ -50,7 +53,11 @@ class Load:
         rolls = len(bundles) == 1 and bundles[0].width_m < 1.5 * bundles[0].bar_diameter_m
         size = high - low
         ids = tuple(b.id for b in bundles)
-        return cls(ids, float(x), float(y), yaw, float(size[0]), float(size[1]), height, rolls)
+        off = axes @ (load_centre(bundles) - (x, y))
+        return cls(
+            ids, float(x), float(y), yaw, float(size[0]), float(size[1]), height, rolls, float(off[0]),
+            float(off[1]),
+        )  # fmt: skip
 
 
 def axes_of(yaw_rad: float) -> Float64:

@@ -34,7 +34,8 @@ class SetDown:
     """Place for a load, yard axes: the middle of its underside; yaw as a bundle's.
 
     turn_deg: from where it lies. slope_deg: of what it lies on. support_m: from the first support to the
-    last. margin_along_m, margin_across_m: from the load's middle to the end and the side of what carries it.
+    last. margin_along_m, margin_across_m: from the load's centre of mass to the end and the side of what
+    carries it.
     """
 
     x_m: float

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
 
 from barsight.core.notices import FORBIDS
+from barsight.core.parallel import ordered_map
 from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
@@ -104,9 +106,11 @@ def plan_lifts(
         near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
         heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
         here = LiftScene(heights, BundleTable.of(near), standing, travel, now_ns, events)
-        for number, group in enumerate(groups):
-            if part.owns(group[0].centre_m):
-                lifts[number] = _best(group, here, magnet, settings)
+        own_groups = [n for n, group in enumerate(groups) if part.owns(group[0].centre_m)]
+        chosen = ordered_map(
+            partial(_best, yard=here, magnet=magnet, settings=settings), (groups[n] for n in own_groups)
+        )
+        lifts |= dict(zip(own_groups, chosen, strict=True))
     offered, refused = [], []
     for _, lift in sorted(lifts.items()):
         listed = tuple(
@@ -124,7 +128,7 @@ def plan_lifts(
         ground = sound_ground(Ground.of(yard), bundles, standing, settings, events_since(events, captured_ns))
         by_id = {bundle.id: bundle for bundle in bundles}
         loads = (Load.of(tuple(by_id[k] for k in lift.bundles)) for lift in offered)
-        places = (find_set_down(ground, load, magnet, settings) for load in loads)
+        places = ordered_map(lambda load: find_set_down(ground, load, magnet, settings), loads)
         offered = [replace(lift, set_down=place) for lift, place in zip(offered, places, strict=True)]
     return LiftPlan(
         magnet,

@@ -44,7 +44,7 @@ def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) 
     1970.
     """
     if captured_to_ns is None:
-        reason = "when the map was captured is not known"
+        reason = "when it was last seen is not known"
         return [check_true("map-too-old", "age of what was seen", None, reason)]
     age_ns, max_age_ns = now_ns - captured_to_ns, seconds_to_ns(settings.max_age_s)
     return [

@@ -107,7 +107,7 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
     seen = np.isfinite(points[:, Z])
     if seen.sum() < 3:
         return None
-    noise = straighten_heights(points, seen)
+    noise = straighten_heights(points)
     most = np.tan(np.radians(magnet.limits.roll_deg))
     u, v, z = (np.ascontiguousarray(points[seen, k]) for k in (U, V, Z))
     height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)

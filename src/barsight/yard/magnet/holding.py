@@ -9,16 +9,18 @@ strap, and the noise on top.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, frozen, kernel
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.magnet.contact import Contact, PoleContact
 from barsight.yard.magnet.description import Magnet, Pole
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_least
+from barsight.yard.weight import load_centre
 
 SMOOTHING_M = 0.016
 """Standard deviation of a map's smoothing across the bars, at most."""
@@ -50,17 +52,43 @@ def _pull(
 ) -> PoleContact:
     """Sum the pull over a face whose plane lies so much higher, likely and at most, than over the map."""
     likely, low = magnet.pull.on_bars(diameter_m, min(pole.length_m, pole.width_m))
-    gaps = np.where(np.isnan(own.gap_map_m), np.inf, own.gap_map_m)
-    newton = 1e3 * pole.length_m * pole.width_m / gaps.size
-    across = pole.width_m * ((np.arange(len(gaps)) + 0.5) / len(gaps) - 0.5)
-    held = np.interp(gaps + higher_m, magnet.pull.gap_m, low, right=0.0)
-    total = float(held.sum())
-    return replace(
-        own,
-        pull_n=newton * float(np.interp(gaps + likely_m, magnet.pull.gap_m, likely, right=0.0).sum()),
-        pull_low_n=newton * total,
-        pull_across_m=float(across @ held.sum(axis=1)) / total if total > 0 else 0.0,
-    )
+    sums = _sum_pull(own.gap_map_m, np.array(magnet.pull.gap_m), likely, low, likely_m, higher_m)
+    newton = 1e3 * pole.length_m * pole.width_m / own.gap_map_m.size
+    across = pole.width_m * sums[2] / sums[1] if sums[1] > 0 else 0.0
+    return replace(own, pull_n=newton * sums[0], pull_low_n=newton * sums[1], pull_across_m=across)
+
+
+@kernel()
+def _sum_pull(
+    gaps: Float64, gap_m: Float64, likely: Float64, low: Float64, likely_m: float, higher_m: float
+) -> tuple[float, float, float]:
+    """Sum a face's pull (kPa) over its cells: what is likely, its lower bound, and that one's moment about
+    the face's middle over its width.
+
+    gaps: (across, along) air gaps, m, NaN where unknown: nothing pulls there. likely, low: kPa at gap_m.
+    likely_m, higher_m: by how much the gaps may be wider.
+    """
+    total, least, moment = 0.0, 0.0, 0.0
+    for i in range(gaps.shape[0]):
+        place = (i + 0.5) / gaps.shape[0] - 0.5
+        for k in range(gaps.shape[1]):
+            if np.isnan(gaps[i, k]):
+                continue
+            total += _between(gaps[i, k] + likely_m, gap_m, likely)
+            held = _between(gaps[i, k] + higher_m, gap_m, low)
+            least += held
+            moment += place * held
+    return total, least, moment
+
+
+@kernel()
+def _between(gap: float, gap_m: Float64, curve: Float64) -> float:
+    """Interpolate a curve over gap_m at a gap; 0 beyond its end."""
+    for k in range(gap_m.size - 1):
+        if gap <= gap_m[k + 1]:
+            part = (gap - gap_m[k]) / (gap_m[k + 1] - gap_m[k])
+            return float(curve[k] + part * (curve[k + 1] - curve[k]))
+    return 0.0
 
 
 def _least_diameter(bundle: Bundle) -> float:
@@ -77,24 +105,33 @@ def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[
     off about its edge: that may use the safety factor up, and no more. The offsets are upper bounds by the
     sigmas of the load's centre.
     """
-    weights = np.array([np.nan_to_num(bundle.length_m * bundle.width_m**2, nan=1.0) for bundle in load])
-    centres = np.array([bundle.centre_m[:2] for bundle in load])
-    away = weights @ centres / weights.sum() - (place.x_m, place.y_m)
+    away = load_centre(load) - (place.x_m, place.y_m)
     slack = UPPER * np.max([
         np.nan_to_num((bundle.sigma.along_m, bundle.sigma.lateral_m), nan=0.05) for bundle in load
     ], axis=0)  # fmt: skip
     offset = np.array([away @ place.along, away @ place.across])
-    poles = magnet.pole_table
-    arms = poles[:, :2] - poles[:, :2].mean(axis=0)
-    offset = offset - poles[:, :2].mean(axis=0)
+    middle, slope, in_row = _levers(magnet.poles)
+    offset = offset - middle
+    share = 1 / len(slope) + slope @ offset + np.abs(slope) @ slack
+    if in_row:
+        pulls = np.array([own.pull_across_m for own in contact.poles])
+        widths = np.array([pole.width_m for pole in magnet.poles])
+        beside = np.abs(offset[1] - pulls) + slack[1]
+        share = share * np.maximum((1 + 2 * beside / widths) / magnet.needed_factor, 1.0)
+    return np.asarray(share)
+
+
+@lru_cache(maxsize=64)
+def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64, bool]:
+    """Compute the poles' middle (2,), along and across, how each one's share (P, 2) grows with the load's
+    offset from it, and whether they stand in one row.
+    """
+    places = np.array([(pole.along_m, pole.across_m) for pole in poles])
+    middle = places.mean(axis=0)
+    arms = places - middle
     spread = np.linalg.eigvalsh(arms.T @ arms) if len(arms) > 1 else np.zeros(2)
     slope = arms @ np.linalg.pinv(arms.T @ arms, rcond=1e-6)
-    share = 1 / len(poles) + slope @ offset + np.abs(slope) @ slack
-    if spread.min() < 1e-6:
-        pulls = np.array([own.pull_across_m for own in contact.poles])
-        beside = np.abs(offset[1] - pulls) + slack[1]
-        share = share * np.maximum((1 + 2 * beside / poles[:, 3]) / magnet.needed_factor, 1.0)
-    return np.asarray(share)
+    return frozen(middle), frozen(slope), bool(spread.min() < 1e-6)
 
 
 @dataclass(frozen=True)

@@ -102,15 +102,20 @@ class Pull:
         Bars offer the section of a plate pi/4 as thick as they are. Where the maker rates round bars, his
         figure for one holds; the lower bound takes it only where it is less than the sum over the face.
         """
-        likely = self.on_plate(math.pi / 4 * diameter_m, face_m)
-        if not self.round_diameter_m:
-            return likely, likely
-        rated = float(np.interp(diameter_m, self.round_diameter_m, self.round_ratio))
-        rated *= min(diameter_m / self.round_diameter_m[0], 1.0)
-        thick = self.on_plate(self.thickness_m or 1.0, face_m)
-        summed = float(np.interp(_falls_off(diameter_m, face_m), self.gap_m, likely).mean())
-        ratio = rated * thick[0] / max(summed, 1e-9)
-        return likely * ratio, likely * min(ratio, 1.0)
+        return _on_bars(self, diameter_m, face_m)
+
+
+@lru_cache(maxsize=1024)
+def _on_bars(pull: Pull, diameter_m: float, face_m: float) -> tuple[Float64, Float64]:
+    likely = pull.on_plate(math.pi / 4 * diameter_m, face_m)
+    if not pull.round_diameter_m:
+        return frozen(likely), frozen(likely)
+    rated = float(np.interp(diameter_m, pull.round_diameter_m, pull.round_ratio))
+    rated *= min(diameter_m / pull.round_diameter_m[0], 1.0)
+    thick = pull.on_plate(pull.thickness_m or 1.0, face_m)
+    summed = float(np.interp(_falls_off(diameter_m, face_m), pull.gap_m, likely).mean())
+    ratio = rated * thick[0] / max(summed, 1e-9)
+    return frozen(likely * ratio), frozen(likely * min(ratio, 1.0))
 
 
 @lru_cache(maxsize=256)

@@ -5,11 +5,9 @@ The noise of a map would hold the plane up: heights are medians along the bars, 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
+from barsight.core.arrays import Float32, Float64, Int64, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
@@ -34,20 +32,6 @@ _STEEPEST = 0.35
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
-class MapCells(NamedTuple):
-    """The arrays of a `HeightMap`: unknown and filled cells (see `HeightSource`) aren't seen.
-
-    z_m, sigma_m, source: (rows, columns). x0_m, y0_m: the first cell's centre.
-    """
-
-    z_m: Float32
-    sigma_m: Float32
-    source: UInt8
-    x0_m: float
-    y0_m: float
-    cell_m: float
-
-
 def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list[tuple[int, int]], Float64]:
     """Sample columns across and parts along of each pole; (N, COLUMNS) of all: place across and along, median
     height, scatter, cells seen and in all, the cells' mean sigma, the pole.
@@ -56,29 +40,42 @@ def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list
         (max(round(width / STEP_M), 2), max(round(length / SEGMENT_M), 1)) for _, _, length, width in poles
     ]
     points = np.empty((sum(a * b for a, b in shape), COLUMNS))
-    first = 0
-    cells = MapCells(heights.z_m, heights.sigma_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m)
-    cos, sin = np.cos(place.yaw_rad), np.sin(place.yaw_rad)
-    for number, (pole, (columns, parts)) in enumerate(zip(poles, shape, strict=True)):
-        own = points[first : first + columns * parts]
-        own[:, POLE] = number
-        _profile(cells, place.x_m, place.y_m, cos, sin, pole, parts, own)
-        first += columns * parts
+    _sample(
+        heights.z_m, heights.sigma_m, heights.source,
+        np.array([heights.x0_m, heights.y0_m, heights.cell_m]),
+        np.array([(place.x_m, place.y_m), place.along, place.across]), poles, np.array(shape), points,
+    )  # fmt: skip
     return shape, points
 
 
-def straighten_heights(points: Float64, seen: Bool) -> float:
-    """Correct the heights, in place, towards a straight load; returns the noise that remains.
+@kernel()
+def straighten_heights(points: Float64) -> float:
+    """Correct the heights (N, COLUMNS), in place, towards a straight load; returns the noise that remains.
 
     A load's section is the same under all poles but for a slope along. What departs from that, pole by pole
     and point by point, is weighed by how straight bundles are against how sure the map is.
     """
+    seen = np.flatnonzero(~np.isnan(points[:, Z]))
     known = points[seen]
-    cells = max(float(np.median(known[:, SEEN])) / CORRELATED_CELLS, 1.0)
-    noise = float(1.25 * np.median(known[:, SCATTER]) / np.sqrt(cells))
-    _, column = np.unique(np.round(known[:, U], 6), return_inverse=True)
-    points[seen, Z] = _straight(known, column, noise)
+    cells = max(np.median(known[:, SEEN]) / CORRELATED_CELLS, 1.0)
+    noise = 1.25 * np.median(known[:, SCATTER]) / np.sqrt(cells)
+    points[seen, Z] = _straight(known, _columns(known[:, U]), noise)
     return float(noise * STRAIGHT_M / np.hypot(STRAIGHT_M, noise))
+
+
+@kernel()
+def _columns(u: Float64) -> Int64:
+    """Number the places across (N,) of points: those within a micrometre are one."""
+    numbers, places, count = np.empty(u.size, np.int64), np.empty(u.size), 0
+    for k in range(u.size):
+        number = 0
+        while number < count and abs(places[number] - u[k]) > 0.5e-6:
+            number += 1
+        if number == count:
+            places[count] = u[k]
+            count += 1
+        numbers[k] = number
+    return numbers
 
 
 @kernel()
@@ -138,16 +135,34 @@ def rest_faces(
 
 
 @kernel()
+def _sample(
+    z: Float32, sigma: Float32, source: UInt8, at: Float64, frame: Float64, poles: Float64, shape: Int64,
+    out: Float64,
+) -> None:  # fmt: skip
+    """Sample the map's median heights under all poles, each of `shape` (P, 2) columns and parts; see
+    `_profile`. Fills out (N, COLUMNS), pole by pole.
+    """
+    first = 0
+    for number in range(len(poles)):
+        last = first + shape[number, 0] * shape[number, 1]
+        out[first:last, POLE] = number
+        _profile(z, sigma, source, at, frame, poles[number], shape[number, 1], out[first:last])
+        first = last
+
+
+@kernel()
 def _profile(
-    cells: MapCells, x: float, y: float, cos: float, sin: float, pole: Float64, parts: int, out: Float64
-) -> None:
+    z: Float32, sigma: Float32, source: UInt8, at: Float64, frame: Float64, pole: Float64, parts: int,
+    out: Float64,
+) -> None:  # fmt: skip
     """Sample the map's median heights under one pole.
 
-    x, y, cos, sin: the magnet's place (m) and yaw. pole: (4,) along, across, length, width, m. parts: along
-    the pole, sampled every STEP_M. Fills out (columns * parts, COLUMNS) but for POLE; height and scatter are
-    NaN where fewer than half of a part's samples are seen.
+    z, sigma: maps (rows, columns), m; source: `HeightSource`, of which unknown and filled cells aren't seen.
+    at: x and y of the first cell's centre, and its size, m. frame: (3, 2) the magnet's place, m, unit vectors
+    along and across. pole: (4,) along, across, length, width, m. parts: along the pole, sampled every STEP_M.
+    Fills out (columns * parts, COLUMNS) but for POLE; height and scatter are NaN where fewer than half of a
+    part's samples are seen.
     """
-    z, source, cell = cells.z_m, cells.source, cells.cell_m
     along, across, length, width = pole[0], pole[1], pole[2], pole[3]
     columns = out.shape[0] // parts
     samples = max(int(length / parts / STEP_M), 1)
@@ -158,10 +173,8 @@ def _profile(
             count, unsure, weight = 0, 0.0, 0.0
             for m in range(samples):
                 v = along + length * ((k + (m + 0.5) / samples) / parts - 0.5)
-                column, row = (
-                    (x + u * cos - v * sin - cells.x0_m) / cell,
-                    (y + u * sin + v * cos - cells.y0_m) / cell,
-                )
+                column = (frame[0, 0] + u * frame[2, 0] + v * frame[1, 0] - at[0]) / at[2]
+                row = (frame[0, 1] + u * frame[2, 1] + v * frame[1, 1] - at[1]) / at[2]
                 left, low = int(np.floor(column)), int(np.floor(row))
                 total, spread, found = 0.0, 0.0, 0.0
                 for c, share_c in ((left, 1 - (column - left)), (left + 1, column - left)):
@@ -171,7 +184,7 @@ def _profile(
                         if source[r, c] == _UNKNOWN or source[r, c] == _FILLED:
                             continue
                         total += share_c * share_r * z[r, c]
-                        spread += share_c * share_r * cells.sigma_m[r, c]
+                        spread += share_c * share_r * sigma[r, c]
                         found += share_c * share_r
                 weight += found
                 if found >= 0.5:

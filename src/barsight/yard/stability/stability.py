@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
+from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
@@ -82,7 +83,7 @@ def mean_yaw(bundles: tuple[Bundle, ...]) -> float:
 
 def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings) -> tuple[Footing, ...]:
     """Assess how each bundle stands, in the bundles' order."""
-    return tuple(_footing(heights, bundle, settings) for bundle in bundles)
+    return tuple(ordered_map(lambda bundle: _footing(heights, bundle, settings), bundles))
 
 
 def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Footing:
@@ -162,22 +163,22 @@ def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Flo
     return found
 
 
-def interpolate_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
-    """Interpolate heights between the four cells about each place; NaN where less than half was seen."""
-    columns, rows = (x - heights.x0_m) / heights.cell_m, (y - heights.y0_m) / heights.cell_m
-    left, low = np.floor(columns), np.floor(rows)
-    total, weight = np.zeros(x.shape), np.zeros(x.shape)
-    for right in (0, 1):
-        for up in (0, 1):
-            part = np.abs(1 - right - (columns - left)) * np.abs(1 - up - (rows - low))
-            z = lookup_heights(
-                heights, heights.x0_m + (left + right) * heights.cell_m,
-                heights.y0_m + (low + up) * heights.cell_m,
-            )  # fmt: skip
-            seen = np.isfinite(z)
-            total += np.where(seen, part * z, 0)
-            weight += np.where(seen, part, 0)
-    return np.where(weight >= 0.5, total / np.maximum(weight, 0.5), np.nan)
+@kernel()
+def interpolate_height(z: Float32, source: UInt8, column: float, row: float) -> float:
+    """Interpolate the height between the four cells about a place in cells; NaN where less than half of it
+    was seen. z, source: maps (rows, columns).
+    """
+    left, low = int(np.floor(column)), int(np.floor(row))
+    total, weight = 0.0, 0.0
+    for c, share_c in ((left, 1 - (column - left)), (left + 1, column - left)):
+        for r, share_r in ((low, 1 - (row - low)), (low + 1, row - low)):
+            if r < 0 or c < 0 or r >= z.shape[0] or c >= z.shape[1]:
+                continue
+            if source[r, c] == _UNKNOWN or source[r, c] == _FILLED or np.isnan(z[r, c]):
+                continue
+            total += share_c * share_r * z[r, c]
+            weight += share_c * share_r
+    return total / weight if weight >= 0.5 else np.nan
 
 
 def _side(profile: Float64, bundle: Bundle) -> Side:
