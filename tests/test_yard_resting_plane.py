@@ -29,7 +29,7 @@ from barsight.yard.magnet.resting_plane import (
     profiles,
     rest_faces,
 )
-from barsight.yard.stability.stability import interpolate_heights, lookup_heights
+from barsight.yard.stability.stability import interpolate_height, lookup_heights
 from barsight.yard.types import HeightMap
 
 POLES = np.array([[-0.3, 0.02, 0.9, 0.1], [0.7, -0.02, 0.5, 0.12]])
@@ -74,7 +74,10 @@ def test_profiles_are_medians_of_what_was_seen() -> None:
             weight = read(np.ones(seen.shape), x, y)
             known = weight >= 0.5
             z = read(heights.z_m, x, y)[known] / weight[known]
-            np.testing.assert_allclose(interpolate_heights(heights, x, y)[known], z, atol=1e-6)
+            cells = np.array([(x - heights.x0_m) / 0.01, (y - heights.y0_m) / 0.01])[:, known]
+            for column, row, height in zip(*cells, z, strict=True):
+                alone = interpolate_height(heights.z_m, heights.source, column, row)
+                assert alone == pytest.approx(height, abs=1e-6)
             assert (own[POLE], own[ALL]) == (number, samples)
             assert own[[U, V, SEEN]] == pytest.approx((u, v.mean(), weight.sum()))
             if 2 * known.sum() < samples:

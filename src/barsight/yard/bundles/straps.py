@@ -64,7 +64,7 @@ _APART_M = 0.3
 
 @dataclass(frozen=True)
 class StrapSpan:
-    """Where straps hold bars together: from low_m to high_m beside a bundle's axis. rows_m: where along it;
+    """Place that straps hold together: from low_m to high_m beside a bundle's axis. rows_m: where along it;
     spread_m: how far the straps disagree on an end.
     """
 

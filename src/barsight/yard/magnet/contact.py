@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import grey_opening
 
 from barsight.core.arrays import Float64, kernel
 from barsight.yard.magnet.description import Magnet
@@ -29,13 +30,16 @@ from barsight.yard.magnet.resting_plane import (
 from barsight.yard.types import HeightMap
 
 NEWTON_PER_KG = 9.81
+HIDING_COLUMNS = 4
+"""Columns of `resting_plane.STEP_M` side by side that must be unseen to hide what stands: between two bars, where
+no picture shows the steel, nothing does."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoleContact:
     """One pole's face. gap_m: mean air gap, least_gap_m: where it is nearest to steel; gap_map_m: (across,
     along) air gaps, NaN where unknown. contact_share: of the face that lies on steel. unknown_share: of the
-    cells under it that were not seen. z_m: height of its centre. pull_n, pull_low_n: its part of the pull, 0
+    cells under it that were not seen, but for strips along it that are too narrow to hide anything. z_m: height of its centre. pull_n, pull_low_n: its part of the pull, 0
     until a load is known (`holding.hold_load`). pull_across_m: where that acts, across from its centre.
     """
 
@@ -117,7 +121,9 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
     found, first = [], 0
     for number, (columns, parts) in enumerate(shape):
         last = first + columns * parts
-        mean, least, share, unknown = (float(figure) for figure in table[number])
+        mean, least, share = (float(figure) for figure in table[number])
+        unseen = (1 - points[first:last, SEEN] / points[first:last, ALL]).reshape(columns, parts)
+        unknown = float(grey_opening(unseen, (HIDING_COLUMNS, 1), mode="nearest").mean())
         gap_map = gaps[first:last].reshape(columns, parts)
         face = float(faces[number])
         found.append(PoleContact(mean, least, share, unknown, face, gap_map))
@@ -138,17 +144,15 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
 def _gaps(
     points: Float64, height: float, roll: float, pitch: float, near: float, poles: Float64
 ) -> tuple[Float64, Float64]:
-    """Compute mean and least gap, ratios of contact and unknown cells (P, 4); (N,) gaps."""
-    table, gaps = np.zeros((len(poles), 4)), np.empty(len(points))
-    counts = np.zeros((len(poles), 4))
+    """Compute mean and least gap and the ratio of contact (P, 3); (N,) gaps."""
+    table, gaps = np.zeros((len(poles), 3)), np.empty(len(points))
+    counts = np.zeros((len(poles), 2))
     table[:, 1] = np.inf
     for k in range(len(points)):
         own = points[k]
         p = int(own[POLE])
         gaps[k] = max(height + roll * own[U] + pitch * own[V] - own[Z], 0.0)
         counts[p, 0] += 1
-        counts[p, 2] += own[SEEN]
-        counts[p, 3] += own[ALL]
         if np.isnan(own[Z]):
             gaps[k] = np.nan
             continue
@@ -159,5 +163,4 @@ def _gaps(
     for p in range(len(poles)):
         table[p, 0] = table[p, 0] / counts[p, 1] if counts[p, 1] else np.nan
         table[p, 2] /= counts[p, 0]
-        table[p, 3] = 1 - counts[p, 2] / counts[p, 3]
     return table, gaps
