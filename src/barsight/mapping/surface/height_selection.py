@@ -15,16 +15,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
-import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface.block_visibility import (
+    BLOCK,
+    NOWHERE,
+    SOMEWHERE,
+    bound_blocks,
+    highest_within,
+    supported_span,
+)
 from barsight.mapping.surface.visibility import (
     STRIDE,
-    frustum_margin,
+    is_pictured,
     is_unoccluded,
     may_be_occluded,
     point_density,
@@ -143,19 +150,22 @@ def elect_surface(
 
     around: (3 * TILE_CELLS, 3 * TILE_CELLS) `elect_by_votes` of the tile and its eight neighbours.
     """
-    known = np.isfinite(around)
-    ceiling = float(around[known].max()) if known.any() else 0.0
     box = supported_box(tile, key, cell_m, min_views)
     if box is None:
         return np.full(tile.shape[:2], -1, np.int8)
     corner = np.array(key, np.float64) * TILE_CELLS
     sights = sights.near(*box)
-    around = np.where(known, around, _NOTHING)
-    roof = np.asarray(cv2.dilate(around, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)), np.float32)
-    share, expected = _supported(
-        tile, corner, around, roof, ceiling, sights.planes(), sights.eyes, cell_m, float(min_views),
-        cell_m / sights.spacing_rad,
+    around = np.fmax(around, _NOTHING)
+    ceiling = float(around.max())
+    planes, one_point_m = sights.planes(), cell_m / sights.spacing_rad
+    blocks = bound_blocks(
+        tile, corner, highest_within(around, BLOCK), ceiling, planes, sights.eyes, cell_m, float(min_views),
+        one_point_m,
     )  # fmt: skip
+    scene = around, highest_within(around, STRIDE), ceiling
+    share, expected = _supported(
+        tile, corner, scene, planes, sights.eyes, blocks, cell_m, float(min_views), one_point_m
+    )
     return _elected(tile, share, expected, cell_m, float(min_views), settings.own_ratio, settings.along_ratio)
 
 
@@ -163,12 +173,11 @@ def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) ->
     """Return (2, 3) m, the lowest and the highest corner of the heights that min_views support; None without
     any.
     """
-    held = tile[..., Z][tile[..., VIEWS] >= min_views]
-    if held.size == 0:
+    low_m, high_m = supported_span(tile, min_views)
+    if low_m > high_m:
         return None
-    corner = np.array(key, np.float64) * TILE_CELLS
-    low, high = held.min() / cell_m, held.max() / cell_m
-    box: Float64 = np.array([[*corner, low], [*(corner + TILE_CELLS), high]]) * cell_m
+    corner = np.array(key, np.float64) * TILE_CELLS * cell_m
+    box: Float64 = np.array([[*corner, low_m], [*(corner + TILE_CELLS * cell_m), high_m]])
     return box
 
 
@@ -176,11 +185,10 @@ def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) ->
 def _supported(
     tile: Float32,
     corner: Float64,
-    around: Float32,
-    roof: Float32,
-    ceiling: float,
+    scene: tuple[Float32, Float32, float],
     planes: Float64,
     eyes: Float64,
+    blocks: tuple[Int8, Bool, Float64, Bool],
     cell_m: float,
     min_views: float,
     one_point_m: float,
@@ -189,33 +197,46 @@ def _supported(
     where fewer than min_views see or can see it or something may lie above; and how many it can expect.
 
     A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
-    further apart than cells: at ranges over one_point_m, and where it looks along the ground.
+    further apart than cells: at ranges over one_point_m, and where it looks along the ground. scene: around,
+    roof and ceiling of `is_unoccluded`. blocks: what `bound_blocks` tells.
     """
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
     point, margin = np.empty(3), np.empty(eyes.shape[0])
+    (around, roof, ceiling), (within, dense, clear, is_open) = scene, blocks
     for i in range(rows):
         for j in range(columns):
+            a, b = i // BLOCK, j // BLOCK
             for s in range(SLOTS):
                 if tile[i, j, s, VIEWS] < min_views:
                     continue
                 z = float(tile[i, j, s, Z])
-                point[0], point[1], point[2] = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z
+                x, y = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m
+                point[0], point[1], point[2] = x, y, z
                 able, votes = 0, 0.0
-                frustum_margin(point[0], point[1], z, planes, margin)
                 for k in range(margin.size):
-                    if margin[k] >= 0:
-                        seen = is_unoccluded(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
-                        if seen and is_unoccluded(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
-                            able += 1
-                            votes += point_density(point, eyes[k, 0], one_point_m)
-                covered = able >= min_views and may_be_occluded(
-                    point, i, j, around, ceiling, planes, margin, cell_m, min_views
-                )
-                if able >= min_views and not covered:
-                    share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
-                    expected[i, j, s] = votes
+                    if within[a, b, k] == NOWHERE:
+                        continue
+                    if within[a, b, k] == SOMEWHERE and not is_pictured(x, y, z, planes, k):
+                        continue
+                    is_seen = True
+                    for e in range(2):
+                        if is_seen and z < clear[a, b, k, e]:
+                            way = eyes[k, e, 0] - x, eyes[k, e, 1] - y, eyes[k, e, 2] - z
+                            is_seen = is_unoccluded(z, i, j, way, around, roof, ceiling, cell_m)
+                    if not is_seen:
+                        continue
+                    able += 1
+                    votes += 1.0 if dense[a, b, k] else point_density(point, eyes[k, 0], one_point_m)
+                if (
+                    able < min_views
+                    or not is_open[a, b]
+                    and may_be_occluded(point, i, j, around, ceiling, planes, margin, cell_m, min_views)
+                ):
+                    continue
+                share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
+                expected[i, j, s] = votes
     return share, expected
 
 
