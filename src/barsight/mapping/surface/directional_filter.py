@@ -82,8 +82,7 @@ def _add_squares(squares: Float64, beside: Float32, own: Float32, gate_m: float)
     """
     for j in range(squares.size):
         gap = np.float64(abs(beside[j] - own[j]))
-        gap = gap if gap <= gate_m else gate_m
-        squares[j] += gap * gap
+        squares[j] += gap * gap if gap <= gate_m else gate_m * gate_m
 
 
 def deblur_across(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:

@@ -6,18 +6,18 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int8, Int64
 from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.cloud import CloudPart, cloud_file, read_part
+from barsight.mapping.surface.cloud import CloudPart, cloud_file
 from barsight.mapping.surface.directional_filter import (
     blur_sigma,
     deblur_across,
@@ -76,31 +76,32 @@ class SurfaceElection:
         self._height_m = np.inf
 
     def snapshot(self, min_views: int, sights: ViewFrusta) -> Surface:
-        """Return the surface as it stands, of its own from now on; only tiles that changed are elected anew.
+        """Return the surface as it stands, without its cloud, of its own from now on; only tiles that changed
+        are elected anew.
 
         A tile that lies beside one that changed waits for its own next change, or for `finish`.
         """
         if not abs(sights.height_m - self._height_m) <= _KEPT_HEIGHT_M:
             self._height_m = sights.height_m
-        return self._surface(min_views, sights, beside=False)
+        return self._surface(min_views, sights, last=False)
 
     def finish(self, min_views: int, sights: ViewFrusta) -> Surface:
         """Return the surface at the end; the tiles in `store` are given up."""
         self._height_m = sights.height_m
-        surface = self._surface(min_views, sights, beside=True)
+        surface = self._surface(min_views, sights, last=True)
         self._store.clear()
         shutil.rmtree(self._work)
         return surface
 
-    def _surface(self, min_views: int, sights: ViewFrusta, *, beside: bool) -> Surface:
-        """beside: whether tiles count as changed for what lies beside them too."""
+    def _surface(self, min_views: int, sights: ViewFrusta, *, last: bool) -> Surface:
+        """last: whether tiles count as changed for what lies beside them too, and the cloud is written."""
         keys = self._store.keys()
         read_tile.cache_clear()
         _read_first.cache_clear()
         self._look(keys, min_views)
-        self._elect(keys, min_views, sights, beside)
-        self._finish(keys, sights, beside)
-        folder = self._linked(keys)
+        self._elect(keys, min_views, sights, last)
+        self._finish(keys, min_views, sights, last)
+        folder = self._linked(keys, (tile_file, cloud_file) if last else (tile_file,))
         figures = [self._figures[key][1] for key in keys]
         columns = [column for one in figures if one.columns for column in one.columns]
         rows = [row for one in figures if one.rows for row in one.rows]
@@ -131,8 +132,8 @@ class SurfaceElection:
         for key, box in ordered_map(look, ((key, self._store.read(key)) for key in changed)):
             self._boxes[key] = states[key], box
 
-    def _elect(self, keys: list[TileKey], min_views: int, sights: ViewFrusta, beside: bool) -> None:
-        """Elect tiles that changed; if `beside`, also those round which one did or that new views look at."""
+    def _elect(self, keys: list[TileKey], min_views: int, sights: ViewFrusta, last: bool) -> None:
+        """Elect tiles that changed; at last also those round which one did or that new views look at."""
         known = frozenset(keys)
 
         def state(key: TileKey) -> tuple[object, ...]:
@@ -146,32 +147,38 @@ class SurfaceElection:
             around = _first_around(self._first, key, known)
             winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings)
             write_tile(self._elected, key, elected_layers(tile, winner))
-            CloudPart.of(tile, winner, key, self._cell_m, min_views).write(self._elected, key)
+            np.save(_winner_file(self._elected, key), winner)
             return key
 
         states = {key: state(key) for key in keys}
-        changed = _changed(states, self._winners, beside)
+        changed = _changed(states, self._winners, last)
         for key in ordered_map(elect_tile, ((key, self._store.read(key)) for key in changed)):
             self._winners[key] = states[key], (self._winners[key][1] if key in self._winners else 0) + 1
 
-    def _finish(self, keys: list[TileKey], sights: ViewFrusta, beside: bool) -> None:
-        """Average, sharpen and fill tiles that were elected anew; if `beside`, also those round them."""
+    def _finish(self, keys: list[TileKey], min_views: int, sights: ViewFrusta, last: bool) -> None:
+        """Average, sharpen and fill tiles that were elected anew; at last also those round them, and write
+        each one's part of the cloud.
+        """
         known = frozenset(keys)
 
-        def finish_tile(key: TileKey) -> tuple[TileKey, _Figures]:
+        def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, _Figures]:
+            key, tile = item
             layers, blur = self._filled(key, known, sights)
             write_tile(self._finished, key, layers)
-            part = read_part(self._elected, key).finished(layers.z_m, layers.sigma_m, blur)
-            part.write(self._finished, key)
+            if tile is not None:
+                winner: Int8 = np.load(_winner_file(self._elected, key))
+                part = CloudPart.of(tile, winner, key, self._cell_m, min_views)
+                part.finished(layers.z_m, layers.sigma_m, blur).write(self._finished, key)
             return key, _figures(key, layers)
 
         turns = {key: turn for key, (_, turn) in self._winners.items()}
         states: dict[TileKey, tuple[object, ...]] = {
-            key: ((turns[key], self._height_m), tuple(turns.get(other, 0) for other in _around(key)))
+            key: ((turns[key], self._height_m, last), tuple(turns.get(other, 0) for other in _around(key)))
             for key in keys
         }
-        changed = _changed(states, self._figures, beside)
-        for key, figures in ordered_map(finish_tile, changed):
+        changed = _changed(states, self._figures, last)
+        items = ((key, self._store.read(key) if last else None) for key in changed)
+        for key, figures in ordered_map(finish_tile, items):
             self._figures[key] = states[key], figures
 
     def _filled(self, key: TileKey, keys: frozenset[TileKey], sights: ViewFrusta) -> tuple[Layers, Float32]:
@@ -200,11 +207,13 @@ class SurfaceElection:
         layers = Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
         return layers, blur[inner, inner]
 
-    def _linked(self, keys: list[TileKey]) -> Path:
-        """Return a folder of its own with links to the finished tiles, which are never written to again."""
+    def _linked(self, keys: list[TileKey], names: tuple[Callable[[Path, TileKey], Path], ...]) -> Path:
+        """Return a folder of its own with links to the finished tiles' files of these names, which are never
+        written to again.
+        """
         folder = Path(tempfile.mkdtemp(prefix="surface_", dir=self._folder))
         for key in keys:
-            for name in (tile_file, cloud_file):
+            for name in names:
                 os.link(name(self._finished, key), name(folder, key))
         return folder
 
@@ -212,11 +221,11 @@ class SurfaceElection:
 def _changed(
     states: dict[TileKey, tuple[object, ...]],
     done: Mapping[TileKey, tuple[tuple[object, ...], object]],
-    beside: bool,
+    last: bool,
 ) -> list[TileKey]:
     """Tiles that weren't done in the state they are in: its first part is their own, the rest is of what lies
-    round them."""
-    part = slice(None) if beside else slice(1)
+    round them, which counts at last."""
+    part = slice(None) if last else slice(1)
     return [key for key, state in states.items() if key not in done or done[key][0][part] != state[part]]
 
 
@@ -243,6 +252,10 @@ def _read_first(folder: Path, key: TileKey) -> Float32:
 
 def _first_file(folder: Path, key: TileKey) -> Path:
     return folder / f"first_{key[0]}_{key[1]}.npy"
+
+
+def _winner_file(folder: Path, key: TileKey) -> Path:
+    return folder / f"winner_{key[0]}_{key[1]}.npy"
 
 
 def _figures(key: TileKey, layers: Layers) -> _Figures:
