@@ -117,7 +117,7 @@ def test_a_hook_that_travels_along_leaves_no_ghost(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("low", "high", "held"), [(-0.5, 0.5, True), (30.0, 31.0, False), (7.0, 8.0, False)])
 def test_views_far_from_a_box_are_left_out(low: float, high: float, held: bool) -> None:
     sights = ViewFrusta.of([pose_at(0.0)], CAMERA)
-    near = sights.near(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0]))
+    near = sights.only(sights.touching(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0])))
     assert len(near.eyes) == held
 
 

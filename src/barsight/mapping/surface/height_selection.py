@@ -42,6 +42,8 @@ _ALONG = 30
 _ALIKE_CELLS = 3.0
 _BORDER_PX = 3.0
 _NOTHING = np.float32(-1e6)
+_MOVED_CELLS = 0.5
+"""A height that has moved less is seen by the same views as before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,15 +109,29 @@ class ViewFrusta:
         chosen: Bool = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
         return chosen
 
-    def near(self, low_m: Float64, high_m: Float64) -> ViewFrusta:
-        """Those views alone that are `touching` the box."""
-        chosen = self.touching(low_m, high_m)
+    def only(self, chosen: Bool) -> ViewFrusta:
+        """Those views alone; chosen: (K,)."""
         return replace(
             self,
             rotation=self.rotation[chosen],
             translation=self.translation[chosen],
             eyes=self.eyes[chosen],
         )
+
+
+@dataclass(eq=False)
+class Asked:
+    """A tile's heights as the first `views` views were asked whether they see them: (rows, columns, SLOTS, 3)
+    float32, z, how many see it and how many points these have in its cell; NaN where none was asked.
+    """
+
+    views: int
+    heights: Float32
+
+    @classmethod
+    def none(cls) -> Asked:
+        """No view was asked."""
+        return cls(0, np.full((TILE_CELLS, TILE_CELLS, SLOTS, 3), np.nan, np.float32))
 
 
 @kernel()
@@ -145,16 +161,20 @@ def elect_surface(
     cell_m: float,
     min_views: int,
     settings: MapSettings,
+    asked: Asked,
 ) -> Int8:
     """Elect which of each cell's heights is the surface, (rows, columns), -1 where none is.
 
     around: (3 * TILE_CELLS, 3 * TILE_CELLS) `elect_by_votes` of the tile and its eight neighbours.
+    asked: is brought up to date.
     """
     box = supported_box(tile, key, cell_m, min_views)
     if box is None:
         return np.full(tile.shape[:2], -1, np.int8)
     corner = np.array(key, np.float64) * TILE_CELLS
-    sights = sights.near(*box)
+    near = sights.touching(*box)
+    first_new, asked.views = int(near[: asked.views].sum()), near.size
+    sights = sights.only(near)
     around = np.fmax(around, _NOTHING)
     ceiling = float(around.max())
     planes, one_point_m = sights.planes(), cell_m / sights.spacing_rad
@@ -164,7 +184,16 @@ def elect_surface(
     )  # fmt: skip
     scene = around, highest_within(around, STRIDE), ceiling
     share, expected = _supported(
-        tile, corner, scene, planes, sights.eyes, blocks, cell_m, float(min_views), one_point_m
+        tile,
+        corner,
+        scene,
+        planes,
+        sights.eyes,
+        blocks,
+        cell_m,
+        float(min_views),
+        one_point_m,
+        (first_new, asked.heights),
     )
     return _elected(tile, share, expected, cell_m, float(min_views), settings.own_ratio, settings.along_ratio)
 
@@ -192,19 +221,23 @@ def _supported(
     cell_m: float,
     min_views: float,
     one_point_m: float,
+    asked: tuple[int, Float32],
 ) -> tuple[Float32, Float32]:
     """Compute support, two arrays (rows, columns, SLOTS): the ratio of votes to those a height can expect, -1
     where fewer than min_views see or can see it or something may lie above; and how many it can expect.
 
     A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
     further apart than cells: at ranges over one_point_m, and where it looks along the ground. scene: around,
-    roof and ceiling of `is_unoccluded`. blocks: what `bound_blocks` tells.
+    roof and ceiling of `is_unoccluded`. blocks: what `bound_blocks` tells. asked: the first view that wasn't
+    yet, and what those before it see, of `Asked`; it holds for a height that has hardly moved, and is brought
+    up to date.
     """
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
     point, margin = np.empty(3), np.empty(eyes.shape[0])
     (around, roof, ceiling), (within, dense, clear, is_open) = scene, blocks
+    first_new, known = asked
     for i in range(rows):
         for j in range(columns):
             a, b = i // BLOCK, j // BLOCK
@@ -214,8 +247,12 @@ def _supported(
                 z = float(tile[i, j, s, Z])
                 x, y = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m
                 point[0], point[1], point[2] = x, y, z
-                able, votes = 0, 0.0
-                for k in range(margin.size):
+                able, votes, first = 0.0, 0.0, 0
+                if abs(known[i, j, s, 0] - z) <= _MOVED_CELLS * cell_m:
+                    able, votes, first = known[i, j, s, 1], known[i, j, s, 2], first_new
+                else:
+                    known[i, j, s, 0] = z
+                for k in range(first, margin.size):
                     if within[a, b, k] == NOWHERE:
                         continue
                     if within[a, b, k] == SOMEWHERE and not is_pictured(x, y, z, planes, k):
@@ -229,10 +266,11 @@ def _supported(
                         continue
                     able += 1
                     votes += 1.0 if dense[a, b, k] else point_density(point, eyes[k, 0], one_point_m)
-                if (
-                    able < min_views
-                    or not is_open[a, b]
-                    and may_be_occluded(point, i, j, around, ceiling, planes, margin, cell_m, min_views)
+                known[i, j, s, 1], known[i, j, s, 2] = able, votes
+                if able < min_views:
+                    continue
+                if not is_open[a, b] and may_be_occluded(
+                    point, i, j, around, ceiling, planes, margin, cell_m, min_views
                 ):
                     continue
                 share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
