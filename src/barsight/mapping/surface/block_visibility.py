@@ -11,36 +11,36 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
+from barsight.mapping.surface.visibility import STRIDE
 from barsight.mapping.tiles import TILE_CELLS, VIEWS, Z
 
-BLOCK = 4
-"""Cells to a side of a block."""
+BLOCK = STRIDE
+"""Cells to a side of a block: what is highest about it is highest about a stride."""
 NOWHERE, SOMEWHERE, EVERYWHERE = 0, 1, 2
 """Where in a block heights may lie in both pictures of a view."""
 _SURE = 1e-6
 """More than rounding adds to any bound here, in its own unit (m, or m px)."""
 
 
-def highest_within(around: Float32, cells: int) -> Float32:
-    """Compute the highest of all within so many cells, or a little further, for each square of so many cells
-    to a side.
-    """
-    highest = reduce(np.maximum, (around[n::cells] for n in range(cells)))
-    highest = reduce(np.maximum, (highest[:, n::cells] for n in range(cells)))
+def highest_about(around: Float32) -> Float32:
+    """Compute the highest of each block's cells and of all about it, a block wide."""
+    highest = reduce(np.maximum, (around[n::BLOCK] for n in range(BLOCK)))
+    highest = reduce(np.maximum, (highest[:, n::BLOCK] for n in range(BLOCK)))
     return np.asarray(cv2.dilate(highest, np.ones((3, 3), np.uint8)), np.float32)
 
 
 @kernel()
 def bound_blocks(
     tile: Float32, corner: Float64, roof: Float32, ceiling: float, planes: Float64, eyes: Float64,
-    cell_m: float, min_views: float, one_point_m: float,
+    cell_m: float, min_views: float, one_point_m: float, first: int,
 ) -> tuple[Int8, Bool, Float64, Bool]:  # fmt: skip
     """Bound what K views see of a tile's blocks (B, B): where their heights lie in both pictures, (B, B, K);
     whether `point_density` is 1 all over, (B, B, K); from which height on `is_unoccluded` holds for either
     camera, (B, B, K, 2) m, inf if that isn't known; and whether min_views views see each of its cells at the
     ceiling, (B, B).
 
-    roof: see `clear_height`. A block without heights is in no picture.
+    roof: see `clear_height`. first: for views before it nothing but where their pictures lie is told. A block
+    without heights is in no picture.
     """
     blocks, views = TILE_CELLS // BLOCK, planes.shape[2]
     within, dense = np.zeros((blocks, blocks, views), np.int8), np.zeros((blocks, blocks, views), np.bool_)
@@ -62,7 +62,7 @@ def bound_blocks(
                 if most[k] < 0:
                     continue
                 within[i, j, k] = EVERYWHERE if least[k] >= 0 else SOMEWHERE
-                for e in range(2):
+                for e in range(2 if k >= first else 0):
                     way = eyes[k, e, 0] - middle[0], eyes[k, e, 1] - middle[1], eyes[k, e, 2] - middle[2]
                     clear[i, j, k, e] = clear_height((low, high), at, way, roof, ceiling, cell_m)
                     if e == 0:
@@ -118,7 +118,7 @@ def clear_height(
     """Bound from above the heights from which `is_unoccluded` holds in each cell of a block; inf if unknown.
 
     span: its lowest and highest height, m. at: row and column of its middle in the middle tile. way: from the
-    middle of both to the eye, m. roof: the highest within a block, of `highest_within`. A block's lines of
+    middle of both to the eye, m. roof: of `highest_about`. A block's lines of
     sight never lie further apart than its cells: half a block about the middle's and half a block onward, the
     roof holds all.
     """

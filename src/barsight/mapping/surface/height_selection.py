@@ -26,11 +26,10 @@ from barsight.mapping.surface.block_visibility import (
     NOWHERE,
     SOMEWHERE,
     bound_blocks,
-    highest_within,
+    highest_about,
     supported_span,
 )
 from barsight.mapping.surface.visibility import (
-    STRIDE,
     is_pictured,
     is_unoccluded,
     may_be_occluded,
@@ -178,11 +177,11 @@ def elect_surface(
     around = np.fmax(around, _NOTHING)
     ceiling = float(around.max())
     planes, one_point_m = sights.planes(), cell_m / sights.spacing_rad
+    roof = highest_about(around)
     blocks = bound_blocks(
-        tile, corner, highest_within(around, BLOCK), ceiling, planes, sights.eyes, cell_m, float(min_views),
-        one_point_m,
-    )  # fmt: skip
-    scene = around, highest_within(around, STRIDE), ceiling
+        tile, corner, roof, ceiling, planes, sights.eyes, cell_m, float(min_views), one_point_m, first_new
+    )
+    scene = around, roof, ceiling
     share, expected = _supported(
         tile,
         corner,

@@ -100,8 +100,8 @@ def is_unoccluded(
     """Check that no cell between rises over the line from a point at z_m, in a cell of the middle tile, to an
     eye above it. way: from the point to the eye, m.
 
-    roof: the highest of `around` within a stride, of `highest_within`. A line over the roof skips as many
-    cells: it only rises.
+    roof: the highest within a stride, of `highest_about`. A line over the roof skips as many cells: it only
+    rises.
     """
     x, y, z = way
     length = max(abs(x), abs(y)) / cell_m
