@@ -11,7 +11,9 @@ from barsight.core.types import HeightSource, RectifiedCamera
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.height_selection import ViewFrusta, elect_by_votes
+from barsight.mapping.surface import height_selection
+from barsight.mapping.surface.block_visibility import EVERYWHERE, SOMEWHERE, bound_blocks
+from barsight.mapping.surface.height_selection import Asked, ViewFrusta, elect_by_votes, elect_surface
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Layers
 from barsight.mapping.tiles import FIELDS, SLOTS, VIEWS, TileStore, Z
@@ -117,7 +119,7 @@ def test_a_hook_that_travels_along_leaves_no_ghost(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("low", "high", "held"), [(-0.5, 0.5, True), (30.0, 31.0, False), (7.0, 8.0, False)])
 def test_views_far_from_a_box_are_left_out(low: float, high: float, held: bool) -> None:
     sights = ViewFrusta.of([pose_at(0.0)], CAMERA)
-    near = sights.near(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0]))
+    near = sights.only(sights.touching(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0])))
     assert len(near.eyes) == held
 
 
@@ -175,3 +177,72 @@ def test_first_heights_are_the_highest_with_enough_votes() -> None:
         needed = max(3, 0.35 * tile[i, j, :, VIEWS].max())
         enough = [z for z, views in tile[i, j][:, [Z, VIEWS]] if views >= needed]
         np.testing.assert_equal(found[i, j], max(enough, default=np.float32(np.nan)))
+
+
+def drawn_yard(folder: Path) -> tuple[TileStore, list[Pose]]:
+    """Nine views of 90 x 70 cells: steps of up to 0.9 m, and in every view heights that are wrong."""
+    x, y = (a.ravel() for a in block(90, 70, -10, -20))
+    z = 0.3 * np.random.default_rng(4).integers(0, 4, (8, 10))[(y + 20) // 10, (x + 10) // 10]
+    store, rng, poses = TileStore(folder, 64), np.random.default_rng(5), []
+    for eye in EYES_X_M:
+        wrong = rng.random(x.size) < 0.1
+        fuse_view(store, view(x, y, np.where(wrong, 0.3 * rng.integers(0, 5, x.size), z)), MapSettings())
+        poses.append(pose_at(eye / 2))
+    return store, poses
+
+
+def elected(store: TileStore, poses: list[Pose], asked: Asked) -> tuple[np.ndarray, np.ndarray]:
+    """The winners of the tile at (0, 0) and how its views see its heights."""
+    first = {key: elect_by_votes(store.read(key), 2, 0.35) for key in sorted(store.keys())}
+    nothing = np.full((256, 256), np.nan, np.float32)
+    around = np.block([[first.get((i, j), nothing) for i in (-1, 0, 1)] for j in (-1, 0, 1)])
+    sights = ViewFrusta.of(poses, replace(CAMERA, height=60, cy_px=30.0))
+    winner = elect_surface(store.read((0, 0)), (0, 0), around, sights, CELL_M, 2, MapSettings(), asked)
+    return winner, asked.heights
+
+
+def test_what_is_said_of_blocks_is_what_their_cells_would_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, poses = drawn_yard(tmp_path)
+    quick = elected(store, poses, Asked.none())
+    told = []
+
+    def nothing_told(*values: object) -> tuple[np.ndarray, ...]:
+        told.extend(bound_blocks(*values))
+        within, dense, clear, is_open = told
+        return 0 * within + SOMEWHERE, dense & False, np.full_like(clear, np.inf), is_open & False
+
+    monkeypatch.setattr(height_selection, "bound_blocks", nothing_told)
+    slow = elected(store, poses, Asked.none())
+    for one, other in zip(quick, slow, strict=True):
+        np.testing.assert_array_equal(one, other)
+    within, dense, clear, is_open = told
+    shares = [(within[:12, :20] == where).mean() for where in (SOMEWHERE, EVERYWHERE)]
+    assert 0.05 < shares[0] < 0.5
+    assert 0.3 < shares[1] < 0.9
+    assert 0.3 < np.isfinite(clear[:12, :20]).mean() < 1
+    assert dense.any()
+    assert is_open.any()
+    votes = quick[1][..., 1][np.isfinite(quick[1][..., 1])]
+    assert len(np.unique(votes)) == len(EYES_X_M) + 1
+
+
+def test_views_asked_before_arent_asked_again(tmp_path: Path) -> None:
+    """Asked in two turns views say what they say in one; those of a height that moved are asked anew."""
+    store, poses = drawn_yard(tmp_path)
+    winner, heights = elected(store, poses, Asked.none())
+    asked = Asked.none()
+    elected(store, poses[:5], asked)
+    assert asked.views == 5
+    forged = np.isfinite(asked.heights[..., 0])
+    forged[20:] = False
+    asked.heights[forged, 0] += 1.0
+    asked.heights[forged, 1:] = 50.0
+    np.testing.assert_array_equal(elected(store, poses, asked)[0], winner)
+    np.testing.assert_array_equal(asked.heights, heights)
+    asked.heights[forged, 1] = 50.0
+    elected(store, poses, asked)
+    assert asked.views == 9
+    assert forged.sum() > 100
+    assert (asked.heights[forged, 1] == 50).all()

@@ -29,7 +29,7 @@ PRIOR_VIEWS = 4.0
 
 
 def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -> None:
-    """Add one view to the tiles in `store`, of which as many more stay in memory as the view has touched."""
+    """Add one view to the tiles in `store`, of which as many stay in memory as the view has touched."""
     columns, rows = view.x // TILE_CELLS, view.y // TILE_CELLS
     numbers = rows.astype(np.int64) * (1 << 31) + columns
     order = np.argsort(numbers, kind="stable")
@@ -49,7 +49,7 @@ def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -
             view.central,
             (settings.gate_sigma, settings.min_gate_m),
         )
-    store.hold(2 * edges.size)
+    store.hold(edges.size)
 
 
 @kernel()

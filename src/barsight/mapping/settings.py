@@ -39,8 +39,8 @@ class MapSettings:
     max_sigma_m: float = 0.5
     """Points less sure than this are left out."""
     resident_tiles: int = 64
-    """At most so many tiles of 256 x 256 cells are kept in memory (7 MiB each), and no more than twice those
-    that a view touches; the others wait on disk."""
+    """At most so many tiles of 256 x 256 cells are kept in memory (7 MiB each), and no more than the
+    last view has touched; the others wait on disk."""
     contours: Literal["fused", "paper"] = "fused"
     """fused: the surface as it is, unknown where not seen. paper: its median, cubic interpolation and
     filter; what it fills is flagged."""

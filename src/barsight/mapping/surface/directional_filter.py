@@ -38,40 +38,51 @@ def smooth_along_bars(z: Float32, weight: Float32, gate_m: float, reach: int) ->
 def _lengthways(
     z: Float32, weight: Float32, gate_m: float, rows: Int64, columns: Int64, reach: int
 ) -> tuple[Float32, Int8]:
-    """Average along the best direction.
+    """Average along the best direction, the first of those that are alike.
 
-    z, weight: with `reach` cells more on each side. What the neighbour chose is tried first: it is mostly
-    right, and so the others are given up early.
+    z, weight: with `reach` cells more on each side. The squares of a whole row of cells are summed at once,
+    direction by direction, which vector instructions do.
     """
     height, width = z.shape[0] - 2 * reach, z.shape[1] - 2 * reach
     out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)
-    likely = 0
+    least, squares, best = np.empty(width), np.empty(width), np.empty(width, np.int64)
     for i in range(height):
+        own = z[i + reach, reach : reach + width]
+        least[:] = np.inf
+        for d in range(rows.shape[0]):
+            squares[:] = 0
+            for k in range(rows.shape[1]):
+                b = reach + columns[d, k]
+                if rows[d, k] == 0 and columns[d, k] == 0:
+                    continue
+                _add_squares(squares, z[i + reach + rows[d, k], b : b + width], own, gate_m)
+            for j in range(width):
+                best[j] = d if squares[j] < least[j] else best[j]
+                least[j] = min(squares[j], least[j])
         for j in range(width):
-            own = z[i + reach, j + reach]
-            out[i, j] = own
+            out[i, j] = own[j]
             if not weight[i + reach, j + reach] > 0:
                 continue
-            least, best = np.inf, rows.shape[0]
-            for turn in range(rows.shape[0]):
-                d = likely if turn == 0 else turn - (turn <= likely)
-                off, total, squares = 0.0, 0.0, 0.0
-                for k in range(rows.shape[1]):
-                    a, b = i + reach + rows[d, k], j + reach + columns[d, k]
-                    gap = z[a, b] - own
-                    if abs(gap) <= gate_m:
-                        off += weight[a, b] * gap
-                        total += weight[a, b]
-                    else:
-                        gap = gate_m
-                    squares += gap * gap
-                    if squares > least:
-                        break
-                if squares < least or (squares == least and d < best):
-                    least, best = squares, d
-                    out[i, j] = own + off / total
-            chosen[i, j] = likely = best
+            chosen[i, j] = best[j]
+            off, total = 0.0, 0.0
+            for k in range(rows.shape[1]):
+                a, b = i + reach + rows[best[j], k], j + reach + columns[best[j], k]
+                gap = z[a, b] - own[j]
+                if abs(gap) <= gate_m:
+                    off += weight[a, b] * gap
+                    total += weight[a, b]
+            out[i, j] = own[j] + off / total
     return out, chosen
+
+
+@kernel()
+def _add_squares(squares: Float64, beside: Float32, own: Float32, gate_m: float) -> None:
+    """Add the squared differences of two rows of heights (W,), each no more than the gate; as much where one
+    is missing.
+    """
+    for j in range(squares.size):
+        gap = np.float64(abs(beside[j] - own[j]))
+        squares[j] += gap * gap if gap <= gate_m else gate_m * gate_m
 
 
 def deblur_across(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:

@@ -15,16 +15,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
-import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface.block_visibility import (
+    BLOCK,
+    NOWHERE,
+    SOMEWHERE,
+    bound_blocks,
+    highest_about,
+    supported_span,
+)
 from barsight.mapping.surface.visibility import (
-    STRIDE,
-    frustum_margin,
+    is_pictured,
     is_unoccluded,
     may_be_occluded,
     point_density,
@@ -35,6 +41,8 @@ _ALONG = 30
 _ALIKE_CELLS = 3.0
 _BORDER_PX = 3.0
 _NOTHING = np.float32(-1e6)
+_MOVED_CELLS = 0.5
+"""A height that has moved less is seen by the same views as before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,15 +108,29 @@ class ViewFrusta:
         chosen: Bool = (touched | (depth <= 0).any(1)) & (depth > 0).any(1)
         return chosen
 
-    def near(self, low_m: Float64, high_m: Float64) -> ViewFrusta:
-        """Those views alone that are `touching` the box."""
-        chosen = self.touching(low_m, high_m)
+    def only(self, chosen: Bool) -> ViewFrusta:
+        """Those views alone; chosen: (K,)."""
         return replace(
             self,
             rotation=self.rotation[chosen],
             translation=self.translation[chosen],
             eyes=self.eyes[chosen],
         )
+
+
+@dataclass(eq=False)
+class Asked:
+    """A tile's heights as the first `views` views were asked whether they see them: (rows, columns, SLOTS, 3)
+    float32, z, how many see it and how many points these have in its cell; NaN where none was asked.
+    """
+
+    views: int
+    heights: Float32
+
+    @classmethod
+    def none(cls) -> Asked:
+        """No view was asked."""
+        return cls(0, np.full((TILE_CELLS, TILE_CELLS, SLOTS, 3), np.nan, np.float32))
 
 
 @kernel()
@@ -138,24 +160,40 @@ def elect_surface(
     cell_m: float,
     min_views: int,
     settings: MapSettings,
+    asked: Asked,
 ) -> Int8:
     """Elect which of each cell's heights is the surface, (rows, columns), -1 where none is.
 
     around: (3 * TILE_CELLS, 3 * TILE_CELLS) `elect_by_votes` of the tile and its eight neighbours.
+    asked: is brought up to date.
     """
-    known = np.isfinite(around)
-    ceiling = float(around[known].max()) if known.any() else 0.0
     box = supported_box(tile, key, cell_m, min_views)
     if box is None:
         return np.full(tile.shape[:2], -1, np.int8)
     corner = np.array(key, np.float64) * TILE_CELLS
-    sights = sights.near(*box)
-    around = np.where(known, around, _NOTHING)
-    roof = np.asarray(cv2.dilate(around, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)), np.float32)
+    near = sights.touching(*box)
+    first_new, asked.views = int(near[: asked.views].sum()), near.size
+    sights = sights.only(near)
+    around = np.fmax(around, _NOTHING)
+    ceiling = float(around.max())
+    planes, one_point_m = sights.planes(), cell_m / sights.spacing_rad
+    roof = highest_about(around)
+    blocks = bound_blocks(
+        tile, corner, roof, ceiling, planes, sights.eyes, cell_m, float(min_views), one_point_m, first_new
+    )
+    scene = around, roof, ceiling
     share, expected = _supported(
-        tile, corner, around, roof, ceiling, sights.planes(), sights.eyes, cell_m, float(min_views),
-        cell_m / sights.spacing_rad,
-    )  # fmt: skip
+        tile,
+        corner,
+        scene,
+        planes,
+        sights.eyes,
+        blocks,
+        cell_m,
+        float(min_views),
+        one_point_m,
+        (first_new, asked.heights),
+    )
     return _elected(tile, share, expected, cell_m, float(min_views), settings.own_ratio, settings.along_ratio)
 
 
@@ -163,12 +201,11 @@ def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) ->
     """Return (2, 3) m, the lowest and the highest corner of the heights that min_views support; None without
     any.
     """
-    held = tile[..., Z][tile[..., VIEWS] >= min_views]
-    if held.size == 0:
+    low_m, high_m = supported_span(tile, min_views)
+    if low_m > high_m:
         return None
-    corner = np.array(key, np.float64) * TILE_CELLS
-    low, high = held.min() / cell_m, held.max() / cell_m
-    box: Float64 = np.array([[*corner, low], [*(corner + TILE_CELLS), high]]) * cell_m
+    corner = np.array(key, np.float64) * TILE_CELLS * cell_m
+    box: Float64 = np.array([[*corner, low_m], [*(corner + TILE_CELLS * cell_m), high_m]])
     return box
 
 
@@ -176,46 +213,67 @@ def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) ->
 def _supported(
     tile: Float32,
     corner: Float64,
-    around: Float32,
-    roof: Float32,
-    ceiling: float,
+    scene: tuple[Float32, Float32, float],
     planes: Float64,
     eyes: Float64,
+    blocks: tuple[Int8, Bool, Float64, Bool],
     cell_m: float,
     min_views: float,
     one_point_m: float,
+    asked: tuple[int, Float32],
 ) -> tuple[Float32, Float32]:
     """Compute support, two arrays (rows, columns, SLOTS): the ratio of votes to those a height can expect, -1
     where fewer than min_views see or can see it or something may lie above; and how many it can expect.
 
     A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
-    further apart than cells: at ranges over one_point_m, and where it looks along the ground.
+    further apart than cells: at ranges over one_point_m, and where it looks along the ground. scene: around,
+    roof and ceiling of `is_unoccluded`. blocks: what `bound_blocks` tells. asked: the first view that wasn't
+    yet, and what those before it see, of `Asked`; it holds for a height that has hardly moved, and is brought
+    up to date.
     """
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
     point, margin = np.empty(3), np.empty(eyes.shape[0])
+    (around, roof, ceiling), (within, dense, clear, is_open) = scene, blocks
+    first_new, known = asked
     for i in range(rows):
         for j in range(columns):
+            a, b = i // BLOCK, j // BLOCK
             for s in range(SLOTS):
                 if tile[i, j, s, VIEWS] < min_views:
                     continue
                 z = float(tile[i, j, s, Z])
-                point[0], point[1], point[2] = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m, z
-                able, votes = 0, 0.0
-                frustum_margin(point[0], point[1], z, planes, margin)
-                for k in range(margin.size):
-                    if margin[k] >= 0:
-                        seen = is_unoccluded(point, i, j, eyes[k, 0], around, roof, ceiling, cell_m)
-                        if seen and is_unoccluded(point, i, j, eyes[k, 1], around, roof, ceiling, cell_m):
-                            able += 1
-                            votes += point_density(point, eyes[k, 0], one_point_m)
-                covered = able >= min_views and may_be_occluded(
+                x, y = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m
+                point[0], point[1], point[2] = x, y, z
+                able, votes, first = 0.0, 0.0, 0
+                if abs(known[i, j, s, 0] - z) <= _MOVED_CELLS * cell_m:
+                    able, votes, first = known[i, j, s, 1], known[i, j, s, 2], first_new
+                else:
+                    known[i, j, s, 0] = z
+                for k in range(first, margin.size):
+                    if within[a, b, k] == NOWHERE:
+                        continue
+                    if within[a, b, k] == SOMEWHERE and not is_pictured(x, y, z, planes, k):
+                        continue
+                    is_seen = True
+                    for e in range(2):
+                        if is_seen and z < clear[a, b, k, e]:
+                            way = eyes[k, e, 0] - x, eyes[k, e, 1] - y, eyes[k, e, 2] - z
+                            is_seen = is_unoccluded(z, i, j, way, around, roof, ceiling, cell_m)
+                    if not is_seen:
+                        continue
+                    able += 1
+                    votes += 1.0 if dense[a, b, k] else point_density(point, eyes[k, 0], one_point_m)
+                known[i, j, s, 1], known[i, j, s, 2] = able, votes
+                if able < min_views:
+                    continue
+                if not is_open[a, b] and may_be_occluded(
                     point, i, j, around, ceiling, planes, margin, cell_m, min_views
-                )
-                if able >= min_views and not covered:
-                    share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
-                    expected[i, j, s] = votes
+                ):
+                    continue
+                share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
+                expected[i, j, s] = votes
     return share, expected
 
 

@@ -6,25 +6,25 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Int8
 from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
-from barsight.mapping.surface.cloud import CloudPart, cloud_file, read_part
+from barsight.mapping.surface.cloud import CloudPart, cloud_file
 from barsight.mapping.surface.directional_filter import (
     blur_sigma,
     deblur_across,
     smooth_along_bars,
     valley_mask,
 )
-from barsight.mapping.surface.height_selection import ViewFrusta, elect_by_votes, elect_surface, supported_box
+from barsight.mapping.surface.height_selection import Asked, ViewFrusta, elect_by_votes, elect_surface
 from barsight.mapping.surface.surface import (
     Layers,
     Surface,
@@ -70,38 +70,48 @@ class SurfaceElection:
         for made in (self._first, self._elected, self._finished):
             made.mkdir()
         self._work = work
-        self._boxes: dict[TileKey, tuple[tuple[int, int], Float64 | None]] = {}
-        self._winners: dict[TileKey, tuple[tuple[object, ...], int]] = {}
-        self._figures: dict[TileKey, tuple[tuple[object, ...], _Figures]] = {}
+        self._states: dict[TileKey, tuple[int, int]] = {}
+        self._asked: dict[TileKey, int] = {}
+        self._figures: dict[TileKey, _Figures] = {}
         self._height_m = np.inf
 
     def snapshot(self, min_views: int, sights: ViewFrusta) -> Surface:
-        """Return the surface as it stands, of its own from now on; only tiles that changed are elected anew.
+        """Return the surface as it stands, without its cloud, of its own from now on; only tiles that changed
+        are elected anew.
 
-        A tile that lies beside one that changed waits for its own next change, or for `finish`.
+        A tile that lies beside one that changed waits for its own next change, and a view is asked once
+        whether it sees a height, until that moves.
         """
+        keys = self._store.keys()
+        states = {key: (self._store.version(key), min_views) for key in keys}
+        changed = [key for key in keys if self._states.get(key) != states[key]]
+        self._elect(changed, min_views, sights, last=False)
+        self._states |= states
         if not abs(sights.height_m - self._height_m) <= _KEPT_HEIGHT_M:
-            self._height_m = sights.height_m
-        return self._surface(min_views, sights, beside=False)
+            self._height_m, changed = sights.height_m, keys
+        self._finish(changed, sights)
+        return self._surface(tile_file)
 
     def finish(self, min_views: int, sights: ViewFrusta) -> Surface:
-        """Return the surface at the end; the tiles in `store` are given up."""
-        self._height_m = sights.height_m
-        surface = self._surface(min_views, sights, beside=True)
+        """Return the surface at the end, all elected from the start; the tiles in `store` are given up."""
+        keys, self._height_m = self._store.keys(), sights.height_m
+        self._elect(keys, min_views, sights, last=True)
+        self._finish(keys, sights, min_views)
+        surface = self._surface(tile_file, cloud_file)
         self._store.clear()
         shutil.rmtree(self._work)
         return surface
 
-    def _surface(self, min_views: int, sights: ViewFrusta, *, beside: bool) -> Surface:
-        """beside: whether tiles count as changed for what lies beside them too."""
+    def _surface(self, *names: Callable[[Path, TileKey], Path]) -> Surface:
+        """Gather the finished tiles in a folder of its own, by links to their files of these names, which are
+        never written to again.
+        """
         keys = self._store.keys()
-        read_tile.cache_clear()
-        _read_first.cache_clear()
-        self._look(keys, min_views)
-        self._elect(keys, min_views, sights, beside)
-        self._finish(keys, sights, beside)
-        folder = self._linked(keys)
-        figures = [self._figures[key][1] for key in keys]
+        folder = Path(tempfile.mkdtemp(prefix="surface_", dir=self._folder))
+        for key in keys:
+            for name in names:
+                os.link(name(self._finished, key), name(folder, key))
+        figures = [self._figures[key] for key in keys]
         columns = [column for one in figures if one.columns for column in one.columns]
         rows = [row for one in figures if one.rows for row in one.rows]
         sigmas = np.concatenate([one.sigmas_m for one in figures]) if figures else np.empty(0)
@@ -118,61 +128,50 @@ class SurfaceElection:
         weakref.finalize(surface, shutil.rmtree, folder, ignore_errors=True)
         return surface
 
-    def _look(self, keys: list[TileKey], min_views: int) -> None:
-        """Write the changed tiles' first heights."""
+    def _elect(self, keys: list[TileKey], min_views: int, sights: ViewFrusta, *, last: bool) -> None:
+        """Elect these tiles, at last with no regard to what was asked for snapshots."""
+        known, read = frozenset(self._store.keys()), self._store.read
 
-        def look(item: tuple[TileKey, Float32]) -> tuple[TileKey, Float64 | None]:
+        def look(item: tuple[TileKey, Float32]) -> None:
             key, tile = item
             np.save(_first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
-            return key, supported_box(tile, key, self._cell_m, min_views)
 
-        states = {key: (self._store.version(key), min_views) for key in keys}
-        changed = [key for key in keys if key not in self._boxes or self._boxes[key][0] != states[key]]
-        for key, box in ordered_map(look, ((key, self._store.read(key)) for key in changed)):
-            self._boxes[key] = states[key], box
-
-    def _elect(self, keys: list[TileKey], min_views: int, sights: ViewFrusta, beside: bool) -> None:
-        """Elect tiles that changed; if `beside`, also those round which one did or that new views look at."""
-        known = frozenset(keys)
-
-        def state(key: TileKey) -> tuple[object, ...]:
-            box = self._boxes[key][1]
-            views: Int64 = np.flatnonzero(sights.touching(*box)) if box is not None else np.empty(0, np.int64)
-            around = tuple(self._boxes.get(other, (None,))[0] for other in _around(key))
-            return self._boxes[key][0], views.tobytes(), around
-
-        def elect_tile(item: tuple[TileKey, Float32]) -> TileKey:
+        def elect_tile(item: tuple[TileKey, Float32]) -> None:
             key, tile = item
-            around = _first_around(self._first, key, known)
-            winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings)
+            around, asked = _first_around(self._first, key, known), Asked.none()
+            if not last and key in self._asked:
+                asked = Asked(self._asked[key], np.load(_asked_file(self._elected, key)))
+            winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
-            CloudPart.of(tile, winner, key, self._cell_m, min_views).write(self._elected, key)
-            return key
+            np.save(_winner_file(self._elected, key), winner)
+            if not last:
+                np.save(_asked_file(self._elected, key), asked.heights)
+                self._asked[key] = asked.views
 
-        states = {key: state(key) for key in keys}
-        changed = _changed(states, self._winners, beside)
-        for key in ordered_map(elect_tile, ((key, self._store.read(key)) for key in changed)):
-            self._winners[key] = states[key], (self._winners[key][1] if key in self._winners else 0) + 1
+        _read_first.cache_clear()
+        for step in (look, elect_tile):
+            for _ in ordered_map(step, ((key, read(key)) for key in keys)):
+                pass
 
-    def _finish(self, keys: list[TileKey], sights: ViewFrusta, beside: bool) -> None:
-        """Average, sharpen and fill tiles that were elected anew; if `beside`, also those round them."""
-        known = frozenset(keys)
+    def _finish(self, keys: list[TileKey], sights: ViewFrusta, cloud_views: int | None = None) -> None:
+        """Average, sharpen and fill these tiles; write the cloud of heights that cloud_views views support,
+        if it is given.
+        """
+        known = frozenset(self._store.keys())
 
-        def finish_tile(key: TileKey) -> tuple[TileKey, _Figures]:
+        def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, _Figures]:
+            key, tile = item
             layers, blur = self._filled(key, known, sights)
             write_tile(self._finished, key, layers)
-            part = read_part(self._elected, key).finished(layers.z_m, layers.sigma_m, blur)
-            part.write(self._finished, key)
+            if tile is not None and cloud_views is not None:
+                winner: Int8 = np.load(_winner_file(self._elected, key))
+                part = CloudPart.of(tile, winner, key, self._cell_m, cloud_views)
+                part.finished(layers.z_m, layers.sigma_m, blur).write(self._finished, key)
             return key, _figures(key, layers)
 
-        turns = {key: turn for key, (_, turn) in self._winners.items()}
-        states: dict[TileKey, tuple[object, ...]] = {
-            key: ((turns[key], self._height_m), tuple(turns.get(other, 0) for other in _around(key)))
-            for key in keys
-        }
-        changed = _changed(states, self._figures, beside)
-        for key, figures in ordered_map(finish_tile, changed):
-            self._figures[key] = states[key], figures
+        read_tile.cache_clear()
+        items = ((key, None if cloud_views is None else self._store.read(key)) for key in keys)
+        self._figures |= ordered_map(finish_tile, items)
 
     def _filled(self, key: TileKey, keys: frozenset[TileKey], sights: ViewFrusta) -> tuple[Layers, Float32]:
         """Average the tile lengthways, sharpen it, fill its narrow gaps, looking at most the halo around it;
@@ -200,25 +199,6 @@ class SurfaceElection:
         layers = Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
         return layers, blur[inner, inner]
 
-    def _linked(self, keys: list[TileKey]) -> Path:
-        """Return a folder of its own with links to the finished tiles, which are never written to again."""
-        folder = Path(tempfile.mkdtemp(prefix="surface_", dir=self._folder))
-        for key in keys:
-            for name in (tile_file, cloud_file):
-                os.link(name(self._finished, key), name(folder, key))
-        return folder
-
-
-def _changed(
-    states: dict[TileKey, tuple[object, ...]],
-    done: Mapping[TileKey, tuple[tuple[object, ...], object]],
-    beside: bool,
-) -> list[TileKey]:
-    """Tiles that weren't done in the state they are in: its first part is their own, the rest is of what lies
-    round them."""
-    part = slice(None) if beside else slice(1)
-    return [key for key, state in states.items() if key not in done or done[key][0][part] != state[part]]
-
 
 def _around(key: TileKey) -> list[TileKey]:
     """Return a tile and its eight neighbours."""
@@ -243,6 +223,14 @@ def _read_first(folder: Path, key: TileKey) -> Float32:
 
 def _first_file(folder: Path, key: TileKey) -> Path:
     return folder / f"first_{key[0]}_{key[1]}.npy"
+
+
+def _asked_file(folder: Path, key: TileKey) -> Path:
+    return folder / f"asked_{key[0]}_{key[1]}.npy"
+
+
+def _winner_file(folder: Path, key: TileKey) -> Path:
+    return folder / f"winner_{key[0]}_{key[1]}.npy"
 
 
 def _figures(key: TileKey, layers: Layers) -> _Figures:

@@ -77,7 +77,7 @@ class Surface:
 
     def cloud(self) -> Iterator[CloudPart]:
         """Yield every height that enough views support, sides and lower surfaces included, tile by tile;
-        those that are the surface are as it has them.
+        those that are the surface are as it has them. A snapshot has none.
         """
         for key in sorted(self.tiles):
             yield read_part(self.folder, key)

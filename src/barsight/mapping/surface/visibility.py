@@ -10,7 +10,7 @@ from barsight.mapping.tiles import TILE_CELLS
 _CUT_CELLS = 30
 _CUT_MARGIN_CELLS = 3
 _OVERHANG_CELLS = 10.0
-STRIDE = 8
+STRIDE = 4
 """Cells that a line of sight passes at once where all around lies below it."""
 
 
@@ -20,6 +20,16 @@ def point_density(point: Float64, eye: Float64, one_point_m: float) -> float:
     x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
     squared = x * x + y * y + z * z
     return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
+
+
+@kernel()
+def is_pictured(x_m: float, y_m: float, z_m: float, planes: Float64, view: int) -> bool:
+    """Check that a point lies inside both pictures of a view. planes: see `frustum_margin`."""
+    for p in range(planes.shape[0]):
+        over = planes[p, 0, view] * x_m + planes[p, 1, view] * y_m + planes[p, 2, view] * z_m
+        if over + planes[p, 3, view] < 0:
+            return False
+    return True
 
 
 @kernel()
@@ -76,36 +86,38 @@ def has_enough_views(
     return bool((margin >= 0).sum() >= least)
 
 
-@kernel()
+@kernel(inline=True)
 def is_unoccluded(
-    point: Float64,
+    z_m: float,
     row: int,
     column: int,
-    eye: Float64,
+    way: tuple[float, float, float],
     around: Float32,
     roof: Float32,
     ceiling: float,
     cell_m: float,
 ) -> bool:
-    """Check that no cell between rises over the line from the point (in the middle tile) to the eye above it.
+    """Check that no cell between rises over the line from a point at z_m, in a cell of the middle tile, to an
+    eye above it. way: from the point to the eye, m.
 
-    roof: the highest of `around` within `STRIDE` cells. A line over the roof skips as many: it only rises.
+    roof: the highest within a stride, of `highest_about`. A line over the roof skips as many cells: it only
+    rises.
     """
-    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
+    x, y, z = way
     length = max(abs(x), abs(y)) / cell_m
     if length < 2:
         return True
-    step_x, step_y, step_z = x / cell_m / length, y / cell_m / length, z / length
+    scale = 1 / (length * cell_m)
+    step_x, step_y, step_z = x * scale, y * scale, z * scale * cell_m
     n = 2
     while n < int(length):
-        height = point[2] + n * step_z
+        height = z_m + n * step_z
         if height > ceiling:
             return True
-        i = int(np.rint(row + TILE_CELLS + n * step_y))
-        j = int(np.rint(column + TILE_CELLS + n * step_x))
+        i, j = int(np.rint(row + TILE_CELLS + n * step_y)), int(np.rint(column + TILE_CELLS + n * step_x))
         if i < 0 or j < 0 or i >= around.shape[0] or j >= around.shape[1]:
             return True
-        if step_z >= 0 and roof[i, j] <= height + cell_m:
+        if step_z >= 0 and roof[i // STRIDE, j // STRIDE] <= height + cell_m:
             n += STRIDE
             continue
         if around[i, j] > height + cell_m:

@@ -1,0 +1,139 @@
+"""Bound what a view sees of a whole block of cells, so that most cells needn't be asked one by one.
+
+All bounds are careful: what is said of a block holds for each height in it, whatever rounding does.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
+from barsight.mapping.surface.visibility import STRIDE
+from barsight.mapping.tiles import TILE_CELLS, VIEWS, Z
+
+BLOCK = STRIDE
+"""Cells to a side of a block: what is highest about it is highest about a stride."""
+NOWHERE, SOMEWHERE, EVERYWHERE = 0, 1, 2
+"""Where in a block heights may lie in both pictures of a view."""
+_SURE = 1e-6
+"""More than rounding adds to any bound here, in its own unit (m, or m px)."""
+
+
+def highest_about(around: Float32) -> Float32:
+    """Compute the highest of each block's cells and of all about it, a block wide."""
+    highest = reduce(np.maximum, (around[n::BLOCK] for n in range(BLOCK)))
+    highest = reduce(np.maximum, (highest[:, n::BLOCK] for n in range(BLOCK)))
+    return np.asarray(cv2.dilate(highest, np.ones((3, 3), np.uint8)), np.float32)
+
+
+@kernel()
+def bound_blocks(
+    tile: Float32, corner: Float64, roof: Float32, ceiling: float, planes: Float64, eyes: Float64,
+    cell_m: float, min_views: float, one_point_m: float, first: int,
+) -> tuple[Int8, Bool, Float64, Bool]:  # fmt: skip
+    """Bound what K views see of a tile's blocks (B, B): where their heights lie in both pictures, (B, B, K);
+    whether `point_density` is 1 all over, (B, B, K); from which height on `is_unoccluded` holds for either
+    camera, (B, B, K, 2) m, inf if that isn't known; and whether min_views views see each of its cells at the
+    ceiling, (B, B).
+
+    roof: see `clear_height`. first: for views before it nothing but where their pictures lie is told. A block
+    without heights is in no picture.
+    """
+    blocks, views = TILE_CELLS // BLOCK, planes.shape[2]
+    within, dense = np.zeros((blocks, blocks, views), np.int8), np.zeros((blocks, blocks, views), np.bool_)
+    clear, is_open = np.full((blocks, blocks, views, 2), np.inf), np.zeros((blocks, blocks), np.bool_)
+    middle, half, to_middle = np.empty(3), np.full(3, BLOCK / 2 * cell_m), (BLOCK - 1) / 2
+    for i in range(blocks):
+        for j in range(blocks):
+            row, column = i * BLOCK, j * BLOCK
+            low, high = supported_span(tile[row : row + BLOCK, column : column + BLOCK], min_views)
+            if low > high:
+                continue
+            at = row + to_middle, column + to_middle
+            middle[0], middle[1] = (corner[0] + at[1]) * cell_m, (corner[1] + at[0]) * cell_m
+            middle[2], half[2] = ceiling, 0
+            is_open[i, j] = (_margins(middle, half, planes)[0] >= 0).sum() >= min_views
+            middle[2], half[2] = (low + high) / 2, (high - low) / 2 + _SURE
+            least, most = _margins(middle, half, planes)
+            for k in range(views):
+                if most[k] < 0:
+                    continue
+                within[i, j, k] = EVERYWHERE if least[k] >= 0 else SOMEWHERE
+                for e in range(2 if k >= first else 0):
+                    way = eyes[k, e, 0] - middle[0], eyes[k, e, 1] - middle[1], eyes[k, e, 2] - middle[2]
+                    clear[i, j, k, e] = clear_height((low, high), at, way, roof, ceiling, cell_m)
+                    if e == 0:
+                        dense[i, j, k] = _is_dense(way, half, one_point_m)
+    return within, dense, clear, is_open
+
+
+@kernel()
+def supported_span(heights: Float32, min_views: float) -> tuple[float, float]:
+    """Find the lowest and the highest height that min_views support, inf and -inf where there is none."""
+    low, high = np.inf, -np.inf
+    for i in range(heights.shape[0]):
+        for j in range(heights.shape[1]):
+            for s in range(heights.shape[2]):
+                if heights[i, j, s, VIEWS] >= min_views:
+                    low, high = min(low, heights[i, j, s, Z]), max(high, heights[i, j, s, Z])
+    return low, high
+
+
+@kernel()
+def _margins(middle: Float64, half: Float64, planes: Float64) -> tuple[Float64, Float64]:
+    """Bound the `frustum_margin` (K,) of a box's points, from below and from above. middle, half: (3,) m, its
+    middle and half its sides.
+    """
+    least, most = np.full(planes.shape[2], np.inf), np.full(planes.shape[2], np.inf)
+    for p in range(planes.shape[0]):
+        for k in range(planes.shape[2]):
+            over, spread = planes[p, 3, k], _SURE
+            for axis in range(3):
+                over += planes[p, axis, k] * middle[axis]
+                spread += abs(planes[p, axis, k]) * half[axis]
+            least[k], most[k] = min(least[k], over - spread), min(most[k], over + spread)
+    return least, most
+
+
+@kernel()
+def _is_dense(way: tuple[float, float, float], half: Float64, one_point_m: float) -> bool:
+    """Check that `point_density` is 1 all over a box. way: from its middle to the eye, m."""
+    x, y, z = abs(way[0]) + half[0], abs(way[1]) + half[1], abs(way[2])
+    squared = x * x + y * y + (z + half[2]) ** 2
+    return bool(one_point_m * one_point_m * (z - half[2]) > (1 + _SURE) * squared * np.sqrt(squared))
+
+
+@kernel()
+def clear_height(
+    span: tuple[float, float],
+    at: tuple[float, float],
+    way: tuple[float, float, float],
+    roof: Float32,
+    ceiling: float,
+    cell_m: float,
+) -> float:
+    """Bound from above the heights from which `is_unoccluded` holds in each cell of a block; inf if unknown.
+
+    span: its lowest and highest height, m. at: row and column of its middle in the middle tile. way: from the
+    middle of both to the eye, m. roof: of `highest_about`. A block's lines of
+    sight never lie further apart than its cells: half a block about the middle's and half a block onward, the
+    roof holds all.
+    """
+    (low, high), (x, y, z) = span, way
+    length, side, rise = max(abs(x), abs(y)) / cell_m, BLOCK / 2, z - (high - low) / 2 - _SURE
+    if rise <= 0:
+        return np.inf
+    scale = 1 / (max(length, 1) * cell_m)
+    step_x, step_y, step_z = x * scale, y * scale, rise / (length + side)
+    last, clear, n = roof.shape[0] * BLOCK - 1, -np.inf, 2
+    while low + n * step_z <= ceiling + _SURE and n < length + side:
+        if n + BLOCK > length - side or clear > high:
+            return np.inf
+        i, j = int(at[0] + TILE_CELLS + (n + side) * step_y), int(at[1] + TILE_CELLS + (n + side) * step_x)
+        i, j = min(max(i, 0), last), min(max(j, 0), last)
+        clear = max(clear, roof[i // BLOCK, j // BLOCK] - cell_m - n * step_z + _SURE)
+        n += BLOCK
+    return clear
