@@ -79,6 +79,12 @@ def test_an_unseen_face_needs_free_space_down_to_its_plane() -> None:
     assert found(with_block(*place, None, TOP_M)) == set()
 
 
+@pytest.mark.parametrize(("wide_m", "vetoed"), [(0.02, False), (0.06, True)])
+def test_a_strip_between_bars_hides_nothing_but_a_wide_one_does(wide_m: float, vetoed: bool) -> None:
+    heights = with_block((0.3 - wide_m / 2, 0.3 + wide_m / 2 - 0.005), (-3.0, 3.0), None)
+    assert ("unknown-under-footprint" in found(heights)) == vetoed
+
+
 def test_a_map_that_ends_beside_the_magnet_is_unseen_there() -> None:
     heights = map_of([laid(0.3)], x_m=(-1.5, 0.4))
     assert "unknown-under-footprint" in found(heights)

@@ -31,16 +31,17 @@ from barsight.yard.types import HeightMap
 
 NEWTON_PER_KG = 9.81
 HIDING_COLUMNS = 4
-"""Columns of `resting_plane.STEP_M` side by side that must be unseen to hide what stands: between two bars, where
-no picture shows the steel, nothing does."""
+"""Columns of `resting_plane.STEP_M` side by side that must be unseen to hide what stands: nothing does between
+two bars, where no picture shows the steel."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoleContact:
     """One pole's face. gap_m: mean air gap, least_gap_m: where it is nearest to steel; gap_map_m: (across,
     along) air gaps, NaN where unknown. contact_share: of the face that lies on steel. unknown_share: of the
-    cells under it that were not seen, but for strips along it that are too narrow to hide anything. z_m: height of its centre. pull_n, pull_low_n: its part of the pull, 0
-    until a load is known (`holding.hold_load`). pull_across_m: where that acts, across from its centre.
+    cells under it that were not seen, but for strips along it that are too narrow to hide what stands. z_m:
+    height of its centre. pull_n, pull_low_n: its part of the pull, 0 until a load is known
+    (`holding.hold_load`). pull_across_m: where that acts, across from its centre.
     """
 
     gap_m: float
