@@ -31,6 +31,8 @@ from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto, check_true, vetoes_of
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
+BETWEEN_M = (0.0075, -0.0075, 0.0225, -0.0225)
+"""Across, where some of those hold but not within the crane's tolerance."""
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
 ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight"})
 """Vetoes of the load itself: another place of the magnet changes nothing."""
@@ -184,7 +186,9 @@ def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: 
     if wherever or (sound is not None and not sound.vetoes):
         return sound or quick[0]
     middle = _offset_across(group, quick[0].place)
-    more = tried((along, across) for along in ALONG_M for across in dict.fromkeys((0.0, middle)))
+    between = [across for across in BETWEEN_M if sound is not None and abs(across) < limit]
+    beside = [(along, across) for along in ALONG_M for across in dict.fromkeys((0.0, middle))]
+    more = tried([*((0.0, across) for across in between), *beside])
     found = [one for one in (sound, _sound(more, yard, magnet, settings)) if one is not None]
     return min(found or [*quick, *more], key=_worst_first)
 

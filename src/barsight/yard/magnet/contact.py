@@ -31,8 +31,8 @@ from barsight.yard.types import HeightMap
 
 NEWTON_PER_KG = 9.81
 HIDING_COLUMNS = 4
-"""Columns of `resting_plane.STEP_M` side by side that must be unseen to hide what stands: nothing does between
-two bars, where no picture shows the steel."""
+"""Unseen columns of `resting_plane.STEP_M` side by side that may hide what stands: between two bars, where no
+picture shows the steel, nothing does."""
 
 
 @dataclass(frozen=True, eq=False)
