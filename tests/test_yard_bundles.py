@@ -104,7 +104,7 @@ def test_a_pack_that_was_read_as_one_thin_bar_does_not_weigh_as_little() -> None
     fit = Fit(0, 0.0, values, np.zeros((6, 6)), 0, 0, empty.astype(np.uint8), empty, 0.001, 0.001)
     steel_m2 = 25 * np.pi / 4 * 0.04**2
     for width_m in (0.18, 0.2, 0.24):
-        seen = SeenSection(width_m, 0.02, 0.2, 0.001, sides_seen=True, sides_free=True)
+        seen = SeenSection(width_m, 0.001, sides_seen=True, sides_free=True)
         assert is_no_hexagon(seen, fit, 0.235, 0.0)
         section, sigma = estimate_section(seen, fit, 0.235, 0.0)
         assert np.isnan(section) or section + 1.645 * sigma > steel_m2

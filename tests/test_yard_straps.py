@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit
 from barsight.yard.bundles.fitting.rotated_map import align_map
-from barsight.yard.bundles.straps import Pack, split_columns, strapped_pack
+from barsight.yard.bundles.seen_section import section_of_pack
+from barsight.yard.bundles.straps import Pack, StrapSpan, contradicts, split_columns, strapped_pack
 from barsight.yard.types import HeightMap
 
 CELL = 0.01
@@ -62,11 +65,40 @@ def test_straps_tell_touching_bundles_apart(seed: int) -> None:
         assert len(pack.span.rows_m) == 3
 
 
-def test_straps_in_line_leave_the_sides_open() -> None:
+@pytest.mark.parametrize("seed", range(5))
+def test_straps_in_line_leave_the_sides_open(seed: int) -> None:
     rows = (-1.5, 0.1, 1.6)
-    heights = drawn([(-0.25, 0.0, rows), (0.0, 0.22, rows)], np.random.default_rng(1))
-    pack = pack_at(heights, -0.15)
-    assert pack is None or not pack.sides_seen or pack.high_m > 0.2 + 0.15
+    heights = drawn([(-0.25, 0.0, rows), (0.0, 0.22, rows)], np.random.default_rng(seed))
+    for u in (-0.15, 0.12):
+        pack = pack_at(heights, u)
+        assert pack is None or not pack.sides_seen
+
+
+def test_a_flank_out_of_sight_is_not_seen() -> None:
+    rng = np.random.default_rng(3)
+    heights = drawn([(-0.2, 0.2, (-1.5, 0.1, 1.6))], rng)
+    assert (whole := pack_at(heights, 0.0, 0.3)) is not None and whole.sides_seen
+    x = heights.x0_m + CELL * np.arange(heights.shape[1])
+    for hidden in ((x > 0.05), (x > 0.05) & (x < 0.15)):
+        part = replace(heights, z_m=np.where(hidden, np.float32(np.nan), heights.z_m))
+        pack = pack_at(part, -0.05, 0.3)
+        assert pack is None or not pack.sides_seen
+
+
+def test_straps_that_go_on_contradict_an_outline() -> None:
+    span = StrapSpan(-0.14, 0.06, (1.0, 2.0), 0.0)
+    pack = Pack(-0.15, 0.08, span, (-np.inf, 0.09), 0.1, False)
+    assert "beyond its outline" in contradicts(pack, 0.2)
+    assert "into its outline" in contradicts(pack, 0.26)
+    assert contradicts(replace(pack, others_m=(-np.inf, np.inf)), 0.26) == ""
+
+
+@pytest.mark.parametrize("over_m", [0.1, 0.18, 0.36, np.inf])
+@pytest.mark.parametrize("width_m", [0.1, 0.25, 0.7])
+def test_sections_of_packs_leave_room_for_doubt(width_m: float, over_m: float) -> None:
+    section, sigma = section_of_pack(width_m, over_m)
+    assert section > 1.645 * sigma > 0
+    assert section + 1.645 * sigma <= 0.73 * (width_m + 0.02) * over_m + 1e-12
 
 
 def test_what_goes_on_beside_a_strap_leaves_the_side_open() -> None:

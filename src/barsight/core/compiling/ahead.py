@@ -36,10 +36,13 @@ def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> Non
     os.write(write_place, b"".join(place.to_bytes(_PLACE_BYTES) for place in missing))
     os.close(write_place)
     command = [sys.executable, "-P", "-m", __name__, *groups]
-    workers = [
-        subprocess.Popen(command, stdin=read_place, stdout=write_done, stderr=subprocess.DEVNULL)
-        for _ in range(cores)
-    ]
+    workers = list[subprocess.Popen[bytes]]()
+    # Fewer processes do, where no more may be started.
+    with contextlib.suppress(OSError):
+        while len(workers) < cores:
+            workers.append(
+                subprocess.Popen(command, stdin=read_place, stdout=write_done, stderr=subprocess.DEVNULL)
+            )
     os.close(read_place)
     os.close(write_done)
     try:

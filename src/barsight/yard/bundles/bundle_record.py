@@ -46,9 +46,12 @@ _CREST_M = 0.006
 """How far a map's mean section cuts the crests of bars."""
 _STRAPPED = 0.95
 """Confidence in a bundle whose straps and flanks were seen."""
-_PIECE_M, _PIECE_HIGHER_M, _PIECE_SKEW = 0.02, 0.03, 0.05
-"""How far within the flanks a piece's axis runs, how much higher its top may be, sine of its skew."""
-_DOUBTFUL = 0.5
+_PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
+"""How far within the flanks a piece's axis runs, how much higher its top may be, how far its ends may lie
+beyond the pack's, sine of its skew."""
+_ASIDE_M = 0.02
+"""Straps whose middle lies so far beside an outline's make its place that unsure."""
+_DOUBTFUL = 0.4
 """The most where straps speak against an outline."""
 _SURE_KNOWN = 0.7
 
@@ -152,13 +155,14 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
     the section alone where both agree, a doubt where the pack is not seen whole and goes on beyond it.
     """
     if not pack.sides_seen:
-        lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
-        bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
         doubt = contradicts(pack, bundle.width_m)
-        if not doubt:
-            return bundle
-        sure = min(bundle.confidence, _DOUBTFUL)
-        return replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
+        if doubt:
+            sure = min(bundle.confidence, _DOUBTFUL)
+            bundle = replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
+        if abs(pack.middle_m) > _ASIDE_M:
+            lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
+            bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
+        return bundle
     if reading.outlines_pack:
         if bundle.bars is not None:
             return bundle
@@ -181,7 +185,7 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
         bars=None,
         bar_axes=(),
         section_m2=section,
-        confidence=max(bundle.confidence, _STRAPPED),
+        confidence=_STRAPPED * _agreement(fit.state[fit.first : fit.last + 1]),
         reasons=(*(reason for reason in bundle.reasons if "explains the surface" not in reason), packing),
         sigma=replace(
             bundle.sigma,
@@ -217,7 +221,7 @@ def _is_piece(piece: Bundle, whole: Bundle) -> bool:
     lower = whole.top_z_m - piece.top_z_m
     return bool(
         beside < whole.width_m / 2 - _PIECE_M
-        and abs(float(away @ along)) < whole.length_m / 2
+        and abs(float(away @ along)) + piece.length_m / 2 < whole.length_m / 2 + _PIECE_BEYOND_M
         and abs(np.sin(piece.yaw_rad - whole.yaw_rad)) < _PIECE_SKEW
         and -_PIECE_HIGHER_M < lower < whole.width_m
     )
@@ -310,13 +314,17 @@ def _confidence(reading: Reading, rows: UInt8) -> float:
     """Estimate the probability from how much of the length agrees and how far the next other reading is
     behind.
     """
-    agrees = float((rows == AGREES).sum() / max((rows != 0).sum(), 1))
     fit, rival = reading.found.fit, reading.rival
     lead = 1.0
     if rival is not None and abs(rival.fit.width_m - fit.width_m) > 0.15 * fit.width_m:
         lead = 1 - reading.rival_weight / max(reading.weight, 1e-9)
     sure = 1 - 0.5 * np.exp(-max(lead, 0.0) / 0.05)
-    return float(np.clip(sure * min(1.0, agrees / 0.8), 0.01, 0.99))
+    return float(np.clip(sure * _agreement(rows), 0.01, 0.99))
+
+
+def _agreement(rows: UInt8) -> float:
+    """Rate by how much of what was seen of its length agrees with an outline: 1 from four fifths on."""
+    return min(1.0, float((rows == AGREES).sum() / max((rows != 0).sum(), 1)) / 0.8)
 
 
 def _runs(flags: Bool) -> list[tuple[int, int]]:

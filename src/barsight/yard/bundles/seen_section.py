@@ -152,12 +152,10 @@ def section_of_pack(width_m: float, over_floor_m: float) -> tuple[float, float]:
 
     over_floor_m: height of the top over the floor, inf where none was seen: bars reach no further down.
     """
-    least, most = (
-        ratio * (width_m + error) ** 2
-        for ratio, error in zip(_STRAPPED_RATIOS, (-_STRAPPED_ERROR_M, _STRAPPED_ERROR_M), strict=True)
-    )
-    most = min(most, _FILLED_RATIOS[1] * (width_m + _STRAPPED_ERROR_M) * over_floor_m)
-    return (least + most) / 2, max(most - least, 0.0) / 2 / UPPER
+    narrow, wide = max(width_m - _STRAPPED_ERROR_M, 0.0), width_m + _STRAPPED_ERROR_M
+    least = min(_STRAPPED_RATIOS[0] * narrow, _FILLED_RATIOS[0] * over_floor_m) * narrow
+    most = min(_STRAPPED_RATIOS[1] * wide, _FILLED_RATIOS[1] * over_floor_m) * wide
+    return (least + most) / 2, (most - least) / 2 / UPPER
 
 
 def agreeing_rows(fit: Fit) -> Int64:
@@ -213,10 +211,11 @@ def _edge(
     last, lowest, lowest_at = middle, level[middle], middle
     for k in range(middle, len(level) if step > 0 else -1, step):
         if np.isnan(level[k]):
-            behind = level[k + step :: step][:hidden]
+            behind = (level[k + 1 :] if step > 0 else level[:k][::-1])[:hidden]
             behind = behind[~np.isnan(behind)]
             floor = bool(behind.size and behind[0] == -np.inf)
-            return last, floor or not is_overhung(level[last::-step], behind), floor
+            inwards = level[last::-1] if step > 0 else level[last:]
+            return last, bool(behind.size) and not is_overhung(inwards, behind), floor
         if not level[k] > -np.inf:
             return last, True, True
         if others_begin[k]:

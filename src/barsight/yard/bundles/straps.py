@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64
+from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.seen_section import agreeing_rows, is_overhung, mean_section
@@ -51,6 +52,10 @@ _OWN_RATIO = 0.5
 """Of the narrower one's width: what straps and a fit must have in common."""
 _FLANK_RATIO, _FLANK_DEPTH_M, _FLANK_M = 0.6, 0.15, 0.08
 """How far under the top a flank is seen, of the straps' width and at least; how far straps end before it."""
+_HIDDEN_CELLS = 12
+"""A flank may be hidden over so many places before the surface is seen to have fallen away."""
+_DIP_RATIO = 0.12
+"""Of a span's width: a deeper dip in it may part two bundles whose straps lie in line."""
 _SPREAD_M = 0.02
 """Straps that disagree on an end by more (median) leave it open."""
 _IN_LINE_M = 0.025
@@ -128,13 +133,19 @@ def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64
     high = [int(a.max()) + 2 for a in (row, column)]
     part = height_map.grey[low[0] : high[0], low[1] : high[1]]
     heights = height_map.z_m[low[0] : high[0], low[1] : high[1]]
+    sources = height_map.source[low[0] : high[0], low[1] : high[1]]
     if part.size == 0:
         nothing: Float32 = np.full(u.shape, np.nan, np.float32)
         return beside, nothing, np.zeros(u.shape, bool)
     seen = np.where(part > 0, part, np.nan).astype(np.float32)
     places = column - low[1], row - low[0]
     grey = cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan)
-    z = cv2.remap(heights, *places, cv2.INTER_NEAREST, borderValue=np.nan)
+    z = cv2.remap(
+        np.where(sources == HeightSource.VISION, heights, np.float32(np.nan)),
+        *places,
+        cv2.INTER_NEAREST,
+        borderValue=np.nan,
+    )
     stock: Bool = np.asarray(np.isfinite(grey) & (z > sheet.stock_over_m))
     return beside, np.asarray(grey, np.float32), stock
 
@@ -289,13 +300,15 @@ def find_pack(
     top = float(level_m[inside].max())
     deep = top - max(_FLANK_RATIO * own.width_m, _FLANK_DEPTH_M)
     cell = float(beside_m[1] - beside_m[0])
-    ends, others, seen = [], [], own.spread_m <= _SPREAD_M
+    level_inside = level_m[inside[0] : inside[-1] + 1]
+    seen = own.spread_m <= _SPREAD_M and _dip(level_inside) < _DIP_RATIO * own.width_m
+    ends, others = [], []
     for step, at, number_beside in ((-1, inside[0], number - 1), (1, inside[-1], number + 1)):
-        beside = spans[number_beside] if 0 <= number_beside < len(spans) else None
-        near = np.inf if beside is None else (beside.high_m if step < 0 else beside.low_m)
-        places = (abs(near - float(beside_m[at])) - cell / 2) / cell if beside else np.inf
-        others.append(step * np.inf if beside is None or _shared(own, beside) else float(near))
-        parted = beside is not None and not _shared(own, beside) and places <= _FLANK_M / cell
+        next_one = spans[number_beside] if 0 <= number_beside < len(spans) else None
+        near = np.inf if next_one is None else (next_one.high_m if step < 0 else next_one.low_m)
+        places = (abs(near - float(beside_m[at])) - cell / 2) / cell if next_one else np.inf
+        others.append(step * np.inf if next_one is None or _shared(own, next_one) else float(near))
+        parted = next_one is not None and not _shared(own, next_one) and places <= _FLANK_M / cell
         outwards = level_m[at::step]
         last, falls = _flank(outwards, min(places, _FLANK_M / cell), deep)
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
@@ -317,6 +330,13 @@ def contradicts(pack: Pack, width_m: float) -> str:
     return ""
 
 
+def _dip(level: Float64) -> float:
+    """Compute how deep the surface sinks between two higher places; what isn't seen lies on the floor."""
+    seen = np.nan_to_num(level, nan=-_FLOOR_M, neginf=-_FLOOR_M)
+    between = np.minimum(np.maximum.accumulate(seen), np.maximum.accumulate(seen[::-1])[::-1])
+    return float((between - seen).max(initial=0.0))
+
+
 def _shared(one: StrapSpan, other: StrapSpan) -> bool:
     """Check whether most straps of either lie in line with the other's, as those of one bundle do."""
     apart = np.abs(np.subtract.outer(one.rows_m, other.rows_m))
@@ -325,15 +345,18 @@ def _shared(one: StrapSpan, other: StrapSpan) -> bool:
 
 
 def _flank(level: Float64, limit: float, deep: float) -> tuple[int, bool]:
-    """Walk outwards to the lowest place before a neighbour; whether the surface falls away there or
-    out of sight.
+    """Walk outwards to the lowest place before a neighbour; whether the surface is seen to fall away there.
 
     level: heights from the last place that a strap holds: NaN unseen, -inf floor. limit: places to a
     neighbour's strap. deep: height under which nothing belongs to the bundle.
     """
     lowest = 0
     for k in range(1, min(len(level), int(limit) + 1)):
-        if not level[k] > deep:
+        if np.isnan(level[k]):
+            behind = level[k : k + _HIDDEN_CELLS]
+            behind = behind[~np.isnan(behind)]
+            return lowest, bool(behind.size and behind[0] <= deep)
+        if level[k] <= deep:
             return lowest, True
         if level[k] > level[lowest] + _RISES_M:
             break
