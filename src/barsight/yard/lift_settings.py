@@ -15,7 +15,7 @@ class LiftSettings:
     """Bundles to be taken by one lift."""
     min_count_probability: float = 0.999
     """How sure the count under the footprint must be."""
-    max_unknown_ratio: float = 0.1
+    max_unknown_ratio: float = 0.25
     """Of the cells under a pole that were not seen; filled ones count as not seen."""
     max_unexplained_ratio: float = 0.03
     """Of the poles' area over something that belongs to no bundle."""
