@@ -174,7 +174,7 @@ def test_a_fattened_map_makes_the_bar_thicker(bar: tuple[PosedScene, Rendered]) 
 def test_outlines_are_found_below_a_pixel_from_a_wrong_radius(bar: tuple[PosedScene, Rendered]) -> None:
     posed, rendered = bar
     steel = _bar_of(posed)
-    start = BarFit(steel.centre_m, steel.axis, 1.1 * steel.radius_m, 0.1)
+    start = BarFit(steel.centre_m, steel.axis, 1.1 * steel.radius_m)
     outlines = find_outlines(rendered.pair.left, posed.scene.camera, start)
     assert not isinstance(outlines, Failed)
     true = tangent_planes(steel.centre_m, steel.axis, steel.radius_m)
@@ -245,7 +245,7 @@ def test_maps_without_floor_or_bar_fail_with_a_reason(bar: tuple[PosedScene, Ren
     bare = replace(exact, disparity_px=np.where(on_bar, np.nan, exact.disparity_px).astype(np.float32))
     no_bar = fit_bar(bare, posed.scene.camera, guess)
     assert isinstance(no_bar, Failed) and no_bar.code == "no-bar"
-    outside = BarFit(steel.centre_m + np.array([5, 0, 0]), steel.axis, steel.radius_m, 0.1)
+    outside = BarFit(steel.centre_m + np.array([5, 0, 0]), steel.axis, steel.radius_m)
     no_outline = bar_diameter(exact, rendered.pair, outside)
     assert isinstance(no_outline, Failed) and no_outline.code == "no-outline"
     assert np.isnan(measure_bar(empty, rendered.pair, guess)).all()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
+from barsight.mapping.surface.block_visibility import BLOCK, SOMEWHERE, highest_about
 from barsight.mapping.surface.height_selection import (
     _ALIKE_CELLS,
     _ALONG,
@@ -20,7 +20,6 @@ from barsight.mapping.surface.visibility import (
     _CUT_CELLS,
     _CUT_MARGIN_CELLS,
     _OVERHANG_CELLS,
-    STRIDE,
     frustum_margin,
     has_enough_views,
     is_unoccluded,
@@ -82,14 +81,14 @@ def free_slowly(point: np.ndarray, row: int, column: int, eye: np.ndarray, aroun
 
 def test_a_line_of_sight_is_free_where_no_cell_rises_over_it(hills: np.ndarray) -> None:
     rng = np.random.default_rng(0)
-    roof = np.asarray(cv2.dilate(hills, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)))
-    ceiling, found = float(hills.max()), []
+    roof, ceiling, found = highest_about(hills), float(hills.max()), []
     for k in range(600):
         row, column = (int(n) for n in rng.integers(0, TILE_CELLS, 2))
         z = hills[row + TILE_CELLS, column + TILE_CELLS] if k % 3 else rng.uniform(-0.5, 2.5)
         point = np.array([column * CELL_M, row * CELL_M, z])
         eye = point + np.array([0, 0, 5]) if k == 0 else EYES_M[k % 6] - (0, 0, 4 * (k % 2))
-        found.append(is_unoccluded(point, row, column, eye, hills, roof, ceiling, CELL_M))
+        way = tuple(float(part) for part in eye - point)
+        found.append(is_unoccluded(float(z), row, column, way, hills, roof, ceiling, CELL_M))
         assert found[-1] == free_slowly(point, row, column, eye, hills)
     assert 0.2 < np.mean(found) < 0.9
 
@@ -148,13 +147,18 @@ def test_beneath_a_surface_that_the_pictures_cut_off_all_is_doubted(hills: np.nd
 
 def test_support_is_the_votes_over_those_that_can_be_expected(hills: np.ndarray) -> None:
     rng, views = np.random.default_rng(4), sights()
-    tile = np.zeros((2, 24, SLOTS, FIELDS), np.float32)
+    tile = np.zeros((4, 24, SLOTS, FIELDS), np.float32)
     tile[..., VIEWS], tile[..., CENTRAL] = rng.integers(0, 7, (2, *tile.shape[:3]))
     tile[..., Z] = rng.uniform(0, 2, tile.shape[:3])
     corner, ceiling = np.array([20.0, 40.0]), float(hills.max())
-    roof = np.asarray(cv2.dilate(hills, np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)))
+    parts, scene = (1, 24 // BLOCK, len(views.eyes)), (hills, highest_about(hills), ceiling)
+    nothing_told = (
+        np.full(parts, SOMEWHERE, np.int8), np.zeros(parts, bool), np.full((*parts, 2), np.inf),
+        np.zeros(parts[:2], bool),
+    )  # fmt: skip
+    asked = 0, np.full((*tile.shape[:3], 3), np.nan, np.float32)
     share, expected = _supported(
-        tile, corner, hills, roof, ceiling, views.planes(), views.eyes, CELL_M, 2.0, 4.0
+        tile, corner, scene, views.planes(), views.eyes, nothing_told, CELL_M, 2.0, 4.0, asked
     )
     cut = 0
     for i, j, s in np.ndindex(share.shape):
