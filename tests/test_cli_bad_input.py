@@ -1,5 +1,6 @@
 """What `barsight measure` does with a user's mistakes: one line, an exit code, and nothing left behind."""
 
+import contextlib
 import errno
 import os
 import shutil
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from barsight.cli import main
 from barsight.cli.main import run
 from cli_runs import FAST, cut_short, edit, measure, pictures, refused
 
@@ -191,6 +193,26 @@ def test_interrupted_in_the_middle(recording: Path, sent: signal.Signals) -> Non
     assert text.strip().splitlines()[-1] == "barsight: interrupted; nothing half-written is left"
     assert "Traceback" not in text
     assert set(recording.parent.iterdir()) == before
+
+
+def test_an_interrupt_that_a_library_hides_is_one_still(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Libraries in C that are just being loaded make an ImportError of it."""
+
+    def load(_: str) -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            main._interrupt(signal.SIGINT, None)
+        raise ImportError("initialization failed")
+
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    monkeypatch.setattr("importlib.import_module", load)
+    try:
+        assert main.run(["measure", "x"]) == 130
+    finally:
+        for number, handler in zip((signal.SIGINT, signal.SIGTERM), handlers, strict=True):
+            signal.signal(number, handler)
+    assert "interrupted" in capsys.readouterr().err
 
 
 def test_truth_is_never_read_by_a_measurement(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,6 +35,8 @@ GROUPS = ("bench", "calibrate")
 OF_A_YARD = ("lifts", "explain", "compare")
 """Commands in the package `yard`."""
 INTERRUPTED = 130
+_interrupts: list[int] = []
+"""Signals that have ended this run."""
 
 
 def home(name: str) -> str:
@@ -63,26 +65,36 @@ def run(arguments: Sequence[str]) -> int:
     name, rest = arguments[0], list(arguments[1:])
     if name not in COMMANDS:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
+    _interrupts.clear()
     try:
         importlib.import_module(home(name)).run(rest)
-    except BarsightError as error:
-        return _refuse(str(error), error.exit_code)
     except KeyboardInterrupt:
         return _refuse("interrupted; nothing half-written is left", INTERRUPTED)
-    except BrokenPipeError:
+    except Exception as error:
+        # A library that was just being loaded makes another error of an interrupt.
+        if _interrupts:
+            return _refuse("interrupted; nothing half-written is left", INTERRUPTED)
+        return _exit_code(error)
+    return 0
+
+
+def _exit_code(error: Exception) -> int:
+    """Print a user's mistake, or what the system refused, as one line; raise anything else again."""
+    if isinstance(error, BarsightError):
+        return _refuse(str(error), error.exit_code)
+    if isinstance(error, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:
-        if error.errno is None:
-            raise
+    if isinstance(error, OSError) and error.errno is not None:
         what = "reading or writing failed" if error.filename is None else _short(str(error.filename))
         return _refuse(f"{what}: {os.strerror(error.errno).lower()}", 1)
-    return 0
+    raise error
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     for again in (signal.SIGINT, signal.SIGTERM):
         signal.signal(again, signal.SIG_IGN)  # a second one must not cut the tidying short
+    _interrupts.append(number)
     raise KeyboardInterrupt
 
 
