@@ -37,6 +37,8 @@ OF_A_YARD = ("lifts", "explain", "compare")
 INTERRUPTED = 130
 _interrupts: list[int] = []
 """Signals that have ended this run."""
+_AGAIN_S = 20.0
+"""Time that a run has to tidy up before it is interrupted again."""
 
 
 def home(name: str) -> str:
@@ -69,11 +71,11 @@ def run(arguments: Sequence[str]) -> int:
     try:
         importlib.import_module(home(name)).run(rest)
     except KeyboardInterrupt:
-        return _refuse("interrupted; nothing half-written is left", INTERRUPTED)
+        return _interrupted()
     except Exception as error:
         # A library that was just being loaded makes another error of an interrupt.
         if _interrupts:
-            return _refuse("interrupted; nothing half-written is left", INTERRUPTED)
+            return _interrupted()
         return _exit_code(error)
     return 0
 
@@ -95,7 +97,22 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     for again in (signal.SIGINT, signal.SIGTERM):
         signal.signal(again, signal.SIG_IGN)  # a second one must not cut the tidying short
     _interrupts.append(number)
+    if hasattr(signal, "setitimer"):
+        # A library may swallow what is raised here: it is raised again where the run goes on.
+        signal.signal(signal.SIGALRM, _interrupt_again)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
     raise KeyboardInterrupt
+
+
+def _interrupt_again(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _interrupted() -> int:
+    """Print that a run was interrupted."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    return _refuse("interrupted; nothing half-written is left", INTERRUPTED)
 
 
 def _refuse(line: str, code: int) -> int:
