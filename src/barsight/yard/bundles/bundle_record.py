@@ -43,11 +43,11 @@ _SAME_RATIO, _SAME_M = 0.12, 0.005
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M = 0.009, 0.02, 0.006
 """Standard deviations of a pack's middle, width and top."""
 _CREST_M = 0.006
-"""How far a map's mean section cuts the crests of bars."""
+"""Crest height that a map's mean section cuts off."""
 _STRAPPED = 0.95
 """Confidence in a bundle whose straps and flanks were seen."""
 _PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
-"""How far within the flanks a piece's axis runs, how much higher its top may be, how far its ends may lie
+"""Bounds of a piece: way of its axis within the flanks, most by which its top is higher and its ends lie
 beyond the pack's, sine of its skew."""
 _ASIDE_M = 0.02
 """Straps whose middle lies so far beside an outline's make its place that unsure."""

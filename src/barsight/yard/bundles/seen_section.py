@@ -32,7 +32,7 @@ _GULLIES_APART = 0.8
 _MISFIT_RATIO, _HEIGHT_RATIO, _WIDTH_RATIO = 0.05, 0.1, 0.2
 """Of a bar's diameter: how far surface (root mean square), height and width of counted bars may be off."""
 _HIDDEN_M = 0.12
-"""What stands behind a hidden side is looked for over so much."""
+"""Search reach behind a hidden side."""
 _RIM, _HIGHER_M = 4, 0.03
 """Places at a flank over which a neighbour may stand higher by so much."""
 _WIDER_M = 0.045

@@ -21,7 +21,7 @@ from barsight.yard.bundles.seen_section import agreeing_rows, is_overhung, mean_
 from barsight.yard.types import HeightMap
 
 REACH_M = 0.55
-"""How far to either side of a bundle's axis its straps and its neighbours' are looked for."""
+"""Search reach to either side of a bundle's axis, its neighbours' straps included."""
 _AROUND_M = 0.2
 """Length along the bars over which the steel's own grey level is taken."""
 _LEAST_SIGMA_LOG = 0.05
@@ -33,11 +33,11 @@ _PRICE, _GULLY_PRICE = 60.0, 10.0
 """Contrast that a bundle's straps must have in all, so that chance doesn't part one bundle into two; less is
 asked where the surface does."""
 _GULLY_M, _GULLY_SIDE_M = 0.03, 0.08
-"""How deep a gully may part bundles, within this distance to either side."""
+"""Least depth of a gully that may part bundles, and the reach of its two sides."""
 _CLIFF_M, _CLIFF_CELLS = 0.12, 2
 """No straps hold bars on both sides of a step of this height, within so many places."""
 _FLOOR_M = 1e3
-"""How far below a bundle the floor is taken to lie."""
+"""Depth that stands for the floor and for what is not seen."""
 _NARROWEST_M = 0.07
 _EDGE = 1.0
 """Median contrast of the straps, beyond _NOISE, where a bundle's are still seen."""
@@ -51,7 +51,7 @@ MIN_STRAPS, MIN_ROWS = 2, 20
 _OWN_RATIO = 0.5
 """Of the narrower one's width: what straps and a fit must have in common."""
 _FLANK_RATIO, _FLANK_DEPTH_M, _FLANK_M = 0.6, 0.15, 0.08
-"""How far under the top a flank is seen, of the straps' width and at least; how far straps end before it."""
+"""Depth of a flank under the top, of the straps' width and at least; largest gap between both."""
 _HIDDEN_CELLS = 12
 """A flank may be hidden over so many places before the surface is seen to have fallen away."""
 _DIP_RATIO = 0.12
@@ -87,11 +87,10 @@ class StrapSpan:
 def strap_spans(
     height_map: HeightMap, sheet: AlignedMap, fit: Fit, level_m: Float64
 ) -> tuple[StrapSpan, ...]:
-    """Find what straps hold together within REACH_M of a bundle's axis, from low to high; empty where the map
-    has no orthophoto. level_m: mean heights over the axis at the same places.
+    """Find what straps hold together within REACH_M of a bundle's axis, from low to high.
+
+    height_map: one with an orthophoto. level_m: mean heights over the axis at the same places.
     """
-    if height_map.grey is None:
-        return ()
     beside, grey, stock = _around(height_map, sheet, fit)
     contrast = line_contrast(grey, sheet.cell_m)
     near = 2 * round(_CLOSE_M / sheet.cell_m) + 1
