@@ -117,11 +117,11 @@ def _vote(
 
 
 def height_sigma(slots: Float32) -> Float32:
-    """Compute the sigma (N,) of fused heights (N, FIELDS).
+    """Compute the sigma (...) of fused heights (..., FIELDS).
 
     The weights' own noise, scaled by how the views really scatter, and the calibration's part whole: it is
     the same in all views and doesn't average out.
     """
-    scatter = (PRIOR_VIEWS + slots[:, SQUARES]) / (PRIOR_VIEWS + slots[:, VIEWS] - 1)
-    sigma: Float32 = np.sqrt(scatter / slots[:, WEIGHT] + slots[:, SHARED] ** 2)
+    scatter = (PRIOR_VIEWS + slots[..., SQUARES]) / (PRIOR_VIEWS + slots[..., VIEWS] - 1)
+    sigma: Float32 = np.sqrt(scatter / slots[..., WEIGHT] + slots[..., SHARED] ** 2)
     return sigma

@@ -21,15 +21,16 @@ TileKey = tuple[int, int]
 
 
 class TileStore:
-    """Tiles by (column, row) number: (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS) float32, [y, x].
+    """Tiles by (column, row) number: (TILE_CELLS, TILE_CELLS, SLOTS, fields) float32, [y, x].
 
     At most `resident` tiles are held; the one untouched for longest goes to a file in `scratch` and comes
-    back when it is needed, so memory doesn't grow with the yard.
+    back when it is needed, so memory doesn't grow with the yard. A fresh tile holds `fill`.
     """
 
-    def __init__(self, scratch: Path, resident: int) -> None:
+    def __init__(self, scratch: Path, resident: int, fields: int = FIELDS, fill: float = 0.0) -> None:
         self._scratch = scratch
         self._resident = resident
+        self._shape, self._fill = (TILE_CELLS, TILE_CELLS, SLOTS, fields), fill
         self._held: OrderedDict[TileKey, Float32] = OrderedDict()
         self._versions: dict[TileKey, int] = {}
 
@@ -45,7 +46,9 @@ class TileStore:
             if key in self._versions:
                 tile = np.load(self._file(key))
             else:
-                tile = np.zeros((TILE_CELLS, TILE_CELLS, SLOTS, FIELDS), np.float32)
+                tile = np.zeros(self._shape, np.float32)
+                if self._fill:
+                    tile.fill(self._fill)
         self._held[key] = tile
         self._versions[key] = self._versions.get(key, 0) + 1
         return tile

@@ -47,31 +47,35 @@ def _lengthways(
     out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)
     least, squares, best = np.empty(width), np.empty(width), np.empty(width, np.int64)
     for i in range(height):
-        own = z[i + reach, reach : reach + width]
-        least[:] = np.inf
+        out[i] = z[i + reach, reach : reach + width]
+        known = np.flatnonzero(weight[i + reach, reach : reach + width] > 0)
+        if known.size == 0:
+            continue
+        first, size = reach + known[0], known[-1] + 1 - known[0]
+        own = z[i + reach, first : first + size]
+        least[:size] = np.inf
         for d in range(rows.shape[0]):
-            squares[:] = 0
+            squares[:size] = 0
             for k in range(rows.shape[1]):
-                b = reach + columns[d, k]
+                b = first + columns[d, k]
                 if rows[d, k] == 0 and columns[d, k] == 0:
                     continue
-                _add_squares(squares, z[i + reach + rows[d, k], b : b + width], own, gate_m)
-            for j in range(width):
+                _add_squares(squares[:size], z[i + reach + rows[d, k], b : b + size], own, gate_m)
+            for j in range(size):
                 best[j] = d if squares[j] < least[j] else best[j]
                 least[j] = min(squares[j], least[j])
-        for j in range(width):
-            out[i, j] = own[j]
-            if not weight[i + reach, j + reach] > 0:
-                continue
-            chosen[i, j] = best[j]
+        for column in known:
+            chosen[i, column] = best[column - known[0]]
+            to_row, to_column = rows[chosen[i, column]], columns[chosen[i, column]]
+            own_m = z[i + reach, column + reach]
             off, total = 0.0, 0.0
             for k in range(rows.shape[1]):
-                a, b = i + reach + rows[best[j], k], j + reach + columns[best[j], k]
-                gap = z[a, b] - own[j]
+                a, b = i + reach + to_row[k], column + reach + to_column[k]
+                gap = z[a, b] - own_m
                 if abs(gap) <= gate_m:
                     off += weight[a, b] * gap
                     total += weight[a, b]
-            out[i, j] = own[j] + off / total
+            out[i, column] = own_m + off / total
     return out, chosen
 
 

@@ -64,14 +64,15 @@ class SurfaceElection:
     def __init__(self, store: TileStore, folder: Path, cell_m: float, settings: MapSettings) -> None:
         self._store, self._folder, self._cell_m, self._settings = store, folder, cell_m, settings
         work = Path(tempfile.mkdtemp(prefix="election_", dir=folder))
-        self._first, self._elected, self._finished = (
-            work / name for name in ("first", "elected", "finished")
+        self._first, self._elected, self._finished, asked = (
+            work / name for name in ("first", "elected", "finished", "asked")
         )
-        for made in (self._first, self._elected, self._finished):
+        for made in (self._first, self._elected, self._finished, asked):
             made.mkdir()
         self._work = work
         self._states: dict[TileKey, tuple[int, int]] = {}
-        self._asked: dict[TileKey, int] = {}
+        self._heights = TileStore(asked, settings.resident_tiles, fields=3, fill=np.nan)
+        self._views: dict[TileKey, int] = {}
         self._figures: dict[TileKey, _Figures] = {}
         self._height_m = np.inf
 
@@ -132,26 +133,26 @@ class SurfaceElection:
         """Elect these tiles, at last with no regard to what was asked for snapshots."""
         known, read = frozenset(self._store.keys()), self._store.read
 
-        def look(item: tuple[TileKey, Float32]) -> None:
-            key, tile = item
+        def look(key: TileKey, tile: Float32) -> None:
             np.save(_first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
 
-        def elect_tile(item: tuple[TileKey, Float32]) -> None:
-            key, tile = item
-            around, asked = _first_around(self._first, key, known), Asked.none()
-            if not last and key in self._asked:
-                asked = Asked(self._asked[key], np.load(_asked_file(self._elected, key)))
+        def elect_tile(key: TileKey, tile: Float32, asked: Asked) -> None:
+            around = _first_around(self._first, key, known)
             winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
             np.save(_winner_file(self._elected, key), winner)
-            if not last:
-                np.save(_asked_file(self._elected, key), asked.heights)
-                self._asked[key] = asked.views
+            self._views[key] = asked.views
+
+        def asked_of(key: TileKey) -> Asked:
+            return Asked.none() if last else Asked(self._views.get(key, 0), self._heights.take(key))
 
         _read_first.cache_clear()
-        for step in (look, elect_tile):
-            for _ in ordered_map(step, ((key, read(key)) for key in keys)):
-                pass
+        for _ in ordered_map(lambda item: look(*item), ((key, read(key)) for key in keys)):
+            pass
+        items = ((key, read(key), asked_of(key)) for key in keys)
+        for _ in ordered_map(lambda item: elect_tile(*item), items):
+            pass
+        self._heights.hold(len(keys))
 
     def _finish(self, keys: list[TileKey], sights: ViewFrusta, cloud_views: int | None = None) -> None:
         """Average, sharpen and fill these tiles; write the cloud of heights that cloud_views views support,
@@ -223,10 +224,6 @@ def _read_first(folder: Path, key: TileKey) -> Float32:
 
 def _first_file(folder: Path, key: TileKey) -> Path:
     return folder / f"first_{key[0]}_{key[1]}.npy"
-
-
-def _asked_file(folder: Path, key: TileKey) -> Path:
-    return folder / f"asked_{key[0]}_{key[1]}.npy"
 
 
 def _winner_file(folder: Path, key: TileKey) -> Path:

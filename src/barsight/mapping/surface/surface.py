@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Int8, UInt8
+from barsight.core.arrays import Float32, Int8, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.mapping.fusion import height_sigma
 from barsight.mapping.surface.cloud import CloudPart, read_part
 from barsight.mapping.surface.hole_filling import bridge_gaps
-from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, Z
+from barsight.mapping.tiles import FIELDS, GREY, TILE_CELLS, VIEWS, TileKey, Z
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +84,28 @@ class Surface:
 
 
 def elected_layers(tile: Float32, winner: Int8) -> Layers:
-    """Take from a tile's heights those that `elect` chose."""
-    layers = Layers.unknown(TILE_CELLS, TILE_CELLS)
-    row, column = np.nonzero(winner >= 0)
-    won = tile[row, column, winner[row, column]]
-    layers.z_m[row, column] = won[:, Z]
-    layers.sigma_m[row, column] = height_sigma(won)
-    layers.views[row, column] = won[:, VIEWS]
-    layers.source[row, column] = HeightSource.VISION
-    layers.intensity[row, column] = won[:, GREY]
-    return layers
+    """Take from a tile's heights those that `elect_surface` chose."""
+    won = _winners(tile, winner)
+    source = np.where(winner >= 0, HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8)
+    return Layers(won[Z], height_sigma(np.moveaxis(won, 0, -1)), won[VIEWS], source, won[GREY])
+
+
+@kernel()
+def _winners(tile: Float32, winner: Int8) -> Float32:
+    """Gather the fields (FIELDS, rows, columns) of each cell's winner; NaN and no views where there is none.
+
+    tile: (rows, columns, SLOTS, FIELDS). winner: (rows, columns) its slot, -1 where there is none.
+    """
+    rows, columns = winner.shape
+    won = np.full((FIELDS, rows, columns), np.nan, np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            if winner[i, j] < 0:
+                won[VIEWS, i, j] = 0
+                continue
+            for field in range(FIELDS):
+                won[field, i, j] = tile[i, j, winner[i, j], field]
+    return won
 
 
 def fill_gaps(layers: Layers, reach: int) -> None:
