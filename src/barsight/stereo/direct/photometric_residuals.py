@@ -286,4 +286,6 @@ def _noise_power(
         slide_window(column, reach, found)
         for x in range(width):
             each = one / (weights[x] + np.float32(1e-3))
-            found[x] = found[x] / size * each * (one + hold * (seen[x] + np.float32(1e-6)) * each)
+            # Sliding sums of squares round to a little under 0 where no pull is left.
+            square = max(found[x], np.float32(0)) / size
+            found[x] = square * each * (one + hold * (seen[x] + np.float32(1e-6)) * each)
