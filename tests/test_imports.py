@@ -15,7 +15,7 @@ FLOORS = {
     "mapping": 4,
     "yard": 5,
     "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "simulation": 6, "board_views": 6,
-    "measure_settings": 6, 
+    "measure_settings": 6,
     "map_building": 7,
     "live_map": 8,
     "report": 9, "pipeline": 9, "benchmarks": 9, "viewer": 9,

@@ -492,7 +492,7 @@ def test_pulls_are_what_box_filters_say() -> None:
 
 
 def test_noise_power_is_not_negative_beside_strong_pulls() -> None:
-    """Sliding sums leave a rest of either sign where strong pulls have gone by, and no weight holds it down."""
+    """Sliding sums leave a rest of either sign where strong pulls have gone by; no weight holds it down."""
     shape, rng = (240, 200), np.random.default_rng(3)
     pull, ones = allocate_frame(shape), np.ones(shape, np.float32)
     inside(pull, shape)[:] = rng.normal(0, 1e-2, shape)

@@ -28,8 +28,8 @@ Some wheels bundle libraries: NumPy's and SciPy's for Linux OpenBLAS (BSD-3-Clau
 with the GCC Runtime Library Exception), OpenCV's FFmpeg (LGPL-2.1). Whoever passes these wheels on passes
 the libraries on too; their licences lie in the wheels' `.dist-info` folders.
 
-GTSAM's wheel declares that it needs pytest, so pytest's packages are listed under Run time; `requirements.lock`
-leaves them out.
+GTSAM's wheel declares that it needs pytest, so pytest's packages are listed under Run time;
+`requirements.lock` leaves them out.
 """
 
 
