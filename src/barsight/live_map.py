@@ -13,7 +13,12 @@ from barsight.core.arrays import Float64
 from barsight.core.timing import Stopwatch
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
 from barsight.map_building import FusedViews
-from barsight.mapping.scene_extent import choose_cell_size, least_way_m, points_per_pixel, probe_recording
+from barsight.mapping.scene_extent import (
+    choose_cell_size,
+    keyframe_spacing_m,
+    points_per_pixel,
+    probe_recording,
+)
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
@@ -67,7 +72,7 @@ class LiveMap:
         store = TileStore(folder, settings.map.resident_tiles)
         self._views = FusedViews(binner, store, settings.map)
         self._election = SurfaceElection(store, folder, cell_m, settings.map)
-        self._min_way_m = least_way_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
+        self._min_way_m = keyframe_spacing_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
         self._ahead = np.array([0.0, 0.0, first.range_m])
         self._last: Float64 | None = None
 

@@ -45,7 +45,7 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.settings import StereoSettings, make_method
 
-Advance = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
 _MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
@@ -159,7 +159,7 @@ def inspect_recording(
 
 @contextmanager
 def estimate_trajectory(
-    probed: ProbedRecording, settings: MeasureSettings, advance: Advance
+    probed: ProbedRecording, settings: MeasureSettings, advance: ProgressCallback
 ) -> Iterator[TrackedRecording]:
     """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
     source, pairs, watch = probed.source, probed.pairs, probed.watch
@@ -214,7 +214,7 @@ def build_map(
     way: TrackedRecording,
     settings: MeasureSettings,
     scratch: Path,
-    advance: Advance,
+    advance: ProgressCallback,
 ) -> BuiltMap:
     """Fuse each matched pair into the map's tiles, and carve its lines of sight.
 
