@@ -1,4 +1,4 @@
-"""The map while packets still come: each view enters once its pose is known, and it can be looked at."""
+"""Build the map while packets still come: each view is fused once its pose is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The first half of the way of the data: recording -> trajectory and matched pairs -> votes in the map."""
+"""Build the map: recording -> trajectory and matched pairs -> votes in the map's cells."""
 
 from __future__ import annotations
 

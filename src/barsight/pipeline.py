@@ -234,7 +234,7 @@ def _warnings(
 
 
 def _floor_doubts(probed: ProbedRecording, built: BuiltMap, trajectory: Trajectory) -> list[Notice]:
-    """Doubt a way on which the cameras look under the yard's floor, or not down."""
+    """Warn where the cameras' view lies below the yard's floor, or not below the cameras."""
     if trajectory.reference != "yard":
         return []
     ahead = np.array([0.0, 0.0, probed.first.range_m])

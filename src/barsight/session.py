@@ -1,4 +1,4 @@
-"""The way of the data from packets: what came so far can be looked at any time, the end is the batch's."""
+"""Measure packets as they come, with a snapshot at any time and the batch's result at the end."""
 
 from __future__ import annotations
 

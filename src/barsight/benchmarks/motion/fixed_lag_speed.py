@@ -38,7 +38,7 @@ LEVER_M = np.array([0.35, -0.2, -0.55])
 
 @dataclass(frozen=True)
 class LiveSpeed:
-    """Of each tenth of the way: ms a keyframe by the clock and of CPU, and MiB grown since the first tenth.
+    """Cost of each tenth of the way: ms a keyframe, wall and CPU, and MiB grown since the first tenth.
 
     rmse_mm: the places against the truth. nees: per degree of freedom.
     """
