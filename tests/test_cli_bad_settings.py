@@ -13,12 +13,13 @@ from cli_runs import FAST, measure, refused
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[stereo]\nmethod = 'magic'\n", ("stereo", "magic")),
-        ("[stereo]\nmax_dept_m = 3.0\n", ("max_dept_m",)),
+        ("[stereo]\nmethod = 'magic'\n", ("stereo.method is 'magic'; choose sgbm, csca,",)),
+        ("[stereo]\nmax_dept_m = 3.0\n", ("no setting stereo.max_dept_m; did you mean max_depth_m?",)),
+        ("preset = 'quick'\n", ("preset is 'quick'; choose best or fast",)),
         ("[map]\ncell_m = -1.0\n", ("cell_m",)),
         ("[map\n", ("TOML",)),
-        ("\ufeff[map]\ncell_m = 99\n", ("cell_m must lie",)),
-        ("mp = 1\n", ("(mp);",)),
+        ("\ufeff[map]\ncell_m = 99\n", ("map.cell_m must lie",)),
+        ("mp = 1\n", ("there is no setting mp; did you mean map?",)),
     ],
 )
 def test_bad_configuration(

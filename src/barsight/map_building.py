@@ -114,7 +114,7 @@ def probe(
     """
     source, watch = SelectedSensors(recording, settings.use), Stopwatch()
     if faults := clock_faults(source):
-        raise InputError(source.path, "; ".join(faults), "or leave the sensor out with --use")
+        raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
     configuration, inputs = to_json(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
