@@ -48,6 +48,21 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("group", "line"),
+    [
+        ("bench", "barsight: bench needs a benchmark: stereo | "),
+        ("calibrate", "barsight: calibrate needs a kind: board, stereo, "),
+    ],
+)
+def test_a_group_alone_asks_for_the_rest(group: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([group]) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith(line) and told.err.count("\n") == 1 and not told.out
+    assert run([group, "--help"]) == 0
+    assert capsys.readouterr().out.startswith(f"usage: barsight {group} ")
+
+
 def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     measure(recording, capsys, "--use", "stereo", "imu")
     result = json.loads((recording.parent / "out" / "result.json").read_text())
