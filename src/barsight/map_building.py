@@ -141,7 +141,7 @@ def inspect_recording(
     """
     source, watch = SelectedSensors(recording, settings.use), Stopwatch()
     if faults := clock_faults(source):
-        raise InputError(source.path, "; ".join(faults), "or leave the sensor out with --use")
+        raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
     configuration, inputs = to_json(asdict(settings)), source.digests()
     kept = None
     if resume is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import resource
+import mmap
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,6 +15,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import ConfigError
+from barsight.core.memory import peak_memory_mib
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame
 from barsight.features.guided_matching import project_stereo
@@ -91,7 +92,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
     return LiveSpeed(
         keyframes, float(np.mean(seen)), tuple(tenths[:, 0].tolist()), tuple(tenths[:, 1].tolist()),
         tuple((held_mib - held_mib[0]).tolist()),
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        peak_memory_mib(),
         float(1e3 * np.sqrt((off**2).sum(axis=1).mean())), float(nees.mean()),
     )  # fmt: skip
 
@@ -152,4 +153,4 @@ def _rig() -> StereoRig:
 def _resident_mib() -> float:
     """Read the resident memory from the kernel's own count of its pages."""
     with open("/proc/self/statm") as file:  # noqa: PTH123
-        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+        return int(file.read().split()[1]) * mmap.PAGESIZE / 2**20

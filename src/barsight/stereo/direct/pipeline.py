@@ -64,7 +64,7 @@ class BarsightSettings:
 
     def __post_init__(self) -> None:
         if min(self.consistency_px, self.max_sigma_px) <= 0:
-            raise ConfigError("consistency_px and max_sigma_px must be positive")
+            raise ConfigError("stereo.barsight.consistency_px and max_sigma_px must be positive")
         shares = (
             self.vertical_error_ratio,
             self.edge_error_ratio,
@@ -73,7 +73,9 @@ class BarsightSettings:
         )
         lengths = (self.max_edge_px, self.wrong_side_px)
         if min(self.model_sigma_px, self.island_px, *shares, *lengths) < 0:
-            raise ConfigError("model_sigma_px, island_px and the shares of sigma can't be negative")
+            raise ConfigError(
+                "stereo.barsight.model_sigma_px, island_px and the shares of sigma can't be negative"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Literal
@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.settings.file import read_settings
-from barsight.core.settings.numbers import expect_numbers
+from barsight.core.settings.values import expect_values
 from barsight.yard.magnet.pull import Pull, expect
 
 MagnetType = Literal["electro", "permanent", "electro-permanent"]
@@ -105,7 +105,7 @@ class Magnet:
     battery_backup: bool = False
 
     def __post_init__(self) -> None:
-        expect_numbers(asdict(self))
+        expect_values(self)
         expect(len(self.poles) >= 1, "there must be at least one pole")
         expect(min(self.own_mass_kg, self.capacity_kg) > 0, "own_mass_kg and capacity_kg must be over 0")
         expect(
@@ -160,6 +160,6 @@ def load_magnet(path: Path | None) -> Magnet:
     """
     help_at = "docs/how-to/describe-a-magnet.md says how"
     if path is not None:
-        return read_settings(path, Magnet, help_at, "--magnet")
+        return read_settings(path, Magnet, help_at, "magnet")
     with resources.as_file(_EXAMPLE) as example:
-        return read_settings(example, Magnet, help_at, "--magnet")
+        return read_settings(example, Magnet, help_at, "magnet")
