@@ -15,6 +15,7 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.checkpoint import checkpoint_folder, checkpointed
+from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
@@ -23,7 +24,7 @@ from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoF
 from barsight.live_map import LiveMap, Snapshot
 from barsight.map_building import checkpoint_key, matching
 from barsight.mapping.view import Matcher
-from barsight.measure_folder import write_measured
+from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import to_json
 from barsight.motion.estimator import PoseEstimator
@@ -61,6 +62,7 @@ class Session:
             raise ConfigError(f"settings are given twice; add {', '.join(fields)} to them")
         self._asked = build_settings(fields if settings is None else settings, MeasureSettings)
         self._magnet = None if magnet is None else load_magnet(Path(magnet))
+        compile_ahead(ignore_progress, "measure")  # a crane that travels doesn't wait for kernels
         self._settings = self._asked.chosen()
         self._folder = Path(tempfile.mkdtemp(prefix="barsight."))
         self._yard = self._folder / "yard"
