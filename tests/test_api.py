@@ -11,6 +11,9 @@ import pytest
 
 import barsight as bs
 from barsight.cli.main import run
+from barsight.core.settings.values import build_settings
+from barsight.mapping.settings import MapSettings
+from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts
 from cli_runs import FAST
 
@@ -52,6 +55,7 @@ def test_a_notebook_measures_looks_and_saves(
     with pytest.raises(bs.BarsightError, match="not empty"):
         yard.save(saved)
     np.testing.assert_array_equal(bs.load(saved).height_map.z_m, heights.z_m)
+    assert all(len(repr(one)) < 130 for one in (yard, yard.lifts, heights, contour))
     folder = yard.folder
     del yard, heights
     gc.collect()
@@ -60,14 +64,61 @@ def test_a_notebook_measures_looks_and_saves(
 
 
 def test_misspelt_settings_and_missing_recordings_say_so(tmp_path: Path) -> None:
-    with pytest.raises(bs.BarsightError, match=r"MapSettings has no 'cel_m'; it has .*cell_m"):
-        bs.measure(tmp_path, map={"cel_m": 0.05})
     with pytest.raises(bs.BarsightError, match="no such file"):
         bs.open_recording(tmp_path / "none")
     with pytest.raises(bs.BarsightError, match=r"no result\.json"):
         bs.load(tmp_path)
-    with pytest.raises(bs.BarsightError, match="lens is 'round'; give one of"):
+    with pytest.raises(bs.BarsightError, match="lens is 'round'; choose radtan4, "):
         bs.calibrate_stereo(tmp_path, "checkerboard:9x6:0.025", lens="round")
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        ({"at": "later"}, "at is 'later'; choose now or end"),
+        ({"preset": "quick"}, "preset is 'quick'; choose best or fast"),
+        ({"self_calibrate": "pitch"}, "self_calibrate is 'pitch'; choose none or yaw"),
+        ({"use": ("stereo", "radar")}, "use is 'radar'; choose stereo, imu or crane"),
+        ({"use": ("imu",)}, "stereo can't be left out of use: it is what measures"),
+        ({"use": "stereo"}, "use is 'stereo'; give a list"),
+        ({"map": 3}, "map is 3; give its fields by name"),
+        ({"map": {"cel_m": 0.05}}, "there is no setting map.cel_m; did you mean cell_m?"),
+        ({"map": {"cell_m": "x"}}, "map.cell_m is 'x'; give a number"),
+        ({"map": {"min_views": True}}, "map.min_views is True; give a whole number"),
+        ({"map": {"cell_m": 99}}, "map.cell_m must lie in 0.001...10, not 99.0"),
+        ({"map": {"least_shift": 0.1}}, "map.least_shift is called map.min_shift now"),
+        ({"lift": {"stanchions": [(1, 2)]}}, "lift.stanchions has 2 values; give 3"),
+        ({"motion": {"estimator": "gtsam"}}, "motion.estimator is 'gtsam'; choose fused, live, "),
+        ({"recording": {"rig": 3}}, "recording.rig is 3; give a path"),
+        ({"magnet": "no.toml"}, "no.toml: no such file; check the path given as magnet"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named(whole: Path, settings: dict[str, Any], line: str) -> None:
+    with pytest.raises(bs.BarsightError) as caught:
+        bs.measure(whole, **settings)
+    assert str(caught.value).startswith(line)
+
+
+def test_settings_made_by_hand_are_checked_too() -> None:
+    """Their types are what a checker of types sees; at run time they are held to it as well."""
+    with pytest.raises(bs.BarsightError, match="preset is 'quick'; choose best or fast"):
+        bs.MeasureSettings(preset="quick")  # type: ignore[arg-type]
+    with pytest.raises(bs.BarsightError, match="contours is 'drawn'; choose fused or paper"):
+        bs.MeasureSettings(map=MapSettings(contours="drawn"))  # type: ignore[arg-type]
+    with pytest.raises(bs.BarsightError, match=r"map is \{'cell_m': 0.02\}; give a MapSettings"):
+        bs.MeasureSettings(map={"cell_m": 0.02})  # type: ignore[arg-type]
+
+
+def test_settings_take_numbers_and_paths_of_any_kind() -> None:
+    """NumPy's numbers, whole ones for others, lists, texts for paths, records that are made already."""
+    given = {
+        "map": {"cell_m": np.float32(0.5), "min_views": np.int64(3), "profile_y_m": [1, 2.5]},
+        "recording": {"rig": "rig.yaml"}, "lift": LiftSettings(bundles=2),
+    }  # fmt: skip
+    built = build_settings(given, bs.MeasureSettings)
+    assert built.map == MapSettings(cell_m=0.5, min_views=3, profile_y_m=(1.0, 2.5))
+    assert [type(one) for one in (built.map.cell_m, built.map.min_views)] == [float, int]
+    assert (built.recording.rig, built.lift.bundles) == (Path("rig.yaml"), 2)
 
 
 def test_a_disparity_of_two_arrays() -> None:
@@ -91,10 +142,12 @@ def test_without_xarray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_importing_loads_nothing_heavy_and_needs_no_unix() -> None:
-    code = "import sys; sys.modules['resource'] = None; import barsight as bs; print({names})"
-    light = code.format(names="[n for n in ('numpy', 'cv2', 'numba', 'scipy') if n in sys.modules]")
+    code = "import sys; sys.modules['resource'] = None; import barsight as bs{more}; print({names})"
+    light = code.format(more="", names="[n for n in ('numpy', 'cv2', 'numba', 'scipy') if n in sys.modules]")
     assert subprocess.check_output([sys.executable, "-c", light], text=True).strip() == "[]"
-    every = code.format(names="[n for n in bs.__all__ if getattr(bs, n) is None]")
+    commands = ", barsight.cli.bench.command, barsight.cli.measure"
+    every = code.format(more=commands, names="[n for n in bs.__all__ if getattr(bs, n) is None]")
     assert subprocess.check_output([sys.executable, "-c", every], text=True).strip() == "[]"
+    assert dir(bs) == sorted(bs.__all__)
     with pytest.raises(AttributeError, match="no attribute 'mesure'"):
         bs.mesure  # noqa: B018

@@ -125,6 +125,12 @@ def test_a_calibration_that_does_not_fit_is_said(recording: Path, capsys: pytest
     assert code == 0 and "px off their rows" in " ".join(text.split())
 
 
+def test_a_demo_into_a_recording(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["demo", "-o", str(recording)]) == 4
+    assert f"{recording}: exists and is not empty" in capsys.readouterr().err
+    assert {path.name for path in recording.iterdir()} == {"mav0", "truth"}
+
+
 def test_out_under_a_file(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blocker = recording.parent / "file"
     blocker.write_text("in the way")

@@ -13,12 +13,13 @@ from cli_runs import FAST, measure, refused
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[stereo]\nmethod = 'magic'\n", ("stereo", "magic")),
-        ("[stereo]\nmax_dept_m = 3.0\n", ("max_dept_m",)),
+        ("[stereo]\nmethod = 'magic'\n", ("stereo.method is 'magic'; choose sgbm, csca,",)),
+        ("[stereo]\nmax_dept_m = 3.0\n", ("no setting stereo.max_dept_m; did you mean max_depth_m?",)),
+        ("preset = 'quick'\n", ("preset is 'quick'; choose best or fast",)),
         ("[map]\ncell_m = -1.0\n", ("cell_m",)),
         ("[map\n", ("TOML",)),
-        ("\ufeff[map]\ncell_m = 99\n", ("cell_m must lie",)),
-        ("mp = 1\n", ("(mp);",)),
+        ("\ufeff[map]\ncell_m = 99\n", ("map.cell_m must lie",)),
+        ("mp = 1\n", ("there is no setting mp; did you mean map?",)),
     ],
 )
 def test_bad_configuration(
@@ -45,6 +46,21 @@ def test_flags_go_before_the_configuration(recording: Path, capsys: pytest.Captu
 def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["mesure"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("group", "line"),
+    [
+        ("bench", "barsight: bench needs a benchmark: stereo | "),
+        ("calibrate", "barsight: calibrate needs a kind: board, stereo, "),
+    ],
+)
+def test_a_group_alone_asks_for_the_rest(group: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([group]) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith(line) and told.err.count("\n") == 1 and not told.out
+    assert run([group, "--help"]) == 0
+    assert capsys.readouterr().out.startswith(f"usage: barsight {group} ")
 
 
 def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

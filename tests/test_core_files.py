@@ -133,6 +133,21 @@ def test_a_missing_parent_is_an_output_error(tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
+@pytest.mark.parametrize("opener", [atomic_path, atomic_directory])
+def test_a_place_that_takes_no_files(opener: Opener) -> None:
+    """The system's word for it names our temporary file, which says nothing to the user."""
+    line = r"^/proc/x: nothing can be written there \(No such file or directory\); name another folder$"
+    with pytest.raises(OutputError, match=line), opener(Path("/proc/x")) as path:
+        path.write_text("x")
+
+
+def test_a_file_that_is_missing_elsewhere_is_no_output(tmp_path: Path) -> None:
+    for lacking in ("recording.csv", "out/height.tif"):
+        with pytest.raises(FileNotFoundError), atomic_directory(tmp_path / "out"):
+            (tmp_path / lacking).read_text()
+    assert names(tmp_path) == []
+
+
 @pytest.mark.parametrize("inside", ["out", "out/part", ".out.x1.part/part", "."])
 def test_a_refusal_names_the_side_that_it_is_about(tmp_path: Path, inside: str) -> None:
     target = tmp_path / "out"

@@ -19,3 +19,4 @@ def test_floats_keep_their_significant_digits() -> None:
     value = 1234.5678901234
     assert json_value({"x": [value, -value / 1e9]}, 9) == {"x": [1234.56789, -1.23456789e-06]}
     assert json_value(value) == value
+    assert json_value((value, np.nan, 7), decimals=3) == [1234.568, None, 7]

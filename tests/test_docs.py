@@ -125,7 +125,7 @@ def test_toml_blocks_are_valid(tmp_path: Path) -> None:
     (magnet,) = blocks(ROOT / "docs" / "how-to" / "describe-a-magnet.md", "toml")
     path = tmp_path / "magnet.toml"
     path.write_text(magnet)
-    assert read_settings(path, Magnet, "", "--magnet").safety_factor >= 2
+    assert read_settings(path, Magnet, "", "magnet").safety_factor >= 2
 
 
 def anchors(page: Path) -> set[str]:

@@ -15,11 +15,13 @@ FLOORS = {
     "mapping": 4,
     "yard": 5,
     "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "simulation": 6, "board_views": 6,
-    "measure_settings": 6, "map_building": 6.5, "live_map": 6.7,
-    "report": 7, "pipeline": 7, "benchmarks": 7, "plant": 7, "viewer": 7,
-    "result": 8, "pair_matching": 8, "measure_folder": 8,
-    "api": 9, "session": 9,
-    "cli": 10,
+    "measure_settings": 6,
+    "map_building": 7,
+    "live_map": 8,
+    "report": 9, "pipeline": 9, "benchmarks": 9, "viewer": 9,
+    "result": 10, "pair_matching": 10, "measure_folder": 10,
+    "api": 11, "session": 11,
+    "cli": 12,
 }  # fmt: skip
 ROOMS = {
     "calibration": ("geometry", "boards", "files", "stereo", "camera_imu"),

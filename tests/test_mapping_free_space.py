@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.mapping.free_space import COARSE_CELLS, OVER_END_M, REACH_M, FreeSpace, carve_rays
+from barsight.mapping.free_space import (
+    COARSE_CELLS,
+    OVER_END_M,
+    REACH_M,
+    FreeSpace,
+    bound_heights,
+    carve_rays,
+)
 from barsight.mapping.observation import CellObservations
 
 CELL_M = 0.01
@@ -105,3 +112,15 @@ def test_tiles_join_without_a_seam(corner: tuple[int, int]) -> None:
     here = whole.window(int(X[0]), 0, X.size, 40)
     there = moved.window(int(X[0]) + even[0], even[1], X.size, 40)
     np.testing.assert_allclose(here, there, atol=1e-4)
+
+
+def test_heights_of_a_cell_are_bounded_by_its_highest_and_its_lowest() -> None:
+    rng = np.random.default_rng(4)
+    row, column = rng.integers(0, 9, (2, 200)).astype(np.int32)
+    z = rng.normal(0, 1, 200).astype(np.float32)
+    highest, lowest = np.full((9, 9), -np.inf, np.float32), np.full((9, 9), np.inf, np.float32)
+    bound_heights(row, column, z, highest, lowest)
+    for i, j in np.ndindex(9, 9):
+        of_cell = z[(row == i) & (column == j)]
+        assert highest[i, j] == max(of_cell, default=-np.inf)
+        assert lowest[i, j] == min(of_cell, default=np.inf)

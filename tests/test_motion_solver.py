@@ -29,9 +29,9 @@ from barsight.motion.linear.reprojection_kernels import (
     POINT,
     POSE,
     SHARED,
-    Given,
     LinearisationPoint,
     Observations,
+    PointTerms,
     Rig,
     disparity_offset,
     empty_rows,
@@ -486,7 +486,7 @@ def test_a_sightings_rows_are_its_error_and_slopes() -> None:
         rows, mount = empty_rows(), np.column_stack([axes, lever])
         assert rows.shape == (3, 13)
         camera = np.column_stack([from_reference, shift])[None]
-        given = Given(huber, 1.0, *x[10:])
+        given = PointTerms(huber, 1.0, *x[10:])
         points = np.append(point, x[9])[None]
         whitened_rows(lens, mount, camera, points, np.array([seen]), 2.0, given, (0, 0, 0), rows)
         return rows
@@ -518,5 +518,5 @@ def test_what_a_points_sightings_share_is_its_pieces() -> None:
     rig = Rig(np.empty(5), np.empty((3, 4)), 2.5)
     assert [slide_offset(points, shared, piece, t) for t in (0, 1)] == pytest.approx([0.3, 0.6])
     assert [disparity_offset(shared, piece, t) for t in (0, 1)] == [4.0, 3.0]
-    assert given_of(rig, sights, shared, 1) == Given(2.5, 0.0, 3.0, 0.01, 0.02)
+    assert given_of(rig, sights, shared, 1) == PointTerms(2.5, 0.0, 3.0, 0.01, 0.02)
     assert slide_offset(points, shared[4:], piece, 1) == 0.7 and disparity_offset(shared[4:], piece, 1) == 0.0

@@ -276,10 +276,10 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, name: str) -> None:
 def test_no_such_folder_and_no_recording(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file or folder"):
         open_recording(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="no recording that Barsight knows"):
+    with pytest.raises(InputError, match="not a recording that Barsight recognises"):
         open_recording(tmp_path)
     (tmp_path / "a.txt").write_text("x")
-    with pytest.raises(InputError, match="file of an unknown kind"):
+    with pytest.raises(InputError, match="of an unknown file type"):
         open_recording(tmp_path / "a.txt")
     write_euroc(tmp_path / "inside")
     with pytest.raises(InputError, match=r"give the folder inside, .*inside"):

@@ -1,6 +1,7 @@
 """Packets pushed one by one: snapshots on the way, and at the end the bytes of the batch."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight.api import with_settings
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.types import StereoFrame
 from barsight.motion.frontend.tracking import Tracker
@@ -38,9 +38,7 @@ def test_packets_with_snapshots_end_as_the_batch(
 ) -> None:
     settings = {**SETTINGS, "motion": {"estimator": estimator}}
     recording = bs.open_recording(whole)
-    session = bs.Session(
-        recording.rig, with_settings(bs.MeasureSettings(), settings), imu_noise=recording.imu_noise()
-    )
+    session = bs.Session(recording.rig, imu_noise=recording.imu_noise(), **settings)
     rectified = counted(monkeypatch, Rectifier, "__call__")
     tracked = counted(monkeypatch, Tracker, "push")
     shown = []
@@ -105,10 +103,25 @@ def test_samples_that_say_nothing_are_refused_and_empty_packets_wait(whole: Path
 
 def test_a_finished_session_takes_no_more(whole: Path) -> None:
     recording = bs.open_recording(whole)
-    session = bs.Session(recording.rig, with_settings(bs.MeasureSettings(), SETTINGS))
+    session = bs.Session(recording.rig, SETTINGS)
     frames = list(recording.frames())
     session.push(frames[0])
     session.finish()
     for call in (session.finish, lambda: session.push(frames[1])):
         with pytest.raises(bs.BarsightError, match="is finished"):
             call()
+
+
+def test_a_session_refuses_what_it_could_only_miss_at_the_end(whole: Path, tmp_path: Path) -> None:
+    rig: Any = bs.open_recording(whole).rig
+    refused: list[tuple[Any, tuple[Any, ...], dict[str, Any], str]] = [
+        (rig, (), {"magnet": str(tmp_path / "no.toml")}, "no.toml: no such file"),
+        (rig, (), {"map": {"cell_m": "x"}}, "map.cell_m is 'x'; give a number"),
+        (rig, ({"preset": "quick"},), {}, "preset is 'quick'; choose best or fast"),
+        (rig, (3,), {}, "settings is 3; give its fields by name"),
+        (rig, (bs.MeasureSettings(),), {"preset": "fast"}, "settings are given twice; add preset to them"),
+        (3, (), {}, "rig is 3; give a StereoRig"),
+    ]
+    for given, settings, named, line in refused:
+        with pytest.raises(bs.BarsightError, match=re.escape(line)):
+            bs.Session(given, *settings, **named)

@@ -13,7 +13,7 @@ TREES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts): ast.parse(path.read_text(encoding="utf-8"))
     for path in sorted(ROOT.rglob("*.py"))
 }
-QUESTIONS = ("What", "Where", "By", "How", "Whether")
+QUESTIONS = ("What", "Where", "By", "How", "Whether", "Why", "When", "Which", "Who", "Of")
 TESTS = [ast.parse(path.read_text(encoding="utf-8")) for path in sorted(Path(__file__).parent.glob("*.py"))]
 MAX_LINES = 60
 MAX_PARAMETERS = 10

@@ -500,6 +500,15 @@ def test_pulls_are_what_box_filters_say() -> None:
     np.testing.assert_allclose(power, wanted_power, rtol=2e-3)
 
 
+def test_noise_power_is_not_negative_beside_strong_pulls() -> None:
+    """Sliding sums leave a rest of either sign where strong pulls have gone by; no weight holds it down."""
+    shape, rng = (240, 200), np.random.default_rng(3)
+    pull, ones = allocate_frame(shape), np.ones(shape, np.float32)
+    inside(pull, shape)[:] = rng.normal(0, 1e-2, shape)
+    inside(pull, shape)[20:60, :90] = rng.normal(0, 1e6, (40, 90))
+    assert noise_power(pull, ones, ones, 1e-3 * ones, 0.1, 21).min() >= 0
+
+
 def test_a_step_at_half_size_is_carried_up_without_mixing_surfaces() -> None:
     y, x = np.mgrid[0:41, 0:63].astype(np.float32)
     start = np.where(x < 30, 20 + 0.05 * x + 0.03 * y, 40 - 0.04 * x).astype(np.float32)

@@ -40,7 +40,7 @@ def test_the_example_is_assumed_where_no_file_is_given(tmp_path: Path) -> None:
         ("yaw_deg = 0.2", "yaw_deg = 99", "tolerance"),
         ("contact_share = 0.1", "contact_share = 2.0", "contact_share"),
         ("safety_factor = 2.0", "saftey_factor = 2.0", "safety_factor"),
-        ("safety_factor = 2.0", "safety_factor = true", "expected float"),
+        ("safety_factor = 2.0", "safety_factor = true", "safety_factor is True; give a number"),
         ("safety_factor = 2.0", "safety_factor = ", "no TOML"),
     ],
 )
@@ -104,7 +104,7 @@ def test_a_magnet_file_that_is_not_there_is_one_line(
 ) -> None:
     assert run(["lifts", str(tmp_path), "--magnet", str(tmp_path / "no.toml")]) == 3
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "no such file" in said and "--magnet" in said
+    assert said.count("\n") == 1 and "no such file" in said and "given as magnet" in said
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,9 @@ the GPL or AGPL.
 Some wheels bundle libraries: NumPy's and SciPy's for Linux OpenBLAS (BSD-3-Clause) and libgfortran (GPL-3.0
 with the GCC Runtime Library Exception), OpenCV's FFmpeg (LGPL-2.1). Whoever passes these wheels on passes
 the libraries on too; their licences lie in the wheels' `.dist-info` folders.
+
+GTSAM's wheel declares that it needs pytest, so pytest's packages are listed under Run time;
+`requirements.lock` leaves them out.
 """
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
-from collections.abc import Mapping
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,10 +15,10 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.calibration import StereoCalibration
 from barsight.calibration.stereo.calibration import calibrate_stereo as solve_stereo
 from barsight.core.arrays import UInt8
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import build_settings, expect_choice
 from barsight.core.types import Disparity
-from barsight.map_building import Advance
-from barsight.measure_folder import measure_into, unheard
+from barsight.map_building import ProgressCallback
+from barsight.measure_folder import ignore_progress, measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.pair_matching import match_pictures
 from barsight.recording.open import open_recording as open_path
@@ -37,11 +35,12 @@ def open_recording(path: Path | str) -> StoredPictures:
 
 def measure(
     recording: Path | str,
+    /,
     *,
     preset: Literal["best", "fast"] = "best",
     magnet: Path | str | None = None,
     at: Literal["now", "end"] = "now",
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     **settings: Any,
 ) -> Yard:
     """Measure a recording; the files lie in a temporary folder, which goes with the yard unless saved.
@@ -51,7 +50,7 @@ def measure(
     settings: fields of `MeasureSettings`; those of a stage as a mapping, `map={"cell_m": 0.02}`.
     Raises a BarsightError whose text is one line where nothing can be measured.
     """
-    chosen: MeasureSettings = with_settings(MeasureSettings(), {"preset": preset, **settings})
+    chosen = build_settings({"preset": preset, **settings}, MeasureSettings)
     described = None if magnet is None else Path(magnet)
     out = Path(tempfile.mkdtemp(prefix="barsight."))
     try:
@@ -84,9 +83,9 @@ def disparity(
     left, right: files or (H, W) uint8, rectified unless a rig is given. range_px: candidates from, to; found
     from the pictures if None. settings: fields of `StereoSettings`.
     """
-    chosen: StereoSettings = with_settings(StereoSettings(), settings)
     if range_px is not None:
-        chosen = replace(chosen, min_disparity_px=range_px[0], max_disparity_px=range_px[1])
+        settings |= {"min_disparity_px": range_px[0], "max_disparity_px": range_px[1]}
+    chosen = build_settings(settings, StereoSettings)
     first, second = (Path(one) if isinstance(one, str) else one for one in (left, right))
     return match_pictures(first, second, chosen, Path(rig) if isinstance(rig, str) else rig)[1]
 
@@ -98,22 +97,7 @@ def calibrate_stereo(
 
     pictures, board, lens: as `barsight calibrate stereo` takes them.
     """
-    known = [one.value for one in Lens]
-    if lens not in known:
-        raise ConfigError(f"lens is {lens!r}; give one of {', '.join(known)}")
+    expect_choice("lens", lens, tuple(one.value for one in Lens))
     target, path = parse_board(board), Path(pictures)
-    views, sizes, left_out = views_from_pictures(path, target, max_views, unheard)
+    views, sizes, left_out = views_from_pictures(path, target, max_views, ignore_progress)
     return solve_stereo(views, target, Lens(lens), sizes, path, left_out)
-
-
-def with_settings(default: Any, told: Mapping[str, Any]) -> Any:
-    """Return a settings record with some fields told, nested ones as mappings. Raises ConfigError."""
-    known = sorted(field.name for field in fields(default))
-    for name in told:
-        if name not in known:
-            raise ConfigError(f"{type(default).__name__} has no {name!r}; it has {', '.join(known)}")
-    parts = {
-        name: with_settings(getattr(default, name), part) if isinstance(part, Mapping) else part
-        for name, part in told.items()
-    }
-    return replace(default, **parts)

@@ -31,7 +31,7 @@ def views_from_detections(
         width, height = (int(part) for part in (resolution or "").lower().split("x"))
     except ValueError:
         raise ConfigError(
-            f"detections need the cameras' --resolution as WIDTHxHEIGHT, not {resolution!r}"
+            f"detections need the cameras' resolution as WIDTHxHEIGHT, not {resolution!r}"
         ) from None
     views = read_detections(folder, board)
     chosen = np.unique(np.linspace(0, len(views) - 1, min(max_views, len(views))).astype(int))

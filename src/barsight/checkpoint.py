@@ -1,4 +1,4 @@
-"""Checkpoints of a run: results kept whole as data beside the output until the run ends well."""
+"""Keep checkpoints of a run: whole results, as data, beside the output until the run ends well."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map while packets still come: each view enters once its pose is known, and it can be looked at."""
+"""Build the map while packets still come: each view is fused once its pose is known."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.core.errors import Failed
-from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
-from barsight.mapping.fusion import fuse_view
-from barsight.mapping.scene_extent import choose_cell_size, least_way_m, points_per_pixel, probe_recording
+from barsight.map_building import FusedViews
+from barsight.mapping.scene_extent import (
+    choose_cell_size,
+    keyframe_spacing_m,
+    points_per_pixel,
+    probe_recording,
+)
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
@@ -62,35 +65,30 @@ class LiveMap:
         has_crane = pairs.recording.crane() is not None
         cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=has_crane)
         self._settings, self._per_pixel = settings.map, points_per_pixel(first, cell_m)
-        self._placer = PointBinner(
+        binner = PointBinner(
             settings.stereo, self._rectifier.body_from_rect0, cell_m, self._per_pixel,
             settings.map.max_sigma_m, Stopwatch(),
         )  # fmt: skip
-        self._store = TileStore(folder, settings.map.resident_tiles)
-        self._election = SurfaceElection(self._store, folder, cell_m, settings.map)
-        self._min_way_m = least_way_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
+        store = TileStore(folder, settings.map.resident_tiles)
+        self._views = FusedViews(binner, store, settings.map)
+        self._election = SurfaceElection(store, folder, cell_m, settings.map)
+        self._min_way_m = keyframe_spacing_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
         self._ahead = np.array([0.0, 0.0, first.range_m])
         self._last: Float64 | None = None
-        self._placed: list[Pose] = []
 
     def add(self, pair: RectifiedPair, posed: PosedFrame) -> None:
         """Match a pair and fuse it, unless its picture has hardly moved."""
-        pose = posed.reference_from_body @ self._rectifier.body_from_rect0
-        seen = pose.apply(self._ahead)
+        seen = (posed.reference_from_body @ self._rectifier.body_from_rect0).apply(self._ahead)
         if self._last is not None and np.linalg.norm(seen - self._last) < self._min_way_m:
             return
-        matched = self._match(pair)
-        view = matched if isinstance(matched, Refusal) else self._placer(matched, posed)
-        if isinstance(view, (Refusal, Failed)):
-            return
-        fuse_view(self._store, view.cells, self._settings)
-        self._placed.append(pose)
-        self._last = seen
+        if not isinstance(self._views.add(self._match(pair), posed), Refusal):
+            self._last = seen
 
     def snapshot(self, owner: object) -> Snapshot:
         """Elect the surface as it stands; only tiles that changed since the last one are elected anew."""
-        if len(self._placed) < 2:
-            return Snapshot(None, len(self._placed))
-        frusta = ViewFrusta.of(self._placed, self._rectifier.camera, self._per_pixel)
+        placed = self._views.placed
+        if len(placed) < 2:
+            return Snapshot(None, len(placed))
+        frusta = ViewFrusta.of(placed, self._rectifier.camera, self._per_pixel)
         surface = self._election.snapshot(self._settings.min_views, frusta)
-        return Snapshot(surface, len(self._placed), owner)
+        return Snapshot(surface, len(placed), owner)

@@ -1,8 +1,8 @@
-"""The first half of the way of the data: recording -> trajectory and matched pairs -> votes in the map."""
+"""Build the map: recording -> trajectory and matched pairs -> votes in the map's cells."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, islice, pairwise, takewhile
@@ -31,9 +31,10 @@ from barsight.mapping.scene_extent import (
     select_keyframes,
     select_keyframes_by_encoders,
 )
+from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.tiles import TileStore
-from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner
+from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner, PosedView
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Preview, Refusal, to_json
 from barsight.motion.rig_check.self_calibration import self_calibrate
@@ -44,7 +45,7 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.settings import StereoSettings, make_method
 
-Advance = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
 _MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
@@ -78,7 +79,7 @@ class ProbedRecording:
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class TrackedRecording:
     """The trajectory, and the pairs that the map is made of. rectifier: as corrected in service. stereo: with
     the disparity's calibration sigma. poses: of the frames taken, by stamp. matched: those frames, in order.
     """
@@ -105,7 +106,33 @@ class BuiltMap:
     preview: Preview | None
 
 
-def probe(
+class FusedViews:
+    """Fuses posed views, one after the other, into the tiles of `store`.
+
+    placed: reference_from_rect0 of the views used, stamps_ns theirs.
+    """
+
+    def __init__(self, binner: PointBinner, store: TileStore, settings: MapSettings) -> None:
+        self._binner, self.store, self._settings = binner, store, settings
+        self.placed: list[Pose] = []
+        self.stamps_ns: list[int] = []
+
+    def add(
+        self, frame: MatchedFrame | Refusal, posed: PosedFrame, beside: Sequence[Neighbour] = ()
+    ) -> PosedView | Refusal:
+        """Bin a matched frame's points at its pose and fuse them. beside: see `PointBinner`."""
+        view = frame if isinstance(frame, Refusal) else self._binner(frame, posed, beside)
+        if isinstance(view, Failed):
+            return Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
+        if isinstance(view, PosedView):
+            with self._binner.watch("fuse", 1):
+                fuse_view(self.store, view.cells, self._settings)
+            self.placed.append(posed.reference_from_body @ self._binner.body_from_rect0)
+            self.stamps_ns.append(posed.stamp_ns)
+        return view
+
+
+def inspect_recording(
     recording: Recording, settings: MeasureSettings, scratch: Path, resume: Path | None
 ) -> ProbedRecording:
     """Look at a recording: how far the scene is, how large the cells, how sure the calibration.
@@ -114,7 +141,7 @@ def probe(
     """
     source, watch = SelectedSensors(recording, settings.use), Stopwatch()
     if faults := clock_faults(source):
-        raise InputError(source.path, "; ".join(faults), "or leave the sensor out with --use")
+        raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
     configuration, inputs = to_json(asdict(settings)), source.digests()
     kept = None
     if resume is not None:
@@ -131,7 +158,9 @@ def probe(
 
 
 @contextmanager
-def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance) -> Iterator[Way]:
+def estimate_trajectory(
+    probed: ProbedRecording, settings: MeasureSettings, advance: ProgressCallback
+) -> Iterator[TrackedRecording]:
     """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
     source, pairs, watch = probed.source, probed.pairs, probed.watch
     rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
@@ -165,7 +194,7 @@ def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance)
             rest = pairs({stamp for stamp in poses if stamp >= late})
             after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
-        yield Way(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
+        yield TrackedRecording(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
 
 
 @contextmanager
@@ -181,44 +210,43 @@ def _naming(probed: ProbedRecording) -> Iterator[None]:
 
 
 def build_map(
-    probed: ProbedRecording, way: Way, settings: MeasureSettings, scratch: Path, advance: Advance
+    probed: ProbedRecording,
+    way: TrackedRecording,
+    settings: MeasureSettings,
+    scratch: Path,
+    advance: ProgressCallback,
 ) -> BuiltMap:
     """Fuse each matched pair into the map's tiles, and carve its lines of sight.
 
     Raises MeasurementError where no frame could be measured.
     """
     source, watch = probed.source, probed.watch
-    body_from_rect0, camera = way.rectifier.body_from_rect0, way.rectifier.camera
+    camera = way.rectifier.camera
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in way.trajectory.refused]
-    placer = PointBinner(
-        way.stereo, body_from_rect0, probed.cell_m, probed.per_pixel, settings.map.max_sigma_m, watch
-    )
-    store, free = TileStore(scratch, settings.map.resident_tiles), FreeSpace(probed.cell_m)
-    preview = None
-    placed: list[Pose] = []
-    stamps: list[int] = []
+    binner = PointBinner(
+        way.stereo, way.rectifier.body_from_rect0, probed.cell_m, probed.per_pixel, settings.map.max_sigma_m,
+        watch,
+    )  # fmt: skip
+    views = FusedViews(binner, TileStore(scratch, settings.map.resident_tiles), settings.map)
+    free, preview = FreeSpace(probed.cell_m), None
     for done, (frame, posed, neighbours) in enumerate(_placed(way.matched, way.poses), start=1):
-        view = frame if isinstance(frame, Refusal) else placer(frame, posed, neighbours)
-        if isinstance(view, Failed):
-            view = Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
+        view = views.add(frame, posed, neighbours)
         if isinstance(view, Refusal):
             refusals.append(view)
         else:
-            with watch("fuse", 1):
-                fuse_view(store, view.cells, settings.map)
-            placed.append(posed.reference_from_body @ body_from_rect0)
-            stamps.append(posed.stamp_ns)
             with watch("free space", 1):
-                free.carve(view.cells, ViewFrusta.of([placed[-1]], camera).eyes[0])
+                free.carve(view.cells, ViewFrusta.of(views.placed[-1:], camera).eyes[0])
             if preview is None or abs(done - len(way.poses) / 2) < 1:
                 preview = Preview(view.left, view.disparity_px)
         if done % _TIDIED_EVERY == 1:
             trim_heap()
         advance("map", done, len(way.poses))
-    if not placed:
+    if not views.placed:
         raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
-    return BuiltMap(store, free, tuple(placed), tuple(stamps), tuple(refusals), preview)
+    return BuiltMap(
+        views.store, free, tuple(views.placed), tuple(views.stamps_ns), tuple(refusals), preview
+    )  # fmt: skip
 
 
 def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:

@@ -10,8 +10,9 @@ from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.parallel import in_background
+from barsight.core.settings.values import expect_choice
 from barsight.evaluation.score import score_folder
-from barsight.map_building import Advance
+from barsight.map_building import ProgressCallback
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import find_lifts, map_yard
 from barsight.recording.base import Recording
@@ -19,10 +20,10 @@ from barsight.recording.open import open_recording
 from barsight.report.page import write_report
 from barsight.report.result_files import RESULT_FILES, summary, write_results, write_summary, write_surface
 from barsight.result_folder import seal_map
-from barsight.yard.magnet.description import load_magnet
+from barsight.yard.magnet.description import Magnet, load_magnet
 
 
-def unheard(stage: str, done: int, total: int) -> None:
+def ignore_progress(stage: str, done: int, total: int) -> None:
     """Take progress that nobody asked for."""
 
 
@@ -31,7 +32,7 @@ def measure_into(
     out: Path,
     settings: MeasureSettings,
     *,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     overwrite: bool = False,
     resume: bool = False,
     truth_of: Path | None = None,
@@ -45,12 +46,14 @@ def measure_into(
     truth_of: a recording with truth to score against; only after the measuring is done. judged_at: when
     lifts are judged, see `barsight.pipeline.find_lifts`.
     """
+    expect_choice("at", judged_at, ("now", "end"))
     if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
     content = write_measured(
         open_recording(path, settings.recording), out, settings, advance=advance, overwrite=overwrite,
-        keep=keep, truth_of=truth_of, magnet=magnet, judged_at=judged_at, report=report,
+        keep=keep, truth_of=truth_of, magnet=None if magnet is None else load_magnet(magnet),
+        judged_at=judged_at, report=report,
     )  # fmt: skip
     if keep is not None:
         shutil.rmtree(keep, ignore_errors=True)
@@ -62,23 +65,22 @@ def write_measured(
     out: Path,
     settings: MeasureSettings,
     *,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     overwrite: bool = False,
     keep: Path | None = None,
     truth_of: Path | None = None,
-    magnet: Path | None = None,
+    magnet: Magnet | None = None,
     judged_at: Literal["now", "end"] = "now",
     report: bool = True,
 ) -> dict[str, Any]:
     """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from."""
-    described = load_magnet(magnet) if magnet is not None else None
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
         compile_ahead(advance, "measure")
         mapped = map_yard(recording, settings, scratch, advance, keep)
         with in_background(lambda: write_surface(mapped.surface, mapped.built.free, staging)):
-            measured = find_lifts(mapped, described, judged_at)
+            measured = find_lifts(mapped, magnet, judged_at)
         content = summary(measured)
         write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)

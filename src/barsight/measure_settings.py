@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from barsight.core.errors import ConfigError
-from barsight.core.settings.numbers import expect_numbers
+from barsight.core.settings.values import expect_values
 from barsight.mapping.settings import MapSettings
 from barsight.motion.settings import MotionSettings
 from barsight.recording.base import RecordingSettings
@@ -35,9 +35,9 @@ class MeasureSettings:
     lift: LiftSettings = field(default_factory=LiftSettings)
 
     def __post_init__(self) -> None:
+        expect_values(self)
         if "stereo" not in self.use:
-            raise ConfigError("stereo can't be left out of --use: it is what measures")
-        expect_numbers(asdict(self))
+            raise ConfigError("stereo can't be left out of use: it is what measures")
 
     def chosen(self) -> MeasureSettings:
         """Apply the preset to the settings."""

@@ -25,7 +25,7 @@ Picture = Path | UInt8
 _IN_COLOUR: tuple[MethodName, ...] = ("csca",)
 """Methods that look at colours."""
 _REMEDIES = {
-    "swapped": "exchange the two pictures or give --range A:B",
+    "swapped": "exchange the two pictures or give the range of disparities",
     "same-image": "give two pictures of one pair",
 }
 _MIN_SIZE = (3, 16)
@@ -87,7 +87,7 @@ def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: M
         )
     offset = vertical_offset(pair.left, pair.right)
     if not isinstance(offset, Failed) and offset > MAX_OFFSET_PX:
-        remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their --rig"
+        remedy = "give the rig of these pictures" if rig else "rectify the pictures, or give their rig"
         raise InputError(
             _name(left), f"the pair is not rectified: matches lie {offset:.1f} px off their rows", remedy
         )

@@ -20,7 +20,15 @@ from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import Agreement, Contour, CraneSamples, LaserProfile, Trajectory
-from barsight.map_building import Advance, BuiltMap, ProbedRecording, Way, build_map, follow, probe
+from barsight.map_building import (
+    BuiltMap,
+    ProbedRecording,
+    ProgressCallback,
+    TrackedRecording,
+    build_map,
+    estimate_trajectory,
+    inspect_recording,
+)
 from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.surface.contours import cut_contours
 from barsight.mapping.surface.height_selection import ViewFrusta
@@ -47,7 +55,7 @@ from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
 
-LEAST_DOWN = 0.5
+MIN_DOWN_COSINE = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
 MAX_BELOW_FLOOR_RATIO = 0.3
 """Depth under the floor over the working distance, at most; depths of one pair are rough."""
@@ -69,7 +77,7 @@ class MappedYard:
 
     settings: MeasureSettings
     probed: ProbedRecording
-    way: Way
+    way: TrackedRecording
     built: BuiltMap
     surface: Surface
     profiles: Profiles
@@ -78,7 +86,7 @@ class MappedYard:
 
 
 def map_yard(
-    recording: Recording, settings: MeasureSettings, scratch: Path, advance: Advance,
+    recording: Recording, settings: MeasureSettings, scratch: Path, advance: ProgressCallback,
     resume: Path | None = None,
 ) -> MappedYard:  # fmt: skip
     """Measure the surface. `scratch` is an empty folder for tiles and pictures; the caller removes it.
@@ -91,8 +99,8 @@ def map_yard(
     """
     began_s, settings = time.perf_counter(), settings.chosen()
     stock = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
-    probed = probe(recording, settings, scratch, resume)
-    with follow(probed, settings, advance) as way:
+    probed = inspect_recording(recording, settings, scratch, resume)
+    with estimate_trajectory(probed, settings, advance) as way:
         built = build_map(probed, way, settings, scratch, advance)
     with probed.watch("surface"):
         surface = _elect(probed, way, built, settings, scratch)
@@ -167,7 +175,7 @@ def _yard_frame_id(crane: CraneSamples | None, trajectory: Trajectory) -> str | 
 
 
 def _elect(
-    probed: ProbedRecording, way: Way, built: BuiltMap, settings: MeasureSettings, scratch: Path
+    probed: ProbedRecording, way: TrackedRecording, built: BuiltMap, settings: MeasureSettings, scratch: Path
 ) -> Surface:
     """Elect the surface of all views. Raises MeasurementError where no place was seen often enough."""
     min_views = settings.map.min_views if len(built.placed) > 1 else 1
@@ -200,7 +208,9 @@ def _compare_with_laser(
     return Profiles(contours, laser, agreed, len(laser) < len(whole))
 
 
-def _warnings(probed: ProbedRecording, way: Way, built: BuiltMap, profiles: Profiles) -> list[Notice]:
+def _warnings(
+    probed: ProbedRecording, way: TrackedRecording, built: BuiltMap, profiles: Profiles
+) -> list[Notice]:
     """Gather what every stage had to assume or leave out."""
     warnings = [Notice("assumed", text) for text in probed.source.notes]
     warnings += probed.doubts
@@ -224,13 +234,13 @@ def _warnings(probed: ProbedRecording, way: Way, built: BuiltMap, profiles: Prof
 
 
 def _floor_doubts(probed: ProbedRecording, built: BuiltMap, trajectory: Trajectory) -> list[Notice]:
-    """Doubt a way on which the cameras look under the yard's floor, or not down."""
+    """Warn where the cameras' view lies below the yard's floor, or not below the cameras."""
     if trajectory.reference != "yard":
         return []
     ahead = np.array([0.0, 0.0, probed.first.range_m])
     seen_z_m = float(np.median([pose.apply(ahead)[2] for pose in built.placed]))
     eye_z_m = float(np.median([pose.translation[2] for pose in built.placed]))
-    if eye_z_m - seen_z_m < LEAST_DOWN * probed.first.range_m:
+    if eye_z_m - seen_z_m < MIN_DOWN_COSINE * probed.first.range_m:
         where = "not below them"
     elif seen_z_m < -MAX_BELOW_FLOOR_RATIO * probed.first.range_m:
         where = f"{-seen_z_m:.1f} m below the yard's floor (z = 0)"
@@ -244,7 +254,9 @@ def _frames_total(probed: ProbedRecording) -> int:
     return len(probed.source.index.stamps_ns) + len(probed.source.index.unpaired)
 
 
-def _travel(probed: ProbedRecording, way: Way, built: BuiltMap, settings: MeasureSettings) -> Travel:
+def _travel(
+    probed: ProbedRecording, way: TrackedRecording, built: BuiltMap, settings: MeasureSettings
+) -> Travel:
     """Tell how sure the frames' way is, and how far off the encoders."""
     source = probed.source
     shift_ns, window_ns = source.rig.timeshift_cam_imu_ns, seconds_to_ns(settings.motion.crane.window_s)

@@ -6,7 +6,7 @@ import math
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -57,7 +57,7 @@ class LiftTarget:
     mass_sigma_kg: float | None
     valid_until_ns: int | None
     vetoes: tuple[tuple[str, str], ...]
-    record: dict[str, Any]
+    record: dict[str, Any] = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -78,18 +78,21 @@ class Lifts:
     def __len__(self) -> int:
         return len(self.offered)
 
+    def __repr__(self) -> str:
+        counts = f"{len(self.offered)} offered, {len(self.refused)} refused, {len(self.past)} past"
+        forbidden = ", ".join(code for code, _ in self.vetoes)
+        return f"<Lifts: {counts}{forbidden and f'; forbidden by {forbidden}'}>"
+
 
 class Yard:
-    """A measured yard; `folder` holds its files, which are read when they are asked for."""
+    """A measured yard; `folder` holds its files, which are read when they are asked for.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    owner: what `folder` goes with; it lives as long as the yard.
+    """
+
+    def __init__(self, folder: Path, owner: object = None) -> None:
+        self.folder, self._owner = folder, owner
         self.summary, _ = open_folder(folder)
-        self._kept: object = None
-
-    def keep(self, owner: object) -> None:
-        """Hold on to the owner of `folder`, with which it goes."""
-        self._kept = owner
 
     @cached_property
     def height_map(self) -> HeightMap:

@@ -1,4 +1,4 @@
-"""The way of the data from packets: what came so far can be looked at any time, the end is the batch's."""
+"""Measure packets as they come, with a snapshot at any time and the batch's result at the end."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import shutil
 import tempfile
 import weakref
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.checkpoint import checkpoint_folder, checkpointed
-from barsight.core.errors import MeasurementError
+from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
@@ -30,6 +33,7 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.result import Yard
 from barsight.stereo.settings import make_method
+from barsight.yard.magnet.description import load_magnet
 
 GRACE_NS = NS_PER_S
 """A frame waits so long for a sensor's readings, the first one for signs of every sensor."""
@@ -44,11 +48,19 @@ class Session:
     """
 
     def __init__(
-        self, rig: StereoRig, settings: MeasureSettings | None = None, *, magnet: Path | None = None,
-        imu_noise: ImuNoise | None = None, is_simulated: bool = False,
+        self, rig: StereoRig, settings: MeasureSettings | Mapping[str, Any] | None = None, *,
+        magnet: Path | str | None = None, imu_noise: ImuNoise | None = None, is_simulated: bool = False,
+        **fields: Any,
     ) -> None:  # fmt: skip
-        """magnet: TOML file of the magnet that lifts are chosen for. is_simulated: said in the result."""
-        self._asked, self._magnet = settings or MeasureSettings(), magnet
+        """settings: or their fields by name, as `measure` takes them. magnet: TOML file of the magnet that
+        lifts are chosen for. is_simulated: said in the result. Raises InputError or ConfigError.
+        """
+        if not isinstance(rig, StereoRig):
+            raise ConfigError(f"rig is {rig!r}; give a StereoRig, like open_recording(PATH).rig")
+        if settings is not None and fields:
+            raise ConfigError(f"settings are given twice; add {', '.join(fields)} to them")
+        self._asked = build_settings(fields if settings is None else settings, MeasureSettings)
+        self._magnet = None if magnet is None else load_magnet(Path(magnet))
         self._settings = self._asked.chosen()
         self._folder = Path(tempfile.mkdtemp(prefix="barsight."))
         self._yard = self._folder / "yard"
@@ -97,9 +109,7 @@ class Session:
             self._recording, self._yard, self._asked, keep=self._kept.parent, magnet=self._magnet,
             report=False,
         )  # fmt: skip
-        yard = Yard(self._yard)
-        yard.keep(self)
-        return yard
+        return Yard(self._yard, self)
 
     def _expect_open(self) -> None:
         if self._yard.exists():

@@ -1,1 +1,1 @@
-"""Floor 8: the command line; thin wiring, one file per command."""
+"""The command line: thin wiring, one file per command."""

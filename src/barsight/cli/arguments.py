@@ -53,4 +53,4 @@ def load_settings(path: Path | None, kind: type[Settings]) -> Settings:
     """
     if path is None:
         return kind()
-    return read_settings(path, kind, "barsight measure --help lists the settings", "--config")
+    return read_settings(path, kind, "barsight measure --help lists the settings", "config")

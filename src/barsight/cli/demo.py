@@ -13,8 +13,7 @@ from barsight.cli.arguments import call
 from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
 from barsight.core.compiling.ahead import compile_ahead
-from barsight.core.errors import OutputError
-from barsight.core.files import atomic_path
+from barsight.core.files import atomic_path, expect_empty
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings import SimulationSettings
@@ -29,14 +28,12 @@ def run(arguments: Sequence[str]) -> None:
         """Simulate a small yard, measure it, and compare with its truth and its simulated laser.
 
         Args:
-            out: The folder for the recording (OUT/recording), the example magnet that lifts are chosen for
+            out: A new folder for the recording (OUT/recording), the example magnet that lifts are chosen for
                 (OUT/magnet.toml) and the results (OUT/result).
         """
         console = Console(stderr=True)
         recording, magnet, result = (out / name for name in ("recording", "magnet.toml", "result"))
-        for folder in (recording, magnet, result):
-            if folder.exists():
-                raise OutputError(f"{folder}: exists already; remove it or name another folder with -o")
+        expect_empty(out)
         console.print("Simulating a small yard ...")
         with stages(console) as advance:
             compile_ahead(advance, "simulate", "measure")

@@ -50,7 +50,7 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
     target = target.absolute()
     with translated_os_errors(target):
         if not replace:
-            _expect_empty(target)
+            expect_empty(target)
         elif target.exists() and not target.is_dir():
             raise OutputError(f"{target}: is a file; name a folder")
         made = [folder for folder in target.parents if not folder.exists()]
@@ -62,7 +62,7 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
             yield staging
             if not replace:
                 # Another run may have written there in the meantime.
-                _expect_empty(target)
+                expect_empty(target)
             if target.is_dir():
                 fresh = sorted(staging.iterdir())
                 for name in set(owned) - {path.name for path in fresh}:
@@ -83,7 +83,8 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
 def translated_os_errors(target: Path) -> Iterator[None]:
     """Translate the operating system's refusals (full disk, no permission) into one `OutputError` line.
 
-    `InputError` where it is a file elsewhere that may not be read.
+    `InputError` where it is a file elsewhere that may not be read. Other refusals are translated where they
+    name the temporary file, which the user doesn't know.
     """
     try:
         yield
@@ -109,6 +110,8 @@ def translated_os_errors(target: Path) -> Iterator[None]:
             advice = (
                 "the disk is full or a limit is reached: a file could not be written whole; free some space"
             )
+        if advice is None and _is_temporary(error.filename, target):
+            advice = f"nothing can be written there ({error.strerror}); name another folder"
         if advice is None:
             raise
         raise OutputError(f"{target}: {advice}") from error
@@ -122,10 +125,17 @@ def _belongs(name: object, target: Path) -> bool:
     if target.is_relative_to(path) or path.is_relative_to(target):
         return True
     beside = path.is_relative_to(target.parent)
-    return beside and path.relative_to(target.parent).parts[0].startswith(f".{target.name[:40]}.")
+    return beside and _is_temporary(target.parent / path.relative_to(target.parent).parts[0], target)
 
 
-def _expect_empty(target: Path) -> None:
+def _is_temporary(name: object, target: Path) -> bool:
+    """Check whether the file is the temporary one, or the temporary folder itself, that waits beside it."""
+    path, target = Path(str(name)), target.absolute()
+    return path.absolute().parent == target.parent and path.name.startswith(f".{target.name[:40]}.")
+
+
+def expect_empty(target: Path) -> None:
+    """Raise `OutputError` where `target` is a file or a folder that holds something."""
     if target.exists() and not target.is_dir():
         raise OutputError(f"{target}: is a file; name a folder")
     if target.is_dir() and any(target.iterdir()):

@@ -13,21 +13,22 @@ DIGITS = 9
 """Significant digits of a result's documents: a micrometre in any yard."""
 
 
-def json_value(value: Any, digits: int | None = None) -> Any:
+def json_value(value: Any, digits: int | None = None, decimals: int | None = None) -> Any:
     """Replace NaN and infinity by None, arrays and tuples by lists, NumPy scalars by Python's, at any depth.
 
-    digits: significant digits that floats are rounded to; all where None.
+    digits, decimals: significant digits or decimals that floats are rounded to; all where None.
     """
     if isinstance(value, dict):
-        return {key: json_value(item, digits) for key, item in value.items()}
+        return {key: json_value(item, digits, decimals) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return json_value(value.tolist(), digits)
+        return json_value(value.tolist(), digits, decimals)
     if isinstance(value, list | tuple):
-        return [json_value(item, digits) for item in value]
+        return [json_value(item, digits, decimals) for item in value]
     if isinstance(value, float):
         if not math.isfinite(value):
             return None
-        return value if digits is None else float(f"{value:.{digits}g}")
+        shortened = value if digits is None else float(f"{value:.{digits}g}")
+        return shortened if decimals is None else round(shortened, decimals)
     return value
 
 

@@ -1,4 +1,4 @@
-"""The memory of this process: its peak, and giving back what was freed."""
+"""Read this process's peak memory, and return freed memory to the system."""
 
 from __future__ import annotations
 

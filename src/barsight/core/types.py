@@ -290,6 +290,9 @@ class Contour:
     sigma_m: Float64
     source: UInt8
 
+    def __repr__(self) -> str:
+        return f"<Contour {self.profile}: {self.x_m.size} points>"
+
 
 @dataclass(frozen=True)
 class Agreement:

@@ -17,7 +17,8 @@ MIN_FOR_PLANE = 4
 
 @dataclass(frozen=True, eq=False)
 class NearestNeighbours:
-    """Of each of N first descriptors: index (N,) of the nearest second one, its distance and the next one's.
+    """Nearest neighbours of N first descriptors: index (N,) of the nearest second one, its distance and the
+    next one's.
 
     The distance is Hamming's [paper Eq. 6] for bits, else L2.
     """

@@ -103,8 +103,7 @@ def _level(cells: CellObservations) -> Bool:
     column, row = cells.x - cells.x.min(), cells.y - cells.y.min()
     shape = int(row.max()) + 1, int(column.max()) + 1
     highest, lowest = np.full(shape, -np.inf, np.float32), np.full(shape, np.inf, np.float32)
-    np.maximum.at(highest, (row, column), cells.z_m)
-    np.minimum.at(lowest, (row, column), cells.z_m)
+    bound_heights(row, column, cells.z_m, highest, lowest)
     about = np.ones((LEVEL_CELLS, LEVEL_CELLS), np.uint8)
     highest, lowest = cv2.dilate(highest, about), cv2.erode(lowest, about)
     over, under = highest[row, column] - cells.z_m, cells.z_m - lowest[row, column]
@@ -123,6 +122,17 @@ def _overlap(
         ours.append(slice(low - tile * TILE, high - tile * TILE))
         theirs.append(slice(low - first, high - first))
     return (ours[0], ours[1]), (theirs[0], theirs[1])
+
+
+@kernel()
+def bound_heights(row: Int32, column: Int32, z: Float32, highest: Float32, lowest: Float32) -> None:
+    """Bound the heights z (N,) of each cell: raise `highest` and lower `lowest` (H, W), in place, at row,
+    column (N,).
+    """
+    for k in range(z.size):
+        i, j = row[k], column[k]
+        highest[i, j] = max(highest[i, j], z[k])
+        lowest[i, j] = min(lowest[i, j], z[k])
 
 
 @kernel()

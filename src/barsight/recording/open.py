@@ -39,7 +39,7 @@ def _open(path: Path, settings: RecordingSettings) -> StoredPictures:
         raise InputError(path, "no such file or folder", "check the path")
     if path.is_file():
         if path.suffix not in BAG_KINDS:
-            raise InputError(path, "is a file of an unknown kind", f"give {KNOWN}")
+            raise InputError(path, "is of an unknown file type", f"give {KNOWN}")
         return BagRecording(path, path, BAG_KINDS[path.suffix], settings)
     if any((path / name).is_dir() for name in ("mav0", "cam0", "cam1")):
         return EurocRecording(path, settings)
@@ -50,7 +50,7 @@ def _open(path: Path, settings: RecordingSettings) -> StoredPictures:
         return CornerRecording(path, settings)
     if is_kitti(path):
         return KittiRecording(path, settings)
-    raise InputError(path, "is no recording that Barsight knows", f"give {_hint(path) or KNOWN}")
+    raise InputError(path, "is not a recording that Barsight recognises", f"give {_hint(path) or KNOWN}")
 
 
 def _open_bag_folder(path: Path, bags: list[Path], settings: RecordingSettings) -> BagRecording:

@@ -16,6 +16,7 @@ import tifffile
 import barsight
 from barsight.core.arrays import Float32
 from barsight.core.files import atomic_path
+from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S, format_seconds
 from barsight.core.types import Contour, LaserProfile, Trajectory
 from barsight.mapping.free_space import UNPROVEN, FreeSpace
@@ -292,15 +293,5 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "warnings": [asdict(warning) for warning in measurement.warnings],
         "vetoes": [{"code": v.code, "message": v.reason} for v in measurement.lifts.vetoes],
     }
-    rounded: dict[str, Any] = _rounded(content)
+    rounded: dict[str, Any] = json_value(content, decimals=6)
     return rounded
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_rounded(item) for item in value]
-    if isinstance(value, float):
-        return round(value, 6) if np.isfinite(value) else None
-    return value

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import tyro
 
 from barsight.core.errors import ConfigError
-from barsight.core.settings.numbers import expect_numbers
+from barsight.core.settings.values import expect_values
 
 BARS_OF_RINGS = (1, 7, 19, 37, 61)
 
@@ -261,7 +261,7 @@ class SimulationSettings:
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 
     def __post_init__(self) -> None:
-        expect_numbers(asdict(self))
+        expect_values(self)
         _expect(1 <= self.length_m <= 500, "length_m must lie between 1 and 500 m")
         _expect(2 <= self.frames <= 100_000, "frames must lie between 2 and 100000")
         _expect(self.seed >= 0, "seed can't be negative")

@@ -50,11 +50,11 @@ class StereoSettings:
         if low is not None and high is not None and high <= low:
             raise ConfigError(f"the disparity range {low}:{high} is empty")
         if self.calibration_sigma_px < 0 or self.max_depth_m <= 0:
-            raise ConfigError("calibration_sigma_px can't be negative, max_depth_m must be positive")
+            raise ConfigError("stereo.calibration_sigma_px can't be negative, max_depth_m must be positive")
         if self.max_sigma_px <= 0:
-            raise ConfigError(f"max_sigma_px must be positive, not {self.max_sigma_px}")
+            raise ConfigError(f"stereo.max_sigma_px must be positive, not {self.max_sigma_px}")
         if not 0 <= self.gap_darkness < 1:
-            raise ConfigError(f"gap_darkness must lie in 0...1, not {self.gap_darkness}")
+            raise ConfigError(f"stereo.gap_darkness must lie in 0...1, not {self.gap_darkness}")
 
     def for_map(self) -> StereoSettings:
         """Drop guesses, which no map takes, and be as sure of a pixel's side as if there were no edge: a map

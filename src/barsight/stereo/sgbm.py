@@ -41,11 +41,11 @@ class SgbmSettings:
 
     def __post_init__(self) -> None:
         if self.block_px < 1 or self.block_px % 2 == 0:
-            raise ConfigError(f"block_px must be odd and positive, not {self.block_px}")
+            raise ConfigError(f"stereo.sgbm.block_px must be odd and positive, not {self.block_px}")
         if not 0 <= self.uniqueness_pct <= 100:
-            raise ConfigError(f"uniqueness_pct must lie in 0...100, not {self.uniqueness_pct}")
+            raise ConfigError(f"stereo.sgbm.uniqueness_pct must lie in 0...100, not {self.uniqueness_pct}")
         if self.speckle_px < 0 or self.subpixel_sigma_px < 0:
-            raise ConfigError("speckle_px and subpixel_sigma_px can't be negative")
+            raise ConfigError("stereo.sgbm.speckle_px and subpixel_sigma_px can't be negative")
 
 
 @dataclass(frozen=True)

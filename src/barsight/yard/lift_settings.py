@@ -56,29 +56,29 @@ class LiftSettings:
 
     def __post_init__(self) -> None:
         if not 1 <= self.bundles <= 10:
-            raise ConfigError(f"lift bundles must lie in 1...10, not {self.bundles}")
+            raise ConfigError(f"lift.bundles must lie in 1...10, not {self.bundles}")
         shares = (
             self.max_unknown_ratio, self.max_unexplained_ratio, self.min_confidence,
             self.max_overhang_ratio, self.min_count_probability, self.max_refused_ratio,
         )  # fmt: skip
         if not all(0 <= share <= 1 for share in shares):
-            raise ConfigError("lift shares, min_confidence and min_count_probability lie in 0...1")
+            raise ConfigError("lift: shares, min_confidence and min_count_probability lie in 0...1")
         if not 0 <= self.strap_m <= 0.05:
-            raise ConfigError(f"lift strap_m must lie in 0...0.05, not {self.strap_m}")
+            raise ConfigError(f"lift.strap_m must lie in 0...0.05, not {self.strap_m}")
         if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
-            raise ConfigError("lift contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
+            raise ConfigError("lift.contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
         if not 0 <= self.disturbed_reach_m <= 100:
-            raise ConfigError(f"lift disturbed_reach_m must lie in 0...100, not {self.disturbed_reach_m}")
+            raise ConfigError(f"lift.disturbed_reach_m must lie in 0...100, not {self.disturbed_reach_m}")
         if min(self.set_down_clear_m, self.travel_clear_m, self.swing_m) <= 0:
-            raise ConfigError("lift set_down_clear_m, travel_clear_m and swing_m must be over 0")
+            raise ConfigError("lift.set_down_clear_m, travel_clear_m and swing_m must be over 0")
         if not 0 <= self.dunnage_m <= 0.5:
-            raise ConfigError(f"lift dunnage_m must lie in 0...0.5, not {self.dunnage_m}")
+            raise ConfigError(f"lift.dunnage_m must lie in 0...0.5, not {self.dunnage_m}")
         if not 0 <= self.max_turn_deg <= 180:
-            raise ConfigError(f"lift max_turn_deg must lie in 0...180, not {self.max_turn_deg}")
+            raise ConfigError(f"lift.max_turn_deg must lie in 0...180, not {self.max_turn_deg}")
         if self.max_stack_m is not None and not 0 < self.max_stack_m <= 50:
-            raise ConfigError(f"lift max_stack_m must lie between 0 and 50, not {self.max_stack_m}")
+            raise ConfigError(f"lift.max_stack_m must lie between 0 and 50, not {self.max_stack_m}")
         if not 0 < self.max_lean_deg <= 45:
-            raise ConfigError(f"lift max_lean_deg must lie in 0...45, not {self.max_lean_deg}")
+            raise ConfigError(f"lift.max_lean_deg must lie in 0...45, not {self.max_lean_deg}")
 
 
 UPPER = 1.645

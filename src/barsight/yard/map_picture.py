@@ -1,4 +1,4 @@
-"""A small picture of a height map for notebooks."""
+"""Draw a small picture of a height map for notebooks."""
 
 from __future__ import annotations
 

@@ -63,6 +63,10 @@ class HeightMap:
         centres = {"y": ("y", self.y_m, {"units": "m"}), "x": ("x", self.x_m, {"units": "m"})}
         return Dataset(layers, centres, {"cell_m": self.cell_m})
 
+    def __repr__(self) -> str:
+        rows, columns = self.shape
+        return f"<HeightMap: {columns} x {rows} cells of {1e3 * self.cell_m:.0f} mm>"
+
     def _repr_html_(self) -> str:
         """Return a picture of the heights for a notebook."""
         from barsight.yard.map_picture import picture_html

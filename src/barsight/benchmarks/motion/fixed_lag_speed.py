@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import resource
+import mmap
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,13 +15,14 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import ConfigError
+from barsight.core.memory import peak_memory_mib
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 from barsight.motion.frontend.tracking import Sighting
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
@@ -38,7 +39,7 @@ LEVER_M = np.array([0.35, -0.2, -0.55])
 
 @dataclass(frozen=True)
 class LiveSpeed:
-    """Of each tenth of the way: ms a keyframe by the clock and of CPU, and MiB grown since the first tenth.
+    """Cost of each tenth of the way: ms a keyframe, wall and CPU, and MiB grown since the first tenth.
 
     rmse_mm: the places against the truth. nees: per degree of freedom.
     """
@@ -73,7 +74,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
     poses = [Pose("yard", "body", r, p) for r, p in zip(true.yard_from_body, true.position_m, strict=True)]
     rectifier = Rectifier(rig)
     samples = ImuSamples(imu.stamp_ns, imu.gyro_radps, imu.accel_mps2)
-    readings = ReadingsSoFar(crane, samples, ORDINARY_NOISE)
+    readings = SensorBuffer(crane, samples, ORDINARY_NOISE)
     estimator = FixedLagEstimator(FusionSettings(), CraneSettings(), held, rectifier, 0, readings, None)
     clocks, memory, seen, found = [], [], [], []
     for sighting in _sightings(poses, stamps, rectifier, rng):
@@ -91,7 +92,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
     return LiveSpeed(
         keyframes, float(np.mean(seen)), tuple(tenths[:, 0].tolist()), tuple(tenths[:, 1].tolist()),
         tuple((held_mib - held_mib[0]).tolist()),
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        peak_memory_mib(),
         float(1e3 * np.sqrt((off**2).sum(axis=1).mean())), float(nees.mean()),
     )  # fmt: skip
 
@@ -152,4 +153,4 @@ def _rig() -> StereoRig:
 def _resident_mib() -> float:
     """Read the resident memory from the kernel's own count of its pages."""
     with open("/proc/self/statm") as file:  # noqa: PTH123
-        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+        return int(file.read().split()[1]) * mmap.PAGESIZE / 2**20

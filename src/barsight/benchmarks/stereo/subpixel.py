@@ -32,7 +32,7 @@ _FLOOR_MARGIN_PX, _BAR_MARGIN_PX = 12, 4
 
 @dataclass(frozen=True)
 class FractionBias:
-    """Of one method on one kind of scene.
+    """Errors of one method on one kind of scene.
 
     bias_px: median error per tenth of a pixel of the true disparity's fraction, from 0 on. peak_to_peak_px:
     their highest minus their lowest. median_bias_px: of all pixels. median_error_px: of the absolute error.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from dataclasses import dataclass
 
 from barsight.benchmarks.yard.bundle_detection import drawn_map, drawn_yards
+from barsight.core.memory import peak_memory_mib
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
@@ -47,7 +47,7 @@ def time_yard(magnet: Magnet, seed: int, length_m: float = LENGTH_M) -> YardSpee
         plan_lifts(height_map, bundles, magnet, LiftSettings(), ())
         wall.append(time.perf_counter())
         cpu.append(time.process_time())
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return YardSpeed(
-        length_m, len(bundles), wall[1] - wall[0], cpu[1] - cpu[0], wall[2] - wall[1], cpu[2] - cpu[1], peak
-    )
+        length_m, len(bundles), wall[1] - wall[0], cpu[1] - cpu[0], wall[2] - wall[1], cpu[2] - cpu[1],
+        peak_memory_mib(),
+    )  # fmt: skip

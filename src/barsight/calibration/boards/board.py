@@ -90,7 +90,7 @@ def parse_board(text: str) -> Board:
         columns, rows = (int(part) for part in rest[0].lower().split("x"))
         sizes = [float(part) for part in rest[1:3]]
     except (KeyError, ValueError):
-        raise ConfigError(f"--board {text!r} is no board; give {BOARD_FORMS}") from None
+        raise ConfigError(f"board {text!r} is no board; give {BOARD_FORMS}") from None
     if kind == "checkerboard":
         return Board(BoardKind.CHECKERBOARD, columns, rows, sizes[0])
     if kind == "aprilgrid":

@@ -1,4 +1,4 @@
-"""The noise model of an IMU."""
+"""Describe an IMU's noise: white noise and bias random walk of gyro and accelerometer."""
 
 from __future__ import annotations
 

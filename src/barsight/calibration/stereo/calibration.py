@@ -202,7 +202,7 @@ def _solve_alone(
     corners = [c for c in (view.cameras[camera] for view in views) if isinstance(c, Corners)]
     start = start_lens(lens, corners, points, size)
     if isinstance(start, Failed):
-        raise CalibrationError(source, f"cam{camera}: {start.reason}", "check --board and the pictures")
+        raise CalibrationError(source, f"cam{camera}: {start.reason}", "check the board and the pictures")
     guess = lens.camera(start, *size)
     poses = [board_pose(guess, c, points) for c in corners]
     state = AdjustmentState(
@@ -218,7 +218,9 @@ def _camera(lens: Lens, parameters: Float64, size: tuple[int, int], source: Path
         return lens.camera(parameters, *size)
     except ValueError as error:
         raise CalibrationError(
-            source, f"the views don't determine the lens: {error}", "add tilted views, or take --lens radtan4"
+            source,
+            f"the views don't determine the lens: {error}",
+            "add tilted views, or take the lens radtan4",
         ) from None
 
 
@@ -241,7 +243,7 @@ def _expect_views(views: Sequence[BoardView], source: Path, removed: Sequence[Re
         source,
         f"only {both} views show the board to both cameras, {FEWEST_VIEWS} are needed"
         + (f" ({reasons})" if reasons else ""),
-        "check --board and that left and right are of the same moments, or take more views",
+        "check the board and that left and right are of the same moments, or take more views",
     )
 
 
@@ -261,7 +263,7 @@ def _finish(
             "add views with the board tilted about both axes and near the picture's corners",
         ) from None
     except ValueError as error:
-        raise CalibrationError(source, str(error), "check the pictures' order and --board") from None
+        raise CalibrationError(source, str(error), "check the pictures' order and the board") from None
     names = parameter_names(lens)
     own = len(names)
     return StereoCalibration(

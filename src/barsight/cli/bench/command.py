@@ -50,7 +50,9 @@ def run(arguments: Sequence[str]) -> None:
         "length": bench_length,
     }
     names = " | ".join(benches)
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments:
+        raise ConfigError(f"bench needs a benchmark: {names}")
+    if arguments[0] in ("-h", "--help"):
         Console().print(f"usage: barsight bench {names} ...", markup=False)
         return
     if arguments[0] not in benches:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import resource
+import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,5 +86,5 @@ def _row(recording: Path, out: Path) -> LengthRow:
 
 
 def _children_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    used = os.times()
+    return used.children_user + used.children_system

@@ -21,11 +21,11 @@ KINDS = {
 
 def run(arguments: Sequence[str]) -> None:
     """Pass the rest of the line on to the calibration named first."""
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments:
+        raise ConfigError(f"calibrate needs a kind: {', '.join(KINDS)}; --help says what each does")
+    if arguments[0] in ("-h", "--help"):
         lines = "\n".join(f"  {name:<11}{summary}" for name, summary in KINDS.items())
         sys.stdout.write(f"usage: barsight calibrate KIND ...\n\nkinds:\n{lines}\n\n")
-        if not arguments:
-            raise ConfigError(f"barsight calibrate needs a kind: {', '.join(KINDS)}")
         return
     kind, rest = arguments[0], arguments[1:]
     if kind not in KINDS:

@@ -53,7 +53,7 @@ class Options:
 
 
 class Termination(Enum):
-    """Why the search ended."""
+    """Name the condition that ended the search."""
 
     CONVERGED = "converged"
     MAX_STEPS = "max-steps"

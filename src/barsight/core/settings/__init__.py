@@ -1,1 +1,1 @@
-"""Settings: numbers checked, TOML files read, old names refused with the new one."""
+"""Settings: built and checked by their types, read from TOML files, old names refused with the new one."""

@@ -24,7 +24,7 @@ from barsight.mapping.surface.directional_filter import (
     smooth_along_bars,
     valley_mask,
 )
-from barsight.mapping.surface.height_selection import Asked, ViewFrusta, elect_by_votes, elect_surface
+from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
 from barsight.mapping.surface.surface import (
     Layers,
     Surface,
@@ -136,15 +136,17 @@ class SurfaceElection:
         def look(key: TileKey, tile: Float32) -> None:
             np.save(_first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
 
-        def elect_tile(key: TileKey, tile: Float32, asked: Asked) -> None:
+        def elect_tile(key: TileKey, tile: Float32, asked: ViewSupport) -> None:
             around = _first_around(self._first, key, known)
             winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
             np.save(_winner_file(self._elected, key), winner)
             self._views[key] = asked.views
 
-        def asked_of(key: TileKey) -> Asked:
-            return Asked.none() if last else Asked(self._views.get(key, 0), self._heights.take(key))
+        def asked_of(key: TileKey) -> ViewSupport:
+            return (
+                ViewSupport.none() if last else ViewSupport(self._views.get(key, 0), self._heights.take(key))
+            )
 
         _read_first.cache_clear()
         for _ in ordered_map(lambda item: look(*item), ((key, read(key)) for key in keys)):

@@ -173,7 +173,7 @@ def step_gain(
     short_of = np.empty_like(mean_weight)
 
     def work(first: int, end: int) -> None:
-        _lengthen(
+        _apply_step_gain(
             weight,
             trust,
             np.float32(slope_noise),
@@ -191,7 +191,7 @@ def step_gain(
 
 
 @kernel()
-def _lengthen(
+def _apply_step_gain(
     weight: Float32, trust: Float32, slope_noise: np.float32, reach: int, is_last: bool, pull: Float32,
     mean_weight: Float32, short_of: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
@@ -286,4 +286,6 @@ def _noise_power(
         slide_window(column, reach, found)
         for x in range(width):
             each = one / (weights[x] + np.float32(1e-3))
-            found[x] = found[x] / size * each * (one + hold * (seen[x] + np.float32(1e-6)) * each)
+            # Sliding sums of squares round to a little under 0 where no pull is left.
+            square = max(found[x], np.float32(0)) / size
+            found[x] = square * each * (one + hold * (seen[x] + np.float32(1e-6)) * each)

@@ -19,7 +19,7 @@ from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove
 from barsight.stereo.direct.depth_edges import sharpen_edges
 from barsight.stereo.direct.kernels.pyramid import halve
 from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes, fill_row_holes
-from barsight.stereo.direct.refinement import IcpResult, RefinementSettings, refine_disparity
+from barsight.stereo.direct.refinement import RefinedDisparity, RefinementSettings, refine_disparity
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 
 _NAN = np.float32(np.nan)
@@ -64,7 +64,7 @@ class BarsightSettings:
 
     def __post_init__(self) -> None:
         if min(self.consistency_px, self.max_sigma_px) <= 0:
-            raise ConfigError("consistency_px and max_sigma_px must be positive")
+            raise ConfigError("stereo.barsight.consistency_px and max_sigma_px must be positive")
         shares = (
             self.vertical_error_ratio,
             self.edge_error_ratio,
@@ -73,7 +73,9 @@ class BarsightSettings:
         )
         lengths = (self.max_edge_px, self.wrong_side_px)
         if min(self.model_sigma_px, self.island_px, *shares, *lengths) < 0:
-            raise ConfigError("model_sigma_px, island_px and the shares of sigma can't be negative")
+            raise ConfigError(
+                "stereo.barsight.model_sigma_px, island_px and the shares of sigma can't be negative"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +126,7 @@ class BarsightStereo:
         disparity, sigma = np.where(pair.left_valid, disparity, _NAN), np.where(pair.left_valid, sigma, _NAN)
         return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
 
-    def _sigma(self, pair: RectifiedPair, refined: IcpResult, start_px: Float32) -> Float32:
+    def _sigma(self, pair: RectifiedPair, refined: RefinedDisparity, start_px: Float32) -> Float32:
         """Combine noise, what noise doesn't explain, and what a bend costs. start_px: NaN where unmatched."""
         settings = self.settings
         matched = np.isfinite(start_px)

@@ -97,13 +97,13 @@ class Vectors:
         return self.builder.select(self.builder.icmp_unsigned("<", one, other), back, forth)
 
     def product(self, one: Any, *others: Any) -> Any:
-        """Of floats."""
+        """Multiply vectors of floats."""
         for other in others:
             one = self.builder.fmul(one, other)
         return one
 
     def sum(self, one: Any, other: Any) -> Any:
-        """Of floats."""
+        """Add vectors of floats."""
         return self.builder.fadd(one, other)
 
     def at_least(self, vector: Any, least: float) -> Any:

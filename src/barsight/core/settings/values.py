@@ -1,0 +1,118 @@
+"""Build frozen settings from plain values, and check them by the types that their fields state."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from barsight.core.errors import ConfigError
+from barsight.core.settings.renamed import refuse_old_keys
+
+Settings = TypeVar("Settings")
+MAX_VALUE = 2**31 - 1
+
+
+def build_settings(content: Any, kind: type[Settings], name: str = "settings") -> Settings:
+    """Build settings of `kind` from nested mappings over the defaults; those that are of the kind stay.
+
+    name: what `content` itself is called. Raises ConfigError naming a setting that there is not, that is
+    missing or can't be what it is.
+    """
+    if isinstance(content, Mapping):
+        refuse_old_keys(content)
+        built: Settings = _built(content, kind, "")
+    else:
+        built = _checked(content, kind, name)
+    return built
+
+
+def expect_values(settings: Any, prefix: str = "") -> None:
+    """Raise ConfigError naming a setting, in nested ones too, that isn't of its type or none of its choices,
+    is NaN or too large.
+    """
+    record: Any = type(settings)
+    for name, kind in _types_of(record).items():
+        value = getattr(settings, name)
+        if isinstance(value, Mapping) and isinstance(kind, type):
+            raise ConfigError(f"{prefix}{name} is {value!r}; give a {kind.__name__}")
+        _checked(value, kind, f"{prefix}{name}")
+
+
+def expect_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
+    """Raise ConfigError where a value is none of the choices."""
+    if value not in choices:
+        *most, last = map(str, choices)
+        raise ConfigError(f"{name} is {value!r}; choose {', '.join(most)}{' or ' if most else ''}{last}")
+
+
+@cache
+def _types_of(kind: Any) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def _built(content: Mapping[str, Any], kind: Any, prefix: str) -> Any:
+    known = _types_of(kind)
+    for key in content:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1)
+            told = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+            raise ConfigError(f"there is no setting {prefix}{key}; {told}")
+    for field in fields(kind):
+        if field.name not in content and field.default is field.default_factory is MISSING:
+            raise ConfigError(f"{prefix}{field.name} is missing")
+    return kind(**{key: _checked(value, known[key], f"{prefix}{key}") for key, value in content.items()})
+
+
+def _checked(value: Any, kind: Any, name: str) -> Any:
+    """Return a value as its type has it: records of mappings, tuples of lists, paths of texts."""
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None:
+            return None
+        (kind,) = (one for one in get_args(kind) if one is not types.NoneType)
+    if get_origin(kind) is Literal:
+        expect_choice(name, value, get_args(kind))
+        return value
+    if get_origin(kind) is tuple:
+        return _tuple(value, get_args(kind), name)
+    if is_dataclass(kind):
+        if isinstance(value, Mapping):
+            return _built(value, kind, f"{name}.")
+        if isinstance(value, kind):  # type: ignore[arg-type]
+            expect_values(value, f"{name}.")
+            return value
+        raise ConfigError(f"{name} is {value!r}; give its fields by name")
+    return _plain(value, kind, name)
+
+
+def _tuple(value: Any, kinds: tuple[Any, ...], name: str) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ConfigError(f"{name} is {value!r}; give a list")
+    if kinds[-1] is Ellipsis:
+        kinds = kinds[:1] * len(value)
+    if len(value) != len(kinds):
+        raise ConfigError(f"{name} has {len(value)} values; give {len(kinds)}")
+    return tuple(_checked(one, kind, name) for one, kind in zip(value, kinds, strict=True))
+
+
+def _plain(value: Any, kind: Any, name: str) -> Any:
+    """Return a number, flag, text or path."""
+    accepted: Any
+    accepted, wanted = {
+        float: (Real, "a number"), int: (Integral, "a whole number"), bool: (bool, "true or false"),
+        str: (str, "text in quotes"), Path: ((str, Path), "a path"),
+    }[kind]  # fmt: skip
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise ConfigError(f"{name} is {value!r}; give {wanted}")
+    if kind is float and not math.isfinite(value):
+        raise ConfigError(f"{name} is {value}; give a number")
+    if kind is int and abs(value) > MAX_VALUE:
+        raise ConfigError(f"{name} is {value}; the most is {MAX_VALUE}")
+    return kind(value)
