@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.interpolate import BSpline
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.camera_imu.arrowhead_system import (
@@ -26,7 +27,17 @@ from barsight.calibration.camera_imu.residual_kernels import (
     imu_rows,
     sum_corners,
 )
-from barsight.calibration.camera_imu.spline_kernels import DEGREE, ORDER, motion_at
+from barsight.calibration.camera_imu.spline_kernels import (
+    BLENDING,
+    CUMULATIVE,
+    DEGREE,
+    ORDER,
+    exp_so3,
+    motion_at,
+    place_at,
+    rotation_at,
+    weights,
+)
 
 STEP_S = 0.1
 
@@ -201,3 +212,66 @@ def test_the_arrow_system_is_the_dense_one() -> None:
     np.testing.assert_allclose(
         project_out_chain(samples, eliminated.through), samples.by_common - through, atol=1e-9
     )
+
+
+def test_weights_are_the_basis_and_its_slopes_by_time() -> None:
+    basis = BSpline((np.arange(2 * ORDER) - DEGREE) * STEP_S, np.eye(ORDER), DEGREE)
+    found, moved = np.empty((3, ORDER)), np.empty((3, 3))
+    places = np.random.default_rng(4).normal(size=(ORDER, 3))
+    for u in (0.0, 0.37, 0.99):
+        weights(u, STEP_S, BLENDING, found)
+        wanted = np.array([basis(u * STEP_S, order) for order in range(3)])
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
+        place_at(places, found, moved)
+        np.testing.assert_allclose(moved, wanted @ places, atol=1e-8)
+
+
+def test_turns_and_their_jacobian_are_the_matrix_exponentials() -> None:
+    rotation, right = np.empty((3, 3)), np.empty((3, 3))
+    for size in (0.0, 1e-7, 2e-5, 0.3, 3.0):
+        v = size / 0.7 * np.array([0.6, -0.64, 0.48])
+        exp_so3(v, 0.7, rotation, right)
+        cross = np.cross(np.eye(3), 0.7 * v)
+        np.testing.assert_allclose(rotation, expm(cross), atol=1e-12)
+        # The integral of Exp(-s w) over s in 0...1 stands beside the exponential of a block matrix.
+        whole = expm(np.block([[-cross, np.eye(3)], [np.zeros((3, 6))]]))
+        np.testing.assert_allclose(right, whole[:3, 3:], atol=1e-9)
+
+
+def slow_rotation(rotations: np.ndarray, u: float) -> Rotation:
+    """[Kim 1995] as it stands: R_0 Exp(l_1 d_1) ... Exp(l_5 d_5)."""
+    basis = BSpline(np.arange(2 * ORDER) - DEGREE, np.eye(ORDER), DEGREE)(u)
+    turned = Rotation.from_matrix(rotations[0])
+    for j in range(1, ORDER):
+        step = Rotation.from_matrix(rotations[j - 1].T @ rotations[j]).as_rotvec()
+        turned = turned * Rotation.from_rotvec(basis[j:].sum() * step)
+    return turned
+
+
+def slow_rate(rotations: np.ndarray, u: float, e: float = 1e-4) -> np.ndarray:
+    before, after = slow_rotation(rotations, u - e), slow_rotation(rotations, u + e)
+    return (before.inv() * after).as_rotvec() / (2 * e * STEP_S)
+
+
+def test_a_segments_rotation_and_its_slopes_are_those_of_its_definition() -> None:
+    rotations, e = some_spline().rotations[:ORDER], 1e-5
+    steps = Rotation.from_matrix(rotations[:-1].transpose(0, 2, 1) @ rotations[1:]).as_rotvec()
+    inverse, unused = np.empty((DEGREE, 3, 3)), np.empty((3, 3))
+    for turn, own in zip(steps, inverse, strict=True):
+        exp_so3(turn, 1.0, unused, own)
+        own[:] = np.linalg.inv(own)
+    share, rotation, rate = np.empty((3, ORDER)), np.empty((3, 3)), np.empty(3)
+    turn_by, rate_by = np.empty((3, 3 * ORDER)), np.empty((3, 3 * ORDER))
+    for u in (0.2, 0.6):
+        weights(u, STEP_S, CUMULATIVE, share)
+        rotation_at(rotations[0], steps, inverse, share, rotation, rate, turn_by, rate_by)
+        np.testing.assert_allclose(rotation, slow_rotation(rotations, u).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(rate, slow_rate(rotations, u), atol=1e-5)
+        for k in range(3 * ORDER):
+            moved = [rotations.copy(), rotations.copy()]
+            for sign, own in zip((-1, 1), moved, strict=True):
+                own[k // 3] = own[k // 3] @ Rotation.from_rotvec(sign * e * np.eye(3)[k % 3]).as_matrix()
+            less, more = (slow_rotation(own, u) for own in moved)
+            np.testing.assert_allclose(turn_by[:, k], (less.inv() * more).as_rotvec() / (2 * e), atol=1e-8)
+            slope = (slow_rate(moved[1], u) - slow_rate(moved[0], u)) / (2 * e)
+            np.testing.assert_allclose(rate_by[:, k], slope, atol=2e-5)

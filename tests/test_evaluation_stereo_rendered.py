@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
 
 from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.bar_edges import bar_diameter, find_outlines, tangent_planes
@@ -22,7 +21,6 @@ from barsight.benchmarks.stereo.bar_renderer import (
     Rendered,
     RenderedBar,
     _light_left,
-    _spline,
     render_pair,
 )
 from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, tilted_floor
@@ -224,13 +222,6 @@ def test_a_bars_shadow_is_as_soft_as_the_lamp_is_wide() -> None:
     assert np.mean(np.array(lit) < 0.5) > 0.02 and np.any((np.array(lit) > 0.1) & (np.array(lit) < 0.9))
     shape[1, 1] = 0
     assert _light_left(*centre, lamp, shape) == 1
-
-
-def test_the_textures_weights_are_a_cubic_b_splines() -> None:
-    for t in np.linspace(0, 0.99, 12):
-        np.testing.assert_allclose(
-            _spline(t), BSpline.basis_element(np.arange(-2, 3))([t + 1, t, t - 1, t - 2])
-        )
 
 
 def test_maps_without_floor_or_bar_fail_with_a_reason(bar: tuple[PosedScene, Rendered]) -> None:

@@ -11,7 +11,7 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.core.types import ImuSamples
-from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias, subtract_bias
+from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated, Preintegrator
 from barsight.recording.formats.ground_truth import read_ground_truth
 
@@ -44,9 +44,8 @@ def integrate_slowly(imu: ImuSamples, start_ns: int, end_ns: int) -> BodyState:
     steps = 2000
     edges = np.linspace(0, end_ns - start_ns, steps + 1)
     middle = start_ns + ((edges[1:] + edges[:-1]) / 2).round().astype(np.int64)
-    clean = subtract_bias(imu, BIAS)
-    rate = interpolate_at(middle, imu.stamp_ns, clean.gyro_radps)
-    force = interpolate_at(middle, imu.stamp_ns, clean.accel_mps2)
+    rate = interpolate_at(middle, imu.stamp_ns, imu.gyro_radps - BIAS.gyro_radps)
+    force = interpolate_at(middle, imu.stamp_ns, imu.accel_mps2 - BIAS.accel_mps2)
     rotation, position, velocity = STATE.rotation, STATE.position_m, STATE.velocity_mps
     dt = (end_ns - start_ns) / NS_PER_S / steps
     for w, a in zip(rate, force, strict=True):
@@ -79,7 +78,6 @@ def test_the_slow_one_is_exact_for_a_fall() -> None:
     end = integrate_slowly(imu, START, START + 1_000_000_000)
     np.testing.assert_allclose(end.position_m, STATE.position_m + STATE.velocity_mps - [0, 0, 9.80665 / 2])
     np.testing.assert_allclose(end.rotation, STATE.rotation, atol=1e-12)
-    assert np.abs(subtract_bias(imu, BIAS).accel_mps2).max() == 0
 
 
 def test_the_bias_jacobian_is_the_difference_quotient() -> None:

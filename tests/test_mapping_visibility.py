@@ -7,7 +7,13 @@ import pytest
 
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
-from barsight.mapping.surface.block_visibility import BLOCK, SOMEWHERE, highest_about
+from barsight.mapping.surface.block_visibility import (
+    BLOCK,
+    SOMEWHERE,
+    clear_height,
+    highest_about,
+    supported_span,
+)
 from barsight.mapping.surface.height_selection import (
     _ALIKE_CELLS,
     _ALONG,
@@ -22,6 +28,7 @@ from barsight.mapping.surface.visibility import (
     _OVERHANG_CELLS,
     frustum_margin,
     has_enough_views,
+    is_pictured,
     is_unoccluded,
     may_be_occluded,
     point_density,
@@ -100,6 +107,8 @@ def test_a_point_is_held_where_both_pictures_hold_it() -> None:
         frustum_margin(*point, planes, margin)
         held.append(holders(point))
         np.testing.assert_array_equal(margin >= 0, held[-1])
+        pictured = [is_pictured(*point, planes, view) for view in range(len(EYES_M))]
+        np.testing.assert_array_equal(pictured, held[-1])
         for least in range(1, 4):
             assert has_enough_views(*point, planes, margin, least) == (held[-1].sum() >= least)
     assert 0.1 < np.mean(held) < 0.9
@@ -214,3 +223,33 @@ def test_the_highest_height_with_support_of_its_own_or_along_a_bar_is_elected() 
         ]  # fmt: skip
         assert winner[i, j] == max(enough, key=lambda s: tile[i, j, s, Z], default=-1)
     assert (winner[:, 7] == 0).all() and (winner == -1).any() and len(np.unique(winner)) == SLOTS + 1
+
+
+def test_over_the_clear_height_all_cells_of_a_block_see_the_eye(hills: np.ndarray) -> None:
+    rng, known = np.random.default_rng(9), []
+    roof, ceiling, half = highest_about(hills), float(hills.max()), (BLOCK - 1) / 2
+    for k in range(300):
+        row, column = (BLOCK * int(n) for n in rng.integers(0, TILE_CELLS // BLOCK, 2))
+        low = rng.uniform(0, 2.2)
+        high = low + rng.uniform(0, 0.5)
+        middle = np.array([(column + half) * CELL_M, (row + half) * CELL_M, (low + high) / 2])
+        eye = EYES_M[k % 6]
+        way = tuple(float(part) for part in eye - middle)
+        clear = clear_height((low, high), (row + half, column + half), way, roof, ceiling, CELL_M)
+        known.append(clear <= high)
+        for i, j in np.ndindex(BLOCK, BLOCK):
+            for z in (max(low, clear), high) if known[-1] else ():
+                point = np.array([(column + j) * CELL_M, (row + i) * CELL_M, z])
+                ray = tuple(float(part) for part in eye - point)
+                assert is_unoccluded(z, row + i, column + j, ray, hills, roof, ceiling, CELL_M)
+    assert 0.2 < np.mean(known) < 0.9
+
+
+def test_the_span_of_heights_is_that_of_the_supported_ones() -> None:
+    rng = np.random.default_rng(10)
+    heights = rng.uniform(-1, 2, (5, 7, SLOTS, FIELDS)).astype(np.float32)
+    heights[..., VIEWS] = rng.integers(0, 6, (5, 7, SLOTS))
+    for least in (2, 5):
+        z = heights[..., Z][heights[..., VIEWS] >= least]
+        assert supported_span(heights, least) == (z.min(), z.max())
+    assert supported_span(heights, 6) == (np.inf, -np.inf)

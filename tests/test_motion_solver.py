@@ -24,7 +24,22 @@ from barsight.motion.linear.chain_elimination import (
     eliminate_nodes,
 )
 from barsight.motion.linear.motion_only_kernel import frame_equations
-from barsight.motion.linear.reprojection_kernels import LinearisationPoint, Observations, Rig, residuals
+from barsight.motion.linear.reprojection_kernels import (
+    PLACE,
+    POINT,
+    POSE,
+    SHARED,
+    LinearisationPoint,
+    Observations,
+    PointTerms,
+    Rig,
+    disparity_offset,
+    empty_rows,
+    given_of,
+    residuals,
+    slide_offset,
+    whitened_rows,
+)
 from barsight.motion.linear.schur_complement import (
     ReducedSystem,
     back_substitute,
@@ -447,3 +462,61 @@ def test_the_drifts_share_is_right() -> None:
             rtol=0.1,
             atol=0.02 * np.abs(drift_jacobian_of_pose[:, :, axis]).max(),
         )
+
+
+def test_a_sightings_rows_are_its_error_and_slopes() -> None:
+    """Of the projection as it is written down: focal 600 px, baseline 0.4 m, doffs 3 px."""
+    lens, point, seen = np.array([600.0, 320, 240, 240, 3]), np.array([0.4, -0.3, 0.2]), [330.0, 250, 290]
+    axes, lever = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.2, -0.1, 0.3])
+    body, high = Rotation.from_rotvec([3.0, 0.1, 0.2]), np.array([0.5, 0.2, 6.0])
+
+    def project(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """x: turn, shift, place, slide, disparity offset, yaw, drift. Error px, and point in the camera."""
+        turned = (body * Rotation.from_rotvec(x[:3])).as_matrix()
+        in_body = turned.T @ (point + x[6:9] - high - body.as_matrix() @ x[3:6])
+        u, v, w = in_camera = axes.T @ (in_body - lever)
+        slide, off, yaw, drift = x[9:]
+        left, row = 600 * (u - slide * v) / w + 320, 600 * (v + slide * u) / w + 240
+        shift = -off - 600 * (1 + ((u - 0.4) / w) ** 2) * yaw - 240 / w * drift
+        return np.array([left, row, left - 240 / w + 3 + shift]) - seen, in_camera
+
+    def rows_of(x: np.ndarray, huber: float = 1e9, upside: float = 1.0) -> np.ndarray:
+        from_reference = np.diag([1, 1, upside]) @ axes.T @ body.as_matrix().T
+        shift = -from_reference @ high - np.diag([1, 1, upside]) @ axes.T @ lever
+        rows, mount = empty_rows(), np.column_stack([axes, lever])
+        assert rows.shape == (3, 13)
+        camera = np.column_stack([from_reference, shift])[None]
+        given = PointTerms(huber, 1.0, *x[10:])
+        points = np.append(point, x[9])[None]
+        whitened_rows(lens, mount, camera, points, np.array([seen]), 2.0, given, (0, 0, 0), rows)
+        return rows
+
+    moved = np.r_[np.zeros(9), 0.02, 0.3, 1e-3, 2e-3]
+    error, in_camera = project(moved)
+    rows = rows_of(moved)
+    np.testing.assert_allclose(rows[:, 0], 2 * error, atol=1e-9)
+    np.testing.assert_allclose(rows[:, POINT], in_camera, atol=1e-12)
+    held = rows_of(moved, huber=5.0)
+    others = [k for k in range(13) if k != POINT]
+    np.testing.assert_allclose(
+        held[:, others], rows[:, others] * np.sqrt(5 / np.linalg.norm(2 * error)), atol=1e-9
+    )
+    assert not rows_of(moved, upside=-1.0).any()
+    rows, slopes = rows_of(np.zeros(13)), np.empty((3, 13))
+    for k, step in enumerate(1e-5 * np.eye(13)):
+        slopes[:, k] = 2 * (project(step)[0] - project(-step)[0]) / 2e-5
+    np.testing.assert_allclose(rows[:, POSE : POSE + 6], slopes[:, :6], atol=1e-5)
+    np.testing.assert_allclose(rows[:, PLACE : PLACE + 4], slopes[:, 6:10], atol=1e-5)
+    np.testing.assert_allclose(rows[:, SHARED], slopes[2, 10:], atol=1e-5)
+
+
+def test_what_a_points_sightings_share_is_its_pieces() -> None:
+    points, piece = np.array([[0.0, 0, 0, 0.5], [1.0, 0, 0, 0.7]]), np.array([1, 0])
+    shared = np.array([0.1, 0.2, 3.0, 4.0, 0.01, 0.02])
+    none = np.empty(0)
+    sights = Observations(none, none, none, none, none, piece, none, 0.0)
+    rig = Rig(np.empty(5), np.empty((3, 4)), 2.5)
+    assert [slide_offset(points, shared, piece, t) for t in (0, 1)] == pytest.approx([0.3, 0.6])
+    assert [disparity_offset(shared, piece, t) for t in (0, 1)] == [4.0, 3.0]
+    assert given_of(rig, sights, shared, 1) == PointTerms(2.5, 0.0, 3.0, 0.01, 0.02)
+    assert slide_offset(points, shared[4:], piece, 1) == 0.7 and disparity_offset(shared[4:], piece, 1) == 0.0

@@ -11,9 +11,18 @@ from scipy.ndimage import map_coordinates
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
-from barsight.simulation.lighting import AROUND, Lamps, Lightmap, _ceiling_directions, bake, hall_lamps
+from barsight.simulation.lighting import (
+    AROUND,
+    Lamps,
+    Lightmap,
+    _ceiling_directions,
+    bake,
+    hall_lamps,
+    lamp_beam,
+    longest_axis,
+)
 from barsight.simulation.optics import sample_rays
-from barsight.simulation.rays import cast_rays
+from barsight.simulation.rays import FAR, cast_rays, hit_box, hit_cylinder, trace
 from barsight.simulation.render import (
     FLOOR_ALBEDO,
     HIGHLIGHT,
@@ -300,3 +309,42 @@ def test_a_grid_of_nothing_sees_the_floor() -> None:
     distance, found = cast_rays(empty, np.array([[0.0, 0.0, 2.0]]), np.array([[0.1, 0.0, -1.0]]))
     assert distance[0] == pytest.approx(2.0)
     assert found[0] == 0
+
+
+def test_one_ray_meets_one_solid_as_the_slow_ones_do() -> None:
+    rng, met = np.random.default_rng(7), []
+    for _ in range(200):
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        box = np.r_[rng.normal(0, 0.2, 3), axes.ravel(), rng.uniform(0.1, 0.5, 3)][None]
+        round_bar = np.r_[box[0, :3], axes[0], np.zeros(6), box[0, 12:14], 0][None]
+        origin = 3 * np.linalg.qr(rng.normal(size=(3, 3)))[0][0]
+        ray = rng.normal(0, 0.4, 3) - origin
+        for shape, hit, slow in ((round_bar, hit_cylinder, slow_cylinder), (box, hit_box, slow_box)):
+            wanted = slow(shape[0], origin, ray)
+            met.append(np.isfinite(wanted))
+            found = hit(shape, 0, *origin, *ray, 1e-6)
+            assert found == (pytest.approx(wanted, abs=1e-9) if met[-1] else FAR)
+            assert hit(shape, 0, *origin, *ray, found + 1e-6) == FAR
+        assert longest_axis(box, 0) == int(np.argmax(box[0, 12:]))
+    assert 0.2 < np.mean(met) < 0.8
+
+
+def test_a_traced_ray_ends_at_its_limit_or_at_any_hit(scene: Scene) -> None:
+    rng, cut = np.random.default_rng(8), []
+    for _ in range(60):
+        origin = np.r_[rng.uniform(0, 1.6), rng.uniform(-1, 1), 4.0]
+        ray = np.r_[rng.uniform(0, 1.6), rng.uniform(-1, 1), rng.uniform(0, 0.5)] - origin
+        far, (nearest, solid) = rng.uniform(0.5, 1.5), slow_trace(scene, origin, ray)
+        cut.append(nearest >= far)
+        wanted = (FAR, -1) if cut[-1] else (pytest.approx(nearest, abs=1e-9), solid)
+        assert trace(scene, *origin, *ray, 1e-6, far, False) == wanted
+        some, found = trace(scene, *origin, *ray, 1e-6, far, True)
+        assert (found >= 0) == (not cut[-1]) and (found < 0 or nearest - 1e-9 <= some < far)
+    assert 0.2 < np.mean(cut) < 0.8
+
+
+def test_a_lamps_beam_ends_smoothly() -> None:
+    lamps = hall_lamps(8.0)
+    assert lamp_beam(lamps, 0.0) == lamps.power
+    assert lamp_beam(lamps, -3.75) == lamp_beam(lamps, 3.75) == pytest.approx(0.5625 * lamps.power)
+    assert lamp_beam(lamps, 7.49) < 1e-4 * lamps.power and lamp_beam(lamps, 7.5) == 0

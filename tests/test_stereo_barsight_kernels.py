@@ -13,7 +13,15 @@ from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove
 from barsight.stereo.direct.curvature import curvature_row
 from barsight.stereo.direct.depth_edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
 from barsight.stereo.direct.disparity_update import blend_fits, fit_variance, update_disparity
-from barsight.stereo.direct.kernels.box_sums import allocate_columns, roll_sum, slide_window, window_means
+from barsight.stereo.direct.kernels.box_sums import (
+    allocate_columns,
+    mirror_index,
+    roll_product,
+    roll_square,
+    roll_sum,
+    slide_window,
+    window_means,
+)
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
 from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
 from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes
@@ -32,6 +40,7 @@ from barsight.stereo.direct.support_regions import (
     TILE_ROWS,
     allocate_frame,
     axis_means,
+    biweight,
     inside,
     tile_axes,
 )
@@ -537,3 +546,29 @@ def test_supports_are_blended_and_steps_settled_as_written() -> None:
     update_disparity(fitted, axes, disparity, unsure)
     np.testing.assert_allclose(inside(disparity, start.shape), start + move, atol=1e-5)
     np.testing.assert_allclose(unsure, wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_sums_of_products_roll_on_as_windows_do() -> None:
+    """A window of seven rows goes down the image: what comes in and goes leaves the sums of its rows."""
+    one, other, reach = _noise(31), _noise(32), 3
+    products, squares = allocate_columns(2, WIDTH, reach)
+    none = np.zeros(WIDTH, dtype=np.float32)
+    for y in range(HEIGHT):
+        ahead, behind = (one[y], other[y]), (one[y - 7], other[y - 7]) if y >= 7 else (none, none)
+        roll_product(products, reach, *ahead, *behind)
+        roll_square(squares, reach, *ahead, *behind)
+    inner = slice(reach, reach + WIDTH)
+    np.testing.assert_allclose(products[inner], (one * other)[-7:].sum(axis=0), atol=1e-4)
+    np.testing.assert_allclose(squares[inner], (one * other**2)[-7:].sum(axis=0), atol=1e-4)
+    assert not products[:reach].any() and not squares[reach + WIDTH :].any()
+
+
+def test_places_are_mirrored_at_the_last_pixel() -> None:
+    for count in range(1, 8):
+        wanted = np.pad(np.arange(count), 15, mode="reflect")
+        assert [mirror_index(place, count) for place in range(-15, count + 15)] == wanted.tolist()
+
+
+def test_biweight_ends_at_one() -> None:
+    gaps = np.array([-2, -1, -0.5, 0, 0.25, 1, 3], dtype=np.float32)
+    assert [biweight(gap) for gap in gaps] == [0, 0, 0.5625, 1, 0.87890625, 0, 0]

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
+from barsight.core.linalg.bspline import sixfold_weights
 from barsight.core.types import RectifiedPair
 
 HALF_PX = 5
@@ -118,11 +119,9 @@ def _coefficients(image: UInt8) -> Float32:
 
 @kernel()
 def _weights(t: float, weights: Float32) -> None:
-    """Compute the four B-spline weights at a fraction t of a pixel."""
-    t2, rest = t * t, 1 - t
-    weights[0] = rest * rest * rest / 6
-    weights[3] = t2 * t / 6
-    weights[1] = (4 - 6 * t2) / 6 + t2 * t / 2
+    """Fill weights (4,) at a fraction t of a pixel; their sum is 1 as near as 32 bits have it."""
+    before, at, _, after = sixfold_weights(t)
+    weights[0], weights[1], weights[3] = before / 6, at / 6, after / 6
     weights[2] = 1 - weights[0] - weights[1] - weights[3]
 
 
@@ -235,6 +234,8 @@ def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
 def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[float, float]:
     """Sum squares over the middle (2 half + 1)^2 of the patch: what the step leaves, and the other patch
     about its mean there.
+
+    other: (_SIZE^2,). design: (5, _SIZE^2), see `_prepare`; step: (4,), see `_step`.
     """
     a, b, c, d = np.float32(step[0]), np.float32(step[1]), np.float32(step[2]), np.float32(step[3])
     left, mean, square = np.float32(0), np.float32(0), np.float32(0)
@@ -251,7 +252,11 @@ def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[
 
 @kernel()
 def _middle_holds(other: Float32, design: Float32, step: Float64, variance: float) -> bool:
-    """Check whether the patch's middle alone is found at that place; variance: DN^2 of a pixel's noise."""
+    """Check that the patch's middle alone is found at that place.
+
+    other: (_SIZE^2,). design: (5, _SIZE^2), see `_prepare`; step: (4,), see `_step`. variance: DN^2 of a
+    pixel's noise.
+    """
     left, spread = _misfit(other, design, step, CORE_PX)
     if 1 - left / max(spread, 1e-9) < MIN_CORE_LIKENESS:
         return False

@@ -44,11 +44,6 @@ class BodyState:
     velocity_mps: Float64
 
 
-def subtract_bias(imu: ImuSamples, bias: ImuBias) -> ImuSamples:
-    """Subtract the bias from the samples [paper Eq. 9-10]."""
-    return ImuSamples(imu.stamp_ns, imu.gyro_radps - bias.gyro_radps, imu.accel_mps2 - bias.accel_mps2)
-
-
 def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
     """Remove the samples at which an axis stands at its end of scale; also how many.
 

@@ -76,19 +76,7 @@ def _vote(
     (first_column, first_row), (x, y), (gate_sigma, min_gate) = first, cells, gates
     for m in members:
         slots = tile[y[m] - first_row, x[m] - first_column]
-        best, best_gap = -1, np.inf
-        empty, weakest = -1, 0
-        for s in range(SLOTS):
-            if slots[s, VIEWS] == 0:
-                if empty < 0:
-                    empty = s
-                continue
-            gap = abs(slots[s, Z] - z[m])
-            spread = variance[m] + 1.0 / slots[s, WEIGHT] + shared[m] ** 2 + slots[s, SHARED] ** 2
-            if gap < best_gap and gap <= max(gate_sigma * np.sqrt(spread), min_gate):
-                best, best_gap = s, gap
-            if slots[s, VIEWS] < slots[weakest, VIEWS]:
-                weakest = s
+        best, target = _choose_slots(slots, z[m], variance[m], shared[m], gate_sigma, min_gate)
         w = 1.0 / max(variance[m], 1e-10)
         if best >= 0:
             total = slots[best, WEIGHT] + w
@@ -102,11 +90,8 @@ def _vote(
             slots[best, SHARED] += share * (shared[m] - slots[best, SHARED])
             slots[best, GREY] += share * (intensity[m] - slots[best, GREY])
             continue
-        target = empty
         if target < 0:
-            if slots[weakest, VIEWS] > 1:
-                continue
-            target = weakest
+            continue
         slots[target, Z] = z[m]
         slots[target, WEIGHT] = w
         slots[target, SQUARES] = 0
@@ -114,6 +99,31 @@ def _vote(
         slots[target, SHARED] = shared[m]
         slots[target, GREY] = intensity[m]
         slots[target, CENTRAL] = central[m]
+
+
+@kernel()
+def _choose_slots(
+    slots: Float32, z: float, variance: float, shared: float, gate_sigma: float, min_gate: float
+) -> tuple[int, int]:
+    """Choose which of a cell's slots (SLOTS, FIELDS) a height z (m) joins, and which it takes if it joins
+    none; -1 where there is no such slot.
+    """
+    best, best_gap = -1, np.inf
+    empty, weakest = -1, 0
+    for s in range(SLOTS):
+        if slots[s, VIEWS] == 0:
+            if empty < 0:
+                empty = s
+            continue
+        gap = abs(slots[s, Z] - z)
+        spread = variance + 1.0 / slots[s, WEIGHT] + shared**2 + slots[s, SHARED] ** 2
+        if gap < best_gap and gap <= max(gate_sigma * np.sqrt(spread), min_gate):
+            best, best_gap = s, gap
+        if slots[s, VIEWS] < slots[weakest, VIEWS]:
+            weakest = s
+    if empty < 0 and slots[weakest, VIEWS] <= 1:
+        empty = weakest
+    return best, empty
 
 
 def height_sigma(slots: Float32) -> Float32:

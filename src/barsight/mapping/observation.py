@@ -119,7 +119,11 @@ def _in_reference(
 def _by_cell(
     x: Int32, y: Int32, said: Float32, low_x: int, low_y: int, width: int, height: int
 ) -> tuple[Float32, Int64]:
-    """Sort by counting: what is said, cell by cell and row by row, and where each cell starts."""
+    """Sort by counting: what is said (N, _SAID), cell by cell and row by row, and where each cell starts
+    (cells + 1,).
+
+    x, y: (N,) cell numbers, within width columns from low_x and height rows from low_y on; said: (N, _SAID).
+    """
     starts = np.zeros(width * height + 1, np.int64)
     for i in range(x.size):
         starts[(y[i] - low_y) * width + x[i] - low_x + 1] += 1
@@ -140,6 +144,10 @@ def _gather(
 ) -> tuple[Int64, Bool, Float32, Float32, Float32, Float32]:
     """Merge within each cell, from the top: points no deeper than 4 sigma below the highest are one surface;
     those below wait at the cell's front.
+
+    said: (N, _SAID) and starts: (cells + 1,), of `_by_cell`; said's order changes. Returns (M,) each: a
+    surface's cell, whether a point lies at the cell's middle, height (m), its variance (m^2), shared sigma
+    (m), grey level.
     """
     count = said.shape[0]
     cell, middle = np.empty(count, np.int64), np.zeros(count, np.bool_)

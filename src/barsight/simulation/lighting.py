@@ -23,7 +23,7 @@ FLOOR_MARGIN_M = 5.0
 
 
 class Lamps(NamedTuple):
-    """Lamp positions (m): spacing and offset along X, the rows' y, height z; half length along Y."""
+    """Lamp positions (m): spacing and offset along X, the two rows' y (2,), height z; half length along Y."""
 
     spacing: float
     offset: float
@@ -149,6 +149,8 @@ def _hall_light(
 ) -> float:
     """Compute irradiance from the hall itself, 1 for an open level surface, with a little that bounces
     anywhere.
+
+    ceiling: (16, 3) unit directions. x, y, z: the place, m; nx, ny, nz: its normal.
     """
     total, norm = 0.0, 0.0
     for k in range(ceiling.shape[0]):
@@ -201,7 +203,7 @@ def _texel(
 
 @kernel()
 def longest_axis(shape: Float64, p: int) -> int:
-    """Find the axis (0, 1, 2) along which a box is longest."""
+    """Find the axis, 0 to 2, along which box `p` is longest. shape: (P, 15), see `Primitives`."""
     k = 0
     for axis in (1, 2):
         if shape[p, 12 + axis] > shape[p, 12 + k]:

@@ -17,7 +17,10 @@ FAR = 1e30
 def hit_cylinder(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """Find the first ray parameter over `near` at which the ray enters the capped cylinder, else FAR."""
+    """Find the first ray parameter over `near` at which the ray enters the capped cylinder, else FAR.
+
+    shape: (P, 15), see `Primitives`; p: the cylinder's number. Origin o in m, direction d of any length.
+    """
     cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
     da = dx * shape[p, 3] + dy * shape[p, 4] + dz * shape[p, 5]
     ca = cx * shape[p, 3] + cy * shape[p, 4] + cz * shape[p, 5]
@@ -43,7 +46,10 @@ def hit_cylinder(
 def hit_box(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """Find the first ray parameter over `near` at which the ray enters the box, else FAR."""
+    """Find the first ray parameter over `near` at which the ray enters the box, else FAR.
+
+    shape: (P, 15), see `Primitives`; p: the box's number. Origin o in m, direction d of any length.
+    """
     cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
     enter: float = -FAR
     leave: float = FAR
@@ -82,6 +88,19 @@ def _inside(
 
 
 @kernel()
+def _first_cell(grid: Grid, axis: int, o: float, d: float, enter: float) -> tuple[int, int, float, float]:
+    """Find the cell along one axis in which the ray o + t d enters the grid, at t = enter; its step to the
+    next cell, 1 or -1; t at the next cell and from cell to cell, FAR where the ray runs across the axis.
+    """
+    low, cell = grid.low[axis], grid.cell[axis]
+    place = min(max(math.floor((o + enter * d - low) / cell), 0), grid.counts[axis] - 1)
+    step = 1 if d > 0 else -1
+    if abs(d) <= 1e-14:
+        return place, step, FAR, FAR
+    return place, step, (low + (place + (step > 0)) * cell - o) / d, cell / abs(d)
+
+
+@kernel()
 def trace(
     scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float, far: float,
     any_hit: bool,
@@ -103,17 +122,10 @@ def trace(
     enter, leave = _inside(grid, ox, oy, oz, dx, dy, dz, near, best)
     if enter > leave:
         return (best, found) if found >= 0 else (FAR, -1)
-    lo, cell, n = grid.low, grid.cell, grid.counts
-    i = min(max(math.floor((ox + enter * dx - lo[0]) / cell[0]), 0), n[0] - 1)
-    j = min(max(math.floor((oy + enter * dy - lo[1]) / cell[1]), 0), n[1] - 1)
-    k = min(max(math.floor((oz + enter * dz - lo[2]) / cell[2]), 0), n[2] - 1)
-    si, sj, sk = 1 if dx > 0 else -1, 1 if dy > 0 else -1, 1 if dz > 0 else -1
-    tx = (lo[0] + (i + (si > 0)) * cell[0] - ox) / dx if abs(dx) > 1e-14 else FAR
-    ty = (lo[1] + (j + (sj > 0)) * cell[1] - oy) / dy if abs(dy) > 1e-14 else FAR
-    tz = (lo[2] + (k + (sk > 0)) * cell[2] - oz) / dz if abs(dz) > 1e-14 else FAR
-    ux = cell[0] / abs(dx) if abs(dx) > 1e-14 else FAR
-    uy = cell[1] / abs(dy) if abs(dy) > 1e-14 else FAR
-    uz = cell[2] / abs(dz) if abs(dz) > 1e-14 else FAR
+    n = grid.counts
+    i, si, tx, ux = _first_cell(grid, 0, ox, dx, enter)
+    j, sj, ty, uy = _first_cell(grid, 1, oy, dy, enter)
+    k, sk, tz, uz = _first_cell(grid, 2, oz, dz, enter)
     while True:
         c = (i * n[1] + j) * n[2] + k
         for m in range(grid.first[c], grid.first[c + 1]):

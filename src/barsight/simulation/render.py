@@ -139,6 +139,9 @@ def _shine(
 ) -> float:  # fmt: skip
     """Compute the lamps' highlight that bar `p` mirrors to the eye; `turn`: cosine and sine of the normal's
     angle.
+
+    shape: (P, 15), see `Primitives`; seen: (T, SLOTS), see `Lightmap`. place: of `_lightmap_place`. point: m;
+    eye: unit vector towards it.
     """
     t00, t01, t10, t11, ws, wa = place
     x, y, z = point
@@ -239,7 +242,10 @@ def _lightmap_place(
 
 @kernel()
 def _texels(tile: Float32, a: float, b: float) -> tuple[float, float, float, float]:
-    """Interpolate the tile's four channels at texel (a, b), bilinear, repeated without end."""
+    """Interpolate the tile's four channels at texel (a, b), bilinear, repeated without end.
+
+    tile: (TILE, TILE, 4).
+    """
     fa, fb = math.floor(a), math.floor(b)
     wa, wb = a - fa, b - fb
     i, j = int(fa) & MASK, int(fb) & MASK

@@ -31,7 +31,11 @@ class Primitives(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Cells over the stock. Cell c = (i * ny + j) * nz + k lists `items[first[c]:first[c + 1]]`."""
+    """Cells over the stock. Cell c = (i * ny + j) * nz + k lists `items[first[c]:first[c + 1]]`.
+
+    low: (3,) the lowest corner, m; cell: (3,) size, m; counts: (3,) nx, ny, nz. first: (cells + 1,). items:
+    (N,) numbers of primitives.
+    """
 
     low: Float64
     cell: Float64
@@ -106,7 +110,8 @@ def _bounds(primitives: Primitives) -> tuple[Float64, Float64]:
 def _fill(shape: Float64, cylinders: int, grid: Grid) -> None:
     """Count each cell's primitives into first[c + 1] without items; with items write them, in order.
 
-    While writing, first[c] runs up to first[c + 1]; the caller's offsets are put back at the end.
+    While writing, first[c] runs up to first[c + 1]; the caller's offsets are put back at the end. shape: (P,
+    15), of which the first are cylinders, see `Primitives`.
     """
     low, cell, counts = grid.low, grid.cell, grid.counts
     writing = grid.items.size > 0
@@ -137,7 +142,10 @@ def _fill(shape: Float64, cylinders: int, grid: Grid) -> None:
 
 @kernel()
 def _slab_extent(s: Float64, round_bar: bool, y0: float, y1: float) -> tuple[float, float, float, float]:
-    """Bound in x and z the part of a primitive that can lie between y0 and y1."""
+    """Bound in x and z the part of a primitive that can lie between y0 and y1.
+
+    s: (15,), a row of `Primitives.shape`. Returns the least and the largest x, then z, m.
+    """
     if not round_bar:
         rx = abs(s[3]) * s[12] + abs(s[6]) * s[13] + abs(s[9]) * s[14]
         rz = abs(s[5]) * s[12] + abs(s[8]) * s[13] + abs(s[11]) * s[14]

@@ -54,7 +54,11 @@ def _points(
     max_depth_m: float,
     max_sigma_m: float,
 ) -> tuple[Float32, Float32, Float32, UInt8]:
-    """Compute points, noise and shared sigma along the ray, and grey levels, row by row."""
+    """Compute points, noise and shared sigma along the ray, and grey levels, row by row.
+
+    shift: (H per_pixel, W per_pixel) disparity + doffs, px; sigma_px, left: (H, W). lens: (4,) focal px, cx,
+    cy, baseline m. Returns (N, 3) m in `rect0`, (N,) m, (N,) m and (N,).
+    """
     focal, strength = lens[0], lens[0] * lens[3]
     xyz = np.empty((shift.size, 3), np.float32)
     noise, shared = np.empty(shift.size, np.float32), np.empty(shift.size, np.float32)

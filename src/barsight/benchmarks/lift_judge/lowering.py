@@ -67,7 +67,11 @@ def lower(v: Float64, u: Float64, z: Float64, cell: Int64, max_roll: float) -> R
 def _highest(
     v: Float64, u: Float64, z: Float64, cell: Int64, height: float, pitch: float, roll: float
 ) -> Int64:
-    """Find the point of each cell that is highest over a plane, -1 where a cell has none."""
+    """Find the point of each cell that is highest over a plane, -1 where a cell has none.
+
+    v, u, z: (N,) m; cell: (N,) from 0 on. The plane rises from height by pitch along v and roll along u.
+    Returns (cells,) the points' numbers.
+    """
     best, found = np.full(cell.max() + 1, -np.inf), np.full(cell.max() + 1, -1)
     for k in range(len(z)):
         over = z[k] - height - v[k] * pitch - u[k] * roll

@@ -36,7 +36,10 @@ def packed(count: int, diameter_m: float, rng: np.random.Generator) -> Float64:
 
 @kernel()
 def _push_apart(places: Float64, least: float, times: int) -> float:
-    """Push discs that overlap off each other, in place; the deepest overlap of the last time."""
+    """Push discs that overlap off each other, in place; returns the deepest overlap of the last time.
+
+    places: (N, 2) centres. least: the distance at which two touch.
+    """
     deepest = 0.0
     for _ in range(times):
         deepest = 0.0

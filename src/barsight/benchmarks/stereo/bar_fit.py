@@ -197,7 +197,11 @@ def _disparity_of_ray(
     scale: float,
     doffs: float,
 ) -> float:
-    """Intersect ray (x, y, 1) with the cylinder and the floor behind; the nearer's disparity."""
+    """Intersect ray (x, y, 1) with the cylinder and the floor behind; the nearer's disparity.
+
+    centre: (3,) m; axis: (3,) unit vector; radius: m. behind: px. scale: focal length times baseline, px m;
+    doffs: px.
+    """
     slide = axis[0] * x + axis[1] * y + axis[2]
     lift = axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]
     ex, ey, ez = x - slide * axis[0], y - slide * axis[1], 1 - slide * axis[2]

@@ -167,7 +167,9 @@ def _basis(radius_px: float, half_px: float) -> Float64:
 def _misfits(gray: Float64, away: Float64, shifts: Float64, basis: Float64, misfit: Float64) -> None:
     """Compute the profile's negative log-likelihood per pixel, with the outline at each shift.
 
-    Floor and bar have each their own texture, hence their own variance; the pixels are always the same.
+    Floor and bar have each their own texture, hence their own variance; the pixels are always the same. gray,
+    away: (N,) gray values and distances from the line, px. shifts: (S,) px. basis: (M, 5), see `_basis`.
+    Fills misfit (S,).
     """
     half = (basis.shape[0] - 1) * _FINE_PX / 2
     size = gray.shape[0]

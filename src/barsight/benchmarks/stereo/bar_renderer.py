@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
+from barsight.core.linalg.bspline import sixfold_weights
 from barsight.core.types import RectifiedCamera, RectifiedPair
 
 FLOOR, BAR = 1, 2
@@ -133,6 +134,8 @@ def _looks(scene: BarScene) -> Float64:
 def _hit(x: float, dx: float, dy: float, shape: Float64) -> tuple[float, int]:
     """Intersect the ray (x, 0, 0) + z (dx, dy, 1): depth z and surface of the first hit; inf and 0 where
     none.
+
+    shape: (4, 3), see `_shape`.
     """
     normal, centre, axis = shape[0], shape[2], shape[3]
     along = normal[0] * dx + normal[1] * dy + normal[2]
@@ -158,7 +161,10 @@ def _hit(x: float, dx: float, dy: float, shape: Float64) -> tuple[float, int]:
 
 @kernel()
 def _light_left(px: float, py: float, pz: float, lamp: Float64, shape: Float64) -> float:
-    """Compute the fraction of the lamp that a floor point sees past the bar: a shadow with soft edges."""
+    """Compute the fraction of the lamp that a floor point sees past the bar: a shadow with soft edges.
+
+    lamp: (3,) unit, towards it. shape: (4, 3), see `_shape`.
+    """
     centre, axis, radius = shape[2], shape[3], shape[1, 1]
     if radius <= 0:
         return 1.0
@@ -177,24 +183,13 @@ def _light_left(px: float, py: float, pz: float, lamp: Float64, shape: Float64) 
 
 
 @kernel()
-def _spline(t: float) -> tuple[float, float, float, float]:
-    """Compute the four weights of the uniform cubic B-spline at 0 <= t < 1."""
-    u = 1 - t
-    return (
-        u * u * u / 6,
-        (4 - 6 * t * t + 3 * t * t * t) / 6,
-        (4 - 6 * u * u + 3 * u * u * u) / 6,
-        t * t * t / 6,
-    )
-
-
-@kernel()
 def _noise(table: Float32, x: float, y: float) -> float:
-    """Interpolate random numbers on a unit lattice by a cubic B-spline: little above half a cycle
-    per unit.
+    """Interpolate random numbers on a unit lattice by a cubic B-spline: little above half a cycle per unit.
+
+    table: (_TABLE, _TABLE), repeated without end.
     """
     column, row = math.floor(x), math.floor(y)
-    across, down = _spline(x - column), _spline(y - row)
+    across, down = sixfold_weights(x - column), sixfold_weights(y - row)
     total = 0.0
     for j in range(4):
         there = table[(row + j) & (_TABLE - 1)]
@@ -202,12 +197,15 @@ def _noise(table: Float32, x: float, y: float) -> float:
         for i in range(4):
             line += across[i] * there[(column + i) & (_TABLE - 1)]
         total += down[j] * line
-    return total
+    return total / 36
 
 
 @kernel()
 def _albedo(table: Float32, x: float, y: float, looks: Float64) -> float:
-    """Sum octaves of detail, each twice as coarse as the one before, of equal strength."""
+    """Sum octaves of detail, each twice as coarse as the one before, of equal strength.
+
+    table: (_TABLE, _TABLE). x, y: m. looks: (6,), a row of `_looks`.
+    """
     size = looks[2]
     detail = 0.0
     for octave in range(_OCTAVES):
@@ -220,7 +218,11 @@ def _albedo(table: Float32, x: float, y: float, looks: Float64) -> float:
 def _shade(
     x: float, dx: float, dy: float, depth: float, surface: int, shape: Float64, looks: Float64, table: Float32
 ) -> float:
-    """Shade the gray value that one ray brings back."""
+    """Shade the gray value that one ray brings back.
+
+    The ray (x, 0, 0) + z (dx, dy, 1) meets `surface` at z = depth. shape: (4, 3), see `_shape`; looks: (3,
+    6), see `_looks`; table: (_TABLE, _TABLE).
+    """
     px, py, pz = x + depth * dx, depth * dy, depth
     lamp, ambient = looks[2, :3], looks[2, 3]
     if surface == FLOOR:
@@ -300,7 +302,11 @@ def _measure(
     surface: UInt8,
     visible: Bool,
 ) -> None:
-    """Compute the left image's true disparity, surface, and visibility in the right camera."""
+    """Compute the left image's true disparity, surface, and visibility in the right camera.
+
+    focal, cx, cy, doffs: px; baseline: m. shape: (4, 3), see `_shape`. Fills truth (px), surface and visible,
+    (H, W), see `Rendered`.
+    """
     height, width = truth.shape
     reach = _SAMPLES // 2
     for row in numba.prange(height):

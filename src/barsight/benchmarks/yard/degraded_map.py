@@ -94,7 +94,10 @@ def _seen(exact: Float64, y: Float64, camera: CameraSettings, defects: Defects) 
 
 @kernel()
 def _opening(exact: Float64, cell: float) -> Float64:
-    """Compute how wide each cell sees the sky along X: the sum of the tangents to either side, at most 4."""
+    """Compute how wide each cell sees the sky along X: the sum of the tangents to either side, at most 4.
+
+    exact: (rows, columns) heights, m; cell: m. Returns (rows, columns).
+    """
     rows, columns = exact.shape
     opening = np.empty((rows, columns))
     for j in range(rows):

@@ -95,7 +95,9 @@ def frame_rows(
 ) -> Rows:  # fmt: skip
     """Form the rows of one camera's frames; `at`, `lens_at`: indices of its parameters among the common ones.
 
-    A frame whose lens is unknown too has more than six rows and becomes several samples.
+    A frame whose lens is unknown too has more than six rows and becomes several samples. segment, u: (K,)
+    each frame's place on the spline. whole: (K, C, C) information, pull: (K, C) gradient, of `sum_corners`.
+    mount: (3, 3) body_from_cam, mount_place: (3,) m. width: number of common parameters.
     """
     count, size = segment.size, whole.shape[1]
     split = -(-size // ROWS)

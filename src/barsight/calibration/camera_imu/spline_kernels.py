@@ -90,7 +90,7 @@ def exp_so3(v: Float64, scale: float, rotation: Float64, right: Float64) -> None
 
 @kernel()
 def _times(a: Float64, b: Float64, transposed: bool, out: Float64) -> None:
-    """Multiply out = a @ b, or a^T @ b."""
+    """Multiply out = a @ b, or a^T @ b, all (3, 3)."""
     for i in range(3):
         for j in range(3):
             total = 0.0

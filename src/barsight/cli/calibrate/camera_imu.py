@@ -19,7 +19,7 @@ from barsight.calibration.boards.detection import detect
 from barsight.calibration.boards.detection_files import NAMES, has_detections, read_detections
 from barsight.calibration.camera_imu.calibration import CameraImuCalibration, calibrate_camera_imu
 from barsight.calibration.camera_imu.result_files import write_camera_imu
-from barsight.calibration.camera_imu.verdict import assess_camera_imu, cross_halves
+from barsight.calibration.camera_imu.verdict import CameraImuAssessment, assess_camera_imu, cross_halves
 from barsight.calibration.files.kalibr import read_imu_file
 from barsight.calibration.files.rig_file import read_board, read_covariance
 from barsight.calibration.files.rig_formats import read_rig_file
@@ -83,12 +83,7 @@ def run(arguments: Sequence[str]) -> None:
             else:
                 settings = RecordingSettings(rig=rig, imu_topic=imu_topic)
                 views, samples, stated = _from_pictures(recording, settings, target, max_views, advance)
-            noise = read_imu_file(imu).noise if imu else stated
-            if noise is None:
-                raise ConfigError(
-                    "the IMU's noise isn't known; give --imu (see barsight calibrate imu-noise)"
-                )
-            _expect_noise(imu or recording, noise)
+            noise = _noise(imu or recording, read_imu_file(imu).noise if imu else stated)
             advance("solve", 0, 3)
             calibration = calibrate_camera_imu(
                 views, samples, lenses, target, noise, recording, scales=imu_scales
@@ -102,12 +97,7 @@ def run(arguments: Sequence[str]) -> None:
         write_camera_imu(calibration, out, camchain, own)
         html = out.with_suffix(".html")
         write_camera_imu_report(calibration, assessment, html, out.with_suffix(".json"))
-        _print(console, calibration, out, html)
-        colour = COLOURS[assessment.verdict]
-        sentence = escape(summary_sentence(assessment.lines))
-        console.print(f"[{colour}]{assessment.verdict}[/{colour}]: {sentence}", highlight=False)
-        for advice in (*calibration.notes, *assessment.advice):
-            console.print(f"  {escape(advice)}", highlight=False)
+        _print(console, calibration, assessment, out, html)
 
     call(command, "calibrate camera-imu", arguments)
 
@@ -118,13 +108,16 @@ def _expect(out: Path, max_views: int) -> None:
         raise ConfigError(f"--max-views {max_views} is too few; give 60 or more")
 
 
-def _expect_noise(path: Path, noise: ImuNoise) -> None:
-    """Refuse noise densities that no IMU has: another unit's."""
+def _noise(path: Path, noise: ImuNoise | None) -> ImuNoise:
+    """Refuse noise that isn't known, and densities that no IMU has: another unit's."""
+    if noise is None:
+        raise ConfigError("the IMU's noise isn't known; give --imu (see barsight calibrate imu-noise)")
     if not (1e-6 < noise.gyro_density < 0.05 and 1e-5 < noise.accel_density < 1.0):
         raise InputError(
             path, f"noise densities of {noise.gyro_density:g} rad/s/sqrt(Hz) and {noise.accel_density:g} "
             "m/s^2/sqrt(Hz) can't be", "give them in these units",
         )  # fmt: skip
+    return noise
 
 
 def _from_detections(
@@ -166,7 +159,13 @@ def _detected(board: Board, frame: StereoFrame) -> BoardView:
     return BoardView(str(frame.stamp_ns), seen[0], seen[1])
 
 
-def _print(console: Console, calibration: CameraImuCalibration, out: Path, html: Path) -> None:
+def _print(
+    console: Console,
+    calibration: CameraImuCalibration,
+    assessment: CameraImuAssessment,
+    out: Path,
+    html: Path,
+) -> None:
     sigma = calibration.sigma
     for camera, mount in enumerate(calibration.solution.state.mounts):
         own = sigma[7 * camera : 7 * camera + 7]
@@ -183,3 +182,8 @@ def _print(console: Console, calibration: CameraImuCalibration, out: Path, html:
         f"{calibration.baseline_sigma_m * 1e3:.2f} mm; report {escape(str(html))}",
         soft_wrap=True, highlight=False,
     )  # fmt: skip
+    colour = COLOURS[assessment.verdict]
+    sentence = escape(summary_sentence(assessment.lines))
+    console.print(f"[{colour}]{assessment.verdict}[/{colour}]: {sentence}", highlight=False)
+    for advice in (*calibration.notes, *assessment.advice):
+        console.print(f"  {escape(advice)}", highlight=False)

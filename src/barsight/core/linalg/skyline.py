@@ -16,7 +16,7 @@ from barsight.core.arrays import Float64, Int64, kernel
 
 
 class Skyline(NamedTuple):
-    """The lower half of a symmetric matrix (n, n). first: (n,) each row's first column that may be filled;
+    """The lower half of a symmetric matrix (N, N). first: (N,) each row's first column that may be filled;
     element (i, j), first[i] <= j <= i, is `values[offset[i] + j]`.
     """
 
@@ -75,7 +75,7 @@ def factorise_skyline(band: Skyline) -> bool:
 
 @kernel()
 def solve_forward(factor: Skyline, x: Float64) -> None:
-    """Replace x (n, m), right sides beside each other so that the factor is read once for all of them, by the
+    """Replace x (N, M), right sides beside each other so that the factor is read once for all of them, by the
     factor's inverse times these. Four rows at a time, so that the sums stay in the registers.
     """
     values, first, offset = factor
@@ -98,7 +98,7 @@ def solve_forward(factor: Skyline, x: Float64) -> None:
 
 @kernel()
 def solve_back_dense(factor: Skyline, x: Float64) -> None:
-    """Replace x (n, m) by the inverse of the factor's transpose times it."""
+    """Replace x (N, M) by the inverse of the factor's transpose times it."""
     values, first, offset = factor
     sides = x.shape[1]
     for i in range(len(first) - 1, -1, -1):
@@ -116,9 +116,9 @@ def inverse_blocks(
     factor: Skyline, at: Int64, diagonal: Float64, blocks: Float64, pairs: Int64, cross: Float64
 ) -> None:
     """Compute blocks of the inverse, from the last column back [Takahashi 1973]: only its elements within the
-    band are needed, and of these only those of the rows that a column reaches. diagonal: (n,). blocks: (K, b,
-    b) of the unknowns from at[k] on, at ascending; cross: (P, b, b) those in the rows of block pairs[:, 0],
-    ascending, and the columns of the later pairs[:, 1]; NaN beyond the band.
+    band are needed, and of these only those of the rows that a column reaches. diagonal: (N,). blocks: (K, B,
+    B) of the unknowns from at[k] on, at (K,) ascending; cross: (P, B, B) those in the rows of block pairs[:,
+    0], ascending, and the columns of the later pairs[:, 1], pairs (P, 2); NaN beyond the band.
     """
     values, first, offset = factor
     n, size = len(first), blocks.shape[1]

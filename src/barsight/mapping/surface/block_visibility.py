@@ -40,7 +40,8 @@ def bound_blocks(
     ceiling, (B, B).
 
     roof: see `clear_height`. first: for views before it nothing but where their pictures lie is told. A block
-    without heights is in no picture.
+    without heights is in no picture. tile: (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS); corner: (2,) column and
+    row of its first cell. planes: (6, 4, K), see `ViewFrusta.planes`; eyes: (K, 2, 3) m.
     """
     blocks, views = TILE_CELLS // BLOCK, planes.shape[2]
     within, dense = np.zeros((blocks, blocks, views), np.int8), np.zeros((blocks, blocks, views), np.bool_)
@@ -72,7 +73,10 @@ def bound_blocks(
 
 @kernel()
 def supported_span(heights: Float32, min_views: float) -> tuple[float, float]:
-    """Find the lowest and the highest height that min_views support, inf and -inf where there is none."""
+    """Find the lowest and the highest height that min_views support, m; inf and -inf where there is none.
+
+    heights: (rows, columns, SLOTS, FIELDS).
+    """
     low, high = np.inf, -np.inf
     for i in range(heights.shape[0]):
         for j in range(heights.shape[1]):
@@ -100,7 +104,10 @@ def _margins(middle: Float64, half: Float64, planes: Float64) -> tuple[Float64, 
 
 @kernel()
 def _is_dense(way: tuple[float, float, float], half: Float64, one_point_m: float) -> bool:
-    """Check that `point_density` is 1 all over a box. way: from its middle to the eye, m."""
+    """Check that `point_density` is 1 all over a box. way: from its middle to the eye, m.
+
+    half: (3,) half its sides, m.
+    """
     x, y, z = abs(way[0]) + half[0], abs(way[1]) + half[1], abs(way[2])
     squared = x * x + y * y + (z + half[2]) ** 2
     return bool(one_point_m * one_point_m * (z - half[2]) > (1 + _SURE) * squared * np.sqrt(squared))
@@ -118,9 +125,9 @@ def clear_height(
     """Bound from above the heights from which `is_unoccluded` holds in each cell of a block; inf if unknown.
 
     span: its lowest and highest height, m. at: row and column of its middle in the middle tile. way: from the
-    middle of both to the eye, m. roof: of `highest_about`. A block's lines of
-    sight never lie further apart than its cells: half a block about the middle's and half a block onward, the
-    roof holds all.
+    middle of both to the eye, m. roof: (3 B, 3 B), of `highest_about`, B blocks to a tile; ceiling: the
+    highest of all, m. A block's lines of sight never lie further apart than its cells: half a block about the
+    middle's and half a block onward, the roof holds all.
     """
     (low, high), (x, y, z) = span, way
     length, side, rise = max(abs(x), abs(y)) / cell_m, BLOCK / 2, z - (high - low) / 2 - _SURE

@@ -41,7 +41,9 @@ def _lengthways(
     """Average along the best direction, the first of those that are alike.
 
     z, weight: with `reach` cells more on each side. The squares of a whole row of cells are summed at once,
-    direction by direction, which vector instructions do.
+    direction by direction, which vector instructions do. z, weight: (rows + 2 reach, columns + 2 reach).
+    rows, columns: (16, N) cells from the middle to each point of a direction. Returns the heights and the
+    directions, (rows, columns), -1 where there is none.
     """
     height, width = z.shape[0] - 2 * reach, z.shape[1] - 2 * reach
     out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)

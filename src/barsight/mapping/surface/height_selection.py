@@ -235,7 +235,7 @@ def _supported(
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
     point, margin = np.empty(3), np.empty(eyes.shape[0])
-    (around, roof, ceiling), (within, dense, clear, is_open) = scene, blocks
+    (around, _, ceiling), (within, dense, clear, is_open) = scene, blocks
     first_new, known = asked
     for i in range(rows):
         for j in range(columns):
@@ -256,12 +256,7 @@ def _supported(
                         continue
                     if within[a, b, k] == SOMEWHERE and not is_pictured(x, y, z, planes, k):
                         continue
-                    is_seen = True
-                    for e in range(2):
-                        if is_seen and z < clear[a, b, k, e]:
-                            way = eyes[k, e, 0] - x, eyes[k, e, 1] - y, eyes[k, e, 2] - z
-                            is_seen = is_unoccluded(z, i, j, way, around, roof, ceiling, cell_m)
-                    if not is_seen:
+                    if not _is_seen(point, i, j, eyes[k], clear[a, b, k], scene, cell_m):
                         continue
                     able += 1
                     votes += 1.0 if dense[a, b, k] else point_density(point, eyes[k, 0], one_point_m)
@@ -275,6 +270,25 @@ def _supported(
                 share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
                 expected[i, j, s] = votes
     return share, expected
+
+
+@kernel()
+def _is_seen(
+    point: Float64, row: int, column: int, eyes: Float64, clear: Float64,
+    scene: tuple[Float32, Float32, float], cell_m: float,
+) -> bool:  # fmt: skip
+    """Check that both cameras of a view have a free line of sight to a point, in a cell of the middle tile.
+
+    point: (3,) m. eyes: (2, 3) m. clear: (2,) m, heights from which the line is known to be free.
+    scene: around, roof and ceiling of `is_unoccluded`.
+    """
+    (around, roof, ceiling), z = scene, point[2]
+    for e in range(2):
+        if z < clear[e]:
+            way = eyes[e, 0] - point[0], eyes[e, 1] - point[1], eyes[e, 2] - z
+            if not is_unoccluded(z, row, column, way, around, roof, ceiling, cell_m):
+                return False
+    return True
 
 
 @kernel()
@@ -314,6 +328,8 @@ def _elected(
 def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
     """Average the support of a height and its like within `_ALONG` cells (every third is read), along that of
     four directions in which most of the tile's cells have one: the bar's own, or the edge's.
+
+    tile: (rows, columns, SLOTS, FIELDS). share: (rows, columns, SLOTS) of `_supported`. z: the height, m.
     """
     most, result = -1, 0.0
     for direction in range(4):

@@ -33,7 +33,10 @@ def bridge_gaps(z: Float32, sigma: Float32, seen: Bool, reach: int) -> Bool:
 
 @kernel()
 def _steps(seen: Bool, i: int, j: int, di: int, dj: int, reach: int) -> int:
-    """Count steps to the first seen cell that way, 0 where there is none within `reach`."""
+    """Count steps to the first seen cell that way, 0 where there is none within `reach`.
+
+    seen: (H, W). i, j: row and column of the cell; di, dj: of a step.
+    """
     for n in range(1, reach + 1):
         a, b = i + n * di, j + n * dj
         if a < 0 or b < 0 or a >= seen.shape[0] or b >= seen.shape[1]:

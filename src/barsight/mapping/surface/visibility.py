@@ -16,7 +16,10 @@ STRIDE = 4
 
 @kernel()
 def point_density(point: Float64, eye: Float64, one_point_m: float) -> float:
-    """Compute points that a view has in a level cell, at most 1."""
+    """Compute points that a view has in a level cell, at most 1.
+
+    point, eye: (3,) m. one_point_m: the range at which points lie as far apart as cells.
+    """
     x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
     squared = x * x + y * y + z * z
     return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
@@ -24,7 +27,10 @@ def point_density(point: Float64, eye: Float64, one_point_m: float) -> float:
 
 @kernel()
 def is_pictured(x_m: float, y_m: float, z_m: float, planes: Float64, view: int) -> bool:
-    """Check that a point lies inside both pictures of a view. planes: see `frustum_margin`."""
+    """Check that a point lies inside both pictures of a view.
+
+    planes: (6, 4, K), see `ViewFrusta.planes`. view: its number among the K.
+    """
     for p in range(planes.shape[0]):
         over = planes[p, 0, view] * x_m + planes[p, 1, view] * y_m + planes[p, 2, view] * z_m
         if over + planes[p, 3, view] < 0:
@@ -81,7 +87,10 @@ def may_be_occluded(
 def has_enough_views(
     x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64, least: float
 ) -> bool:
-    """Check that at least so many views have the point in both pictures."""
+    """Check that at least so many views have the point in both pictures.
+
+    planes: (6, 4, K), see `ViewFrusta.planes`. margin: (K,) is written to.
+    """
     frustum_margin(x_m, y_m, z_m, planes, margin)
     return bool((margin >= 0).sum() >= least)
 
@@ -101,7 +110,8 @@ def is_unoccluded(
     eye above it. way: from the point to the eye, m.
 
     roof: the highest within a stride, of `highest_about`. A line over the roof skips as many cells: it only
-    rises.
+    rises. around: (3 TILE_CELLS, 3 TILE_CELLS) heights of the tile and its neighbours, m; ceiling: the
+    highest of them.
     """
     x, y, z = way
     length = max(abs(x), abs(y)) / cell_m

@@ -110,6 +110,18 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
         chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
         problem = replace(problem, placed=chosen)
         state, system = optimise_graph(problem, build_graph(problem), state, used)
+    return _estimate(frames, everywhere, problem, state, system, used, drift)
+
+
+def _estimate(
+    frames: Int64, everywhere: Problem, problem: Problem, state: GraphState, system: System, used: Bool,
+    drift: RigDrift | None,
+) -> Estimate:  # fmt: skip
+    """Read the estimate and its covariances from the solved system.
+
+    frames: (F,), see `solve_batch`. everywhere: the problem with those places of the encoders that were left
+    out, too.
+    """
     pairs = np.column_stack([np.arange(len(frames) - 1), np.arange(1, len(frames))])
     poses, found = _poses(state, problem), marginals(system, pairs)
     shown = tuple(poses[k] for k in frames)

@@ -94,7 +94,10 @@ def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Elimin
 
 @kernel()
 def add_chain(chain: Chain, at: Int64, band: Skyline) -> None:
-    """Add a chain's nodes, each node's unknowns from at[k] on."""
+    """Add a chain's nodes, each node's unknowns from at[k] on.
+
+    at: (M,). band: the matrix that they are added to.
+    """
     own, link, values, offset, size = chain.own, chain.link, band.values, band.offset, chain.own.shape[1]
     for k in range(len(at)):
         for i in range(size):
@@ -110,6 +113,8 @@ def add_chain(chain: Chain, at: Int64, band: Skyline) -> None:
 def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain: Chain) -> None:
     """Add the normal equations of sparse rows: row r has `right` and values[k] at unknown at[k], where
     first[r] <= k < first[r + 1]. Unknown M n, after the nodes', is the latency.
+
+    first: (R + 1,); at, values: (E,) elements of R rows; right: (R,).
     """
     own, link, gradient, side, corner = chain
     size, end = own.shape[1], own.shape[0] * own.shape[1]

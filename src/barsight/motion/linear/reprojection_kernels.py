@@ -88,6 +88,9 @@ def _error(
 ) -> bool:  # fmt: skip
     """Compute error px, point and derivatives by what is shared of sighting k, of point t, by node's camera.
     False behind the camera.
+
+    lens: (5,), see `Rig`. camera: (M, 3, 4), points: (T, 4), see `LinearisationPoint`. stereo: (N, 3), see
+    `Observations`. Fills rows (3, 13).
     """
     x, y, z = points[t, 0], points[t, 1], points[t, 2]
     for i in range(3):
@@ -114,7 +117,10 @@ def _error(
 
 @kernel(inline=True)
 def slide_offset(points: Float64, shared: Float64, piece: Int64, t: int) -> float:
-    """Subtract the piece's slide from a point's, rad."""
+    """Subtract the piece's slide from a point's, rad.
+
+    points: (T, 4), shared: (2 S + 2,), see `LinearisationPoint`; piece: (T,), see `Observations`.
+    """
     off: float = points[t, 3]
     if len(shared) > 2:
         off -= shared[piece[t]]
@@ -123,7 +129,10 @@ def slide_offset(points: Float64, shared: Float64, piece: Int64, t: int) -> floa
 
 @kernel(inline=True)
 def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
-    """Return what a point's disparity is too large by with all of its piece, px."""
+    """Return what a point's disparity is too large by with all of its piece, px.
+
+    shared: (2 S + 2,), see `LinearisationPoint`; piece: (T,), see `Observations`.
+    """
     pieces = (len(shared) - 2) // 2
     off: float = shared[pieces + piece[t]] if pieces > 0 else 0.0
     return off
@@ -131,7 +140,10 @@ def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
 
 @kernel(inline=True)
 def given_of(rig: Rig, sights: Observations, shared: Float64, t: int) -> PointTerms:
-    """Collect the numbers that the sightings of point t share; shared: as `LinearisationPoint` has it."""
+    """Collect the numbers that the sightings of point t have in common.
+
+    shared: (2 S + 2,), see `LinearisationPoint`.
+    """
     last = len(shared) - 1
     off_px = disparity_offset(shared, sights.piece, t)
     return PointTerms(rig.huber, sights.scale, off_px, shared[last - 1], shared[last])
@@ -169,6 +181,9 @@ def whitened_rows(
 ) -> None:  # fmt: skip
     """Compute the whitened rows of a sighting of 1 / sigma `weight`; at: its node, its own number and its
     point's. All 0 behind the camera.
+
+    lens: (5,), mount: (3, 4), see `Rig`. camera: (M, 3, 4), points: (T, 4), see `LinearisationPoint`. stereo:
+    (N, 3), see `Observations`. Fills rows (3, 13).
     """
     node, k, t = at
     if not _error(lens, camera, points, stereo, given, node, k, t, rows):

@@ -72,7 +72,10 @@ class Span(NamedTuple):
 
 @kernel(inline=True)
 def _factorise(m: Float64, size: int) -> None:
-    """Replace a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse."""
+    """Replace a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse.
+
+    m: (4, 4), of which the first `size` rows and columns count.
+    """
     for i in range(size):
         for j in range(i):
             total = m[i, j]
@@ -216,6 +219,9 @@ def scatter_reduced(
 ) -> None:  # fmt: skip
     """Scatter `reduced` into the equations of all unknowns, which stand as `Layout` has them; the rig's drift
     is the border's last.
+
+    node: (M,) where each node's unknowns begin; piece: (S,) where each piece's do, empty where there are
+    none. Added to: rows, gradient (N,) and, of the border, side (B, N), corner (B, B), corner_gradient (B,).
     """
     band, slope, first, sides, corners, corner_slopes = reduced
     values, offset = rows.values, rows.offset

@@ -80,7 +80,10 @@ def temporal_inflation(residual: Float64, seen: StereoObservations, used: Bool) 
 def _shared_squares(
     residual: Float64, sigma: Float64, stereo: Float64, node: Int64, used: Bool, per_px: float
 ) -> tuple[float, float]:
-    """Sum used residuals over their sigmas: the squares of each cell's sum, and of single ones."""
+    """Sum used residuals over their sigmas: the squares of each cell's sum, and of single ones.
+
+    residual, stereo: (N, 3) px; sigma: (N,) px; node, used: (N,). per_px: cells per pixel.
+    """
     low, high, last = np.full(2, 1 << 40), np.full(2, -(1 << 40)), 0
     for k in range(len(used)):
         if used[k]:
@@ -105,6 +108,8 @@ def _neighbours(
 ) -> tuple[int, float, float, float]:
     """Sum over pairs of neighbouring used sightings of points seen often: how many, their residuals' products
     and squares, over their sigmas, and one over the point's sightings, all summed.
+
+    residual: (N, 3) px; sigma: (N,) px; track, used: (N,), in the tracks' order.
     """
     counts = np.zeros(0 if len(track) == 0 else track[-1] + 1, np.int64)
     for k in range(len(used)):

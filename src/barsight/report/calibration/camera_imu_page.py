@@ -25,15 +25,7 @@ SENSORS = ("pictures", "gyro", "accel")
 def camera_imu_summary(calibration: CameraImuCalibration, assessment: CameraImuAssessment) -> dict[str, Any]:
     """Collect everything of the report as JSON values."""
     problem, state = calibration.problem, calibration.solution.state
-    known, sigma, halves = calibration.uncertainty, calibration.sigma, assessment.halves
-    names = problem.parameter_names
-    values = np.zeros(len(names))
-    for camera, mount in enumerate(state.mounts):
-        values[camera * MOUNT + 3 : camera * MOUNT + 7] = [*mount.place_m, mount.shift_s]
-    half: dict[str, Any] = {"failed": halves.reason} if isinstance(halves, Failed) else {
-        "ratio": halves.ratio, "parameters": list(names[: 2 * MOUNT]),
-        "difference": halves.difference.tolist(), "predicted_sigma": halves.predicted.tolist(),
-    }  # fmt: skip
+    sigma = calibration.sigma
     return {
         "schema": 1,
         "software": {"name": "barsight", "version": barsight.__version__},
@@ -77,6 +69,18 @@ def camera_imu_summary(calibration: CameraImuCalibration, assessment: CameraImuA
             }
             for name, spread in zip(SENSORS, calibration.spreads, strict=True)
         },
+        **_parameters(calibration, assessment),
+    }  # fmt: skip
+
+
+def _parameters(calibration: CameraImuCalibration, assessment: CameraImuAssessment) -> dict[str, Any]:
+    """Collect the parameters with their sigmas, how well they are determined, and what two halves give."""
+    known, halves = calibration.uncertainty, assessment.halves
+    names = calibration.problem.parameter_names
+    values = np.zeros(len(names))
+    for camera, mount in enumerate(calibration.solution.state.mounts):
+        values[camera * MOUNT + 3 : camera * MOUNT + 7] = [*mount.place_m, mount.shift_s]
+    return {
         "correlation": known.correlation,
         "singular_values": known.singular_values.tolist(),
         "undetermined": list(known.undetermined),
@@ -84,10 +88,15 @@ def camera_imu_summary(calibration: CameraImuCalibration, assessment: CameraImuA
             {"name": g.name, "gain": g.chi, "counted": bool(g.matters), "changes": dict(g.changes)}
             for g in known.fixed
         ],
-        "two_halves": half,
+        "two_halves": {"failed": halves.reason} if isinstance(halves, Failed) else {
+            "ratio": halves.ratio, "parameters": list(names[: 2 * MOUNT]),
+            "difference": halves.difference.tolist(), "predicted_sigma": halves.predicted.tolist(),
+        },
         "parameters": [
             {"name": name, "value": float(value), "sigma": float(own), "noise_sigma": float(noise)}
-            for name, value, own, noise in zip(names, values, sigma, known.noise_sigma, strict=True)
+            for name, value, own, noise in zip(
+                names, values, calibration.sigma, known.noise_sigma, strict=True
+            )
         ],
     }  # fmt: skip
 

@@ -27,7 +27,6 @@ ARROW_LENGTH_PX = 40.0
 
 def calibration_summary(calibration: StereoCalibration, assessment: Assessment) -> dict[str, Any]:
     """Collect everything of the report as JSON values."""
-    cross = assessment.cross
     rig = calibration.rig
     errors = view_rms(calibration.observed, calibration.residuals_px, len(calibration.views))
     sigmas = np.sqrt(np.diag(calibration.covariance))
@@ -66,14 +65,7 @@ def calibration_summary(calibration: StereoCalibration, assessment: Assessment) 
             {"range_m": r, "sigma_median_mm": json_value(1e3 * m), "sigma_max_mm": json_value(1e3 * w)}
             for r, (m, w) in zip(assessment.ranges_m, assessment.depth_sigma_m, strict=True)
         ],
-        "cross_validation": {"failed": cross.reason}
-        if isinstance(cross, Failed)
-        else {
-            "ratio": cross.ratio, "difference_px": list(cross.difference_px),
-            "predicted_px": list(cross.predicted_px), "ranges_m": list(cross.ranges_m),
-            "depth_mm": list(cross.depth_mm), "depth_predicted_mm": list(cross.depth_predicted_mm),
-            "baseline_mm": cross.baseline_mm, "baseline_predicted_mm": cross.baseline_predicted_mm,
-        },
+        "cross_validation": _cross_validation(assessment),
         "views": [
             {"name": view.name, "rms_px": float(error), "tilt_deg": [float(t) for t in tilt],
              "corners": [0 if c is None else int(c.ids.size) for c in view.cameras]}
@@ -85,6 +77,19 @@ def calibration_summary(calibration: StereoCalibration, assessment: Assessment) 
             for name, value, sigma in zip(calibration.parameter_names, values, sigmas, strict=True)
         ],
         "parameters_per_camera": width,
+    }  # fmt: skip
+
+
+def _cross_validation(assessment: Assessment) -> dict[str, Any]:
+    """Collect what two halves of the views give, or why they give nothing."""
+    cross = assessment.cross
+    if isinstance(cross, Failed):
+        return {"failed": cross.reason}
+    return {
+        "ratio": cross.ratio, "difference_px": list(cross.difference_px),
+        "predicted_px": list(cross.predicted_px), "ranges_m": list(cross.ranges_m),
+        "depth_mm": list(cross.depth_mm), "depth_predicted_mm": list(cross.depth_predicted_mm),
+        "baseline_mm": cross.baseline_mm, "baseline_predicted_mm": cross.baseline_predicted_mm,
     }  # fmt: skip
 
 

@@ -66,7 +66,11 @@ def bilateral_update(
 def _weighted_means(
     values: Float32, present: Float32, grays: UInt8, near: Float32, alike: Float32, means: Float32
 ) -> None:
-    """Average the window's known values, weighted; NaN (0 / 0) where there is none."""
+    """Average the window's known values, weighted; NaN (0 / 0) where there is none.
+
+    values (px, 0 where unknown), present (1, or 0 where unknown), grays: (H + 2 R, W + 2 R). near: (2 R + 1,
+    2 R + 1) weights by place; alike: (256,) by gray difference. Fills means (H, W) px.
+    """
     height, width = means.shape
     side = near.shape[0]
     radius = side // 2
@@ -185,7 +189,10 @@ def _is_one_parabola(lowest: float, highest: float, mean: float, reach: float) -
 
 @kernel()
 def _run_up(starts: Float64, credit: Float64, begin: int, end: int) -> None:
-    """Integrate the credits of begin...end from the coefficients' changes, which are zero afterwards."""
+    """Integrate the credits of begin...end from the coefficients' changes, which are zero afterwards.
+
+    starts: (K + 1, 3) changes of level, slope and bend, zero again afterwards. Fills credit (K,).
+    """
     level, slope, bend = 0.0, 0.0, 0.0
     for index in range(end - begin):
         level += starts[index, 0]
@@ -198,7 +205,10 @@ def _run_up(starts: Float64, credit: Float64, begin: int, end: int) -> None:
 
 @kernel()
 def _best_place(credit: Float64, begin: int, end: int) -> np.float32:
-    """Find the highest credit's index and the parabola through it and its neighbours [paper Eq. 4]."""
+    """Find the highest credit's index and the parabola through it and its neighbours [paper Eq. 4].
+
+    credit: (K,), of which begin...end count.
+    """
     best = begin
     for index in range(begin, end):
         if credit[index] > credit[best]:

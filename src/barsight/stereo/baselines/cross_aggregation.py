@@ -114,7 +114,10 @@ def _aggregate(slices: Float32, arms: Arms, shares: Float32, rounds: int) -> Non
 
 @kernel()
 def _along_rows(cost: Float32, arms: Arms) -> None:
-    """Sum over the horizontal arms, in place."""
+    """Sum over the horizontal arms, in place.
+
+    cost: (H, W). arms: (4, H, W) px.
+    """
     height, width = cost.shape
     total = np.zeros(width + 1, dtype=np.float32)
     for row in range(height):

@@ -221,6 +221,8 @@ def _pairs(values: Float32, size: int, sums: Float32) -> None:
 def _window_sums(padded: Float32, sums: Float32, radius: int, scratch: Float32) -> None:
     """Sum over 2 r + 1 neighbours of `padded`, which has r zeros at both ends: out of sums over 1, 2, 4...
     neighbours, so that the adds are few and none waits for the one before, as in a running sum.
+
+    padded: (W + 2 R,). Fills sums (W,). scratch: (2, W + 2 R).
     """
     width = sums.shape[0]
     window = 2 * radius + 1

@@ -127,6 +127,9 @@ def _chief_of(chief: Int32, member: int) -> int:
 def _walk(guide: UInt8, kept: UInt8, node: Int32, parent: Int32, weight: UInt8) -> None:
     """Order the nodes in preorder from the middle pixel, so that a node's parent is mostly still in the
     cache.
+
+    guide, kept: (H, W), of `_kept_edges`. Fills node, parent (flat pixel indices) and weight (gray difference
+    of both), all (H * W,).
     """
     height, width = guide.shape
     gray, edges = guide.ravel(), kept.ravel()

@@ -72,46 +72,52 @@ def _falling(v: Vectors, gap: Any) -> Any:
     return power
 
 
+def _load_window(v: Vectors, at: Any, stride: Any) -> tuple[list[Any], list[Any], list[Any]]:
+    """Load the window of `_median`: a vector of values and one of weights per line; then two vectors, the
+    least and the greatest of the values that count.
+    """
+    builder, index = v.builder, at.type
+    nothing, far = v.all(0.0, v.floats), v.all(_UNKNOWN, v.floats)
+    middle = builder.add(at, builder.mul(stride, index(_RADIUS_PX)))
+    own = v.number(1, builder.add(middle, index(_RADIUS_PX)), bytes_of(FLOAT_LANES))
+    values, weights, extremes = [], [], [v.all(x, v.floats) for x in (_UNKNOWN, -_UNKNOWN)]
+    for line in range(_SIDE_PX):
+        there = builder.add(at, builder.mul(stride, index(line)))
+        value = v.load(v.data(0), there, v.floats)
+        share = v.load(v.data(4), index(line * FLOAT_LANES), v.floats)
+        gap = v.apart(v.load(v.data(1), there, bytes_of(FLOAT_LANES)), own)
+        counts = builder.and_(
+            builder.fcmp_ordered("<", value, far), builder.fcmp_ordered(">", share, nothing)
+        )
+        weight = v.product(_falling(v, builder.uitofp(gap, v.floats)), share)
+        values.append(value)
+        weights.append(builder.select(counts, weight, nothing))
+        for which, (sign, none) in enumerate((("<", _UNKNOWN), (">", -_UNKNOWN))):
+            other = builder.select(counts, value, v.all(none, v.floats))
+            nearer = builder.fcmp_ordered(sign, other, extremes[which])
+            extremes[which] = builder.select(nearer, other, extremes[which])
+    return values, weights, extremes
+
+
 @intrinsic  # type: ignore[untyped-decorator]
 def _median(_: Any, theres: Any, greys: Any, at: Any, stride: Any, near: Any) -> Any:
     """Compute the weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GREY),
     of its grey's gap to that of the window's middle, times `near`. All arrays are flat.
 
     The interval of values is quartered until it is short enough: faster than to sort a hundred of them. In
-    vector instructions, so that the window stays in registers, where there are as many.
+    vector instructions, so that the window stays in registers, where there are as many. Plain loops take 2.1
+    to 2.8 times as long for the same bits (benchmarks/results/2026-11-23-kernels.md).
     """
     signature = types.float32(theres, greys, at, stride, near)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
-        at, stride, index = arguments[2], arguments[3], arguments[2].type
-        nothing, far = v.all(0.0, v.floats), v.all(_UNKNOWN, v.floats)
-        middle = builder.add(at, builder.mul(stride, index(_RADIUS_PX)))
-        own = v.number(1, builder.add(middle, index(_RADIUS_PX)), bytes_of(FLOAT_LANES))
-        values, weights = [], []
-        lowest, highest = (
-            cgutils.alloca_once_value(builder, v.all(x, v.floats)) for x in (_UNKNOWN, -_UNKNOWN)
-        )
-        for line in range(_SIDE_PX):
-            there = builder.add(at, builder.mul(stride, index(line)))
-            value = v.load(v.data(0), there, v.floats)
-            share = v.load(v.data(4), index(line * FLOAT_LANES), v.floats)
-            gap = v.apart(v.load(v.data(1), there, bytes_of(FLOAT_LANES)), own)
-            counts = builder.and_(
-                builder.fcmp_ordered("<", value, far), builder.fcmp_ordered(">", share, nothing)
-            )
-            weight = v.product(_falling(v, builder.uitofp(gap, v.floats)), share)
-            values.append(value)
-            weights.append(builder.select(counts, weight, nothing))
-            for extreme, sign, none in ((lowest, "<", _UNKNOWN), (highest, ">", -_UNKNOWN)):
-                other, so_far = builder.select(counts, value, v.all(none, v.floats)), builder.load(extreme)
-                builder.store(
-                    builder.select(builder.fcmp_ordered(sign, other, so_far), other, so_far), extreme
-                )
+        nothing = v.all(0.0, v.floats)
+        values, weights, (lowest, highest) = _load_window(v, arguments[2], arguments[3])
         half = builder.fmul(FLOAT(0.5), v.sum_of(_summed(v, weights)))
-        first = builder.fsub(v.extreme_of(builder.load(lowest), "min"), FLOAT(_EXACT_PX))
+        first = builder.fsub(v.extreme_of(lowest, "min"), FLOAT(_EXACT_PX))
         low = cgutils.alloca_once_value(builder, first)
-        high = cgutils.alloca_once_value(builder, v.extreme_of(builder.load(highest), "max"))
+        high = cgutils.alloca_once_value(builder, v.extreme_of(highest, "max"))
 
         def has_half(level: Any) -> Any:
             """Return whether the values up to a level have half of the weight."""
@@ -154,9 +160,10 @@ def _weighted_medians(
     disparity: Float32, grey: UInt8, wanted: Bool, near: Float32, medians: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
-    """Fill the medians.
+    """Fill in the medians of the pixels `wanted`, in rows first...end.
 
-    disparity, grey: with a margin of _RADIUS_PX before and FLOAT_LANES after; the unknown is _UNKNOWN.
+    disparity, grey: (H, W) with a margin of _RADIUS_PX before and FLOAT_LANES after; the unknown is _UNKNOWN.
+    near: (_SIDE_PX * FLOAT_LANES,) weights by place, 0 beside the window. wanted, medians: (H, W).
     """
     framed_width = disparity.shape[1]
     theres, shades = disparity.reshape(-1), grey.reshape(-1)

@@ -81,7 +81,10 @@ def fill_row_holes(disparity: Float32) -> Float32:
 
 @kernel()
 def _fill_rows(disparity: Float32, filled: Float32) -> bool:
-    """Check whether every row had a disparity; those that had none are NaN."""
+    """Check whether every row had a disparity; those that had none are NaN.
+
+    disparity: (H, W) px. Fills filled (H, W): holes take the smaller of the values beside them in their row.
+    """
     height, width = disparity.shape
     complete = True
     for y in range(height):
@@ -114,6 +117,8 @@ def _slopes_beside_holes(
     """Fit slopes (px per px) of the plane around each matched pixel that touches a hole: three rounds of
     least squares, each on the pixels near the plane before, held to zero slope where there are few. Every
     third pixel in each direction is enough for a slope.
+
+    disparity: (H, W) px, NaN in holes. radius: px. Fills slope_x and slope_y (H, W), in rows first...end.
     """
     height, width = disparity.shape
     for y in range(first, end):
@@ -162,7 +167,9 @@ def _slopes_beside_holes(
 
 @kernel()
 def _sort_by_value(values: Float64, weights: Float64, count: int) -> None:
-    """Sort the first `count` values, ascending, with their weights, in place (insertion sort)."""
+    """Sort the first `count` values (_RAYS,), ascending, with their weights (_RAYS,), in place (insertion
+    sort).
+    """
     for i in range(1, count):
         value, weight = values[i], weights[i]
         j = i - 1
@@ -228,15 +235,27 @@ def _fill(
                     break
             if found == 0:
                 continue
-            wanted = weights[:found].sum() * (0.5 if beyond_border else _HIDDEN_QUANTILE)
-            passed = 0.0
-            _sort_by_value(values, weights, found)
-            for i in range(found):
-                passed += weights[i]
-                if passed >= wanted:
-                    filled[y, x] = values[i]
-                    break
-            spread = 0.0
-            for i in range(found):
-                spread += weights[i] * (values[i] - filled[y, x]) ** 2
-            sigma[y, x] = math.sqrt(1.0 + _SPREAD_RATIO**2 * spread / weights[:found].sum())
+            quantile = 0.5 if beyond_border else _HIDDEN_QUANTILE
+            filled[y, x], sigma[y, x] = _weighted_quantile(values, weights, found, quantile)
+
+
+@kernel()
+def _weighted_quantile(
+    values: Float64, weights: Float64, count: int, quantile: float
+) -> tuple[np.float32, float]:
+    """Compute a weighted quantile of the first `count` candidates and its sigma, px.
+
+    values: (_RAYS,) px; weights: (_RAYS,). Both are sorted by value.
+    """
+    wanted = weights[:count].sum() * quantile
+    passed, guess = 0.0, np.float32(np.nan)
+    _sort_by_value(values, weights, count)
+    for i in range(count):
+        passed += weights[i]
+        if passed >= wanted:
+            guess = np.float32(values[i])
+            break
+    spread = 0.0
+    for i in range(count):
+        spread += weights[i] * (values[i] - guess) ** 2
+    return guess, math.sqrt(1.0 + _SPREAD_RATIO**2 * spread / weights[:count].sum())

@@ -16,7 +16,9 @@ _LANES = TILE_COLUMNS
 
 
 class Evidence(NamedTuple):
-    """Each pixel's disparity, its weight and its pull: frames, or flat."""
+    """Each pixel's disparity, its weight and its pull: frames, which are (H, W) with MARGIN and more around,
+    or these flat.
+    """
 
     disparity: Float32
     weight: Float32

@@ -25,7 +25,9 @@ _MIN_COHERENCE = 0.35
 
 
 class AxisImages(NamedTuple):
-    """Two images that are averaged, their weight and what makes places alike: frames, or flat."""
+    """Two images that are averaged, their weight and what makes places alike: frames, which are (H, W) with
+    MARGIN and more around, or these flat.
+    """
 
     first: Float32
     second: Float32

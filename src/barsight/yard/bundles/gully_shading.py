@@ -146,7 +146,9 @@ def _rests(
 ) -> Float64:  # fmt: skip
     """Compute the fraction (diameters, rolls) of the shades' variance that the best shift leaves unexplained.
 
-    The model: round bars lit from above and from a side, both fading smoothly across the bundle.
+    The model: round bars lit from above and from a side, both fading smoothly across the bundle. places: (N,)
+    m beside the axis; levels: (N,) shades. packing: (bars, 2), in diameters. diameters: m; rolls: rad;
+    shifts: (S,) m. blur: m.
     """
     out = np.ones((diameters.size, rolls.size))
     spread = levels - levels.mean()
@@ -184,6 +186,8 @@ def _rests(
 def _shading(packing: Float64, diameter: float, roll: float, blur: float) -> tuple[Float64, Float64]:
     """Render how much each place faces up, and how much sideways, STEP_M apart about the axis, blurred; 0
     beside.
+
+    packing: (bars, 2), in diameters. Returns two arrays (N,), the axis in the middle. diameter, blur: m.
     """
     c, s = np.cos(roll), np.sin(roll)
     radius = diameter / 2

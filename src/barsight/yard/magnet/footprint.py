@@ -133,7 +133,7 @@ def count_gripped(
 
 
 class Rectangles(NamedTuple):
-    """Bundles from above with their tops: the arrays of a `BundleTable`."""
+    """Bundles from above with their tops: the arrays of a `BundleTable`, centre (B, 2) and so on."""
 
     centre: Float64
     along: Float64
@@ -202,10 +202,12 @@ def overlap(
     dx: float, dy: float, cos: float, sin: float, pole: Float64, along: Float64, half_width: float,
     half_length: float, sigma: Float64, slack: Float64,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Compute a pole's overlap with a bundle (negative is a distance), its sigma and the crane's slack.
+    """Compute a pole's overlap with a bundle (negative is a distance), its sigma and the crane's slack, m.
 
-    dx, dy: pole's centre minus bundle's. Of the four axes across the rectangles' sides the one with the
-    least overlap counts (separating axes).
+    dx, dy: pole's centre minus bundle's. cos, sin: of the magnet's yaw. pole: (4,) along, across, length,
+    width, m. along: (2,) the bundle's unit vector; half_width, half_length, sigma (5,): its own, see
+    `BundleTable`. slack: (3,) on x, y (m) and yaw (rad). Of the four axes across the rectangles' sides the
+    one with the least overlap counts (separating axes).
     """
     best = (np.inf, 1.0, 0.0)
     away = dx * along[0] + dy * along[1]

@@ -66,7 +66,7 @@ def _sum_pull(
     the face's middle over its width.
 
     gaps: (across, along) air gaps, m, NaN where unknown: nothing pulls there. likely, low: kPa at gap_m.
-    likely_m, higher_m: by how much the gaps may be wider.
+    likely_m, higher_m: by how much the gaps may be wider. gap_m, likely, low: (N,).
     """
     total, least, moment = 0.0, 0.0, 0.0
     for i in range(gaps.shape[0]):
@@ -83,7 +83,10 @@ def _sum_pull(
 
 @kernel()
 def _between(gap: float, gap_m: Float64, curve: Float64) -> float:
-    """Interpolate a curve over gap_m at a gap; 0 beyond its end."""
+    """Interpolate a curve over gap_m at a gap; 0 beyond its end.
+
+    gap: m. gap_m: (N,) m, ascending; curve: (N,).
+    """
     for k in range(gap_m.size - 1):
         if gap <= gap_m[k + 1]:
             part = (gap - gap_m[k]) / (gap_m[k + 1] - gap_m[k])

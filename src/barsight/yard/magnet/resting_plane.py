@@ -121,6 +121,9 @@ def rest_faces(
 ) -> tuple[float, float, float, float]:
     """Rest the faces: height at the centre, roll, pitch, and how far beside the middle they rest where the
     suspension holds them, within the lean's sigma; else 0.
+
+    u, v, z: (N,) m across and along from the centre, and up; noise: m. Roll is the slope along u, at most
+    max_roll; pitch along v.
     """
     height, roll, pitch = rest_plane(u, v, z, max_roll)
     # The highest of many noisy points is too high.
@@ -206,7 +209,8 @@ def rest_plane(u: Float64, v: Float64, z: Float64, max_roll: float) -> tuple[flo
     """Rest a plane on the points: height at the origin, slope along u and along v.
 
     Of all planes on or above the points it has the lowest origin; its slope along u is held within
-    `max_roll`. The height is convex in the slopes: two nested searches find the one lowest place.
+    `max_roll`. The height is convex in the slopes: two nested searches find the one lowest place. u, v, z:
+    (N,) m.
     """
     low, high = -max_roll, max_roll
     for _ in range(26):

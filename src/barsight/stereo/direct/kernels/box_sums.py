@@ -40,13 +40,17 @@ def mirror_index(place: int, count: int) -> int:
 
 @kernel()
 def allocate_columns(count: int, width: int, reach: int) -> Float64:
-    """Allocate columns' sums (count, ...), one row for each of the roll_* below."""
+    """Allocate columns' sums (N, W + 2 reach + 2) for N of the roll_* below, zero at the start."""
     return np.zeros((count, width + 2 * reach + 2))
 
 
 @kernel()
 def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> None:
-    """Roll the sum: a row ahead comes in, one behind goes. column: see `allocate_columns`."""
+    """Roll the sum: a row ahead comes in, one behind goes.
+
+    column: (W + 2 reach + 2,), a row of `allocate_columns`, of which column[reach : reach + W] changes.
+    ahead, behind: (W,).
+    """
     for x in range(ahead.shape[0]):
         column[reach + x] += np.float64(ahead[x]) - np.float64(behind[x])
 
@@ -55,7 +59,7 @@ def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> No
 def roll_product(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
-    """Roll the sum of products."""
+    """Roll the sum of products: a row of each comes in, one of each goes. All as in `roll_sum`, rows (W,)."""
     for x in range(ahead.shape[0]):
         column[reach + x] += np.float64(ahead[x] * ahead_other[x]) - np.float64(behind[x] * behind_other[x])
 
@@ -64,7 +68,7 @@ def roll_product(
 def roll_square(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
-    """Roll the sum of the first times the square of the other."""
+    """Roll the sum of the first times the square of the other. All as in `roll_sum`, rows (W,)."""
     for x in range(ahead.shape[0]):
         coming = ahead[x] * ahead_other[x] * ahead_other[x]
         column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])

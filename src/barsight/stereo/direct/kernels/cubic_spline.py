@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8, kernel
+from barsight.core.linalg.bspline import sixfold_weights
 from barsight.core.parallel import parallel_bands
 
 _POLE = math.sqrt(3.0) - 2.0
@@ -80,7 +81,7 @@ def _read(
     """
     width = value.shape[1]
     one, two, three = np.float32(1), np.float32(2), np.float32(3)
-    four, six, half, sixth = np.float32(4), np.float32(6), np.float32(0.5), np.float32(1 / 6)
+    four, half, sixth = np.float32(4), np.float32(0.5), np.float32(1 / 6)
     last, last_first = np.float32(width - 1), np.int32(max(width - 2, 0))
     for y in range(first_row, end_row):
         row, shift = coefficients[y], disparity[y + margin, margin : margin + width]
@@ -90,15 +91,10 @@ def _read(
             first = min(np.int32(place), last_first)
             t = place - np.float32(first)
             t2 = t * t
-            t3 = t2 * t
+            w0, w1, w2, w3 = sixfold_weights(t)
             at = np.uint64(first)
             c0, c1, c2, c3 = row[at], row[at + np.uint64(1)], row[at + np.uint64(2)], row[at + np.uint64(3)]
-            values[x] = sixth * (
-                c0 * (one - three * t + three * t2 - t3)
-                + c1 * (four - six * t2 + three * t3)
-                + c2 * (one + three * t + three * t2 - three * t3)
-                + c3 * t3
-            )
+            values[x] = sixth * (c0 * w0 + c1 * w1 + c2 * w2 + c3 * w3)
             slopes[x] = half * (
                 c1 * (three * t2 - four * t)
                 - c0 * (one - two * t + t2)

@@ -97,7 +97,7 @@ def _compete(
     candidate k at `right` + k.
 
     A key is a candidate's sum and below it, in 16 bits, the candidate: the least number is the winner. down,
-    up: flat, the pixel's sums of four paths each from `at` on.
+    up: flat, the pixel's sums of four paths each from `at` on. least: (W,) with a margin on both sides.
     """
     winner = np.int32(_WORST)
     # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
@@ -119,8 +119,10 @@ def _choose(
     """Choose winners of one row for both images; the left one to a fraction with the equiangular line fit,
     which suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that
     a left pixel's candidates meet them in memory's order. down, up: (W, places) sums of four paths each.
-    least:
-    for use inside, with a margin on both sides that takes what falls beside the right image."""
+    least: for use inside, with a margin on both sides that takes what falls beside the right image.
+
+    Fills left_px and right_px (W,).
+    """
     width, places = down.shape
     downs, ups = down.reshape(-1), up.reshape(-1)
     margin = (len(least) - width) // 2

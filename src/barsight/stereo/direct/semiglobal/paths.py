@@ -94,8 +94,9 @@ def p2_table(large: int, least: int) -> UInt8:
 
 @kernel()
 def allocate_paths(width: int, places: int, small: int) -> UInt8:
-    """Allocate the values of `extend_row`: three paths in two rows, one path in two pixels, and zeros for
-    where a path begins; each with a place to either side that no path takes.
+    """Allocate the values (N,) of `extend_row`: three paths in two rows, one path in two pixels, and zeros
+    for where a path begins; each with a place to either side that no path takes. N: (6 width + 3) * (places +
+    2).
     """
     side = places + 2
     paths = np.full((6 * width + 3) * side, 255 - small, dtype=np.uint8)

@@ -19,7 +19,9 @@ _MIN_SCATTER = 0.04
 
 
 class Heights(NamedTuple):
-    """The sheet's heights and sigmas, and the rows that count: first, last, stride, the middle's place."""
+    """The sheet's heights and sigmas (rows, columns), and the rows that count: first, last, stride, the
+    middle's place.
+    """
 
     z_m: Float32
     sigma_m: Float32
@@ -90,7 +92,10 @@ def fit_outline(
 
 @kernel()
 def _hold(normal: Float64, diameter: float, half: float) -> None:
-    """Add what keeps a step small where the map says nothing of a figure: weak against real evidence."""
+    """Add what keeps a step small where the map says nothing of a figure: weak against real evidence.
+
+    normal: (6, 6), added to. diameter: m. half: of the rows' length, m.
+    """
     slope = 0.1 / max(half, 0.1)
     sigmas = (0.05, slope, 0.05, slope, 0.3, 0.1 * diameter)
     for k in range(6):
@@ -99,7 +104,10 @@ def _hold(normal: Float64, diameter: float, half: float) -> None:
 
 @kernel()
 def _step(normal: Float64, right: Float64, free: Bool) -> Float64:
-    """Solve for the change of the free figures, 0 of the others."""
+    """Solve for the change of the free figures, 0 of the others.
+
+    normal: (6, 6). right, free: (6,). Returns (6,).
+    """
     table, wanted = normal.copy(), right.copy()
     for k in range(6):
         if not free[k]:
@@ -162,7 +170,11 @@ def _normal_equations(
 
 @kernel()
 def _add_row(normal: Float64, right: Float64, part: Float64, side: Float64, along: float) -> None:
-    """Spread a row's sums over place, height, roll and diameter to the figures U ... DIAMETER."""
+    """Spread a row's sums over place, height, roll and diameter to the figures U ... DIAMETER.
+
+    part: (4, 4), its upper half, and side: (4,), the row's sums. along: the row's way from the middle, m.
+    Added to: normal (6, 6), right (6,).
+    """
     source = (0, 0, 1, 1, 2, 3)
     times = (1.0, along, 1.0, along, 1.0, 1.0)
     for a in range(6):

@@ -57,7 +57,11 @@ def extend_rows(sheet: AlignedMap, fit: Fit, settings: BundleSettings, reach_m: 
 
 @kernel()
 def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int:
-    """Find the last agreeing row before a run of others gets too long for its kind."""
+    """Find the last agreeing row before a run of others gets too long for its kind.
+
+    state: (rows,), of `_row_states`. start, step, limit: row to begin with, 1 or -1, last row. runs: (5,)
+    longest run of each kind, rows.
+    """
     last = start
     waiting = np.zeros(5)
     row = start

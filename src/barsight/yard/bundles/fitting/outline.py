@@ -76,6 +76,8 @@ def make_outline(rings: int, diameter_m: float, roll_rad: float, smoothing_m: fl
 def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64, Float64]:
     """Trace the outline, its Gaussian mean over the part that is there, and that mean's slope, at -half ...
     half.
+
+    axes: (bars, 2) sideways and up, m. radius, sigma: m. Returns three arrays (N,), STEP_M apart, NaN beside.
     """
     half = int(np.ceil((np.abs(axes[:, 0]).max() + radius) / STEP_M)) + 1
     size = 2 * half + 1

@@ -78,7 +78,11 @@ def _turned(
     z_turned: Float32,
     sigma_turned: Float32,
 ) -> None:
-    """Fill in, cell by cell, what was measured: whole arrays of places would be ten times the map."""
+    """Fill in, cell by cell, what was measured: whole arrays of places would be ten times the map.
+
+    z, sigma, source: maps (rows, columns). first: (2,) column and row, in their cells, of the first cell that
+    is filled. Fills z_turned and sigma_turned (V, U), m.
+    """
     for i in range(z_turned.shape[0]):
         for j in range(z_turned.shape[1]):
             column = int(np.rint(first[0] + cosine * j - sine * i))

@@ -178,6 +178,9 @@ def _match_blocks(
 ) -> None:  # fmt: skip
     """Match as `_match` does, into `best`. surface: the profile, 0 where unknown; seen: 1 where known, else
     0; known_before: its sums from 0 on.
+
+    profile, surface (m), seen: (columns,); known_before: (columns + 1,). heights: (T, widest) m; offsets,
+    lengths, of_class: (T,). best: gain, height (m) and template's number, (classes, columns).
     """
     gain, height, which = best
     columns = profile.size
@@ -205,7 +208,10 @@ def _match_blocks(
 
 @kernel()
 def _bounds(profile: Float32, template: Float32) -> tuple[float, float]:
-    """Bound the height of the profile over the template at five places; inf, -inf where unknown."""
+    """Bound the height of the profile over the template at five places; inf, -inf where unknown.
+
+    profile: (N,) m. template: (N,) m over the axis, or more.
+    """
     low, high = np.inf, -np.inf
     for q in range(5):
         i = q * (profile.size - 1) // 4
@@ -222,6 +228,8 @@ def _compare(
     """Compute height of the axis and gain of a template laid on a piece of the profile.
 
     surface: 0 where unknown; seen: 1 where known, else 0. All is finite, so sums may run in any order.
+    surface, seen: (N,); template: (N,) m over the axis, or more. known: sum of seen. low, high: bounds of the
+    height, m.
     """
     one, nothing = np.float32(1.0), np.float32(0.0)
     least, most, gate = np.float32(low), np.float32(high), np.float32(1.5 * agreement)
