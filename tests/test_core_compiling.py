@@ -68,6 +68,9 @@ def test_a_change_in_a_called_file_is_compiled_anew(tmp_path: Path) -> None:
     assert answer("constants", "STEP = 1", "STEP = 2") == "103.0 0"
     assert answer("called", "value + STEP", "value - STEP") == "99.0 0"
     assert answer("called", "first: float\n    second", "second: float\n    first") == "199.0 0"
+    texts["caller"] = texts["caller"].replace("Rule", "Law")
+    assert answer("called", "Rule", "Law") == "199.0 0"
+    assert answer("called", "", "") == "199.0 1"
 
 
 @kernel()

@@ -36,12 +36,20 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the code for a signature, None if there is none or something in it has changed."""
         self._stamp()
-        return super().load_overload(sig, target_context)
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # it names a class that is no more, or was torn
+            self.flush()
+            return None
 
     def holds(self, sig: Any, target_context: Any) -> bool:
         """Return whether the code for a signature is there."""
         self._stamp()
-        return self._index_key(sig, target_context.codegen()) in self._cache_file._load_index()
+        try:
+            return self._index_key(sig, target_context.codegen()) in self._cache_file._load_index()
+        except Exception:  # as above
+            self.flush()
+            return False
 
     def _stamp(self) -> None:
         """Stamp the index, only now: what the kernel calls may be defined after it."""
