@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -20,6 +19,7 @@ from barsight.benchmarks.yard.judged_lifts import (
     dangerous_table,
     judge_yard,
 )
+from barsight.cli.bench.seeds import parse_seeds
 from barsight.cli.progress import stages
 from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
@@ -56,7 +56,7 @@ def bench_lift_targets(
         magnet: TOML file of the magnet; an example is assumed without it.
         save: JSON file for all placements, with commit and machine.
     """
-    numbers = _numbers(seeds)
+    numbers = parse_seeds(seeds, "bench lifts")
     if placements < 0:
         raise ConfigError(f"bench lifts: placements must be 0 or more, not {placements}")
     described, settings = load_magnet(magnet), LiftSettings()
@@ -78,13 +78,6 @@ def bench_lift_targets(
     Console().print(bench_table(bench))
     if bench.dangerous:
         Console().print(dangerous_table(bench))
-
-
-def _numbers(seeds: str) -> range:
-    match = re.fullmatch(r"(\d+):(\d+)", seeds)
-    if match is None or int(match[2]) <= int(match[1]):
-        raise ConfigError(f"bench lifts: seeds {seeds!r} is not like 500:560, the last not included")
-    return range(int(match[1]), int(match[2]))
 
 
 def _measured(world: DrawnYard, folder: Path, settings: LiftSettings) -> MappedWorld:
