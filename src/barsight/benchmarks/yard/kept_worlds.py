@@ -54,9 +54,9 @@ def run_world(
 ) -> WorldScore:
     """Score one world in `folder`, with what is kept there of it: recording, measured folder, scores.
 
-    measure: measures a recording into a folder. looked_at: why the seed counts as looked at from now on; empty
-    where it does not. What the product refuses to measure is a score too. Raises OutputError for a folder that
-    is not of this bench.
+    measure: measures a recording into a folder. looked_at: why the seed counts as looked at from now on;
+    empty where it does not. What the product refuses to measure is a score too. Raises OutputError for a
+    folder that is not of this bench.
     """
     note = _read_note(folder)
     recording, out = folder / "recording", folder / "measured"
