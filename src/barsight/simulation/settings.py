@@ -124,6 +124,8 @@ class YardSettings:
     """Share of sections that hold ribbed bars."""
     gloss: float = 1.0
     """Strength of the highlights; 0 is matt steel."""
+    texture_ratio: float = 1.0
+    """Contrast of the surfaces' texture, steel's and the floor's, over the ordinary."""
 
     def __post_init__(self) -> None:
         _expect(1 <= self.max_layers <= 5, "yard max_layers must lie between 1 and 5")
@@ -136,6 +138,7 @@ class YardSettings:
         _expect(0 <= self.gap_m <= 1, "yard gap_m must lie between 0 and 1 m")
         _expect(0 <= self.uneven_ends_m <= 0.5, "yard uneven_ends_m must lie between 0 and 0.5 m")
         _expect(self.gloss >= 0, "yard gloss can't be negative")
+        _expect(0 <= self.texture_ratio <= 2, "yard texture_ratio must lie between 0 and 2")
         _expect(
             self.strap_spacing_m == 0 or self.strap_spacing_m >= 0.3,
             "yard strap_spacing_m must be 0 or at least 0.3 m",

@@ -170,7 +170,8 @@ def _write_pictures(
 ) -> None:
     settings, rig = world.settings, world.mounted.rig
     lamps = hall_lamps(settings.camera.above_floor_m, settings.light)
-    tile = surface_tile(_stream(settings, 7), settings.camera.above_floor_m / settings.camera.focal_px)
+    footprint_m = settings.camera.above_floor_m / settings.camera.focal_px
+    tile = surface_tile(_stream(settings, 7), footprint_m, settings.yard.texture_ratio)
     look = Shading(lamps, bake(world.scene, lamps, _stream(settings, 8)), tile)
     side = settings.camera.samples_per_side
     cameras = (

@@ -42,7 +42,9 @@ def draw_conditions(seed: int, given: SimulationSettings, *, hides: bool) -> Sim
         given,
         seed=seed,
         camera=camera,
-        yard=YardSettings(bar_length_m=float(rng.uniform(*BAR_LENGTH_M))),
+        yard=YardSettings(
+            bar_length_m=float(rng.uniform(*BAR_LENGTH_M)), texture_ratio=float(rng.uniform(0.35, 0.85))
+        ),
         motion=_motion(rng),
         sensors=_sensors(rng, given.sensors),
         light=_light(rng, given.length_m),
@@ -105,9 +107,9 @@ def _sensors(rng: np.random.Generator, given: SensorSettings) -> SensorSettings:
 def _light(rng: np.random.Generator, length_m: float) -> LightSettings:
     x, y = float(rng.uniform(0, 0.7 * length_m)), float(rng.uniform(-3, 1))
     return LightSettings(
-        lamp_ratio=float(rng.uniform(0.5, 1.3)),
-        ambient=float(rng.uniform(0.2, 0.7)),
-        bounce_ratio=float(rng.uniform(0.05, 0.35)),
+        lamp_ratio=float(rng.uniform(0.45, 1.1)),
+        ambient=float(rng.uniform(0.3, 0.8)),
+        bounce_ratio=float(rng.uniform(0.25, 0.8)),
         lamp_length_m=float(rng.uniform(0.3, 2.0)),
         sun_ratio=float(rng.uniform(0.4, 2.0)) * float(rng.random() < 0.3),
         sun_elevation_deg=float(rng.uniform(25, 65)),
