@@ -131,6 +131,18 @@ def test_cover_is_what_hides_a_bundle_from_above(above: tuple, share: float, wid
     assert cover(scene, owners(yard), lying) == pytest.approx((share, widest), abs=0.04)
 
 
+def test_short_bars_do_not_hide_their_bundle() -> None:
+    """One of two bars ends early, over another bundle that lies lower: nothing lies on either."""
+    short = cylinder("bar", np.array([0.1, -0.3, 0.15]), Y, 0.05, 1.4, 0)
+    yard = SolidYard((bar(0.0, 0.15, 0), short, bar(0.1, 0.05, 1)))
+    scene = scene_of(yard, {0: "rusty", 1: "oiled"}, np.random.default_rng(0))
+    cross = np.array([[-0.05, 0.0], [0.05, 0.0]])
+    lying = DrawnBundle(0, 0, 0, "nested", np.array([0.05, 0.0, 0.15]), 0.0, cross, 0.1, 2.0, 0.0)
+    assert cover(scene, owners(yard), lying) == (0.0, 0.0)
+    below = DrawnBundle(1, 0, 0, "nested", np.array([0.1, 0.0, 0.05]), 0.0, np.zeros((1, 2)), 0.1, 2.0, 0.0)
+    assert cover(scene, owners(yard), below) == pytest.approx((0.7, 1.0), abs=0.03)
+
+
 def test_conditions_spread_and_refuse_what_they_draw() -> None:
     drawn = [draw_conditions(seed, GIVEN, hides=False) for seed in range(60)]
     assert all(one.camera.width_px == 160 and one.length_m == 1.6 for one in drawn)

@@ -24,7 +24,7 @@ GIVEN = SimulationSettings(
 MAP = {"samples": 100.0, "p95_mm": 8.0, "within_95_pct": 90.0, "coverage_pct": 99.0}
 COUNTS = {
     "free": 4, "found": 3, "claimed": 4, "wrong": 1, "said_count": 2, "right_count": 1, "single": 0,
-    "single_found": 0,
+    "single_found": 0, "nowhere": 0,
 }  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,9 @@ class WorldScore:
     """Scores of one world. refused: why it could not be measured, empty where it was.
 
     maps: as `score_folder` has them, mm. poses: of the ground below the frames. counts: free bundles in
-    sight, how many were found, bundles said to be free, how many of those are wrong, how often a number of
-    bars was said and right, single bars in sight and found. errors, sigmas: by figure of the bundles that
+    sight, how many were found, bundles said to be free, how many of those are wrong, at how many of those no
+    bundle lies whether free or not, how often a number of bars was said and right, single bars in sight and
+    found. errors, sigmas: by figure of the bundles that
     were found, m (yaw rad, mass t).
     """
 
@@ -93,11 +94,12 @@ def score_world(recording: Path, out: Path | None, looked_at: str, refused: str)
     bundles = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and not alone)
     bars = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and alone)
     found = read_bundles(out / "bundles.json")
-    scores, single, every = (score_bundles(found, part) for part in (bundles, bars, true))
+    lying = tuple(replace(t, on_top=True) for t in true)
+    scores, single, every, anywhere = (score_bundles(found, part) for part in (bundles, bars, true, lying))
     counts = {
         "free": scores.free, "found": scores.found, "claimed": every.claimed, "wrong": every.wrong,
         "said_count": scores.said_count, "right_count": scores.right_count, "single": single.free,
-        "single_found": single.found,
+        "single_found": single.found, "nowhere": anywhere.wrong,
     }  # fmt: skip
     errors = {name: [float(v) for v in values] for name, values in scores.errors.items()}
     sigmas = {name: [float(v) for v in values] for name, values in scores.sigmas.items()}
@@ -204,6 +206,7 @@ def _bundle_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
     for name, part, whole in (
         ("free bundles found, %", "found", "free"),
         ("said to be free and is not, %", "wrong", "claimed"),
+        ("said to be free where no bundle lies so, %", "nowhere", "claimed"),
         ("number of bars right where said, %", "right_count", "said_count"),
         ("single bars found, %", "single_found", "single"),
     ):
@@ -211,7 +214,7 @@ def _bundle_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
             (100 * w.counts[part] / w.counts[whole], w.seed) for w in worlds if w.counts.get(whole, 0) > 0
         ]
         if shares:
-            bad, seed = (max if part == "wrong" else min)(shares)
+            bad, seed = (max if whole == "claimed" else min)(shares)
             count = sum(w.counts[whole] for w in worlds)
             yield WorldRow(kind, name, count, float(np.median([v for v, _ in shares])), bad, seed, math.nan)
 

@@ -89,24 +89,26 @@ def cover(scene: Scene, owner: Int64, bundle: DrawnBundle) -> tuple[float, float
     """Look down on a bundle's bars: the share of what they take up seen from above that other things hide,
     and the largest such share on a line across it.
 
-    owner: (P + 1,) the bundle of each primitive of the scene, the floor last.
+    owner: (P + 1,) the bundle of each primitive of the scene, the floor last. Beyond a bar's end, and between
+    two bars, what is seen lies lower than the bars do: it hides nothing.
     """
-    radius = bundle.diameter_m / 2
+    x, z, radius = bundle.cross_m[:, 0], bundle.cross_m[:, 1], bundle.diameter_m / 2
+    u = np.arange(x.min() - radius + COVER_STEP_M[0] / 2, x.max() + radius, COVER_STEP_M[0])
+    rise = radius**2 - (u[:, None] - x) ** 2
+    own = np.where(rise > 0, z + np.sqrt(np.maximum(rise, 0)), -np.inf).max(axis=1) + bundle.centre_m[2]
+    u, own = u[np.isfinite(own)], own[np.isfinite(own)]
+    v = np.linspace(-0.5, 0.5, max(3, round(bundle.length_m / COVER_STEP_M[1]))) * bundle.length_m
     c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     across, along = np.array([c, s, 0.0]), np.array([-s, c, 0.0])
-    low, high = bundle.cross_m[:, 0].min() - radius, bundle.cross_m[:, 0].max() + radius
-    u = np.arange(low + COVER_STEP_M[0] / 2, high, COVER_STEP_M[0])
-    # A line that falls between two bars sees past them: what lies there doesn't hide the bundle.
-    u = u[(np.abs(u[:, None] - bundle.cross_m[None, :, 0]) < radius).any(axis=1)]
-    half = bundle.length_m / 2 - 0.02
-    v = np.linspace(-half, half, max(2, round(2 * half / COVER_STEP_M[1])))
-    out = u[None, :] + bow_at(bundle.bow_m, bundle.length_m, v)[:, None]
-    places = bundle.centre_m + out[..., None] * across + v[:, None, None] * along
-    origins = places.reshape(-1, 3).copy()
-    origins[:, 2] = ABOVE_M
-    _, found = cast_rays(scene, origins, np.tile([0.0, 0.0, -1.0], (len(origins), 1)))
-    hidden = (owner[found] != bundle.number).reshape(out.shape)
-    return float(hidden.mean()), float(hidden.mean(axis=1).max())
+    aside = u + bow_at(bundle.bow_m, bundle.length_m, v)[:, None]
+    origins = bundle.centre_m + aside[..., None] * across + v[:, None, None] * along
+    origins[..., 2] = ABOVE_M
+    distance, found = cast_rays(scene, origins.reshape(-1, 3), np.tile([0.0, 0.0, -1.0], (aside.size, 1)))
+    is_own = (owner[found] == bundle.number).reshape(aside.shape)
+    hidden = ~is_own & (ABOVE_M - distance.reshape(aside.shape) > own)
+    asked = np.count_nonzero(is_own | hidden, axis=1)
+    lines = hidden.sum(axis=1)[asked > 0] / asked[asked > 0]
+    return float(hidden.sum() / asked.sum()), float(lines.max())
 
 
 def world_truth(world: DrawnWorld) -> dict[str, Any]:
