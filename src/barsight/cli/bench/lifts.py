@@ -67,7 +67,7 @@ def bench_lift_targets(
             described_at.write_text(example_magnet(), encoding="utf-8")
         judged = read_magnet(described_at)
         for done, seed in enumerate(numbers):
-            world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M)
+            world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
             folder = (keep or Path(scratch)) / f"seed_{seed}"
             mapped = _measured(world, folder, settings) if rendered else noisy_world(world, settings)
             found += judge_yard(world, mapped, described, judged, settings, placements)

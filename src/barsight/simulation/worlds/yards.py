@@ -84,8 +84,12 @@ def kind_of(seed: int) -> str:
     return KINDS[seed % len(KINDS)]
 
 
-def draw_yard(seed: int, bar_length_m: float, length_m: float) -> DrawnYard:
-    """Draw the yard of a seed: see `kind_of`. length_m: along X, about; bars are up to bar_length_m long."""
+def draw_yard(seed: int, bar_length_m: float, length_m: float, min_length_ratio: float = 0.75) -> DrawnYard:
+    """Draw the yard of a seed: see `kind_of`.
+
+    length_m: along X, about. bar_length_m: of the longest bars; min_length_ratio: those of a pile have at
+    least this share of it.
+    """
     rng = np.random.default_rng((23, seed))
     kind = kind_of(seed)
     solids: list[Solid] = []
@@ -93,7 +97,7 @@ def draw_yard(seed: int, bar_length_m: float, length_m: float) -> DrawnYard:
     x, section = 0.0, 0
     while x < length_m - SPAN_M[0] or not section:
         manner, upright = _sort(kind, section, rng)
-        length = float(rng.uniform(0.75, 1.0)) * bar_length_m
+        length = float(rng.uniform(min_length_ratio, 1.0)) * bar_length_m
         yaw = _yaw(kind, section, rng)
         if abs(yaw) > 1:
             length = min(length, max(length_m - x, MIN_BAR_M))
