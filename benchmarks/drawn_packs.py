@@ -150,7 +150,7 @@ def field(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[float, 
     return np.asarray(drawn[: shape[0], : shape[1]])
 
 
-def rest_on(packs: list[Pack], place: tuple[float, float, float], poles: Array, most_roll: float) -> Array:
+def rest_on(packs: list[Pack], place: tuple[float, float, float], poles: Array, max_roll: float) -> Array:
     """Lower the rigid faces onto the bars: height at the middle, slopes along and across.
 
     poles: (P, 4) along, across, length, width. Of all planes on or above the steel the lowest at its middle.
@@ -161,7 +161,7 @@ def rest_on(packs: list[Pack], place: tuple[float, float, float], poles: Array, 
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
     rule = -np.column_stack([np.ones(len(points)), points[:, 0], points[:, 1]])
     found = linprog(
-        [1, 0, 0], rule, -points[:, 2], bounds=[(None, None), (-0.35, 0.35), (-most_roll, most_roll)]
+        [1, 0, 0], rule, -points[:, 2], bounds=[(None, None), (-0.35, 0.35), (-max_roll, max_roll)]
     )
     return np.asarray(found.x)
 

@@ -13,7 +13,7 @@ from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import height_selection
 from barsight.mapping.surface.block_visibility import EVERYWHERE, SOMEWHERE, bound_blocks
-from barsight.mapping.surface.height_selection import Asked, ViewFrusta, elect_by_votes, elect_surface
+from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Layers
 from barsight.mapping.tiles import FIELDS, SLOTS, VIEWS, TileStore, Z
@@ -191,7 +191,7 @@ def drawn_yard(folder: Path) -> tuple[TileStore, list[Pose]]:
     return store, poses
 
 
-def elected(store: TileStore, poses: list[Pose], asked: Asked) -> tuple[np.ndarray, np.ndarray]:
+def elected(store: TileStore, poses: list[Pose], asked: ViewSupport) -> tuple[np.ndarray, np.ndarray]:
     """The winners of the tile at (0, 0) and how its views see its heights."""
     first = {key: elect_by_votes(store.read(key), 2, 0.35) for key in sorted(store.keys())}
     nothing = np.full((256, 256), np.nan, np.float32)
@@ -205,7 +205,7 @@ def test_what_is_said_of_blocks_is_what_their_cells_would_say(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, poses = drawn_yard(tmp_path)
-    quick = elected(store, poses, Asked.none())
+    quick = elected(store, poses, ViewSupport.none())
     told = []
 
     def nothing_told(*values: object) -> tuple[np.ndarray, ...]:
@@ -214,7 +214,7 @@ def test_what_is_said_of_blocks_is_what_their_cells_would_say(
         return 0 * within + SOMEWHERE, dense & False, np.full_like(clear, np.inf), is_open & False
 
     monkeypatch.setattr(height_selection, "bound_blocks", nothing_told)
-    slow = elected(store, poses, Asked.none())
+    slow = elected(store, poses, ViewSupport.none())
     for one, other in zip(quick, slow, strict=True):
         np.testing.assert_array_equal(one, other)
     within, dense, clear, is_open = told
@@ -229,10 +229,10 @@ def test_what_is_said_of_blocks_is_what_their_cells_would_say(
 
 
 def test_views_asked_before_arent_asked_again(tmp_path: Path) -> None:
-    """Asked in two turns views say what they say in one; those of a height that moved are asked anew."""
+    """ViewSupport in two turns views say what they say in one; those of a height that moved are asked anew."""
     store, poses = drawn_yard(tmp_path)
-    winner, heights = elected(store, poses, Asked.none())
-    asked = Asked.none()
+    winner, heights = elected(store, poses, ViewSupport.none())
+    asked = ViewSupport.none()
     elected(store, poses[:5], asked)
     assert asked.views == 5
     forged = np.isfinite(asked.heights[..., 0])

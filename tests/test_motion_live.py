@@ -18,7 +18,7 @@ from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.fixed_lag import estimator as live
 from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
-from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import read_ground_truth
@@ -81,7 +81,7 @@ def test_a_crane_over_bars(data: Path) -> None:
 
 def estimator_of(recording: Recording, use: str, held: int) -> FixedLagEstimator:
     crane = recording.crane() if "crane" in use else None
-    readings = ReadingsSoFar(crane, recording.imu(), recording.imu_noise() or ORDINARY_NOISE)
+    readings = SensorBuffer(crane, recording.imu(), recording.imu_noise() or ORDINARY_NOISE)
     level = None if crane else live.align_with_gravity(recording)
     settings = FusionSettings(use=use)
     return FixedLagEstimator(settings, CraneSettings(), held, Rectifier(recording.rig), 0, readings, level)

@@ -13,7 +13,7 @@ from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.lifting.travel_accuracy import target_covariance
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.vetoes import check_least, check_most, check_true, vetoes_of
+from barsight.yard.vetoes import check_max, check_min, check_true, vetoes_of
 from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 
 
@@ -25,8 +25,8 @@ from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 def test_a_figure_within_its_sigma_of_the_limit_is_a_veto_that_says_so(
     value: float, sigma: float, result: str, close: bool
 ) -> None:
-    most = check_most("tilt", "slope", value, 10.0, "deg", "too steep", sigma=sigma)
-    least = check_least("tilt", "slope", -value, -10.0, "deg", "too steep", sigma=sigma)
+    most = check_max("tilt", "slope", value, 10.0, "deg", "too steep", sigma=sigma)
+    least = check_min("tilt", "slope", -value, -10.0, "deg", "too steep", sigma=sigma)
     assert most.result == least.result == result
     assert ("within its sigma of the limit" in most.reason) == close
     assert [v.code for v in vetoes_of([most, least])] == ([] if result == "passed" else ["tilt"] * 2)

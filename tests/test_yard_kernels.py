@@ -122,9 +122,9 @@ def drawn_heights(values: np.ndarray) -> Heights:
     return Heights(z.astype(np.float32), np.full(z.shape, 0.004, np.float32), -0.3, 1.0, 0.01, 0, 39, 1, 1.2)
 
 
-def rules(most_m: float) -> Rules:
+def rules(max_m: float) -> Rules:
     return Rules(
-        hexagon(1), 3.006, np.ones(6, bool), 12, 0.05, 0.004, SMOOTHING_M, 1.0, (0.0, np.inf), (0.1, most_m)
+        hexagon(1), 3.006, np.ones(6, bool), 12, 0.05, 0.004, SMOOTHING_M, 1.0, (0.0, np.inf), (0.1, max_m)
     )
 
 

@@ -19,8 +19,8 @@ from barsight.calibration.stereo.calibration import calibrate_stereo as solve_st
 from barsight.core.arrays import UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity
-from barsight.map_building import Advance
-from barsight.measure_folder import measure_into, unheard
+from barsight.map_building import ProgressCallback
+from barsight.measure_folder import ignore_progress, measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.pair_matching import match_pictures
 from barsight.recording.open import open_recording as open_path
@@ -41,7 +41,7 @@ def measure(
     preset: Literal["best", "fast"] = "best",
     magnet: Path | str | None = None,
     at: Literal["now", "end"] = "now",
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     **settings: Any,
 ) -> Yard:
     """Measure a recording; the files lie in a temporary folder, which goes with the yard unless saved.
@@ -102,7 +102,7 @@ def calibrate_stereo(
     if lens not in known:
         raise ConfigError(f"lens is {lens!r}; give one of {', '.join(known)}")
     target, path = parse_board(board), Path(pictures)
-    views, sizes, left_out = views_from_pictures(path, target, max_views, unheard)
+    views, sizes, left_out = views_from_pictures(path, target, max_views, ignore_progress)
     return solve_stereo(views, target, Lens(lens), sizes, path, left_out)
 
 

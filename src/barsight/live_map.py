@@ -15,7 +15,12 @@ from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
 from barsight.mapping.fusion import fuse_view
-from barsight.mapping.scene_extent import choose_cell_size, least_way_m, points_per_pixel, probe_recording
+from barsight.mapping.scene_extent import (
+    choose_cell_size,
+    keyframe_spacing_m,
+    points_per_pixel,
+    probe_recording,
+)
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
@@ -68,7 +73,7 @@ class LiveMap:
         )  # fmt: skip
         self._store = TileStore(folder, settings.map.resident_tiles)
         self._election = SurfaceElection(self._store, folder, cell_m, settings.map)
-        self._min_way_m = least_way_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
+        self._min_way_m = keyframe_spacing_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
         self._ahead = np.array([0.0, 0.0, first.range_m])
         self._last: Float64 | None = None
         self._placed: list[Pose] = []

@@ -44,7 +44,7 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.settings import StereoSettings, make_method
 
-Advance = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
 
 _MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
@@ -131,7 +131,7 @@ def probe(
 
 
 @contextmanager
-def follow(probed: ProbedRecording, settings: MeasureSettings, advance: Advance) -> Iterator[Way]:
+def follow(probed: ProbedRecording, settings: MeasureSettings, advance: ProgressCallback) -> Iterator[Way]:
     """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
     source, pairs, watch = probed.source, probed.pairs, probed.watch
     rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
@@ -181,7 +181,7 @@ def _naming(probed: ProbedRecording) -> Iterator[None]:
 
 
 def build_map(
-    probed: ProbedRecording, way: Way, settings: MeasureSettings, scratch: Path, advance: Advance
+    probed: ProbedRecording, way: Way, settings: MeasureSettings, scratch: Path, advance: ProgressCallback
 ) -> BuiltMap:
     """Fuse each matched pair into the map's tiles, and carve its lines of sight.
 

@@ -11,7 +11,7 @@ from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.parallel import in_background
 from barsight.evaluation.score import score_folder
-from barsight.map_building import Advance
+from barsight.map_building import ProgressCallback
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import find_lifts, map_yard
 from barsight.recording.base import Recording
@@ -22,7 +22,7 @@ from barsight.result_folder import seal_map
 from barsight.yard.magnet.description import load_magnet
 
 
-def unheard(stage: str, done: int, total: int) -> None:
+def ignore_progress(stage: str, done: int, total: int) -> None:
     """Take progress that nobody asked for."""
 
 
@@ -31,7 +31,7 @@ def measure_into(
     out: Path,
     settings: MeasureSettings,
     *,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     overwrite: bool = False,
     resume: bool = False,
     truth_of: Path | None = None,
@@ -62,7 +62,7 @@ def write_measured(
     out: Path,
     settings: MeasureSettings,
     *,
-    advance: Advance = unheard,
+    advance: ProgressCallback = ignore_progress,
     overwrite: bool = False,
     keep: Path | None = None,
     truth_of: Path | None = None,

@@ -20,7 +20,7 @@ from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import Agreement, Contour, CraneSamples, LaserProfile, Trajectory
-from barsight.map_building import Advance, BuiltMap, ProbedRecording, Way, build_map, follow, probe
+from barsight.map_building import BuiltMap, ProbedRecording, ProgressCallback, Way, build_map, follow, probe
 from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.surface.contours import cut_contours
 from barsight.mapping.surface.height_selection import ViewFrusta
@@ -47,7 +47,7 @@ from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
 
-LEAST_DOWN = 0.5
+MIN_DOWN_COSINE = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
 MAX_BELOW_FLOOR_RATIO = 0.3
 """Depth under the floor over the working distance, at most; depths of one pair are rough."""
@@ -78,7 +78,7 @@ class MappedYard:
 
 
 def map_yard(
-    recording: Recording, settings: MeasureSettings, scratch: Path, advance: Advance,
+    recording: Recording, settings: MeasureSettings, scratch: Path, advance: ProgressCallback,
     resume: Path | None = None,
 ) -> MappedYard:  # fmt: skip
     """Measure the surface. `scratch` is an empty folder for tiles and pictures; the caller removes it.
@@ -230,7 +230,7 @@ def _floor_doubts(probed: ProbedRecording, built: BuiltMap, trajectory: Trajecto
     ahead = np.array([0.0, 0.0, probed.first.range_m])
     seen_z_m = float(np.median([pose.apply(ahead)[2] for pose in built.placed]))
     eye_z_m = float(np.median([pose.translation[2] for pose in built.placed]))
-    if eye_z_m - seen_z_m < LEAST_DOWN * probed.first.range_m:
+    if eye_z_m - seen_z_m < MIN_DOWN_COSINE * probed.first.range_m:
         where = "not below them"
     elif seen_z_m < -MAX_BELOW_FLOOR_RATIO * probed.first.range_m:
         where = f"{-seen_z_m:.1f} m below the yard's floor (z = 0)"

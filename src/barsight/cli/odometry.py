@@ -128,5 +128,5 @@ def _drift_lines(drift: Drift | None) -> list[str]:
             f"{drift.nees_position:.2f} position, {drift.nees_attitude:.2f} attitude"
         )
     if not math.isnan(drift.drift_percent):
-        lines.append(f"drift over {drift.least_way_m:.0f} m and more: {drift.drift_percent:.3f} %")
+        lines.append(f"drift over {drift.min_length_m:.0f} m and more: {drift.drift_percent:.3f} %")
     return lines

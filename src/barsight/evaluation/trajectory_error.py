@@ -18,7 +18,7 @@ from barsight.recording.formats.ground_truth import GroundTruth
 class Drift:
     """frames: compared. aligned_*: after the best rigid motion. reference_*: as they stand, NaN in `world`.
 
-    drift_percent: translation error over all stretches of `least_way_m` and more, relative to their length
+    drift_percent: translation error over all stretches of `min_length_m` and more, relative to their length
     [Geiger 2012]; NaN where the way is shorter. nees_*: squared error per degree of freedom in terms of the
     stated covariance, 1 where it is right; NaN in `world`, which truth knows up to a rigid motion only.
     """
@@ -29,7 +29,7 @@ class Drift:
     reference_rmse_mm: float
     reference_rmse_deg: float
     drift_percent: float
-    least_way_m: float
+    min_length_m: float
     nees_position: float
     nees_attitude: float
 
@@ -88,7 +88,7 @@ def _met(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> _Met | No
 
 
 def trajectory_drift(
-    trajectory: Trajectory, truth: GroundTruth, shift_ns: int, least_way_m: float = 10.0
+    trajectory: Trajectory, truth: GroundTruth, shift_ns: int, min_length_m: float = 10.0
 ) -> Drift | None:
     """Compute drift figures; shift_ns: truth's clock minus the frames' (`timeshift_cam_imu`).
 
@@ -112,8 +112,8 @@ def trajectory_drift(
         float(np.degrees(np.sqrt((spread**2).mean()))),
         _rms(error) * 1e3 if in_yard else nan,
         float(np.degrees(_rms(angle))) if in_yard else nan,
-        _drift(place, turn, true_place, true_turn, least_way_m),
-        least_way_m,
+        _drift(place, turn, true_place, true_turn, min_length_m),
+        min_length_m,
         _nees(error, covariance[:, 3:, 3:]) if in_yard else nan,
         _nees(angle, covariance[:, :3, :3]) if in_yard else nan,
     )
@@ -136,12 +136,12 @@ def _nees(error: Float64, covariance: Float64) -> float:
 
 
 def _drift(
-    place: Float64, turn: Rotation, true_place: Float64, true_turn: Rotation, least_way_m: float
+    place: Float64, turn: Rotation, true_place: Float64, true_turn: Rotation, min_length_m: float
 ) -> float:
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true_place, axis=0), axis=1))])
     shares: list[float] = []
     for first in range(len(way)):
-        last = np.flatnonzero(way - way[first] >= least_way_m)
+        last = np.flatnonzero(way - way[first] >= min_length_m)
         if last.size == 0:
             break
         moved = turn[first].inv().apply(place[last] - place[first])

@@ -99,7 +99,7 @@ def select_keyframes(
     ahead = np.array([0.0, 0.0, range_m])
     seen = [(frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead) for frame in frames]
     stamps = [frame.stamp_ns for frame in frames]
-    return set(_spread(stamps, np.array(seen), least_way_m(rectifier.camera, range_m, min_shift)))
+    return set(_spread(stamps, np.array(seen), keyframe_spacing_m(rectifier.camera, range_m, min_shift)))
 
 
 def select_keyframes_by_encoders(
@@ -114,10 +114,10 @@ def select_keyframes_by_encoders(
     start = int(crane.stamp_ns[0])
     at, known = (np.asarray(times) - start for times in (np.array(stamps_ns) + shift_ns, crane.stamp_ns))
     places = np.column_stack([np.interp(at, known, axis) for axis in crane.position_m.T])
-    return _spread(stamps_ns, places, least_way_m(camera, range_m, min_shift))
+    return _spread(stamps_ns, places, keyframe_spacing_m(camera, range_m, min_shift))
 
 
-def least_way_m(camera: RectifiedCamera, range_m: float, min_shift: float) -> float:
+def keyframe_spacing_m(camera: RectifiedCamera, range_m: float, min_shift: float) -> float:
     """Return the way on a surface range_m away that min_shift of a picture's shorter side spans, m."""
     return min_shift * min(camera.width, camera.height) * range_m / camera.focal_px
 

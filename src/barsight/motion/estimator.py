@@ -14,7 +14,7 @@ from barsight.recording.base import Recording
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 
-Seen = RectifiedPair | NamedPoints | RefusedFrame
+FrameInput = RectifiedPair | NamedPoints | RefusedFrame
 """A frame as an estimator takes it: its pictures, its named points, or only its stamp."""
 
 UNPLACED = "no sensor places it"
@@ -34,7 +34,7 @@ class PoseEstimator(Protocol):
     @property
     def delay_ns(self) -> int | None: ...
 
-    def push(self, seen: Seen) -> PosedFrame | RefusedFrame | None:
+    def push(self, seen: FrameInput) -> PosedFrame | RefusedFrame | None:
         """Take the next frame in time's order; return its final pose or why it has none, None where only
         `finish` can tell.
         """
@@ -59,14 +59,14 @@ class ImmediatePoses(ABC):
         self.refused: list[RefusedFrame] = []
 
     @abstractmethod
-    def place(self, seen: Seen) -> PosedFrame | RefusedFrame | Failed:
+    def place(self, seen: FrameInput) -> PosedFrame | RefusedFrame | Failed:
         """Estimate the next frame's pose, or say why it has none."""
 
     @abstractmethod
     def finish(self) -> Trajectory:
         """Return all frames' poses."""
 
-    def push(self, seen: Seen) -> PosedFrame | RefusedFrame:
+    def push(self, seen: FrameInput) -> PosedFrame | RefusedFrame:
         """Place the next frame; see `PoseEstimator.push`."""
         frame = self.place(seen)
         if isinstance(frame, PosedFrame):
@@ -76,7 +76,7 @@ class ImmediatePoses(ABC):
         return self.refused[-1]
 
 
-def pictures_of(seen: Seen) -> RectifiedPair | Failed:
+def pictures_of(seen: FrameInput) -> RectifiedPair | Failed:
     """Return a frame's pictures; Failed `no-pictures` where it has none."""
     if isinstance(seen, RectifiedPair):
         return seen
@@ -111,7 +111,7 @@ class TrajectoryEstimator(ABC):
         return poses.finish()
 
 
-def _frames(recording: Recording, pairs: RectifiedPairs, reads_pictures: bool) -> Iterator[Seen]:
+def _frames(recording: Recording, pairs: RectifiedPairs, reads_pictures: bool) -> Iterator[FrameInput]:
     if not reads_pictures:
         yield from (RefusedFrame(stamp, UNPLACED) for stamp in recording.index.stamps_ns)
     elif isinstance(recording, CornerRecording):

@@ -131,7 +131,7 @@ def _figures(result: OdometryResult) -> list[KeyFigure]:
                 "In the yard", format_number(drift.reference_rmse_mm, 2, "mm"),
                 f"{format_number(drift.reference_rmse_deg, 3, '°')} RMSE; NEES {nees}"))  # fmt: skip
         if not math.isnan(drift.drift_percent):
-            note = f"over {drift.least_way_m:.0f} m and more"
+            note = f"over {drift.min_length_m:.0f} m and more"
             figures.append(KeyFigure("Drift", format_number(drift.drift_percent, 3, "%"), note))
     return figures
 

@@ -85,7 +85,7 @@ def vetoes_of(checks: Iterable[Check]) -> tuple[Veto, ...]:
     return tuple(Veto(check.code, check.reason) for check in checks if check.result != "passed")
 
 
-def check_most(
+def check_max(
     code: str, what: str, value: float, bound: float, unit: str, reason: str, *, sigma: float = 0.0,
     sigmas: float = 1.0,
 ) -> Check:  # fmt: skip
@@ -93,7 +93,7 @@ def check_most(
     return _checked(code, what, value, bound, unit, reason, sigma, sigmas, value, bound)
 
 
-def check_least(
+def check_min(
     code: str, what: str, value: float, bound: float, unit: str, reason: str, *, sigma: float = 0.0,
     sigmas: float = 1.0,
 ) -> Check:  # fmt: skip

@@ -36,8 +36,8 @@ class Rest:
         return self.height + v * self.pitch + u * self.roll
 
 
-def lower(v: Float64, u: Float64, z: Float64, cell: Int64, most_roll: float) -> Rest:
-    """Lower the plane onto points (N,); one at -inf isn't there. most_roll: slope across that stops it.
+def lower(v: Float64, u: Float64, z: Float64, cell: Int64, max_roll: float) -> Rest:
+    """Lower the plane onto points (N,); one at -inf isn't there. max_roll: slope across that stops it.
 
     Points are added to the programme as the plane is found to cut into them, the deepest of each cell (N,
     numbers from 0) at a time; it ends when none is cut by more than EXACT_M.
@@ -50,7 +50,7 @@ def lower(v: Float64, u: Float64, z: Float64, cell: Int64, most_roll: float) -> 
         found = linprog(
             [1.0, 0.0, 0.0],
             A_ub=-np.column_stack([np.ones(len(rows)), v[rows], u[rows]]), b_ub=-z[rows],
-            bounds=[(None, None), (-STEEPEST_PITCH, STEEPEST_PITCH), (-most_roll, most_roll)],
+            bounds=[(None, None), (-STEEPEST_PITCH, STEEPEST_PITCH), (-max_roll, max_roll)],
             method="highs",
         )  # fmt: skip
         height, pitch, roll = (float(x) for x in np.asarray(found.x, np.float64))

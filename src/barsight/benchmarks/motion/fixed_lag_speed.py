@@ -21,7 +21,7 @@ from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.fixed_lag.sensor_buffer import ReadingsSoFar
+from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 from barsight.motion.frontend.tracking import Sighting
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
@@ -73,7 +73,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
     poses = [Pose("yard", "body", r, p) for r, p in zip(true.yard_from_body, true.position_m, strict=True)]
     rectifier = Rectifier(rig)
     samples = ImuSamples(imu.stamp_ns, imu.gyro_radps, imu.accel_mps2)
-    readings = ReadingsSoFar(crane, samples, ORDINARY_NOISE)
+    readings = SensorBuffer(crane, samples, ORDINARY_NOISE)
     estimator = FixedLagEstimator(FusionSettings(), CraneSettings(), held, rectifier, 0, readings, None)
     clocks, memory, seen, found = [], [], [], []
     for sighting in _sightings(poses, stamps, rectifier, rng):

@@ -119,7 +119,7 @@ class ViewFrusta:
 
 
 @dataclass(eq=False)
-class Asked:
+class ViewSupport:
     """A tile's heights as the first `views` views were asked whether they see them: (rows, columns, SLOTS, 3)
     float32, z, how many see it and how many points these have in its cell; NaN where none was asked.
     """
@@ -128,7 +128,7 @@ class Asked:
     heights: Float32
 
     @classmethod
-    def none(cls) -> Asked:
+    def none(cls) -> ViewSupport:
         """No view was asked."""
         return cls(0, np.full((TILE_CELLS, TILE_CELLS, SLOTS, 3), np.nan, np.float32))
 
@@ -160,7 +160,7 @@ def elect_surface(
     cell_m: float,
     min_views: int,
     settings: MapSettings,
-    asked: Asked,
+    asked: ViewSupport,
 ) -> Int8:
     """Elect which of each cell's heights is the surface, (rows, columns), -1 where none is.
 
@@ -228,7 +228,7 @@ def _supported(
     A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
     further apart than cells: at ranges over one_point_m, and where it looks along the ground. scene: around,
     roof and ceiling of `is_unoccluded`. blocks: what `bound_blocks` tells. asked: the first view that wasn't
-    yet, and what those before it see, of `Asked`; it holds for a height that has hardly moved, and is brought
+    yet, and what those before it see, of `ViewSupport`; it holds for a height that has hardly moved, and is brought
     up to date.
     """
     rows, columns = tile.shape[:2]

@@ -24,7 +24,7 @@ from barsight.mapping.surface.directional_filter import (
     smooth_along_bars,
     valley_mask,
 )
-from barsight.mapping.surface.height_selection import Asked, ViewFrusta, elect_by_votes, elect_surface
+from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
 from barsight.mapping.surface.surface import (
     Layers,
     Surface,
@@ -138,9 +138,9 @@ class SurfaceElection:
 
         def elect_tile(item: tuple[TileKey, Float32]) -> None:
             key, tile = item
-            around, asked = _first_around(self._first, key, known), Asked.none()
+            around, asked = _first_around(self._first, key, known), ViewSupport.none()
             if not last and key in self._asked:
-                asked = Asked(self._asked[key], np.load(_asked_file(self._elected, key)))
+                asked = ViewSupport(self._asked[key], np.load(_asked_file(self._elected, key)))
             winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
             np.save(_winner_file(self._elected, key), winner)

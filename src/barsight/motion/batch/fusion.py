@@ -29,7 +29,7 @@ from barsight.motion.crane.encoder_trajectory import (
     fit_position,
     reestimate_noise,
 )
-from barsight.motion.estimator import Seen, TrajectoryEstimator
+from barsight.motion.estimator import FrameInput, TrajectoryEstimator
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.board_corners import PointTracker, split_tracks
 from barsight.motion.frontend.motion_prediction import CranePredictor
@@ -131,7 +131,7 @@ class BatchPoses:
         bias = np.zeros(3) if imu is None else imu.gyro_radps.mean(axis=0)
         return CranePredictor(crane, imu, bias, self._rectifier, shift)
 
-    def push(self, seen: Seen) -> None:
+    def push(self, seen: FrameInput) -> None:
         """Track the next frame."""
         if not self.reads_pictures:
             return

@@ -15,7 +15,7 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame, Trajectory
 from barsight.motion.crane.robust_parabola import fit_parabola
 from barsight.motion.crane.sway import sway_at
-from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator
+from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator
 from barsight.recording.base import Recording
 
 CAUCHY_SIGMAS = 3.0
@@ -68,7 +68,7 @@ class EncoderPoses(ImmediatePoses):
         self.delay_ns = seconds_to_ns(settings.window_s)
         self._without_sway = 0
 
-    def place(self, seen: Seen) -> PosedFrame | Failed:
+    def place(self, seen: FrameInput) -> PosedFrame | Failed:
         """Place the frame by the readings around it."""
         settings, stamp = self._settings, seen.stamp_ns
         crane, imu = self._recording.crane(), self._recording.imu()

@@ -16,8 +16,8 @@ from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator, pictures_of
-from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, ReadingsSoFar
+from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
+from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.frontend.tracking import Sighting, Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
@@ -77,7 +77,7 @@ class FixedLagPoses(ImmediatePoses):
         )  # fmt: skip
         self._tracker = Tracker(self._estimator.predict, settings.front_end)
 
-    def place(self, seen: Seen) -> PosedFrame | RefusedFrame:
+    def place(self, seen: FrameInput) -> PosedFrame | RefusedFrame:
         """Track the frame and estimate its pose."""
         self._estimator.readings = self._readings()
         pair = pictures_of(seen)
@@ -105,10 +105,10 @@ class FixedLagPoses(ImmediatePoses):
             () if self._level is None else self._level.warnings,
         )  # fmt: skip
 
-    def _readings(self) -> ReadingsSoFar:
+    def _readings(self) -> SensorBuffer:
         """Read the sensors as they stand."""
         recording, use = self._recording, self._use
-        return ReadingsSoFar(
+        return SensorBuffer(
             recording.crane() if "crane" in use else None, recording.imu() if "imu" in use else None,
             self._noise,
         )  # fmt: skip

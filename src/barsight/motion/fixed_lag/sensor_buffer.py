@@ -14,14 +14,14 @@ SENSOR_DELAY_S = 0.06
 
 
 @dataclass(frozen=True, eq=False)
-class ReadingsSoFar:
+class SensorBuffer:
     """Encoder and IMU readings up to now, and the IMU's noise."""
 
     crane: CraneSamples | None
     imu: ImuSamples | None
     noise: ImuNoise
 
-    def between(self, first_ns: int, last_ns: int) -> ReadingsSoFar:
+    def between(self, first_ns: int, last_ns: int) -> SensorBuffer:
         """Select those within the stamps."""
         crane, imu = self.crane, self.imu
         if crane is not None:
@@ -30,4 +30,4 @@ class ReadingsSoFar:
         if imu is not None:
             part = slice(*np.searchsorted(imu.stamp_ns, (first_ns, last_ns)))
             imu = ImuSamples(imu.stamp_ns[part], imu.gyro_radps[part], imu.accel_mps2[part])
-        return ReadingsSoFar(crane, imu, self.noise)
+        return SensorBuffer(crane, imu, self.noise)

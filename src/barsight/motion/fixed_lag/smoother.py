@@ -20,7 +20,7 @@ from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
-from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, ReadingsSoFar
+from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
 from barsight.motion.frontend.motion_prediction import CranePredictor, predict_by_imu
@@ -49,7 +49,7 @@ class FixedLagEstimator:
 
     def __init__(
         self, settings: FusionSettings, crane: CraneSettings, held: int, rectifier: Rectifier, shift_ns: int,
-        readings: ReadingsSoFar, level: GravityAlignment | None,
+        readings: SensorBuffer, level: GravityAlignment | None,
     ) -> None:  # fmt: skip
         self._settings, self._crane, self._held = settings, crane, held
         self._rectifier, self._shift_ns = rectifier, shift_ns
@@ -110,7 +110,7 @@ class FixedLagEstimator:
         self.window = marginalise(window, leaving) if leaving else window
         return PosedFrame(seen.stamp_ns, pose, covariance)
 
-    def _now(self, stamp_ns: int) -> ReadingsSoFar:
+    def _now(self, stamp_ns: int) -> SensorBuffer:
         """Select the readings that have come when the frame of a stamp is computed, back to before the nodes
         held.
         """
@@ -118,7 +118,7 @@ class FixedLagEstimator:
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
         return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
 
-    def _begun(self, stamp: int, sighting: Sighting | None, now: ReadingsSoFar) -> Window | Failed:
+    def _begun(self, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> Window | Failed:
         # Without encoders the first frame is the origin: a node before it would be, and move against it.
         nodes = make_nodes(np.array([stamp]), None if now.crane is None else now.imu)
         if now.crane is None:
@@ -139,7 +139,7 @@ class FixedLagEstimator:
         window = Window(problem, state, np.empty(0, np.int64))
         return self._with_attitudes(window, 0, now)
 
-    def _grown(self, stamp: int, sighting: Sighting | None, now: ReadingsSoFar) -> Window | Failed:
+    def _grown(self, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> Window | Failed:
         window = self.window
         assert window is not None
         first = len(window.problem.start)
@@ -158,7 +158,7 @@ class FixedLagEstimator:
 
     def _started(
         self, window: Window, stamps: list[int], parts: tuple[Preintegrated | None, ...],
-        sighting: Sighting | None, now: ReadingsSoFar,
+        sighting: Sighting | None, now: SensorBuffer,
     ) -> tuple[list[Pose], list[Float64]]:  # fmt: skip
         """Initialise new nodes: by the IMU, else on the line to where pictures or encoders see the last."""
         old = window.pose(len(window.problem.start) - 1)
@@ -187,7 +187,7 @@ class FixedLagEstimator:
         poses = [Pose(old.target, "body", end.rotation, old.translation + s * way) for s in share]
         return poses, [way / seconds] * len(stamps)
 
-    def _stays(self, window: Window, stamp: int, sighting: Sighting | None, now: ReadingsSoFar) -> bool:
+    def _stays(self, window: Window, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> bool:
         """Check whether encoders, else pictures, see no way since the last node. (An IMU sees none at any
         constant speed.)
         """
@@ -201,7 +201,7 @@ class FixedLagEstimator:
             return False
         return float(np.linalg.norm(sighting.motion.translation)) < MAX_STILL_M
 
-    def _with_attitudes(self, window: Window, first: int, now: ReadingsSoFar) -> Window:
+    def _with_attitudes(self, window: Window, first: int, now: SensorBuffer) -> Window:
         """Add the nominal attitude at the nodes from `first` on: loose under way; standing still it is told
         once, since its error is the same each time.
         """
@@ -218,7 +218,7 @@ class FixedLagEstimator:
         told = replace(problem, attitudes=problem.attitudes + tuple(added))
         return replace(window, problem=told, stood=stood)
 
-    def _bound(self, window: Window, sighting: Sighting | None, now: ReadingsSoFar, stamp: int) -> Window:
+    def _bound(self, window: Window, sighting: Sighting | None, now: SensorBuffer, stamp: int) -> Window:
         """Add the encoders' places of nodes whose fit has come to be complete, 0.4 s apart; at once where
         nothing else ties the last node to the one before.
         """

@@ -20,7 +20,7 @@ from barsight.core.types import PosedFrame, RectifiedCamera, Trajectory
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import match_mutual
 from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry
-from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator, pictures_of
+from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
 from barsight.motion.frontend.relative_pose import rotate_covariance, transport_covariance
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_view
 from barsight.motion.gravity import align_with_gravity
@@ -75,7 +75,7 @@ class StitchedPoses(ImmediatePoses):
         self._last: tuple[FeatureView, Pose | None] | None = None
         self._noise = np.diag([1e-12] * 6)
 
-    def place(self, seen: Seen) -> PosedFrame | Failed:
+    def place(self, seen: FrameInput) -> PosedFrame | Failed:
         """Chain the frame; Failed where too few matches agree."""
         pair = pictures_of(seen)
         view = pair if isinstance(pair, Failed) else feature_view(pair, self._features)

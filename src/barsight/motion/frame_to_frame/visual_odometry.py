@@ -12,7 +12,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, Trajectory
-from barsight.motion.estimator import ImmediatePoses, Seen, TrajectoryEstimator, pictures_of
+from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
 from barsight.motion.frontend.relative_pose import estimate_step, rotate_covariance, transport_covariance
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_view
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
@@ -42,7 +42,7 @@ class ChainedPoses(ImmediatePoses):
         self._last: FeatureView | None = None
         self._noise, self._stretch = np.diag([1e-12] * 6), np.zeros(3)
 
-    def place(self, seen: Seen) -> PosedFrame | Failed:
+    def place(self, seen: FrameInput) -> PosedFrame | Failed:
         """Chain the frame; Failed where too few features agree."""
         pair = pictures_of(seen)
         view = pair if isinstance(pair, Failed) else feature_view(pair, self._settings)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from barsight.core.arrays import Float64, kernel
 from barsight.motion.linear.reprojection_kernels import (
     POSE,
-    Given,
     LinearisationPoint,
     Observations,
+    PointTerms,
     Rig,
     empty_rows,
     whitened_rows,
@@ -21,7 +21,7 @@ def frame_equations(
     """Add to the matrix (6, 6) and gradient (6,) of the frame's pose what its used sightings say."""
     lens, mount, camera, points, rows = rig.lens, rig.mount, guess.camera, guess.points, empty_rows()
     stereo, weight, node, last = sights.stereo, sights.weight, sights.node, len(guess.shared) - 1
-    given = Given(rig.huber, sights.scale, 0.0, guess.shared[last - 1], guess.shared[last])
+    given = PointTerms(rig.huber, sights.scale, 0.0, guess.shared[last - 1], guess.shared[last])
     for t in range(len(sights.first) - 1):
         for k in range(sights.first[t], sights.first[t + 1]):
             if not sights.used[k] or node[k] != frame:

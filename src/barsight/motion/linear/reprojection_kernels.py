@@ -56,7 +56,7 @@ class LinearisationPoint(NamedTuple):
     shared: Float64
 
 
-class Given(NamedTuple):
+class PointTerms(NamedTuple):
     """Numbers that a point's sightings share. huber, scale: as `Rig` and `Observations` have them; off_px:
     what its disparity is too large by with its piece's; yaw, drift: the rig's drift (rad, share).
     """
@@ -83,7 +83,7 @@ def empty_rows() -> Float64:
 
 @kernel(inline=True)
 def _error(
-    lens: Float64, camera: Float64, points: Float64, stereo: Float64, given: Given, node: int, k: int, t: int,
+    lens: Float64, camera: Float64, points: Float64, stereo: Float64, given: PointTerms, node: int, k: int, t: int,
     rows: Float64,
 ) -> bool:  # fmt: skip
     """Compute error px, point and derivatives by what is shared of sighting k, of point t, by node's camera.
@@ -130,11 +130,11 @@ def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
 
 
 @kernel(inline=True)
-def given_of(rig: Rig, sights: Observations, shared: Float64, t: int) -> Given:
+def given_of(rig: Rig, sights: Observations, shared: Float64, t: int) -> PointTerms:
     """Collect the numbers that the sightings of point t share; shared: as `LinearisationPoint` has it."""
     last = len(shared) - 1
     off_px = disparity_offset(shared, sights.piece, t)
-    return Given(rig.huber, sights.scale, off_px, shared[last - 1], shared[last])
+    return PointTerms(rig.huber, sights.scale, off_px, shared[last - 1], shared[last])
 
 
 @kernel()
@@ -165,7 +165,7 @@ def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result:
 @kernel(inline=True)
 def whitened_rows(
     lens: Float64, mount: Float64, camera: Float64, points: Float64, stereo: Float64, weight: float,
-    given: Given, at: tuple[int, int, int], rows: Float64,
+    given: PointTerms, at: tuple[int, int, int], rows: Float64,
 ) -> None:  # fmt: skip
     """Compute the whitened rows of a sighting of 1 / sigma `weight`; at: its node, its own number and its
     point's. All 0 behind the camera.

@@ -173,7 +173,7 @@ def step_gain(
     short_of = np.empty_like(mean_weight)
 
     def work(first: int, end: int) -> None:
-        _lengthen(
+        _apply_step_gain(
             weight,
             trust,
             np.float32(slope_noise),
@@ -191,7 +191,7 @@ def step_gain(
 
 
 @kernel()
-def _lengthen(
+def _apply_step_gain(
     weight: Float32, trust: Float32, slope_noise: np.float32, reach: int, is_last: bool, pull: Float32,
     mean_weight: Float32, short_of: Float32, first: int, end: int,
 ) -> None:  # fmt: skip

@@ -19,7 +19,7 @@ from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove
 from barsight.stereo.direct.depth_edges import sharpen_edges
 from barsight.stereo.direct.kernels.pyramid import halve
 from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes, fill_row_holes
-from barsight.stereo.direct.refinement import IcpResult, RefinementSettings, refine_disparity
+from barsight.stereo.direct.refinement import RefinedDisparity, RefinementSettings, refine_disparity
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 
 _NAN = np.float32(np.nan)
@@ -124,7 +124,7 @@ class BarsightStereo:
         disparity, sigma = np.where(pair.left_valid, disparity, _NAN), np.where(pair.left_valid, sigma, _NAN)
         return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
 
-    def _sigma(self, pair: RectifiedPair, refined: IcpResult, start_px: Float32) -> Float32:
+    def _sigma(self, pair: RectifiedPair, refined: RefinedDisparity, start_px: Float32) -> Float32:
         """Combine noise, what noise doesn't explain, and what a bend costs. start_px: NaN where unmatched."""
         settings = self.settings
         matched = np.isfinite(start_px)

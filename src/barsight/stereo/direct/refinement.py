@@ -101,7 +101,7 @@ class RefinementSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class IcpResult:
+class RefinedDisparity:
     """disparity_px: (H, W), no NaN. variance_px2: (H, W), what the residual in each support explains."""
 
     disparity_px: Float32
@@ -110,7 +110,7 @@ class IcpResult:
 
 def refine_disparity(
     left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
-) -> IcpResult:
+) -> RefinedDisparity:
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
     at_half_size = settings.first_at_half_size and min(left.shape) >= _MIN_HALVED_PX and settings.steps > 1
     if at_half_size:
@@ -122,7 +122,7 @@ def refine_disparity(
         remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
         blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
         variance = work.step(left, right, blur_px, noise * _slope_gain(blur_px), remaining == 0)
-    return IcpResult(inside(work.disparity, start.shape).copy(), variance)
+    return RefinedDisparity(inside(work.disparity, start.shape).copy(), variance)
 
 
 def _after_half_size_step(

@@ -36,7 +36,7 @@ _HIDDEN_M = 0.12
 _RIM, _HIGHER_M = 4, 0.03
 """Places at a flank over which a neighbour may stand higher by so much."""
 _WIDER_M = 0.045
-_LEAST_PIECE_RATIO, _PIECE_RATIO = 0.7, 1.5
+_MIN_PIECE_RATIO, _MAX_PIECE_RATIO = 0.7, 1.5
 """Of the outline's width: what is seen narrower, or (by _WIDER_M besides) wider, is not its section."""
 _ALIKE_LOG = 0.35
 """Neighbours whose widths differ by a larger factor's logarithm may be pieces of one irregular pack."""
@@ -137,7 +137,7 @@ def estimate_section(
     """
     if seen is None or not seen.sides_seen:
         return np.nan, np.nan
-    if not _LEAST_PIECE_RATIO * fit.width_m < seen.width_m < _PIECE_RATIO * fit.width_m + _WIDER_M:
+    if not _MIN_PIECE_RATIO * fit.width_m < seen.width_m < _MAX_PIECE_RATIO * fit.width_m + _WIDER_M:
         return np.nan, np.nan
     over_m = np.inf if floor_m is None else max(top_m - floor_m, 0.0)
     heights = [min(ratio * seen.width_m, over_m) for ratio in _HEIGHT_RATIOS]

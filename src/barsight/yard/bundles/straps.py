@@ -24,7 +24,7 @@ REACH_M = 0.55
 """Search reach to either side of a bundle's axis, its neighbours' straps included."""
 _AROUND_M = 0.2
 """Length along the bars over which the steel's own grey level is taken."""
-_LEAST_SIGMA_LOG = 0.05
+_MIN_SIGMA_LOG = 0.05
 _CLIPPED, _NOISE = 6.0, 2.0
 """Contrasts over noise: from where more counts no more, and what a line must have more of."""
 _TOOTH = 0.6
@@ -162,7 +162,7 @@ def line_contrast(grey: Float32, cell_m: float) -> Float64:
     level = np.where(np.isfinite(level), level, np.nan_to_num(middle))
     around = 2 * round(_AROUND_M / cell_m / 2) + 1
     off = np.abs(level - ndimage.median_filter(level, (around, 1), mode="nearest"))
-    sigma = np.maximum(1.4826 * np.median(off, axis=0), _LEAST_SIGMA_LOG)
+    sigma = np.maximum(1.4826 * np.median(off, axis=0), _MIN_SIGMA_LOG)
     beyond = np.minimum(off / sigma, _CLIPPED) - _NOISE
     lines: Float64 = ndimage.maximum_filter1d(ndimage.uniform_filter1d(beyond, 3, axis=0), 3, axis=0)
     return lines

@@ -28,7 +28,7 @@ from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip,
 from barsight.yard.magnet.holding import hold_load, share_checks, weakest_pole
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Check, Veto, check_least, check_true, vetoes_of
+from barsight.yard.vetoes import Check, Veto, check_min, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass, load_centre
 
 SCALES = (1.0, 1.5, 2.5)
@@ -131,7 +131,7 @@ def assess_placement(
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)
         reason = f"within the crane's tolerance {end}"
         what = "the box within which the lift stays as checked, over the crane's tolerance"
-        checks.append(check_least("narrow-tolerance", what, scale, SCALES[0], "", reason))
+        checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
     ratios = (
         contact.pull_low_n / needed if needed > 0 else 0.0,
         weakest.ratio if weakest else 0.0,

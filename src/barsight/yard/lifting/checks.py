@@ -15,7 +15,7 @@ from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.stability.stability import interpolate_height
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Check, check_least, check_most, check_true
+from barsight.yard.vetoes import Check, check_max, check_min, check_true
 from barsight.yard.weight import Mass
 
 MARGIN_M = 0.02
@@ -38,24 +38,24 @@ def count_checks(
     ids = ", ".join(str(near.bundles[k].id) for k in held.gripped)
     checks = [
         unknown_check(contact, settings),
-        check_least(
+        check_min(
             "no-bundle", "bundles under the poles within reach", count, 1, "",
             "no known bundle lies under the poles within reach",
         ),
-        check_most(
+        check_max(
             "straddles-neighbour", "bundles that the footprint takes", count, wanted, "",
             f"the footprint takes {count} bundles ({ids}), not {wanted}",
         ),
     ]  # fmt: skip
     if 0 < count < wanted:
         reason = f"the footprint takes {count} bundles, {wanted} are asked for"
-        checks.append(check_least("count-uncertain", "bundles that are taken", count, wanted, "", reason))
+        checks.append(check_min("count-uncertain", "bundles that are taken", count, wanted, "", reason))
     elif near.bundles:
         why = f": bundle {near.bundles[int(np.argmax(held.flips))].id} may be in or out"
         checks.append(probability_check(held.probability, count, settings, why))
     shares = _unexplained(place, heights, magnet, near, contact)
     checks.append(
-        check_most(
+        check_max(
             "unexplained-surface", "part within the poles' reach that belongs to no known bundle", shares[0],
             settings.max_unexplained_ratio, "", f"{100 * shares[1]:.0f} % of what lies within reach of the "
             "poles belongs to no known bundle", sigma=shares[1] - shares[0],
@@ -69,7 +69,7 @@ def unknown_check(contact: Contact, settings: LiftSettings) -> Check:
     share, most = contact.unknown_share, settings.max_unknown_ratio
     reason = f"{100 * share:.0f} % of the cells under a pole were not seen, {100 * most:.0f} % are allowed"
     what = "unseen part of the cells under the worst pole"
-    return check_most("unknown-under-footprint", what, share, most, "", reason, sigma=UNKNOWN_SIGMA)
+    return check_max("unknown-under-footprint", what, share, most, "", reason, sigma=UNKNOWN_SIGMA)
 
 
 def probability_check(probability: float, count: int, settings: LiftSettings, why: str = "") -> Check:
@@ -80,7 +80,7 @@ def probability_check(probability: float, count: int, settings: LiftSettings, wh
     )
     reason = f"a count of {count} has the probability {probability:.4f} only{why}"
     bound = asked / (1 + SURE_OF_SIGMA)
-    return check_least(
+    return check_min(
         "count-uncertain", "how sure the count is", sure, bound, "sigma", reason, sigma=SURE_OF_SIGMA * bound
     )
 
@@ -101,28 +101,28 @@ def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: Lif
     if not held:
         aside += ": the lean lies within its sigma of the limit"
     return [
-        check_most(
+        check_max(
             "tilt", "slope of the faces along the beam", pitch, limits.pitch_deg, "deg",
             f"the faces slope by {pitch:.1f} deg along the beam, {limits.pitch_deg:g} are allowed",
             sigma=math.degrees(sigma / magnet.half_span_m),
         ),
-        check_most(
+        check_max(
             "tilt", "how far beside their middle the faces rest, leaning as far as the suspension lets them",
             1e3 * contact.rests_off_m, 1e3 * narrowest / 4, "mm", aside,
             sigma=0.0 if contact.rests_off_m == 0 else 1e3 * EDGE_M / 2,
         ),
-        check_most(
+        check_max(
             "gap", "least gap of the pole that is furthest from steel",
             1e3 * gap if math.isfinite(gap) else math.nan, 1e3 * limits.gap_m, "mm",
             f"a pole hangs {1e3 * gap:.0f} mm above the steel, {1e3 * limits.gap_m:.0f} mm are allowed"
             if math.isfinite(gap) else "under one of the poles no steel is known", sigma=1e3 * sigma,
         ),
-        check_least(
+        check_min(
             "gap", "part of the faces that lies on steel", high, limits.contact_share, "",
             f"only {100 * share:.0f} % of the faces lie on steel, {100 * limits.contact_share:.0f} % are "
             "needed", sigma=high - low,
         ),
-        check_least(
+        check_min(
             "weak-pull", "pull on the load", contact.pull_n, needed_n, "N",
             f"the pull is at least {contact.pull_low_n / 1e3:.1f} kN, {needed_n / 1e3:.1f} kN are needed",
             sigma=(contact.pull_n - contact.pull_low_n) / UPPER, sigmas=UPPER,
@@ -151,7 +151,7 @@ def load_checks(
         if known:
             reason = f"the load may weigh {mass.upper_kg:.0f} kg, the {carrier} carries {most:.0f}"
             checks.append(
-                check_most("overweight", f"load against what the {carrier} carries", mass.kg, most, "kg",
+                check_max("overweight", f"load against what the {carrier} carries", mass.kg, most, "kg",
                            reason, sigma=mass.sigma_kg, sigmas=UPPER)
             )  # fmt: skip
     limits = magnet.limits
@@ -165,12 +165,12 @@ def load_checks(
         )
         what = f"the magnet's centre {name} the bars from the load's"
         checks.append(
-            check_most("off-centre", what, 1e3 * abs(offset), 1e3 * most, "mm", reason, sigma=1e3 * sigma)
+            check_max("off-centre", what, 1e3 * abs(offset), 1e3 * most, "mm", reason, sigma=1e3 * sigma)
         )
     upper = overhang_m[0] + UPPER * overhang_m[1]
     reason = f"the bars reach {upper:.2f} m beyond the outermost pole, {limits.overhang_m:g} m are allowed"
     checks.append(
-        check_most("overhang", "bars beyond the outermost pole", overhang_m[0], limits.overhang_m, "m",
+        check_max("overhang", "bars beyond the outermost pole", overhang_m[0], limits.overhang_m, "m",
                    reason, sigma=overhang_m[1], sigmas=UPPER)
     )  # fmt: skip
     return checks
@@ -183,7 +183,7 @@ def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
         check_true(
             "covered", f"nothing lies on bundle {bundle.id}", bundle.on_top, f"{what} bundle {bundle.id}"
         ),
-        check_least(
+        check_min(
             "bundle-doubtful", f"how sure bundle {bundle.id} is", bundle.confidence, settings.min_confidence,
             "", f"bundle {bundle.id} is {100 * bundle.confidence:.0f} % sure: "
             + ("; ".join(bundle.reasons) or "no reason is given"),

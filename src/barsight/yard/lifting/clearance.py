@@ -21,7 +21,7 @@ from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Check, check_most
+from barsight.yard.vetoes import Check, check_max
 
 STEP_M = 0.01
 STRAY_FIELD_M = 0.03
@@ -184,7 +184,7 @@ def resting_checks(
         above.append(contact.z_m - top - UPPER * sigmas[-1])
     highest, sigma = 1e3 * float(np.min(above, axis=0).max()), 1e3 * max(sigmas)
     return [
-        check_most(
+        check_max(
             "obstructed", "how far a face surely rests above the load's top", highest - sigma,
             1e3 * MAX_RISE_M, "mm", f"a face rests at least {highest:.0f} mm above the load's top, "
             f"{1e3 * MAX_RISE_M:.0f} mm are allowed: something lies between", sigma=sigma,

@@ -90,9 +90,9 @@ def sound_ground(
     return ground
 
 
-def _turns(most_deg: float) -> Iterator[float]:
-    yield from (turn for turn in SMALL_TURNS_DEG if abs(turn) <= most_deg)
-    if most_deg >= 90:
+def _turns(max_deg: float) -> Iterator[float]:
+    yield from (turn for turn in SMALL_TURNS_DEG if abs(turn) <= max_deg)
+    if max_deg >= 90:
         yield 90.0
 
 

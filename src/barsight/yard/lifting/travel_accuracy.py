@@ -20,7 +20,7 @@ from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
-from barsight.yard.vetoes import Check, check_most, check_true
+from barsight.yard.vetoes import Check, check_max, check_true
 
 ALONGSIDE_M = 1.0
 """Encoders are held against the map where the crane passed no further than this from the lift."""
@@ -156,11 +156,11 @@ def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: Li
             f"{100 * settings.max_refused_ratio:.0f} % are allowed"
         )
         what = "refused part of the frames that see it"
-        checks.append(check_most(CODE, what, refused / seen, settings.max_refused_ratio, "", reason))
+        checks.append(check_max(CODE, what, refused / seen, settings.max_refused_ratio, "", reason))
     return [*checks, *_encoder_checks(travel, place, min(magnet.tolerance.x_m, magnet.tolerance.y_m))]
 
 
-def _encoder_checks(travel: Travel, place: Placement, most_m: float) -> list[Check]:
+def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Check]:
     """Check that encoders and map agree beside the lift and at the end of the way."""
     known = np.isfinite(travel.off_m)
     if not known.any():
@@ -174,13 +174,13 @@ def _encoder_checks(travel: Travel, place: Placement, most_m: float) -> list[Che
         worst = int(np.argmax(np.where(passing, excess, -np.inf)))
         checks.append((worst, "beside the lift", "encoders and map disagree by "
                        f"{1e3 * travel.off_m[worst]:.0f} mm within {ALONGSIDE_M:g} m of it, "
-                       f"{1e3 * most_m:.0f} mm are allowed"))  # fmt: skip
+                       f"{1e3 * max_m:.0f} mm are allowed"))  # fmt: skip
     checks.append((last, "at the end of the way", f"at the end of the way encoders and map disagreed by "
                    f"{1e3 * travel.off_m[last]:.0f} mm: the crane would go beside its target, "
-                   f"{1e3 * most_m:.0f} mm are allowed"))  # fmt: skip
+                   f"{1e3 * max_m:.0f} mm are allowed"))  # fmt: skip
     return [
-        check_most(CODE, f"what surely parts encoders and map {where}", 1e3 * float(excess[frame]),
-                   1e3 * most_m, "mm", reason)
+        check_max(CODE, f"what surely parts encoders and map {where}", 1e3 * float(excess[frame]),
+                   1e3 * max_m, "mm", reason)
         for frame, where, reason in checks
     ]  # fmt: skip
 
@@ -190,7 +190,7 @@ def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
     gap.
     """
     return [
-        check_most(
+        check_max(
             CODE, f"how well the trajectory knows {name} near it (95 %)", 1e3 * UPPER * float(one),
             1e3 * most, "mm", f"near it the trajectory knows {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
             f"{1e3 * most:.0f} mm are allowed",

@@ -15,7 +15,7 @@ from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
-from barsight.yard.vetoes import Check, check_least, check_most, check_true
+from barsight.yard.vetoes import Check, check_max, check_min, check_true
 
 MAX_CLOCK_ERROR_NS = NS_PER_S
 """Frames may be this much ahead of this computer's clock."""
@@ -48,12 +48,12 @@ def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) 
         return [check_true("map-too-old", "age of what was seen", None, reason)]
     age_ns, max_age_ns = now_ns - captured_to_ns, seconds_to_ns(settings.max_age_s)
     return [
-        check_least(
+        check_min(
             "map-from-the-future", "age by this computer's clock", age_ns / NS_PER_S,
             -MAX_CLOCK_ERROR_NS / NS_PER_S, "s",
             f"the last frame is {_span(-age_ns)} ahead of this computer's clock: set the clocks",
         ),
-        check_most(
+        check_max(
             "map-too-old", "age of the last frame that saw it", age_ns / NS_PER_S, settings.max_age_s, "s",
             f"the last frame that saw it is {_span(age_ns)} old, {_span(max_age_ns)} are allowed",
         ),
@@ -79,7 +79,7 @@ def disturbed_checks(
             f"last seen; {settings.disturbed_reach_m:g} m are needed: measure again"
         )
         what = f"distance from a {event.kind} since it was last seen"
-        checks.append(check_least("disturbed", what, away, settings.disturbed_reach_m, "m", reason))
+        checks.append(check_min("disturbed", what, away, settings.disturbed_reach_m, "m", reason))
     return sorted(checks, key=lambda check: check.value or 0.0)[:1]
 
 

@@ -15,9 +15,9 @@ from barsight.core.settings.numbers import expect_numbers
 from barsight.yard.magnet.pull import Pull, expect
 
 MagnetType = Literal["electro", "permanent", "electro-permanent"]
-LEAST_FACTOR = 3.0
+MIN_SAFETY_FACTOR = 3.0
 """Least safety factor of permanent and electro-permanent magnets [EN 13155], and of one of unknown type."""
-LEAST_FACTOR_BACKED = 2.0
+MIN_SAFETY_FACTOR_BACKED = 2.0
 """The same of an electromagnet that a battery holds when the mains fail [EN 13155]."""
 _EXAMPLE = resources.files("barsight.yard.magnet").joinpath("example_magnet.toml")
 
@@ -116,21 +116,21 @@ class Magnet:
         expect(2 <= self.safety_factor <= 20, "safety_factor lies between 2 and 20")
         kind = f"{self.type} magnet" + (" without battery_backup" if self.type == "electro" else "")
         expect(
-            self.type is None or self.safety_factor >= self.least_factor,
-            f"safety_factor {self.safety_factor:g} is less than {self.least_factor:g}, the least of "
+            self.type is None or self.safety_factor >= self.min_safety_factor,
+            f"safety_factor {self.safety_factor:g} is less than {self.min_safety_factor:g}, the least of "
             f"{'an' if kind[0] == 'e' else 'a'} {kind}",
         )
 
     @property
-    def least_factor(self) -> float:
+    def min_safety_factor(self) -> float:
         """Return the least safety factor of its type."""
         backed = self.type == "electro" and self.battery_backup
-        return LEAST_FACTOR_BACKED if backed else LEAST_FACTOR
+        return MIN_SAFETY_FACTOR_BACKED if backed else MIN_SAFETY_FACTOR
 
     @property
     def needed_factor(self) -> float:
         """Return the factor that lifts are held to: where the file names no type, at least the worst's."""
-        return max(self.safety_factor, self.least_factor)
+        return max(self.safety_factor, self.min_safety_factor)
 
     @property
     def reach_m(self) -> float:

@@ -19,12 +19,12 @@ from barsight.yard.magnet.contact import Contact, PoleContact
 from barsight.yard.magnet.description import Magnet, Pole
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
-from barsight.yard.vetoes import Check, check_least
+from barsight.yard.vetoes import Check, check_min
 from barsight.yard.weight import load_centre
 
 SMOOTHING_M = 0.016
 """Standard deviation of a map's smoothing across the bars, at most."""
-MOST_CUT_RATIO = 0.12
+MAX_CUT_RATIO = 0.12
 """Of a bar's diameter: how far its crest may stand over the mean of it and its neighbours."""
 
 
@@ -36,7 +36,7 @@ def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_
     if not load:
         return contact
     diameter = min(_least_diameter(bundle) for bundle in load)
-    cut = min(SMOOTHING_M**2 / diameter, MOST_CUT_RATIO * diameter)
+    cut = min(SMOOTHING_M**2 / diameter, MAX_CUT_RATIO * diameter)
     higher = cut + strap_m + UPPER * contact.gap_sigma_m
     return replace(
         contact,
@@ -166,7 +166,7 @@ def share_checks(weakest: WeakestPole | None) -> list[Check]:
         return []
     pull, share = weakest.pull_low_n / 1e3, weakest.share_n / 1e3
     return [
-        check_least(
+        check_min(
             "weak-pull", "lower bound of the worst pole's pull over its share", weakest.ratio, 1.0,
             "", f"pole {weakest.number} pulls at least {pull:.1f} kN, its share of what is needed is "
             f"{share:.1f} kN",

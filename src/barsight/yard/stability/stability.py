@@ -17,7 +17,7 @@ from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Check, check_least, check_most, check_true
+from barsight.yard.vetoes import Check, check_max, check_min, check_true
 
 STEP_M = 0.01
 LOOK_M = 1.5
@@ -217,21 +217,21 @@ def footing_checks(
     over = own.overhang_m if own.overhang_side else 0.0
     limit = settings.max_overhang_ratio * target.width_m
     checks = [
-        check_most(
+        check_max(
             "no-support", "how far what carries it ends before its edge", mm * over, mm * target.width_m / 2,
             "mm", f"what carries it ends {mm * over:.0f} mm before its edge, its middle is not carried",
         )
     ]  # fmt: skip
     if checks[0].result == "passed":
         checks.append(
-            check_most(
+            check_max(
                 "overhanging", "how far it stands over the edge of what carries it", mm * over, mm * limit,
                 "mm", f"it stands {mm * over:.0f} mm over the edge of what carries it, {mm * limit:.0f} mm "
                 "are allowed", sigma=mm * _sure(target.sigma.width_m / 2) if over else 0.0, sigmas=UPPER,
             )
         )  # fmt: skip
     checks.append(
-        check_most(
+        check_max(
             "unstable-side", "lean of the side of the pile below it", own.lean_deg, settings.max_lean_deg,
             "deg", f"the side of the pile below it leans by {own.lean_deg:.1f} deg, "
             f"{settings.max_lean_deg:g} are allowed",
@@ -239,7 +239,7 @@ def footing_checks(
     )  # fmt: skip
     if not math.isnan(own.freeboard_m):
         checks.append(
-            check_least(
+            check_min(
                 "over-stanchion", "the lowest stanchion beside it over its top", mm * own.freeboard_m,
                 mm * settings.min_freeboard_m, "mm", f"the stanchion beside it is {mm * own.freeboard_m:.0f} "
                 f"mm above its top, {mm * settings.min_freeboard_m:.0f} mm are needed",
@@ -251,7 +251,7 @@ def footing_checks(
         if lies_over_edge_of(other, target, leaning):
             reason = f"bundle {other.id} stands {mm * leaning.overhang_m:.0f} mm over the edge on this side"
             checks += [
-                check_most("unstable-side", f"bundle {other.id} {what}", value, most, unit, reason)
+                check_max("unstable-side", f"bundle {other.id} {what}", value, most, unit, reason)
                 for what, value, most, unit in (
                     ("over the edge on this side", mm * leaning.overhang_m,
                      mm * settings.max_overhang_ratio * other.width_m, "mm"),
