@@ -7,30 +7,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.benchmarks.lift_judge.magnet import magnet_of, read_magnet
-from barsight.benchmarks.lift_judge.solids import envelope
-from barsight.benchmarks.lift_judge.worlds import draw_world
-from barsight.benchmarks.yard.drawn_worlds import noisy_world, recording_settings, scene_of
+from barsight.benchmarks.yard.drawn_worlds import drawn_scene, noisy_world, recording_settings
 from barsight.benchmarks.yard.judged_lifts import JudgedBench, bench_table, judge_yard, upper_bound
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.core.errors import ConfigError
 from barsight.simulation.sensors import heights
-from barsight.simulation.simulate import World
-from barsight.simulation.stock import Stock
+from barsight.simulation.simulate import LaidYard, World
+from barsight.simulation.worlds.yards import draw_yard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet.description import example_magnet, load_magnet
 
 
 @pytest.mark.parametrize("seed", [5, 7])
 def test_the_renderer_sees_the_solids_that_are_judged(seed: int) -> None:
-    world = draw_world(seed, 3.0, 1.5)
-    scene = scene_of(world.yard, np.random.default_rng(1))
-    drawn = envelope(world.yard, (0.0, -1.5), world.size_m, step=0.037)
+    world = draw_yard(seed, 3.0, 1.5)
+    scene = drawn_scene(world)
+    drawn = envelope(world.yard, (0.0, -1.5), (world.size_m[0], 2.0), step=0.037)
     i, j = np.meshgrid(np.arange(drawn.z.shape[0]), np.arange(drawn.z.shape[1]), indexing="ij")
     cast = heights(scene, (drawn.x0 + 0.037 * i).ravel(), (drawn.y0 + 0.037 * j).ravel()).reshape(i.shape)
     # At a cylinder's very side one of the two may just miss it.
     assert (np.abs(cast - drawn.z) < 1e-5).mean() > 0.999 and drawn.z.max() > 0.2
-    way = World.over(scene, recording_settings(world), Stock((), ()))
+    way = World.over(LaidYard(scene, {}), recording_settings(world))
     assert way.scene is scene and len(way.frame_stamp_ns) >= 6
 
 
@@ -38,7 +37,7 @@ def test_the_bench_tells_what_was_judged(tmp_path: Path) -> None:
     described = tmp_path / "magnet.toml"
     described.write_text(example_magnet(), encoding="utf-8")
     magnet, settings = read_magnet(described), LiftSettings()
-    world = draw_world(4, 2 * magnet.half_span_m + 0.3, 1.2)
+    world = draw_yard(4, 2 * magnet.half_span_m + 0.3, 1.2)
     mapped = noisy_world(world, settings)
     judged = tuple(judge_yard(world, mapped, load_magnet(described), magnet, settings, 4))
     masses = [world.yard.load(bundle)[0] for bundle in world.yard.bundles]

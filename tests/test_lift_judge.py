@@ -1,4 +1,4 @@
-"""The judge of lifts against what can be computed by hand, and its drawn worlds."""
+"""The judge of lifts against what can be computed by hand."""
 
 from __future__ import annotations
 
@@ -8,22 +8,12 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from barsight.benchmarks.lift_judge.envelopes import Envelope, cut, envelope
 from barsight.benchmarks.lift_judge.faces import Spread
 from barsight.benchmarks.lift_judge.judge import Judge, LiftVerdict, Target, covered_width
 from barsight.benchmarks.lift_judge.lowering import STEEPEST_PITCH, lower
 from barsight.benchmarks.lift_judge.magnet import magnet_of
-from barsight.benchmarks.lift_judge.packing import packed
-from barsight.benchmarks.lift_judge.solids import (
-    NOTHING,
-    Envelope,
-    Solid,
-    SolidYard,
-    box,
-    cut,
-    cylinder,
-    envelope,
-)
-from barsight.benchmarks.lift_judge.worlds import KINDS, draw_world
+from barsight.simulation.worlds.solids import NOTHING, Solid, SolidYard, box, cylinder
 
 MAGNET = magnet_of(
     {
@@ -202,32 +192,3 @@ def test_solids_are_cut_where_they_are() -> None:
     drawn = envelope(SolidYard((bar(0.0, 0.2), bar(0.1, 0.1))), (-0.05, 0.0), (0.15, 0.0))
     assert drawn.z[[50, 150, 100], 0] == pytest.approx([0.22, 0.12, 0.0])
     assert drawn.top[[50, 150, 100], 0].tolist() == [0, 1, -1]
-
-
-def test_packs_are_tight_and_not_always_a_lattice() -> None:
-    loose = 0
-    for seed in range(12):
-        places = packed(12, 0.08, np.random.default_rng(seed))
-        away = np.hypot(*(places[:, None] - places[None]).T)
-        nearest = np.sort(away + np.eye(12), axis=1)
-        assert nearest[:, 0].min() > 0.08 * 0.999 and nearest[:, 1].max() < 0.12
-        # In a lattice no two lie between one and 1.73 diameters apart.
-        loose += bool(((away > 1.1 * 0.08) & (away < 1.65 * 0.08)).any())
-    assert loose >= 2
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_worlds_are_stacked_without_cutting_into_each_other(seed: int) -> None:
-    world = draw_world(seed, 3.0, 2.0)
-    assert world.kind == KINDS[seed] and len(world.yard.bundles) > 2
-    turn = SolidYard(world.yard.solids).seen_from(0.0, 0.0, world.yaw_rad)
-    bars = [s for s in turn.solids if s.part == "bar" and s.bundle < 1000]
-    middles = np.array([b.centre for b in bars])
-    radius, number = np.array([b.half[1] for b in bars]), np.array([b.bundle for b in bars])
-    slope = np.array([b.axes[0, 0] / b.axes[0, 1] for b in bars])
-    for y in (-1.0, 1.0):
-        x = middles[:, 0] + slope * (y - middles[:, 1])
-        apart = np.hypot(x[:, None] - x[None], middles[:, None, 2] - middles[None, :, 2])
-        room = apart - radius[:, None] - radius[None]
-        assert room[number[:, None] != number[None]].min() > -0.004
-    assert (middles[:, 2] - radius).min() > -1e-6

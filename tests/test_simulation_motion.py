@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -104,3 +105,57 @@ def test_encoders_plus_lever_are_the_truth(trajectory: SimulatedTrajectory) -> N
     _, place = record_encoders(trajectory, late, lever, np.random.default_rng(2))
     truth = trajectory.at(seconds(stamp_ns) - 0.2).position_m
     np.testing.assert_allclose(place + lever, truth, atol=1e-12)
+
+
+def spring_way() -> SimulatedTrajectory:
+    motion = TravelSettings(
+        stops=2, stop_s=3.0, trolley_m=0.4, oscillation_m=(0.004, 0.003, 0.002), rail_m=0.003, skew_deg=0.1
+    )
+    return SimulatedTrajectory.plan(6.0, CameraSettings(), motion, NOMINAL, np.random.default_rng(5))
+
+
+def test_a_crane_on_springs_has_the_derivatives_of_its_position() -> None:
+    test_derivatives_are_those_of_the_position(spring_way())
+
+
+def test_a_crane_stops_under_way_and_arrives() -> None:
+    way = spring_way()
+    t = np.linspace(0, way.duration_s, 4000)
+    wheels = way.wheels_m(t)
+    legs = way.legs
+    assert len(legs) == 3
+    for before, after in pairwise(legs):
+        assert after.start_s == pytest.approx(before.end_s + 3.0)
+        still = (t > before.end_s) & (t < after.start_s)
+        speed = np.gradient(wheels[still, 0], t[still])
+        assert np.abs(speed).max() < 0.02  # sway alone
+    assert wheels[-1] == pytest.approx([6.6, CameraSettings().trolley_y_m + 0.2, 8.0])
+    assert wheels[0, 1] == pytest.approx(CameraSettings().trolley_y_m - 0.2)
+
+
+def test_encoders_do_not_see_springs_and_rails() -> None:
+    way = spring_way()
+    exact = SensorSettings(encoder_std_m=0.0, encoder_step_m=0.0)
+    stamp_ns, place = record_encoders(way, exact, np.zeros(3), np.random.default_rng(0))
+    apart = way.at(seconds(stamp_ns)).position_m - place
+    np.testing.assert_allclose(place, way.wheels_m(seconds(stamp_ns)), atol=1e-12)
+    under_way = apart[(stamp_ns - stamp_ns[0]) / 1e9 > 6]
+    assert (np.abs(under_way).max(axis=0) > 0.002).all() and np.abs(apart).max() < 0.009
+
+
+def test_encoders_have_scale_play_and_late_readings() -> None:
+    motion = replace(TravelSettings(), sway_deg=0.0, vibration_m=0.0)
+    way = SimulatedTrajectory.plan(4.0, CameraSettings(), motion, NOMINAL, np.random.default_rng(1))
+    off = SensorSettings(
+        encoder_std_m=0.0, encoder_step_m=0.0, encoder_scale=1.001, encoder_backlash_m=0.004,
+        encoder_latency_s=0.05, encoder_jitter_s=0.02,
+    )  # fmt: skip
+    stamp_ns, place = record_encoders(way, off, np.zeros(3), np.random.default_rng(0))
+    end = way.wheels_m(seconds(stamp_ns[-1:]))[0, 0]
+    assert place[-1, 0] == pytest.approx(1.001 * (end - 0.002))
+    assert place[0, 0] == pytest.approx(-1.001 * motion.overrun_m)
+    late = seconds(stamp_ns) - np.interp(
+        place[:, 0] / 1.001 + 0.002, way.wheels_m(t := np.linspace(2.5, way.duration_s - 4, 20000))[:, 0], t
+    )
+    moving = (seconds(stamp_ns) > 3.5) & (seconds(stamp_ns) < way.duration_s - 6)
+    assert late[moving].min() >= 0.05 and late[moving].max() <= 0.0701 and late[moving].std() > 0.003

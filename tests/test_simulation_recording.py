@@ -197,7 +197,7 @@ def test_same_seed_same_bytes_other_seed_other_yard(recording: Path, tmp_path: P
     assert digest(tmp_path / "again") == digest(recording)
     other = stack_yard(replace(SMALL, seed=12), np.random.default_rng((12, 0)))
     assert [b.centre_m.tolist() for b in other.bundles] != [
-        b.centre_m.tolist() for b in World.build(SMALL).stock.bundles
+        b.centre_m.tolist() for b in stack_yard(SMALL, np.random.default_rng((11, 0))).bundles
     ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,8 @@ from rich.console import Console
 
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
+from barsight.core.errors import ConfigError
+from barsight.core.settings.values import MAX_VALUE
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
 
@@ -23,6 +25,7 @@ def run(arguments: Sequence[str]) -> None:
         out: tyro.conf.Positional[Path],
         settings: Annotated[SimulationSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
+        draw: int | None = None,
     ) -> None:
         """Render a recording of a bar yard, with exact truth, as an EuRoC folder.
 
@@ -30,10 +33,27 @@ def run(arguments: Sequence[str]) -> None:
             out: The folder to write; it must not exist yet.
             settings: The yard, the cameras, the crane and its sensors.
             config: TOML file with settings; flags go before it.
+            draw: Seed of a whole world that is drawn: irregular bundles and heaps settled by physics, what
+                stands around them, crane, light, faults of the pictures. Only length, frames, pictures and
+                laser are taken from the settings then; truth/world.json says what was drawn.
         """
         console = Console(stderr=True)
         with stages(console) as advance:
-            simulate(out, settings, lambda done, total: advance("render", done, total))
+            if draw is None:
+                simulate(out, settings, lambda done, total: advance("render", done, total))
+            else:
+                _simulate_drawn(out, draw, settings, lambda done, total: advance("render", done, total))
         console.print(f"simulated recording: {out}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "simulate", arguments)
+
+
+def _simulate_drawn(
+    out: Path, seed: int, settings: SimulationSettings, progress: Callable[[int, int], None]
+) -> None:
+    if not 0 <= seed < MAX_VALUE:
+        raise ConfigError(f"simulate: --draw takes a seed of 0 or more, not {seed}")
+    # The package of physics is an extra: only who draws needs it.
+    from barsight.simulation.worlds.recording import draw_world, simulate_world
+
+    simulate_world(out, draw_world(seed, settings), progress)

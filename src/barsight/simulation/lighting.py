@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int32, Int64, UInt8, kernel
+from barsight.simulation.effects.settings import LightSettings
 from barsight.simulation.rays import FAR, trace
 from barsight.simulation.scene import Grid, Primitives, Scene
 
@@ -20,10 +21,18 @@ TEXEL_M = 0.05
 AROUND = 16
 """Lightmap cells around a bar."""
 FLOOR_MARGIN_M = 5.0
+SUN_EDGE_M = 0.07
+"""Width of a sun patch's edge: half a degree of sun over 8 m."""
+ORDINARY_LIGHT = LightSettings()
 
 
 class Lamps(NamedTuple):
-    """Lamp positions (m): spacing and offset along X, the two rows' y (2,), height z; half length along Y."""
+    """Lamp positions (m): spacing and offset along X, the two rows' y (2,), height z; half length along Y.
+
+    ambient: irradiance from the hall on an open level surface; bounce: share of it that reaches any surface.
+    sun: (8,) unit direction to the sun, the patch that it lights on the floor (x from, to, y from, to),
+    irradiance of a surface that faces it.
+    """
 
     spacing: float
     offset: float
@@ -32,6 +41,8 @@ class Lamps(NamedTuple):
     half_length: float
     power: float
     ambient: float
+    bounce: float
+    sun: Float64
 
 
 class Lightmap(NamedTuple):
@@ -40,6 +51,7 @@ class Lightmap(NamedTuple):
     start: (P + 2,). along, around: (P + 1,). A cylinder's `a` runs around it, a box's is its face (2 k for
     -axis k, 2 k + 1 for +axis k), with `along` on its longest axis; the floor's texels lie along X, then Y.
     diffuse: (T,) irradiance from lamps and hall. seen: (T, SLOTS) share of each lamp that is seen, 255 all.
+    sun: (T,) irradiance from the sun, were its patch everywhere; (0,) without a sun.
     """
 
     start: Int64
@@ -48,12 +60,19 @@ class Lightmap(NamedTuple):
     diffuse: Float32
     seen: UInt8
     floor: Float64
+    sun: Float32
 
 
-def hall_lamps(above_floor_m: float) -> Lamps:
-    """Make two rows of lamps over a crane whose cameras hang `above_floor_m` high."""
+def hall_lamps(above_floor_m: float, light: LightSettings = ORDINARY_LIGHT) -> Lamps:
+    """Make two rows of lamps over a crane whose cameras hang `above_floor_m` high, and perhaps a sun."""
     z = above_floor_m + 3.5
-    return Lamps(5.0, 1.7, np.array([-4.2, 4.6]), z, 0.5, 0.75 * z * z, 0.34)
+    height, turn = np.radians([light.sun_elevation_deg, light.sun_azimuth_deg])
+    to_sun = [np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)]
+    sun = np.array([*to_sun, *light.sun_patch_m, light.sun_ratio / np.sin(height)])
+    return Lamps(
+        5.0, 1.7, np.array([-4.2, 4.6]), z, light.lamp_length_m / 2, light.lamp_ratio * 0.75 * z * z,
+        light.ambient, light.bounce_ratio, sun,
+    )  # fmt: skip
 
 
 def bake(scene: Scene, lamps: Lamps, rng: np.random.Generator) -> Lightmap:
@@ -72,11 +91,12 @@ def bake(scene: Scene, lamps: Lamps, rng: np.random.Generator) -> Lightmap:
     floor = np.array([low[0], low[1], TEXEL_M])
     diffuse = np.zeros(int(start[-1]), dtype=np.float32)
     seen = np.zeros((int(start[-1]), SLOTS), dtype=np.uint8)
-    lightmap = Lightmap(start, along, around, diffuse, seen, floor)
+    sun = np.zeros(int(start[-1]) if lamps.sun[7] > 0 else 0, dtype=np.float32)
+    lightmap = Lightmap(start, along, around, diffuse, seen, floor, sun)
     rows = np.repeat(np.arange(count + 1, dtype=np.int32), along)
     places = np.arange(len(rows), dtype=np.int64) - np.repeat(np.cumsum(along) - along, along)
     order = rng.permutation(len(rows))
-    _bake(*scene, lamps, lightmap, rows[order], places[order], _ceiling_directions(), diffuse, seen)
+    _bake(*scene, lamps, lightmap, rows[order], places[order], _ceiling_directions(), diffuse, seen, sun)
     return lightmap
 
 
@@ -97,13 +117,13 @@ def _ceiling_directions() -> Float64:
 @kernel(parallel=True)
 def _bake(
     primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, rows: Int32, places: Int64,
-    ceiling: Float64, diffuse: Float32, seen: UInt8,
+    ceiling: Float64, diffuse: Float32, seen: UInt8, sun: Float32,
 ) -> None:  # fmt: skip
     """Bake the irradiance of each texel by shadow rays to the lamps and the hall's ceiling.
 
     rows, places: (R,) each row of texels'
     primitive and place along it. ceiling: (16, 3) unit directions. Fills diffuse (T,) and seen (T, SLOTS, 255
-    for all of a lamp), see `Lightmap`; texels at or below the floor's z = 0 stay 0.
+    for all of a lamp), sun (T,) or (0,), see `Lightmap`; texels at or below the floor's z = 0 stay 0.
     """
     # Writes go to plain arrays: Numba 0.68 loses what a prange writes to a named tuple's field.
     for r in numba.prange(rows.shape[0]):
@@ -113,7 +133,15 @@ def _bake(
             if z <= 0.0:
                 continue
             t = lightmap.start[p] + s * lightmap.around[p] + a
-            light = _hall_light(scene, ceiling, x, y, z, nx, ny, nz) * lamps.ambient
+            light = _hall_light(scene, ceiling, x, y, z, nx, ny, nz, lamps.bounce) * lamps.ambient
+            if sun.size > 0:
+                cosine = lamps.sun[0] * nx + lamps.sun[1] * ny + lamps.sun[2] * nz
+                if cosine > 0:
+                    _, found = trace(
+                        scene, x, y, z, lamps.sun[0], lamps.sun[1], lamps.sun[2], 1e-6, FAR, True
+                    )
+                    if found < 0:
+                        sun[t] = cosine * lamps.sun[7]
             middle = int(np.floor((x - lamps.offset) / lamps.spacing + 0.5))
             for slot in range(6):
                 lamp = middle + (slot % 3 - middle + 1) % 3 - 1
@@ -144,10 +172,20 @@ def lamp_beam(lamps: Lamps, along_x: float) -> float:
 
 
 @kernel()
+def sun_patch(sun: Float64, x: float, y: float, z: float) -> float:
+    """Compute how much of the sun's patch (`Lamps.sun`) reaches (x, y, z) m: 1 inside, soft edges."""
+    px, py = x - z * sun[0] / sun[2], y - z * sun[1] / sun[2]
+    inside = min(px - sun[3], sun[4] - px, py - sun[5], sun[6] - py)
+    share: float = min(max(inside / SUN_EDGE_M + 0.5, 0.0), 1.0)
+    return share
+
+
+@kernel()
 def _hall_light(
-    scene: Scene, ceiling: Float64, x: float, y: float, z: float, nx: float, ny: float, nz: float
-) -> float:
-    """Compute irradiance from the hall itself, 1 for an open level surface, with a little that bounces
+    scene: Scene, ceiling: Float64, x: float, y: float, z: float, nx: float, ny: float, nz: float,
+    bounce: float,
+) -> float:  # fmt: skip
+    """Compute irradiance from the hall itself, 1 for an open level surface; the share `bounce` comes from
     anywhere.
 
     ceiling: (16, 3) unit directions. x, y, z: the place, m; nx, ny, nz: its normal.
@@ -162,7 +200,7 @@ def _hall_light(
         _, found = trace(scene, x, y, z, cx, cy, cz, 1e-6, FAR, True)
         if found < 0:
             total += cosine
-    return 0.05 + 0.95 * total / norm
+    return bounce + (1 - bounce) * total / norm
 
 
 @kernel()

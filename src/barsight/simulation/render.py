@@ -10,7 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.pose import Pose
-from barsight.simulation.lighting import Lamps, Lightmap, lamp_beam, longest_axis
+from barsight.simulation.lighting import Lamps, Lightmap, lamp_beam, longest_axis, sun_patch
 from barsight.simulation.rays import FAR, trace
 from barsight.simulation.scene import Grid, Primitives, Scene
 from barsight.simulation.textures import ALONG_M, AROUND_M, TILE
@@ -21,6 +21,7 @@ SPREAD_ALONG = 0.38
 SPREAD_AROUND = 0.17
 HIGHLIGHT = 0.28
 """Radiance of a highlight's middle under a lamp, as a share of white paper's."""
+DUST_ALBEDO = 0.6
 MASK = TILE - 1
 
 
@@ -89,9 +90,9 @@ def shade(
     lamps, lightmap, tile = look
     x, y, z = ox + rx, oy + ry, oz + rz
     if p == primitives.shape.shape[0]:
-        return _shade_floor(lightmap, tile, p, x, y)
+        return _shade_floor(lamps, lightmap, tile, p, x, y)
     if p >= primitives.cylinders:
-        return _shade_box(primitives, lightmap, tile, p, x, y, z)
+        return _shade_box(primitives, look, p, x, y, z)
     shape, material = primitives.shape, primitives.material
     cx, cy, cz = x - shape[p, 0], y - shape[p, 1], z - shape[p, 2]
     s = cx * shape[p, 3] + cy * shape[p, 4] + cz * shape[p, 5]
@@ -117,17 +118,28 @@ def shade(
         albedo *= 1 + 0.22 * math.sin(phase)
         gloss *= 1 + 0.35 * math.sin(phase + 0.6)
     c, d = math.cos(angle + slope), math.sin(angle + slope)
+    if material[p, 8] > 0:
+        up = (c * shape[p, 8] + d * shape[p, 11] - 0.3) / 0.5
+        cover = material[p, 8] * min(max(up, 0.0), 1.0)
+        albedo += cover * (DUST_ALBEDO - albedo)
+        gloss *= 1 - cover
     t00, t01, t10, t11, ws, wa = _lightmap_place(lightmap, p, (s / half + 1) / 2, angle + slope)
-    light = lightmap.diffuse
-    diffuse = (light[t00] * (1 - wa) + light[t01] * wa) * (1 - ws) + (
-        light[t10] * (1 - wa) + light[t11] * wa
-    ) * ws
+    diffuse = _between(lightmap.diffuse, (t00, t01, t10, t11, ws, wa))
+    place = (t00, t01, t10, t11, ws, wa)
+    sun = 0.0
+    if lightmap.sun.size > 0:
+        sun = _between(lightmap.sun, place) * sun_patch(lamps.sun, x, y, z)
+        diffuse += sun
     shine = 0.0
     if material[p, 1] > 0:
         away = -1 / math.sqrt(rx * rx + ry * ry + rz * rz)
-        place = (t00, t01, t10, t11, ws, wa)
         eye = (rx * away, ry * away, rz * away)
-        shine = _shine(shape, p, lamps, lightmap.seen, place, (x, y, z), eye, (c, d))
+        turn = (c, d, material[p, 9])
+        shine = _shine(shape, p, lamps, lightmap.seen, place, (x, y, z), eye, turn)
+        if sun > 0:
+            to_sun = lamps.sun[:3]
+            half = (to_sun[0] + eye[0], to_sun[1] + eye[1], to_sun[2] + eye[2])
+            shine += sun * _mirrored(shape, p, turn, half)
     radiance: float = albedo * diffuse + HIGHLIGHT * material[p, 1] * gloss * shine
     return radiance
 
@@ -135,43 +147,64 @@ def shade(
 @kernel()
 def _shine(
     shape: Float64, p: int, lamps: Lamps, seen: UInt8, place: tuple[int, int, int, int, float, float],
-    point: tuple[float, float, float], eye: tuple[float, float, float], turn: tuple[float, float],
+    point: tuple[float, float, float], eye: tuple[float, float, float], turn: tuple[float, float, float],
 ) -> float:  # fmt: skip
-    """Compute the lamps' highlight that bar `p` mirrors to the eye; `turn`: cosine and sine of the normal's
-    angle.
+    """Compute the lamps' highlight that bar `p` mirrors to the eye; `turn`: see `_mirrored`.
 
     shape: (P, 15), see `Primitives`; seen: (T, SLOTS), see `Lightmap`. place: of `_lightmap_place`. point: m;
     eye: unit vector towards it.
     """
     t00, t01, t10, t11, ws, wa = place
     x, y, z = point
-    c, d = turn
-    nx, tx = c * shape[p, 6] + d * shape[p, 9], c * shape[p, 9] - d * shape[p, 6]
-    ny, ty = c * shape[p, 7] + d * shape[p, 10], c * shape[p, 10] - d * shape[p, 7]
-    nz, tz = c * shape[p, 8] + d * shape[p, 11], c * shape[p, 11] - d * shape[p, 8]
     shine = 0.0
     middle = math.floor((x - lamps.offset) / lamps.spacing + 0.5)
     for slot in range(6):
         lamp = middle + (slot % 3 - middle + 1) % 3 - 1
         lx, ly, lz = lamp * lamps.spacing + lamps.offset - x, lamps.rows[slot // 3] - y, lamps.z - z
         near = 1 / math.sqrt(lx * lx + ly * ly + lz * lz)
-        hx, hy, hz = lx * near + eye[0], ly * near + eye[1], lz * near + eye[2]
-        hn = hx * nx + hy * ny + hz * nz
-        if hn <= 0.1:
-            continue
-        ha = (hx * shape[p, 3] + hy * shape[p, 4] + hz * shape[p, 5]) / (hn * SPREAD_ALONG)
-        ht = (hx * tx + hy * ty + hz * tz) / (hn * SPREAD_AROUND)
-        exponent = ha * ha + ht * ht
-        if exponent > 9:
+        half = (lx * near + eye[0], ly * near + eye[1], lz * near + eye[2])
+        lobe = _mirrored(shape, p, turn, half)
+        if lobe == 0.0:
             continue
         lit = (seen[t00, slot] * (1 - wa) + seen[t01, slot] * wa) * (1 - ws)
         lit += (seen[t10, slot] * (1 - wa) + seen[t11, slot] * wa) * ws
-        shine += lit / 255 * math.exp(-exponent) * lamp_beam(lamps, lx) * lz * near * near * near
+        shine += lit / 255 * lobe * lamp_beam(lamps, lx) * lz * near * near * near
     return shine
 
 
 @kernel()
-def _shade_floor(lightmap: Lightmap, tile: Float32, p: int, x: float, y: float) -> float:
+def _mirrored(
+    shape: Float64, p: int, turn: tuple[float, float, float], half: tuple[float, float, float]
+) -> float:
+    """Compute how much bar `p` mirrors where `half` points between light and eye, 1 at the most [Ward 1992].
+
+    turn: cosine and sine of the normal's angle around the bar, and its roughness over the ordinary.
+    """
+    c, d, rough = turn
+    hx, hy, hz = half
+    nx, tx = c * shape[p, 6] + d * shape[p, 9], c * shape[p, 9] - d * shape[p, 6]
+    ny, ty = c * shape[p, 7] + d * shape[p, 10], c * shape[p, 10] - d * shape[p, 7]
+    nz, tz = c * shape[p, 8] + d * shape[p, 11], c * shape[p, 11] - d * shape[p, 8]
+    hn = hx * nx + hy * ny + hz * nz
+    if hn <= 0.1:
+        return 0.0
+    ha = (hx * shape[p, 3] + hy * shape[p, 4] + hz * shape[p, 5]) / (hn * SPREAD_ALONG * rough)
+    ht = (hx * tx + hy * ty + hz * tz) / (hn * SPREAD_AROUND * rough)
+    exponent = ha * ha + ht * ht
+    return math.exp(-exponent) if exponent <= 9 else 0.0
+
+
+@kernel()
+def _between(light: Float32, place: tuple[int, int, int, int, float, float]) -> float:
+    """Interpolate the light (T,) between the four texels of `_lightmap_place`."""
+    t00, t01, t10, t11, ws, wa = place
+    first, second = light[t00] * (1 - wa) + light[t01] * wa, light[t10] * (1 - wa) + light[t11] * wa
+    between: float = first * (1 - ws) + second * ws
+    return between
+
+
+@kernel()
+def _shade_floor(lamps: Lamps, lightmap: Lightmap, tile: Float32, p: int, x: float, y: float) -> float:
     """Shade the floor at (x, y) m: its diffuse radiance, lightmap and texture interpolated.
 
     p: the floor's id, the number of primitives. tile: (TILE, TILE, 4).
@@ -188,18 +221,20 @@ def _shade_floor(lightmap: Lightmap, tile: Float32, p: int, x: float, y: float) 
     n, light = lightmap.around[p], lightmap.diffuse
     diffuse = (light[t] * (1 - wj) + light[t + 1] * wj) * (1 - wi)
     diffuse += (light[t + n] * (1 - wj) + light[t + n + 1] * wj) * wi
+    if lightmap.sun.size > 0:
+        sun = _between(lightmap.sun, (t, t + 1, t + n, t + n + 1, wi, wj))
+        diffuse += sun * sun_patch(lamps.sun, x, y, 0.0)
     radiance: float = FLOOR_ALBEDO * fine * coarse * diffuse
     return radiance
 
 
 @kernel()
-def _shade_box(
-    primitives: Primitives, lightmap: Lightmap, tile: Float32, p: int, x: float, y: float, z: float
-) -> float:
+def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float, z: float) -> float:
     """Shade box `p` at (x, y, z) m in `yard`: its diffuse radiance, lit per face and along its longest axis.
 
-    The face is that which the point lies nearest to, by the box's half sizes. tile: (TILE, TILE, 4).
+    The face is that which the point lies nearest to, by the box's half sizes.
     """
+    lamps, lightmap, tile = look
     shape, material = primitives.shape, primitives.material
     cx, cy, cz = x - shape[p, 0], y - shape[p, 1], z - shape[p, 2]
     longest = longest_axis(shape, p)
@@ -220,6 +255,9 @@ def _shade_box(
     t = lightmap.start[p] + 2 * face + sign
     light = lightmap.diffuse
     diffuse = light[t + 6 * i0] * (1 - i + i0) + light[t + 6 * i1] * (i - i0)
+    if lightmap.sun.size > 0:
+        sun = lightmap.sun[t + 6 * i0] * (1 - i + i0) + lightmap.sun[t + 6 * i1] * (i - i0)
+        diffuse += sun * sun_patch(lamps.sun, x, y, z)
     radiance: float = material[p, 0] * (1 + material[p, 7] * (pattern - 1)) * diffuse
     return radiance
 

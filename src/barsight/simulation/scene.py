@@ -4,7 +4,8 @@ Primitives 0 .. cylinders-1 are cylinders, the rest boxes. Rows of `shape` (floa
 cylinder: centre 0:3, axis 3:6 (unit), direction of angle 0 6:9, of angle 90 degrees 9:12, radius 12,
 half length 13. Box: centre 0:3, three unit axes 3:12, half sizes 12:15.
 Rows of `material` (float32): base albedo, gloss, texture offsets (m) around and along, twist (m/m), texture
-scale along, rib pitch (m, 0 none), weight of the texture.
+scale along, rib pitch (m, 0 none), weight of the texture, dust on what faces up (share),
+roughness over the ordinary.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ LABEL_HALF_M = (0.032, 0.018, 0.0015)
 
 
 class Primitives(NamedTuple):
-    """shape: (P, 15). material: (P, 8). cylinders: how many of the P are cylinders."""
+    """shape: (P, 15). material: (P, 10). cylinders: how many of the P are cylinders."""
 
     shape: Float64
     material: Float32
@@ -71,7 +72,7 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
         box_materials.append(_plain(rng.uniform(0.3, 0.42), 0.0, rng))
     shape = np.array([np.resize(np.append(s, np.zeros(15 - len(s))), 15) for s in cylinders + boxes])
     material = np.array(cylinder_materials + box_materials, dtype=np.float32)
-    primitives = Primitives(shape.reshape(-1, 15), material.reshape(-1, 8), len(cylinders))
+    primitives = Primitives(shape.reshape(-1, 15), material.reshape(-1, 10), len(cylinders))
     thickest = max(kind.diameter_m for kind in settings.kinds)
     return Scene(primitives, build_grid(primitives, (np.clip(thickest, 0.06, 0.12), 0.5)))
 
@@ -179,12 +180,22 @@ def _bars(
         twist = float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08))
         offsets = rng.uniform(0, 10, 2)
         pitch = 0.7 * bundle.kind.diameter_m if bundle.ribbed else 0.0
-        materials.append([albedo, gloss, *offsets, twist, rng.uniform(0.85, 1.15), pitch, 1.0])
+        materials.append([albedo, gloss, *offsets, twist, rng.uniform(0.85, 1.15), pitch, 1.0, 0.0, 1.0])
     return shapes, materials
 
 
 def _plain(albedo: float, gloss: float, rng: np.random.Generator, weight: float = 0.8) -> list[float]:
-    return [albedo * float(np.exp(rng.normal(0, 0.08))), gloss, *rng.uniform(0, 10, 2), 0.0, 1.0, 0.0, weight]
+    return [
+        albedo * float(np.exp(rng.normal(0, 0.08))),
+        gloss,
+        *rng.uniform(0, 10, 2),
+        0.0,
+        1.0,
+        0.0,
+        weight,
+        0.0,
+        1.0,
+    ]
 
 
 def _beam_shape(beam: DunnageBeam) -> Float64:

@@ -74,13 +74,29 @@ def _walk(
 def record_encoders(
     trajectory: SimulatedTrajectory, settings: SensorSettings, lever_m: Float64, rng: np.random.Generator
 ) -> tuple[Int64, Float64]:
-    """Record stamps (N,) and the crane point's place (N, 3) as read: late, noisy and in whole steps."""
+    """Record stamps (N,) and the crane point's place (N, 3) as read: late, noisy and in whole steps.
+
+    They read the wheels and the drum: not what springs and rails move.
+    """
     stamp_ns = stamps(trajectory.duration_s, settings.encoder_rate_hz)
-    place = trajectory.at(seconds(stamp_ns) - settings.encoder_latency_s).position_m - lever_m
+    latency = np.full(len(stamp_ns), settings.encoder_latency_s)
+    if settings.encoder_jitter_s > 0:
+        latency += rng.uniform(0, settings.encoder_jitter_s, len(latency))
+    place = trajectory.wheels_m(seconds(stamp_ns) - latency) - lever_m
+    place[:, 0] = settings.encoder_scale * _with_play(place[:, 0], settings.encoder_backlash_m)
     place = place + rng.normal(0, 1, place.shape) * settings.encoder_std_m
     if settings.encoder_step_m > 0:
         place = np.round(place / settings.encoder_step_m) * settings.encoder_step_m
     return stamp_ns, place
+
+
+def _with_play(x: Float64, play: float) -> Float64:
+    """Follow x (N,) as what it drags along within `play`: from the middle at first."""
+    out, at = np.empty_like(x), float(x[0])
+    for k, now in enumerate(x.tolist()):
+        at = min(max(at, now - play / 2), now + play / 2)
+        out[k] = at
+    return out
 
 
 def heights(scene: Scene, x_m: Float64, y_m: Float64) -> Float64:

@@ -10,6 +10,7 @@ import tyro
 
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import expect_values
+from barsight.simulation.effects.settings import FaultSettings, LightSettings
 
 BARS_OF_RINGS = (1, 7, 19, 37, 61)
 
@@ -123,6 +124,8 @@ class YardSettings:
     """Share of sections that hold ribbed bars."""
     gloss: float = 1.0
     """Strength of the highlights; 0 is matt steel."""
+    texture_ratio: float = 1.0
+    """Contrast of the surfaces' texture, steel's and the floor's, over the ordinary."""
 
     def __post_init__(self) -> None:
         _expect(1 <= self.max_layers <= 5, "yard max_layers must lie between 1 and 5")
@@ -135,6 +138,7 @@ class YardSettings:
         _expect(0 <= self.gap_m <= 1, "yard gap_m must lie between 0 and 1 m")
         _expect(0 <= self.uneven_ends_m <= 0.5, "yard uneven_ends_m must lie between 0 and 0.5 m")
         _expect(self.gloss >= 0, "yard gloss can't be negative")
+        _expect(0 <= self.texture_ratio <= 2, "yard texture_ratio must lie between 0 and 2")
         _expect(
             self.strap_spacing_m == 0 or self.strap_spacing_m >= 0.3,
             "yard strap_spacing_m must be 0 or at least 0.3 m",
@@ -161,6 +165,20 @@ class TravelSettings:
     """Amplitude of the vibration."""
     vibration_hz: float = 9.0
     """Frequency of the vibration."""
+    stops: int = 0
+    """Times that the crane stops under way, at places drawn from the seed."""
+    stop_s: float = 2.0
+    """Time of a stop, from standing still to starting anew."""
+    trolley_m: float = 0.0
+    """How far the trolley travels during the pass."""
+    oscillation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Amplitudes of bridge, trolley and hoist on their springs, which their encoders don't see."""
+    oscillation_hz: tuple[float, float, float] = (0.7, 1.1, 1.9)
+    """Frequencies of these."""
+    rail_m: float = 0.0
+    """Amplitude by which the rails rise and fall and lead aside, with a wave every few metres."""
+    skew_deg: float = 0.0
+    """Amplitude by which the bridge skews as it travels."""
 
     def __post_init__(self) -> None:
         _expect(0.01 <= self.speed_mps <= 5, "motion speed_mps must lie between 0.01 and 5")
@@ -169,7 +187,17 @@ class TravelSettings:
         _expect(0 <= self.overrun_m <= 5, "motion overrun_m must lie between 0 and 5 m")
         _expect(0 <= self.sway_deg <= 5, "motion sway_deg must lie between 0 and 5")
         _expect(0 <= self.vibration_m <= 0.01, "motion vibration_m must lie between 0 and 0.01")
-        _expect(min(self.sway_hz, self.vibration_hz) > 0, "motion frequencies must be positive")
+        hertz = (self.sway_hz, self.vibration_hz, *self.oscillation_hz)
+        _expect(min(hertz) > 0, "motion frequencies must be positive")
+        _expect(0 <= self.stops <= 20, "motion stops must lie between 0 and 20")
+        _expect(0 <= self.stop_s <= 600, "motion stop_s must lie between 0 and 600")
+        _expect(abs(self.trolley_m) <= 20, "motion trolley_m must lie within 20 m")
+        _expect(
+            0 <= min(self.oscillation_m) <= max(self.oscillation_m) <= 0.1,
+            "motion oscillation_m must lie between 0 and 0.1 m",
+        )
+        _expect(0 <= self.rail_m <= 0.05, "motion rail_m must lie between 0 and 0.05 m")
+        _expect(0 <= self.skew_deg <= 2, "motion skew_deg must lie between 0 and 2")
 
 
 @dataclass(frozen=True)
@@ -200,6 +228,12 @@ class SensorSettings:
     """Quantisation of a reading."""
     encoder_latency_s: float = 0.0
     """A reading stamped t says where the crane was at t minus this."""
+    encoder_jitter_s: float = 0.0
+    """How much later still a reading may be, evenly between 0 and this."""
+    encoder_scale: float = 1.0
+    """A metre of the bridge as its encoder reads it."""
+    encoder_backlash_m: float = 0.0
+    """Play between bridge and encoder: it reads the middle of it, and follows at its end."""
     laser_std_m: float = 0.001
     """Noise of a laser point."""
     laser_y_m: tuple[float, ...] = (0.45, -1.15)
@@ -210,7 +244,15 @@ class SensorSettings:
         _expect(20 <= self.imu_rate_hz <= 2000, "sensors imu_rate_hz must lie between 20 and 2000")
         _expect(1 <= self.encoder_rate_hz <= 1000, "sensors encoder_rate_hz must lie between 1 and 1000")
         _expect(0 <= self.encoder_step_m <= 0.1, "sensors encoder_step_m must lie between 0 and 0.1 m")
-        _expect(0 <= self.encoder_latency_s <= 0.9, "sensors encoder_latency_s must lie between 0 and 0.9 s")
+        latest = self.encoder_latency_s + self.encoder_jitter_s
+        _expect(
+            min(self.encoder_latency_s, self.encoder_jitter_s) >= 0 and latest <= 0.9,
+            "sensors encoder_latency_s and encoder_jitter_s must lie between 0 and 0.9 s together",
+        )
+        _expect(0.9 <= self.encoder_scale <= 1.1, "sensors encoder_scale must lie between 0.9 and 1.1")
+        _expect(
+            0 <= self.encoder_backlash_m <= 0.1, "sensors encoder_backlash_m must lie between 0 and 0.1 m"
+        )
         noises = (
             self.gyro_noise_density, self.gyro_random_walk, self.gyro_bias_radps, self.accel_noise_density,
             self.accel_random_walk, self.accel_bias_mps2, self.encoder_std_m, self.laser_std_m,
@@ -259,6 +301,8 @@ class SimulationSettings:
     motion: TravelSettings = field(default_factory=TravelSettings)
     sensors: SensorSettings = field(default_factory=SensorSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
+    light: LightSettings = field(default_factory=LightSettings)
+    faults: FaultSettings = field(default_factory=FaultSettings)
 
     def __post_init__(self) -> None:
         expect_values(self)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from barsight.calibration.geometry.camera import Camera
 from barsight.core.arrays import Float64, Int64
 from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.simulation import euroc_files
+from barsight.simulation.effects.faults import SpoiledLens, exposure_gain
 from barsight.simulation.hanging_plate import paint_plate, plate_at
 from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
@@ -21,23 +25,32 @@ from barsight.simulation.render import Shading, render_view
 from barsight.simulation.scene import Scene, build_scene
 from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, record_imu, seconds, stamps
 from barsight.simulation.settings import SimulationSettings
-from barsight.simulation.stock import Stock, stack_yard
+from barsight.simulation.stock import stack_yard
 from barsight.simulation.textures import surface_tile
 from barsight.simulation.trajectory import SimulatedTrajectory
-from barsight.simulation.truth import SurfaceTruth, true_depth, write_bundles, write_rig
+from barsight.simulation.truth import SurfaceTruth, bundle_rows, true_depth, write_rig
 
 CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
 GROUND_TRUTH_HZ = 200
 REST_BEFORE_FRAME_S = 0.6
+STACK_M = 0.4
+STEP_NS = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LaidYard:
+    """Geometry of all that lies in the yard. truth: JSON values by the names of their files in `truth`."""
+
+    scene: Scene
+    truth: Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """All that is fixed before the first picture: stock, scene, rig, way of the crane, frames' stamps."""
+    """All that is fixed before the first picture: yard, rig, way of the crane, frames' stamps."""
 
     settings: SimulationSettings
-    stock: Stock
-    scene: Scene
+    laid: LaidYard
     mounted: MountedRig
     trajectory: SimulatedTrajectory
     frame_stamp_ns: Int64
@@ -46,17 +59,23 @@ class World:
     def build(cls, settings: SimulationSettings) -> World:
         """Draw everything from the seed; each part has its own stream, so that one can change alone."""
         stock = stack_yard(settings, _stream(settings, 0))
-        return cls.over(build_scene(stock, settings, _stream(settings, 1)), settings, stock)
+        scene = build_scene(stock, settings, _stream(settings, 1))
+        return cls.over(LaidYard(scene, {"bundles.json": bundle_rows(stock.bundles)}), settings)
 
     @classmethod
-    def over(cls, scene: Scene, settings: SimulationSettings, stock: Stock) -> World:
-        """Draw rig and way over a scene that may come from elsewhere; stock: what the truth tells of it."""
+    def over(cls, laid: LaidYard, settings: SimulationSettings) -> World:
+        """Draw rig and way over a yard that may come from elsewhere."""
         mounted = mount_rig(settings, _stream(settings, 2))
         trajectory = SimulatedTrajectory.plan(
             settings.length_m, settings.camera, settings.motion, mounted.nominal_yard_from_body,
             _stream(settings, 3),
         )  # fmt: skip
-        return cls(settings, stock, scene, mounted, trajectory, frame_stamps(settings, trajectory))
+        return cls(settings, laid, mounted, trajectory, frame_stamps(settings, trajectory))
+
+    @property
+    def scene(self) -> Scene:
+        """Return the geometry of what lies in the yard."""
+        return self.laid.scene
 
     def yard_from_body(self, camera_stamp_ns: int) -> Pose:
         """Compute the exact pose at a camera stamp: t_imu = t_cam + timeshift."""
@@ -64,28 +83,45 @@ class World:
         motion = self.trajectory.at(seconds(np.array([imu_stamp], dtype=np.int64)))
         return Pose("yard", "body", motion.yard_from_body[0], motion.position_m[0])
 
+    def image_velocity(self, camera_stamp_ns: int, camera: Camera, mounting: Pose) -> Float64:
+        """Compute how fast the picture's middle moves over the sensor, right and down, px/s: of a point
+        STACK_M over the floor.
+        """
+        now = self.yard_from_body(camera_stamp_ns) @ mounting
+        ray = now.rotation[:, 2]
+        point = now.translation + ray * (STACK_M - now.translation[2]) / ray[2]
+        around = [
+            camera.project(
+                (self.yard_from_body(camera_stamp_ns + by) @ mounting).inverse().apply(point[None])
+            )[0]
+            for by in (-STEP_NS, STEP_NS)
+        ]
+        velocity: Float64 = (around[1] - around[0]) / (2e-9 * STEP_NS)
+        return velocity
+
 
 def simulate(
     out: Path,
     settings: SimulationSettings,
     progress: Callable[[int, int], None] | None = None,
-    scene: Scene | None = None,
+    laid: LaidYard | None = None,
 ) -> None:
     """Write a simulated recording with its truth to the new folder `out`.
 
-    progress: called with (pairs written, pairs in all). scene: what lies there, instead of a stock drawn from
-    the seed; its truth lists no bundles then. Raises OutputError where `out` can't be written;
-    nothing half-written is left then, nor after an interruption.
+    progress: called with (pairs written, pairs in all). laid: what lies there, instead of a stock drawn from
+    the seed. Raises OutputError where `out` can't be written; nothing half-written is left then, nor after
+    an interruption.
     """
     with atomic_directory(out) as folder:
-        world = World.build(settings) if scene is None else World.over(scene, settings, Stock((), ()))
+        world = World.build(settings) if laid is None else World.over(laid, settings)
         truth_folder = folder / "truth"
         truth_folder.mkdir()
         surface = SurfaceTruth(world.scene, settings)
         imu = _write_slow_sensors(folder / "mav0", world, surface)
         _write_pictures(folder, world, surface, progress)
         surface.write(truth_folder)
-        write_bundles(world.stock.bundles, truth_folder)
+        for name, content in world.laid.truth.items():
+            (truth_folder / name).write_text(json.dumps(content, indent=1), encoding="utf-8")
         write_rig(
             world.mounted.rig, imu.gyro_bias_radps, imu.accel_bias_mps2, np.array(CRANE_TO_BODY_M), settings,
             truth_folder,
@@ -133,8 +169,9 @@ def _write_pictures(
     folder: Path, world: World, surface: SurfaceTruth, progress: Callable[[int, int], None] | None
 ) -> None:
     settings, rig = world.settings, world.mounted.rig
-    lamps = hall_lamps(settings.camera.above_floor_m)
-    tile = surface_tile(_stream(settings, 7), settings.camera.above_floor_m / settings.camera.focal_px)
+    lamps = hall_lamps(settings.camera.above_floor_m, settings.light)
+    footprint_m = settings.camera.above_floor_m / settings.camera.focal_px
+    tile = surface_tile(_stream(settings, 7), footprint_m, settings.yard.texture_ratio)
     look = Shading(lamps, bake(world.scene, lamps, _stream(settings, 8)), tile)
     side = settings.camera.samples_per_side
     cameras = (
@@ -143,18 +180,26 @@ def _write_pictures(
     )
     rays = [sample_rays(camera, side) for _, camera, _, _ in cameras]
     shares = [vignette(camera, settings.camera.vignetting) for _, camera, _, _ in cameras]
+    shape = (settings.camera.height_px, settings.camera.width_px)
+    lenses = [SpoiledLens.draw(settings.faults, shape, _stream(settings, 10, k)) for k in range(2)]
     deep = depth_views(settings)
     for number, stamp in enumerate(world.frame_stamp_ns.tolist()):
         yard_from_body = world.yard_from_body(stamp)
         plate = plate_at(settings.magnet, number / settings.frames, yard_from_body)
         surface.count_frame(rig, yard_from_body, plate)
-        for k, (name, camera, mounting, gain) in enumerate(cameras):
+        for k, (name, camera, mounting, exposure) in enumerate(cameras):
             yard_from_cam = yard_from_body @ mounting
             radiance = render_view(world.scene, look, rays[k], side, yard_from_cam)
             if plate is not None:
                 paint_plate(radiance, plate, rays[k], side, yard_from_cam, tile)
-            noise = _stream(settings, 9, 2 * number + k)
-            image = expose(radiance, shares[k], gain, settings.camera, noise)
+            step = float(_stream(settings, 11, number).normal())
+            phase = float(_stream(settings, 12, 2 * number + k).uniform(0, 2 * np.pi))
+            gain = exposure_gain(settings.faults, step, phase) * exposure
+            radiance = lenses[k].spoil(
+                radiance, settings.faults, world.image_velocity(stamp, camera, mounting)
+            )
+            image = expose(radiance, shares[k], gain, settings.camera, _stream(settings, 9, 2 * number + k))
+            lenses[k].kill(image)
             euroc_files.write_png(folder / "mav0" / name / "data" / f"{stamp}.png", image)
             if number in deep:
                 depth = true_depth(world.scene, camera, yard_from_cam, plate)

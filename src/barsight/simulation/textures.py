@@ -14,13 +14,14 @@ ALONG_M = 0.002
 """Texel size along a bar."""
 
 
-def surface_tile(rng: np.random.Generator, footprint_m: float) -> Float32:
+def surface_tile(rng: np.random.Generator, footprint_m: float, texture_ratio: float = 1.0) -> Float32:
     """Synthesise a (TILE, TILE, 4) periodic float32 tile, first axis around the bar, second along it.
 
     Channels: albedo factor (mean 1), gloss factor (mean 1), slope of the surface around the bar (rad),
     isotropic albedo factor in texels of ALONG_M for floor and wood (mean 1).
     footprint_m: a pixel's size on the floor. The pattern is drawn for 6.4 mm and grows with it, so that a
-    coarser camera finds contrast at its pixels' scale too and nothing finer to alias.
+    coarser camera finds contrast at its pixels' scale too and nothing finer to alias. texture_ratio: contrast
+    of all channels over the ordinary.
     """
     grown = float(np.clip(footprint_m / 0.0064, 0.8, 8.0))
     streaks = _noise(rng, 0.0035 * grown, 0.05)
@@ -36,6 +37,9 @@ def surface_tile(rng: np.random.Generator, footprint_m: float) -> Float32:
         _noise(rng, 0.0035 * grown, 0.0035 * grown) * 0.09 + _noise(rng, 0.015 * grown, 0.015 * grown) * 0.05
     )
     tile = np.stack([albedo / albedo.mean(), gloss / gloss.mean(), slope, np.exp(coarse)], axis=2)
+    if texture_ratio != 1:
+        plain = np.array([1.0, 1.0, 0.0, 1.0])
+        tile = plain + texture_ratio * (tile - plain)
     return np.ascontiguousarray(tile, dtype=np.float32)
 
 

@@ -1,10 +1,11 @@
-"""Define the crane's motion as exact functions of time: travel with acceleration and braking, sway,
-vibration.
+"""Define the crane's motion as exact functions of time: travel with acceleration and braking, stops, sway,
+vibration, oscillation on springs, uneven rails.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from barsight.core.arrays import Float64
 from barsight.simulation.settings import CameraSettings, TravelSettings
 
 SMOOTHSTEP_PEAK_SLOPE = 1.875
+RAIL_WAVE_M = (3.7, 5.3)
+"""Lengths of the rails' waves, up and down and aside."""
+SKEW_WAVE_M = 6.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +44,26 @@ class Jet:
         """Add a constant."""
         return Jet(self.value + offset, self.rate, self.rate2)
 
+    def sine(self) -> Jet:
+        """Take the sine."""
+        sine, cosine = np.sin(self.value), np.cos(self.value)
+        return Jet(sine, cosine * self.rate, cosine * self.rate2 - sine * self.rate**2)
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A travel from rest to rest: starts at start_s, brakes from brake_s; each takes ramp_s."""
+
+    start_s: float
+    ramp_s: float
+    brake_s: float
+    speed_mps: float
+
+    @property
+    def end_s(self) -> float:
+        """Return when it stands."""
+        return self.brake_s + self.ramp_s
+
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
@@ -60,7 +84,7 @@ class BodyMotion:
 class SimulatedTrajectory:
     """The body's way, defined for every instant (s on the IMU's clock, 0 at its first sample).
 
-    The crane rests until `start_s`, ramps up for `ramp_s`, brakes from `brake_s` for `ramp_s` and settles.
+    The crane rests until the first leg's start; after the last it settles.
     """
 
     camera: CameraSettings
@@ -68,10 +92,7 @@ class SimulatedTrajectory:
     nominal_yard_from_body: Float64
     phases_rad: Float64
     begin_x_m: float
-    speed_mps: float
-    start_s: float
-    ramp_s: float
-    brake_s: float
+    legs: tuple[Leg, ...]
     settled_s: float
     duration_s: float
 
@@ -82,21 +103,27 @@ class SimulatedTrajectory:
     ) -> SimulatedTrajectory:  # fmt: skip
         """Plan the travel from `overrun_m` before the stack to as far behind it."""
         distance = length_m + 2 * motion.overrun_m
-        acceleration = motion.acceleration_mps2
-        speed = min(motion.speed_mps, float(np.sqrt(distance * acceleration / SMOOTHSTEP_PEAK_SLOPE)))
-        ramp = SMOOTHSTEP_PEAK_SLOPE * speed / acceleration
-        brake = motion.standstill_s + distance / speed
-        settled = brake + ramp + 1.0
         phases = rng.uniform(0, 2 * np.pi, 16)
+        shares = [0.0, *np.sort(rng.uniform(0.15, 0.85, motion.stops)).tolist(), 1.0]
+        legs, start = [], motion.standstill_s
+        for begin, end in pairwise(shares):
+            legs.append(_leg(start, (end - begin) * distance, motion))
+            start = legs[-1].end_s + motion.stop_s
+        settled = legs[-1].end_s + 1.0
         return cls(
-            camera, motion, nominal_yard_from_body, phases, -motion.overrun_m, speed,
-            motion.standstill_s, ramp, brake, settled, settled + motion.standstill_s,
+            camera, motion, nominal_yard_from_body, phases, -motion.overrun_m, tuple(legs), settled,
+            settled + motion.standstill_s,
         )  # fmt: skip
+
+    @property
+    def start_s(self) -> float:
+        """Return when the crane begins to travel."""
+        return self.legs[0].start_s
 
     def at(self, time_s: Float64) -> BodyMotion:
         """Evaluate the exact motion at (N,) instants."""
         t = np.asarray(time_s, dtype=np.float64)
-        x, y, z = self._place(t)
+        x, y, z = (wheel + off for wheel, off in zip(self._wheels(t), self._springs(t), strict=True))
         roll, pitch, yaw = self._turn(t)
         turn = _about_z(yaw.value) @ _about_y(pitch.value) @ _about_x(roll.value)
         e_x, e_y, e_z = np.eye(3)
@@ -115,9 +142,13 @@ class SimulatedTrajectory:
             np.einsum("nij,ni->nj", yard_from_body, rate),
         )
 
+    def wheels_m(self, time_s: Float64) -> Float64:
+        """Evaluate the body's place (N, 3) as wheels and drum have it: neither springs nor rails move it."""
+        return np.stack([jet.value for jet in self._wheels(np.asarray(time_s, np.float64))], axis=1)
+
     def time_at_x(self, x_m: float) -> float:
         """Find when the travel (sway aside) has reached `x_m`, by bisection."""
-        low, high = self.start_s, self.brake_s + self.ramp_s
+        low, high = self.start_s, self.legs[-1].end_s
         for _ in range(60):
             middle = (low + high) / 2
             reached = self.begin_x_m + self._travel(np.array([middle])).value[0]
@@ -125,20 +156,27 @@ class SimulatedTrajectory:
         return (low + high) / 2
 
     def _travel(self, t: Float64) -> Jet:
-        up, down = _ramp(t, self.start_s, self.ramp_s), _ramp(t, self.brake_s, self.ramp_s)
-        return up.scaled(self.speed_mps) + down.scaled(-self.speed_mps)
+        total: Jet | None = None
+        for leg in self.legs:
+            up, down = _ramp(t, leg.start_s, leg.ramp_s), _ramp(t, leg.brake_s, leg.ramp_s)
+            one = up.scaled(leg.speed_mps) + down.scaled(-leg.speed_mps)
+            total = one if total is None else total + one
+        assert total is not None
+        return total
 
     def _envelope(self, t: Float64) -> Jet:
         """Fade 0 at rest to 1 under way; the sway dies down while the crane brakes and settles."""
-        fade = _smoothstep(t, self.brake_s, self.settled_s - self.brake_s)
-        return _smoothstep(t, self.start_s, self.ramp_s) * fade.scaled(-1).shifted(1)
+        first, last = self.legs[0], self.legs[-1]
+        fade = _smoothstep(t, last.brake_s, self.settled_s - last.brake_s)
+        return _smoothstep(t, first.start_s, first.ramp_s) * fade.scaled(-1).shifted(1)
 
     def _wave(self, t: Float64, hertz: float, number: int) -> Jet:
         omega = 2 * np.pi * hertz
         angle = omega * t + self.phases_rad[number]
         return Jet(np.sin(angle), omega * np.cos(angle), -(omega**2) * np.sin(angle))
 
-    def _place(self, t: Float64) -> tuple[Jet, Jet, Jet]:
+    def _wheels(self, t: Float64) -> tuple[Jet, Jet, Jet]:
+        """Compute travel, sway and vibration along x, y and z."""
         envelope, sway, shake = self._envelope(t), self.motion.sway_hz, self.motion.vibration_hz
         swing_m = 1.2 * np.radians(self.motion.sway_deg)
         vibration = self.motion.vibration_m
@@ -149,11 +187,29 @@ class SimulatedTrajectory:
         z = self._wave(t, 0.8 * sway, 4).scaled(0.6 * swing_m) + self._wave(t, 1.31 * shake, 5).scaled(
             vibration
         )
+        trolley = _smoothstep(t, self.start_s, self.legs[-1].end_s - self.start_s)
+        trolley = trolley.scaled(self.motion.trolley_m).shifted(-self.motion.trolley_m / 2)
         return (
             self._travel(t).shifted(self.begin_x_m) + envelope * x,
-            (envelope * y).shifted(self.camera.trolley_y_m),
+            (envelope * y + trolley).shifted(self.camera.trolley_y_m),
             (envelope * z).shifted(self.camera.above_floor_m),
         )
+
+    def _springs(self, t: Float64) -> tuple[Jet, Jet, Jet]:
+        """Compute what moves the body along x, y and z and no encoder sees: springs and rails."""
+        envelope, motion = self._envelope(t), self.motion
+        waves = [
+            self._wave(t, hertz, 11 + k).scaled(amplitude)
+            for k, (hertz, amplitude) in enumerate(
+                zip(motion.oscillation_hz, motion.oscillation_m, strict=True)
+            )
+        ]
+        up, aside = (self._along(t, wave, 14 + k).scaled(motion.rail_m) for k, wave in enumerate(RAIL_WAVE_M))
+        return envelope * waves[0], envelope * waves[1] + aside, envelope * waves[2] + up
+
+    def _along(self, t: Float64, wave_m: float, number: int) -> Jet:
+        """Wave over the way that has been travelled."""
+        return self._travel(t).scaled(2 * np.pi / wave_m).shifted(float(self.phases_rad[number])).sine()
 
     def _turn(self, t: Float64) -> tuple[Jet, Jet, Jet]:
         envelope, sway, shake = self._envelope(t), self.motion.sway_hz, self.motion.vibration_hz
@@ -162,7 +218,16 @@ class SimulatedTrajectory:
         roll = self._wave(t, 1.1 * sway, 6).scaled(swing) + self._wave(t, shake, 7).scaled(tremble)
         pitch = self._wave(t, sway, 8).scaled(0.8 * swing) + self._wave(t, 1.2 * shake, 9).scaled(tremble)
         yaw = self._wave(t, 0.37 * sway, 10).scaled(0.6 * swing)
-        return envelope * roll, envelope * pitch, envelope * yaw
+        skew = self._along(t, SKEW_WAVE_M, 10).scaled(float(np.radians(self.motion.skew_deg)))
+        return envelope * roll, envelope * pitch, envelope * yaw + skew
+
+
+def _leg(start_s: float, distance_m: float, motion: TravelSettings) -> Leg:
+    """Plan a travel from rest to rest, slower where the way is too short for full speed."""
+    acceleration = motion.acceleration_mps2
+    speed = min(motion.speed_mps, float(np.sqrt(distance_m * acceleration / SMOOTHSTEP_PEAK_SLOPE)))
+    ramp = SMOOTHSTEP_PEAK_SLOPE * speed / acceleration
+    return Leg(start_s, ramp, start_s + distance_m / speed, speed)
 
 
 def _smoothstep(t: Float64, begin_s: float, span_s: float) -> Jet:

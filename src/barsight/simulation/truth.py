@@ -122,9 +122,9 @@ def true_depth(
     return depth.reshape(camera.height, camera.width).astype(np.float32)
 
 
-def write_bundles(bundles: tuple[StackedBundle, ...], folder: Path) -> None:
-    """Write `bundles.json`."""
-    rows = [
+def bundle_rows(bundles: tuple[StackedBundle, ...]) -> list[dict[str, Any]]:
+    """Describe stacked bundles as `bundles.json` lists them."""
+    return [
         {
             "sec": b.section, "lay": b.layer, "col": b.column, "center": b.centre_m.tolist(),
             "yaw_deg": float(np.degrees(b.yaw_rad)), "bundle_radius": b.radius_m,
@@ -133,7 +133,6 @@ def write_bundles(bundles: tuple[StackedBundle, ...], folder: Path) -> None:
         }
         for b in bundles
     ]  # fmt: skip
-    (folder / "bundles.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
 def write_rig(

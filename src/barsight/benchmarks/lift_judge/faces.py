@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from barsight.benchmarks.lift_judge.envelopes import STEP_M, Envelope, envelope
 from barsight.benchmarks.lift_judge.lowering import Rest, lower
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
-from barsight.benchmarks.lift_judge.solids import NOTHING, STEP_M, Envelope, SolidYard, envelope
 from barsight.core.arrays import Float32, Float64, Int32, Int64, kernel
+from barsight.simulation.worlds.solids import NOTHING, SolidYard
 
 STRAY_M = 0.03
 """Margin around the faces in which the stray field, and the poles' bodies, want nothing above them."""

@@ -33,18 +33,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from barsight.benchmarks.lift_judge.envelopes import envelope, undersides
 from barsight.benchmarks.lift_judge.faces import DrawnSurroundings, MagnetOnSolids, Standing
 from barsight.benchmarks.lift_judge.lowering import Rest
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
-from barsight.benchmarks.lift_judge.solids import (
-    NEWTON_PER_KG,
-    NOTHING,
-    SolidYard,
-    envelope,
-    undersides,
-)  # fmt: skip
 from barsight.core.arrays import Float64
+from barsight.simulation.worlds.solids import NOTHING, SolidYard
 
+NEWTON_PER_KG = 9.81
 OVER_FACES_M = (0.015, 0.005)
 OVER_STATED_M = (0.015, 0.010)
 OVER_BEAM_M = (0.0, -0.03)

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.benchmarks.yard.bundle_scores import BundleErrors, TrueBundle, join_scores, score_bundles
+from barsight.benchmarks.yard.bundle_scores import (
+    BundleErrors,
+    TrueBundle,
+    bars_mass,
+    join_scores,
+    score_bundles,
+)
 from barsight.benchmarks.yard.degraded_map import Defects, degraded_map
 from barsight.simulation.scene import build_scene
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
@@ -107,4 +113,5 @@ def _true(bundle: StackedBundle) -> TrueBundle:
     return TrueBundle(
         bundle.centre_m, bundle.yaw_rad, bundle.length_m, 2 * bundle.radius_m, bundle.top_z_m,
         bundle.kind.diameter_m, bundle.kind.count, bundle.layer, bundle.on_top,
+        bars_mass(bundle.kind.count, bundle.kind.diameter_m, bundle.length_m),
     )  # fmt: skip

@@ -13,7 +13,9 @@ from rich.table import Table
 from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
+from barsight.simulation.worlds.solids import STEEL_KG_PER_M3
 from barsight.yard.types import Bundle
+from barsight.yard.weight import bundle_mass
 
 _INSIDE = 1.959964
 _COUNTS = ("free", "found", "claimed", "wrong", "said_count", "right_count")
@@ -21,7 +23,7 @@ _COUNTS = ("free", "found", "claimed", "wrong", "said_count", "right_count")
 
 @dataclass(frozen=True, eq=False)
 class TrueBundle:
-    """centre_m: (3,) the axis at mid-length. on_top: no bundle lies on it."""
+    """centre_m: (3,) the axis at mid-length. on_top: no bundle lies on it. mass_kg: of its bars."""
 
     centre_m: Float64
     yaw_rad: float
@@ -32,15 +34,16 @@ class TrueBundle:
     bars: int
     layer: int
     on_top: bool
+    mass_kg: float
 
 
 @dataclass(frozen=True, eq=False)
 class BundleErrors:
     """Errors of the free true bundles that were found, stacked over yards, and what was missed or false.
 
-    errors, sigmas: by figure (N,), found minus true; NaN where the figure is unknown. free: true bundles with
-    nothing on them; found: of those; claimed: found bundles said to be free; wrong: of those without a true
-    free one. said_count, right_count: pairs whose number of bars was said, and right.
+    errors, sigmas: by figure (N,), found minus true, m, rad, t; NaN where the figure is unknown. free: true
+    bundles with nothing on them; found: of those; claimed: found bundles said to be free; wrong: of those
+    without a true free one. said_count, right_count: pairs whose number of bars was said, and right.
     """
 
     errors: dict[str, Float64]
@@ -63,11 +66,17 @@ def read_true_bundles(recording: Path) -> tuple[TrueBundle, ...]:
     return tuple(
         TrueBundle(
             np.array(row["center"]), float(np.radians(row["yaw_deg"])), row["length"],
-            2 * row["bundle_radius"], row["top_z"], row["bar_diameter"], row["bars"], row["lay"],
-            row["on_top"],
+            row.get("width", 2 * row["bundle_radius"]), row["top_z"], row["bar_diameter"], row["bars"],
+            row["lay"], row["on_top"],
+            row.get("mass_kg", bars_mass(row["bars"], row["bar_diameter"], row["length"])),
         )
         for row in json.loads(path.read_text(encoding="utf-8"))
     )  # fmt: skip
+
+
+def bars_mass(bars: int, diameter_m: float, length_m: float) -> float:
+    """Compute the mass of round steel bars of one length, kg."""
+    return STEEL_KG_PER_M3 * np.pi / 4 * diameter_m**2 * length_m * bars
 
 
 def score_bundles(found: tuple[Bundle, ...], true: tuple[TrueBundle, ...]) -> BundleErrors:
@@ -124,7 +133,7 @@ def join_scores(parts: list[BundleErrors]) -> BundleErrors:
 
 
 def score_figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
-    """Summarise each figure: count, bias, median, P95 of the size (mm; yaw in degrees), ratio in the 95 %
+    """Summarise each figure: count, bias, median, P95 of the size (mm, degrees, kg), ratio in the 95 %
     interval.
     """
     out = {}
@@ -163,7 +172,7 @@ def bundle_report(scores: BundleErrors, cpu_seconds: tuple[float, ...]) -> Bundl
 
 
 def bundle_table(scores: BundleErrors) -> Table:
-    """Tabulate the figures for people; lengths in mm, yaw in degrees."""
+    """Tabulate the figures for people; lengths in mm, yaw in degrees, mass in kg."""
     title = (
         f"{scores.found} of {scores.free} free bundles found, {scores.wrong} of {scores.claimed} false; "
         f"bars counted right in {scores.right_count} of {scores.said_count}"
@@ -208,7 +217,7 @@ def _inside(found: Bundle, true: TrueBundle) -> bool:
 
 
 def _errors(found: Bundle, true: TrueBundle) -> dict[str, tuple[float, float]]:
-    sigma = found.sigma
+    sigma, mass = found.sigma, bundle_mass(found)
     along = _axes(true)[1]
     turned = (found.yaw_rad - true.yaw_rad + np.pi / 2) % np.pi - np.pi / 2
     flip = 1 if np.cos(found.yaw_rad - true.yaw_rad) > 0 else -1
@@ -218,6 +227,7 @@ def _errors(found: Bundle, true: TrueBundle) -> dict[str, tuple[float, float]]:
         "top": (found.top_z_m - true.top_z_m, sigma.top_z_m),
         "width": (found.width_m - true.width_m, sigma.width_m),
         "diameter": (found.bar_diameter_m - true.bar_diameter_m, sigma.bar_diameter_m),
+        "mass": ((mass.kg - true.mass_kg) / 1e3, mass.sigma_kg / 1e3),
     }
     across = [round(one.width_m / one.bar_diameter_m) for one in (found, true)]
     if across[0] != across[1]:  # another packing

@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from barsight.benchmarks.lift_judge.solids import Solid, SolidYard, envelope
-from barsight.benchmarks.lift_judge.worlds import DrawnWorld
-from barsight.core.arrays import Float64
+from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.core.types import HeightSource
 from barsight.result_folder import read_heights, read_summary
-from barsight.simulation.scene import Primitives, Scene, build_grid
+from barsight.simulation.scene import Scene
 from barsight.simulation.settings import SimulationSettings
-from barsight.simulation.simulate import simulate
+from barsight.simulation.simulate import LaidYard, simulate
+from barsight.simulation.worlds.conditions import ASIDE_M
+from barsight.simulation.worlds.surfaces import draw_finishes, scene_of
+from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.inventory.bundle_file import read_bundles
@@ -28,51 +29,30 @@ from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
-ALBEDO = {"bar": 0.27, "strap": 0.13, "tag": 0.75, "beam": 0.36, "wall": 0.45, "stanchion": 0.2}
-CELLS_M = (0.09, 0.5)
 CELL_M, MARGIN_M = 0.01, 0.6
 WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
 """Noise of `noisy_world`: of each cell, and alike over cells."""
-ASIDE_M = 1.3
-"""Offset of the trolley from a yard's middle where a part of it is to be hidden."""
 
 
-def scene_of(yard: SolidYard, rng: np.random.Generator) -> Scene:
+def drawn_scene(world: DrawnYard) -> Scene:
     """Give the solids surfaces and sort them for the renderer."""
-    ordered = sorted(yard.solids, key=lambda s: not s.is_round)
-    shape = np.array([_shape(s) for s in ordered])
-    material = np.array([_material(s, rng) for s in ordered], dtype=np.float32)
-    primitives = Primitives(shape, material, sum(s.is_round for s in ordered))
-    return Scene(primitives, build_grid(primitives, CELLS_M))
+    rng = np.random.default_rng((29, world.seed))
+    return scene_of(world.yard, draw_finishes(world.yard.bundles, rng), rng)
 
 
-def _shape(solid: Solid) -> Float64:
-    sizes = [solid.half[1], solid.half[0], 0.0] if solid.is_round else solid.half
-    return np.concatenate([solid.centre, solid.axes.ravel(), sizes])
-
-
-def _material(solid: Solid, rng: np.random.Generator) -> list[float]:
-    albedo = ALBEDO[solid.part] * float(np.exp(rng.normal(0, 0.12)))
-    gloss = {"bar": 1.0, "strap": 0.5, "stanchion": 0.3}.get(solid.part, 0.0)
-    twist = float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08)) if solid.part == "bar" else 0.0
-    return [albedo, gloss * float(np.exp(rng.normal(0, 0.25))), *rng.uniform(0, 10, 2), twist,
-            float(rng.uniform(0.85, 1.15)), 0.0, 0.3 if solid.part == "tag" else 1.0]  # fmt: skip
-
-
-def recording_settings(world: DrawnWorld) -> SimulationSettings:
+def recording_settings(world: DrawnYard) -> SimulationSettings:
     """Choose a short recording over a world: small pictures, ten pairs for 3 m."""
     base, length = SimulationSettings.demo(), world.size_m[0]
-    aside = ASIDE_M * (-1 if world.seed // 8 % 2 else 1) if world.hides else base.camera.trolley_y_m
+    aside = ASIDE_M * (-1 if world.seed // 10 % 2 else 1) if world.hides else base.camera.trolley_y_m
     return replace(
         base, seed=world.seed, length_m=length, frames=round(3 + 2.3 * length), depth_views=0,
         camera=replace(base.camera, trolley_y_m=aside),
     )  # fmt: skip
 
 
-def render_world(world: DrawnWorld, recording: Path) -> None:
+def render_world(world: DrawnYard, recording: Path) -> None:
     """Render a world as a recording."""
-    scene = scene_of(world.yard, np.random.default_rng((29, world.seed)))
-    simulate(recording, recording_settings(world), scene=scene)
+    simulate(recording, recording_settings(world), laid=LaidYard(drawn_scene(world), {}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +77,7 @@ def measured_world(out: Path, settings: LiftSettings) -> MappedWorld:
     return _mapped(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
 
 
-def noisy_world(world: DrawnWorld, settings: LiftSettings) -> MappedWorld:
+def noisy_world(world: DrawnYard, settings: LiftSettings) -> MappedWorld:
     """Draw noise onto the exact heights of every cell, and find the bundles in that: all is seen, nothing is
     smoothed; no travel is known.
     """

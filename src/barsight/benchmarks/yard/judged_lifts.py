@@ -18,9 +18,9 @@ from scipy.stats import beta
 
 from barsight.benchmarks.lift_judge.judge import Judge, Target
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
-from barsight.benchmarks.lift_judge.worlds import DrawnWorld
 from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld
+from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, assess_placement
 from barsight.yard.lifting.targets import plan_lifts
@@ -85,7 +85,7 @@ class JudgedBench:
 
 
 def judge_yard(
-    world: DrawnWorld, mapped: MappedWorld, magnet: Magnet, judged: JudgedMagnet, settings: LiftSettings,
+    world: DrawnYard, mapped: MappedWorld, magnet: Magnet, judged: JudgedMagnet, settings: LiftSettings,
     placements: int,
 ) -> Iterator[JudgedLift]:  # fmt: skip
     """Assess and judge the offered lifts and so many placements of one world."""
@@ -106,7 +106,7 @@ def judge_yard(
         yield _judged(world, lift, judge, judged, offered=False)
 
 
-def _over(world: DrawnWorld, bundle: int) -> Placement:
+def _over(world: DrawnYard, bundle: int) -> Placement:
     _, centre = world.yard.load(bundle)
     along = world.yard.bars(bundle)[0].axes[0]
     return Placement(float(centre[0]), float(centre[1]), math.atan2(-along[0], along[1]))
@@ -118,9 +118,7 @@ def _beside(middle: Placement, rng: np.random.Generator) -> Placement:
     return Placement(float(x), float(y), middle.yaw_rad + float(turn))
 
 
-def _judged(
-    world: DrawnWorld, lift: Lift, judge: Judge, magnet: JudgedMagnet, *, offered: bool
-) -> JudgedLift:
+def _judged(world: DrawnYard, lift: Lift, judge: Judge, magnet: JudgedMagnet, *, offered: bool) -> JudgedLift:
     place, contact = lift.place, lift.contact
     target = Target(place.x_m, place.y_m, place.yaw_rad, magnet.tolerance)
     if not lift.vetoes and contact is not None:

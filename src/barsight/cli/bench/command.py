@@ -22,6 +22,7 @@ from barsight.cli.bench.bundles import bench_found_bundles
 from barsight.cli.bench.length import bench_length
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.cli.bench.live import bench_live_estimate
+from barsight.cli.bench.worlds import bench_worlds
 from barsight.cli.bench.yard import bench_yard
 from barsight.core.errors import ConfigError
 from barsight.stereo.direct.pipeline import BarsightSettings
@@ -43,6 +44,7 @@ def run(arguments: Sequence[str]) -> None:
         "yard": bench_yard,
         "bundles": bench_found_bundles,
         "lifts": bench_lift_targets,
+        "worlds": bench_worlds,
         "features": matching.features,
         "matching": matching.matching,
         "front-end": matching.front_end,

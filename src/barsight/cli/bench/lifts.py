@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +10,6 @@ import tyro
 from rich.console import Console
 
 from barsight.benchmarks.lift_judge.magnet import read_magnet
-from barsight.benchmarks.lift_judge.worlds import DrawnWorld, draw_world
 from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld, measured_world, noisy_world, render_world
 from barsight.benchmarks.yard.judged_lifts import (
@@ -21,10 +19,12 @@ from barsight.benchmarks.yard.judged_lifts import (
     dangerous_table,
     judge_yard,
 )
+from barsight.cli.bench.seeds import parse_seeds
 from barsight.cli.progress import stages
 from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
+from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet.description import example_magnet, load_magnet
 
@@ -44,18 +44,19 @@ def bench_lift_targets(
 ) -> None:
     """Judge offered lifts and random placements on drawn yards by exact geometry.
 
-    The yards are irregular bundles among beams, walls and stanchions, leaning, askew and along X, partly out
-    of sight. Counts what is dangerous and not vetoed, and what is fine and vetoed.
+    The yards are irregular bundles and heaps of bars, settled by physics among beams, walls and stanchions,
+    askew and along X, partly out of sight. Counts what is dangerous and not vetoed, and what is fine and
+    vetoed.
 
     Args:
-        seeds: Seeds of the yards, first:last, the last not included; the kind of yard is the seed modulo 8.
+        seeds: Seeds of the yards, first:last, the last not included; the kind of yard is the seed modulo 10.
         placements: Random placements on each yard, beside the lifts that are offered there.
         rendered: Render and measure each yard, a minute of computing; without it the exact map gets noise.
         keep: Folder for the rendered yards; what is finished there is not done again.
         magnet: TOML file of the magnet; an example is assumed without it.
         save: JSON file for all placements, with commit and machine.
     """
-    numbers = _numbers(seeds)
+    numbers = parse_seeds(seeds, "bench lifts")
     if placements < 0:
         raise ConfigError(f"bench lifts: placements must be 0 or more, not {placements}")
     described, settings = load_magnet(magnet), LiftSettings()
@@ -66,7 +67,7 @@ def bench_lift_targets(
             described_at.write_text(example_magnet(), encoding="utf-8")
         judged = read_magnet(described_at)
         for done, seed in enumerate(numbers):
-            world = draw_world(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M)
+            world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
             folder = (keep or Path(scratch)) / f"seed_{seed}"
             mapped = _measured(world, folder, settings) if rendered else noisy_world(world, settings)
             found += judge_yard(world, mapped, described, judged, settings, placements)
@@ -79,14 +80,7 @@ def bench_lift_targets(
         Console().print(dangerous_table(bench))
 
 
-def _numbers(seeds: str) -> range:
-    match = re.fullmatch(r"(\d+):(\d+)", seeds)
-    if match is None or int(match[2]) <= int(match[1]):
-        raise ConfigError(f"bench lifts: seeds {seeds!r} is not like 500:560, the last not included")
-    return range(int(match[1]), int(match[2]))
-
-
-def _measured(world: DrawnWorld, folder: Path, settings: LiftSettings) -> MappedWorld:
+def _measured(world: DrawnYard, folder: Path, settings: LiftSettings) -> MappedWorld:
     """Render and measure the yard where its folders are not there yet."""
     recording, out = folder / "recording", folder / "measured"
     folder.mkdir(parents=True, exist_ok=True)

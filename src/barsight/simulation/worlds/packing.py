@@ -1,4 +1,4 @@
-"""Pack round bars as they lie when they are strapped: drawn together at random, in no full hexagon."""
+"""BarPack round bars as they lie when they are strapped: drawn together at random, in no full hexagon."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import math
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from barsight.benchmarks.lift_judge.solids import Part, Solid, cylinder
 from barsight.core.arrays import Float64, kernel
+from barsight.simulation.worlds.solids import Part, Solid, cylinder
 
 STRAP_M = (0.032, 0.0012)
 """Width and thickness of a strap."""
 
 
 def packed(count: int, diameter_m: float, rng: np.random.Generator) -> Float64:
-    """Pack discs (count, 2): attracted to their middle and a little downwards, pushed off each other.
+    """BarPack discs (count, 2): attracted to their middle and a little downwards, pushed off each other.
 
     They shake less and less, some long enough to find a lattice, most not, and lie apart by 0.1 % of their
     diameter at the end.

@@ -1,0 +1,161 @@
+"""Render, measure and score drawn worlds; what is kept is done again only where it must."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tomllib
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import barsight
+from barsight.benchmarks.yard.world_scores import WorldScore, score_world
+from barsight.core.errors import BarsightError, ConfigError, OutputError
+from barsight.core.files import atomic_path
+from barsight.core.json_values import json_digest, json_value
+from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.worlds.recording import GENERATOR, draw_world, simulate_world
+
+NOTE = "world.json"
+LIST = "looked_at.toml"
+DRAWS = ("simulation", "calibration/geometry")
+"""Packages that decide what a seed's recording is,"""
+MEASURES_NOT = ("simulation", "benchmarks", "cli", "viewer", "evaluation")
+"""those that don't decide what is measured from it,"""
+SCORES = ("benchmarks/yard", "evaluation")
+"""and those that decide the score."""
+Measure = Callable[[Path, Path], object]
+
+
+@dataclass(frozen=True)
+class WorldKeys:
+    """Digests of what recording, measurement and score of every seed depend on."""
+
+    recording: str
+    measured: str
+    score: str
+
+    @classmethod
+    def of(cls, given: SimulationSettings) -> WorldKeys:
+        """Compute them from the settings and the package's sources."""
+        root = Path(barsight.__file__).parent
+        measuring = [path.name for path in root.iterdir() if path.name not in (*MEASURES_NOT, "__pycache__")]
+        drawn = json_digest([GENERATOR, json_value(asdict(given)), _sources(root, DRAWS)])
+        measured = json_digest([drawn, _sources(root, measuring)])
+        return cls(drawn, measured, json_digest([measured, _sources(root, SCORES)]))
+
+
+def run_world(
+    folder: Path, seed: int, given: SimulationSettings, keys: WorldKeys, measure: Measure, looked_at: str
+) -> WorldScore:
+    """Score one world in `folder`, with what is kept there of it: recording, measured folder, scores.
+
+    measure: measures a recording into a folder. looked_at: why the seed counts as looked at from now on;
+    empty where it does not. What the product refuses to measure is a score too. Raises OutputError for a
+    folder that is not of this bench.
+    """
+    note = _read_note(folder)
+    recording, out = folder / "recording", folder / "measured"
+    note["looked_at"] = looked_at or note.get("looked_at", "") or looked_at_list().get(seed, "")
+    if note.get("recording") != keys.recording:
+        _remove(recording, out)
+        note = {"looked_at": note["looked_at"], "recording": keys.recording}
+    if not recording.is_dir():
+        simulate_world(recording, draw_world(seed, given))
+    if note.get("measured") != keys.measured:
+        _remove(out)
+        note |= {"refused": "", "score": ""}
+        try:
+            measure(recording, out)
+        except BarsightError as error:
+            note["refused"] = str(error)
+        note["measured"] = keys.measured
+        _write_note(folder, note)
+    done = None if note["refused"] else out
+    if note.get("score") != keys.score:
+        score = score_world(recording, done, note["looked_at"], note["refused"])
+        note |= {"score": keys.score, "scores": json_value(asdict(score))}
+    note["scores"]["looked_at"] = note["looked_at"]
+    _write_note(folder, note)
+    return _score(note["scores"])
+
+
+def looked_at_list() -> dict[int, str]:
+    """Read the project's list of seeds that were looked at while something was set, with why."""
+    content = tomllib.loads((files("barsight.benchmarks.yard") / LIST).read_text(encoding="utf-8"))
+    return {
+        seed: entry["why"]
+        for entry in content.get("seeds", [])
+        if entry["generator"] == GENERATOR
+        for seed in range(entry["first"], entry["last"] + 1)
+    }
+
+
+def run_worlds(
+    keep: Path,
+    seeds: Iterable[int],
+    given: SimulationSettings,
+    measure: Measure,
+    looked_at: str,
+    progress: Callable[[WorldScore], None],
+) -> tuple[WorldScore, ...]:
+    """Score the worlds of the seeds, each in its own folder of `keep`; progress: called after each."""
+    keys = WorldKeys.of(given)
+    scores = []
+    for seed in seeds:
+        folder = keep / f"seed_{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        scores.append(run_world(folder, seed, given, keys, measure, looked_at))
+        progress(scores[-1])
+    return tuple(scores)
+
+
+def _read_note(folder: Path) -> dict[str, Any]:
+    path = folder / NOTE
+    if not path.is_file():
+        if any(one.name not in ("recording", "measured") for one in folder.iterdir()):
+            raise OutputError(f"{folder}: holds other things; name another folder with --keep")
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except ValueError as error:
+        raise ConfigError(f"{path}: is torn; remove it, and the world is done anew") from error
+
+
+def _write_note(folder: Path, note: dict[str, Any]) -> None:
+    with atomic_path(folder / NOTE) as path:
+        path.write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
+
+
+def _remove(*folders: Path) -> None:
+    for folder in folders:
+        if folder.is_dir():
+            shutil.rmtree(folder)
+
+
+def _score(content: dict[str, Any]) -> WorldScore:
+    """Make a score of what JSON kept of it: null for NaN, lists for tuples."""
+
+    def numbers(values: list[float | None]) -> list[float]:
+        return [float("nan") if v is None else v for v in values]
+
+    return WorldScore(
+        content["seed"], content["kind"], tuple(content["conditions"]), content["looked_at"],
+        content["refused"], content["maps"], content["poses"], content["counts"],
+        {name: numbers(values) for name, values in content["errors"].items()},
+        {name: numbers(values) for name, values in content["sigmas"].items()},
+    )  # fmt: skip
+
+
+def _sources(root: Path, names: Iterable[str]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(names):
+        path = root / name
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            if file.suffix == ".py":
+                digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,277 @@
+"""Score the measurement of a drawn world against its truth: map, contours, poses, bundles; tabulate many."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from barsight.benchmarks.provenance import Provenance
+from barsight.benchmarks.yard.bundle_scores import TrueBundle, read_true_bundles, score_bundles
+from barsight.core.arrays import Float64
+from barsight.core.pose import Pose
+from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import PosedFrame, Trajectory
+from barsight.evaluation.score import score_folder
+from barsight.evaluation.trajectory_error import frame_errors
+from barsight.recording.formats.ground_truth import read_ground_truth
+from barsight.result_folder import read_summary
+from barsight.yard.inventory.bundle_file import read_bundles
+
+TWO_SIDED = 1.959964
+SEEN_FRAMES, SEEN_RATIO = 2, 0.5
+"""A bundle is asked for where so many frames see at least this share of its axis in both cameras."""
+MAP_ROWS = ("contour, smooth places", "contour, everywhere", "height, smooth stack", "height, seen by two")
+BUNDLE_ROWS = {
+    "lateral": "mm", "yaw": "deg", "top": "mm", "width": "mm", "diameter": "mm", "low end": "mm",
+    "high end": "mm", "mass": "kg",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WorldScore:
+    """Scores of one world. refused: why it could not be measured, empty where it was.
+
+    maps: as `score_folder` has them, mm. poses: of the ground below the frames. counts: free bundles in
+    sight, how many were found, bundles said to be free, how many of those are wrong, at how many of those no
+    bundle lies whether free or not, how often a number of bars was said and right, single bars in sight and
+    found. errors, sigmas: by figure of the bundles that
+    were found, m (yaw rad, mass t).
+    """
+
+    seed: int
+    kind: str
+    conditions: tuple[str, ...]
+    looked_at: str
+    refused: str
+    maps: dict[str, dict[str, float]]
+    poses: dict[str, float]
+    counts: dict[str, int]
+    errors: dict[str, list[float]]
+    sigmas: dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class WorldRow:
+    """One figure over the worlds of a kind. n: samples of the interval's share; seed: of the worst."""
+
+    kind: str
+    figure: str
+    n: int
+    median: float
+    worst: float
+    seed: int
+    within_95_pct: float
+
+
+@dataclass(frozen=True)
+class WorldBench:
+    """All worlds and what they give together."""
+
+    worlds: tuple[WorldScore, ...]
+    rows: tuple[WorldRow, ...]
+    provenance: Provenance
+
+
+def score_world(recording: Path, out: Path | None, looked_at: str, refused: str) -> WorldScore:
+    """Score the folder that a world was measured into; out: None where measuring was refused."""
+    truth = json.loads((recording / "truth" / "world.json").read_text(encoding="utf-8"))
+    names = tuple(name for name, holds in truth["conditions"].items() if holds)
+    known = (truth["seed"], truth["kind"], names, looked_at, refused)
+    if out is None:
+        return WorldScore(*known, {}, {}, {}, {}, {})
+    maps = {name: dict(figures) for name, figures in score_folder(recording, out).items()}
+    true = read_true_bundles(recording)
+    loose = [bool(row.get("is_loose")) for row in _rows(recording)]
+    shown = _shown(recording, true)
+    bundles = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and not alone)
+    bars = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and alone)
+    found = read_bundles(out / "bundles.json")
+    lying = tuple(replace(t, on_top=True) for t in true)
+    scores, single, every, anywhere = (score_bundles(found, part) for part in (bundles, bars, true, lying))
+    counts = {
+        "free": scores.free, "found": scores.found, "claimed": every.claimed, "wrong": every.wrong,
+        "said_count": scores.said_count, "right_count": scores.right_count, "single": single.free,
+        "single_found": single.found, "nowhere": anywhere.wrong,
+    }  # fmt: skip
+    errors = {name: [float(v) for v in values] for name, values in scores.errors.items()}
+    sigmas = {name: [float(v) for v in values] for name, values in scores.sigmas.items()}
+    return WorldScore(*known, maps, _poses(recording, out), counts, errors, sigmas)
+
+
+def world_rows(worlds: Sequence[WorldScore]) -> tuple[WorldRow, ...]:
+    """Compute the rows of all worlds together, then of each kind."""
+    rows: list[WorldRow] = []
+    for kind in ("all", *sorted({w.kind for w in worlds})):
+        part = [w for w in worlds if kind in ("all", w.kind) and not w.refused]
+        rows += _map_rows(kind, part)
+        rows += _bundle_rows(kind, part)
+    return tuple(rows)
+
+
+def world_table(bench: WorldBench) -> Table:
+    """Tabulate for people: medians, worst cases with their seed, shares in the stated 95 %."""
+    worlds = bench.worlds
+    refused = [w for w in worlds if w.refused]
+    looked = sum(bool(w.looked_at) for w in worlds)
+    title = f"{len(worlds)} worlds, {len(refused)} of them refused, {looked} looked at before"
+    table = Table("kind", "figure", title=title, box=SIMPLE_HEAD)
+    for head in ("n", "median", "worst", "seed", "in 95 %"):
+        table.add_column(head, justify="right")
+    last = ""
+    for row in bench.rows:
+        if row.kind != last and last:
+            table.add_section()
+        share = f"{row.within_95_pct:.1f}" if math.isfinite(row.within_95_pct) else "-"
+        table.add_row(
+            row.kind if row.kind != last else "", row.figure, str(row.n), f"{row.median:.4g}",
+            f"{row.worst:.4g}", str(row.seed) if row.seed >= 0 else "-", share,
+        )  # fmt: skip
+        last = row.kind
+    return table
+
+
+def world_list(bench: WorldBench) -> Table:
+    """List the worlds: kind, conditions, whether looked at, what is found, why refused."""
+    table = Table("seed", "kind", "conditions", "looked at", "found", "false", box=SIMPLE_HEAD)
+    for w in bench.worlds:
+        c = w.counts
+        found = f"{c['found']} of {c['free']}" if c else w.refused
+        wrong = f"{c['wrong']} of {c['claimed']}" if c else "-"
+        table.add_row(str(w.seed), w.kind, ", ".join(w.conditions) or "-", w.looked_at or "-", found, wrong)
+    return table
+
+
+def _map_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
+    for name in MAP_ROWS:
+        figures = [(w.maps[name], w.seed) for w in worlds if w.maps.get(name, {}).get("samples")]
+        yield from _over_worlds(kind, f"{name}: P95, mm", figures, "p95_mm", max)
+        if name == "height, seen by two":
+            yield from _over_worlds(
+                kind, "cells seen by two that are measured, %", figures, "coverage_pct", min
+            )
+    yield from _over_worlds(
+        kind,
+        "ground below the frames: RMSE, mm",
+        [(w.poses, w.seed) for w in worlds if w.poses],
+        "rmse_mm",
+        max,
+    )
+
+
+def _over_worlds(
+    kind: str, name: str, figures: list[tuple[dict[str, float], int]], key: str,
+    worst: Callable[[list[tuple[float, int]]], tuple[float, int]],
+) -> Iterable[WorldRow]:  # fmt: skip
+    """Take the median and the worst of one figure over the worlds, its share weighted by their samples."""
+    values = [(one[key], seed) for one, seed in figures if key in one]
+    if not values:
+        return
+    samples = np.array([one["samples"] for one, _ in figures])
+    inside = np.array([one["within_95_pct"] for one, _ in figures])
+    share = float((samples * inside).sum() / samples.sum()) if key != "coverage_pct" else math.nan
+    bad, seed = worst(values)
+    n = round(samples.sum())
+    yield WorldRow(kind, name, n, float(np.median([v for v, _ in values])), bad, seed, share)
+
+
+def _bundle_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
+    for name, unit in BUNDLE_ROWS.items():
+        errors = np.concatenate(
+            [np.array(w.errors.get(name, []), np.float64) for w in worlds] or [np.empty(0)]
+        )
+        sigmas = np.concatenate(
+            [np.array(w.sigmas.get(name, []), np.float64) for w in worlds] or [np.empty(0)]
+        )
+        seeds = np.concatenate(
+            [np.full(len(w.errors.get(name, [])), w.seed) for w in worlds] or [np.empty(0)]
+        )
+        known = np.isfinite(errors)
+        if not known.any():
+            continue
+        size = np.abs(errors[known]) * (np.degrees(1.0) if unit == "deg" else 1e3)
+        inside = np.abs(errors[known]) <= TWO_SIDED * sigmas[known]
+        k = int(size.argmax())
+        yield WorldRow(
+            kind, f"bundles: {name}, {unit}", len(size), float(np.median(size)), float(size[k]),
+            int(seeds[known][k]), 100 * float(inside.mean()),
+        )  # fmt: skip
+    for name, part, whole in (
+        ("free bundles found, %", "found", "free"),
+        ("said to be free and is not, %", "wrong", "claimed"),
+        ("said to be free where no bundle lies so, %", "nowhere", "claimed"),
+        ("number of bars right where said, %", "right_count", "said_count"),
+        ("single bars found, %", "single_found", "single"),
+    ):
+        shares = [
+            (100 * w.counts[part] / w.counts[whole], w.seed) for w in worlds if w.counts.get(whole, 0) > 0
+        ]
+        if shares:
+            bad, seed = (max if whole == "claimed" else min)(shares)
+            count = sum(w.counts[whole] for w in worlds)
+            yield WorldRow(kind, name, count, float(np.median([v for v, _ in shares])), bad, seed, math.nan)
+
+
+def _rows(recording: Path) -> list[dict[str, Any]]:
+    text = (recording / "truth" / "bundles.json").read_text(encoding="utf-8")
+    return list(json.loads(text))
+
+
+def _shown(recording: Path, true: tuple[TrueBundle, ...]) -> list[bool]:
+    """Tell which bundles the cameras had in view, by the truth's count of frames along their axes."""
+    with np.load(recording / "truth" / "height.npz") as truth:
+        x, y, visible = truth["x"], truth["y"], truth["visible"]
+    out = []
+    for t in true:
+        along = np.linspace(-0.5, 0.5, 41) * t.length_m
+        px, py = t.centre_m[0] - along * np.sin(t.yaw_rad), t.centre_m[1] + along * np.cos(t.yaw_rad)
+        i, j = (np.rint((p - axis[0]) / (axis[1] - axis[0])).astype(int) for p, axis in ((px, x), (py, y)))
+        inside = (i >= 0) & (j >= 0) & (i < len(x)) & (j < len(y))
+        seen = inside & (visible[i * inside, j * inside] >= SEEN_FRAMES)
+        out.append(bool(seen.mean() >= SEEN_RATIO))
+    return out
+
+
+def _poses(recording: Path, out: Path) -> dict[str, float]:
+    """Compare the ground below each frame, as its pose places it, with truth; empty in `world`."""
+    summary = read_summary(out)
+    travel = summary.get("travel")
+    if summary["reference"] != "yard" or not travel:
+        return {}
+    path = read_ground_truth(out / "trajectory.tum", reference="yard")
+    frames = tuple(
+        PosedFrame(int(stamp), pose, np.zeros((6, 6)))
+        for stamp, pose in zip(path.stamp_ns, path.poses, strict=True)
+    )
+    rig = json.loads((recording / "truth" / "rig.json").read_text(encoding="utf-8"))
+    shift = seconds_to_ns(rig["time_offset_s"])
+    found = frame_errors(
+        Trajectory("yard", frames, (), ()), read_ground_truth(recording, reference="yard"), shift
+    )
+    if found is None:
+        return {}
+    poses: dict[int, Pose] = {frame.stamp_ns: frame.reference_from_body for frame in frames}
+    sigma_of = dict(zip(travel["stamp_ns"], travel["sigma_m"], strict=True))
+    errors, sigmas = [], []
+    for stamp, place, turn in zip(found.stamp_ns.tolist(), found.place_m, found.turn_rad, strict=True):
+        if stamp in sigma_of:
+            down = np.array([0.0, 0.0, -poses[stamp].translation[2]])
+            errors.append(place + np.cross(turn, down))
+            sigmas.append(sigma_of[stamp])
+    if not errors:
+        return {}
+    error: Float64 = np.array(errors)
+    inside = np.abs(error) <= TWO_SIDED * np.array(sigmas, np.float64)
+    return {
+        "samples": float(error.size),
+        "rmse_mm": 1e3 * float(np.sqrt((error**2).sum(axis=1).mean())),
+        "max_mm": 1e3 * float(np.linalg.norm(error, axis=1).max()),
+        "within_95_pct": 100 * float(inside.mean()),
+    }

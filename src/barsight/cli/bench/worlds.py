@@ -1,0 +1,78 @@
+"""Run `barsight bench worlds`."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from barsight.benchmarks.provenance import provenance, write_json
+from barsight.benchmarks.yard.kept_worlds import run_worlds
+from barsight.benchmarks.yard.world_scores import (
+    WorldBench,
+    WorldScore,
+    world_list,
+    world_rows,
+    world_table,
+)
+from barsight.cli.bench.seeds import parse_seeds
+from barsight.core.errors import ConfigError
+from barsight.measure_folder import measure_into
+from barsight.measure_settings import MeasureSettings
+from barsight.simulation.settings import CameraSettings, SimulationSettings
+
+WIDTH_PX, FOCAL_PX, ASPECT = 1280, 1250.0, 0.8
+
+
+def bench_worlds(
+    seeds: str = "1000:1006",
+    keep: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
+    looked_at: str = "",
+    length_m: float = 3.5,
+    frames: int = 10,
+    width_px: int = 640,
+    save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+) -> None:
+    """Draw whole worlds, render and measure them, and score map, poses and bundles against truth.
+
+    A world takes about a minute of computing in small pictures. The table has medians, worst cases and the
+    shares in the stated 95 % intervals, over all worlds and by kind.
+
+    Args:
+        seeds: Seeds of the worlds, first:last, the last not included; the kind is the seed modulo 10.
+        keep: Folder for the worlds. What is finished there is not done again, unless the sources or settings
+            that it depends on have changed.
+        looked_at: Why these seeds count as looked at from now on, such as a threshold that is set on them;
+            kept in the folder and said in the tables.
+        length_m: Length of each world, about.
+        frames: Stereo pairs over that length.
+        width_px: Width of the pictures; they show as much of the yard at any width.
+        save: JSON file for all figures, with commit and machine.
+    """
+    numbers = parse_seeds(seeds, "bench worlds")
+    if looked_at and keep is None:
+        raise ConfigError("bench worlds: --looked-at is kept in a folder: name it with --keep")
+    camera = CameraSettings(
+        width_px=width_px, height_px=round(ASPECT * width_px), focal_px=FOCAL_PX * width_px / WIDTH_PX
+    )
+    given = SimulationSettings(length_m=length_m, frames=frames, depth_views=0, camera=camera)
+    console = Console()
+
+    def tell(score: WorldScore) -> None:
+        what = score.refused or f"{score.counts['found']} of {score.counts['free']} free bundles found"
+        console.print(f"seed {score.seed}, {score.kind}: {what}", highlight=False, markup=False)
+
+    with tempfile.TemporaryDirectory() as scratch:
+        worlds = run_worlds(keep or Path(scratch), numbers, given, _measure, looked_at, tell)
+    bench = WorldBench(worlds, world_rows(worlds), provenance())
+    console.print(world_list(bench))
+    console.print(world_table(bench))
+    if save is not None:
+        write_json(save, bench)
+
+
+def _measure(recording: Path, out: Path) -> None:
+    measure_into(recording, out, MeasureSettings(), report=False, judged_at="end")

@@ -1,0 +1,1 @@
+"""Draw whole worlds from a seed: piles settled by physics, what stands about, crane, light, faults."""

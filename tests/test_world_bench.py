@@ -1,0 +1,137 @@
+"""The bench of drawn worlds: its scores by hand, what is kept, what counts as looked at."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from barsight.benchmarks.yard import kept_worlds, world_scores
+from barsight.benchmarks.yard.bundle_scores import TrueBundle, bars_mass, score_bundles
+from barsight.benchmarks.yard.kept_worlds import WorldKeys, looked_at_list, run_world
+from barsight.benchmarks.yard.world_scores import WorldScore, world_rows
+from barsight.cli.main import run
+from barsight.core.errors import MeasurementError, OutputError
+from barsight.simulation.settings import CameraSettings, SimulationSettings
+from lift_yards import laid, record
+
+GIVEN = SimulationSettings(
+    length_m=1.6, frames=4, depth_views=0,
+    camera=CameraSettings(width_px=160, height_px=128, focal_px=156.0),
+)  # fmt: skip
+MAP = {"samples": 100.0, "p95_mm": 8.0, "within_95_pct": 90.0, "coverage_pct": 99.0}
+COUNTS = {
+    "free": 4, "found": 3, "claimed": 4, "wrong": 1, "said_count": 2, "right_count": 1, "single": 0,
+    "single_found": 0, "nowhere": 0,
+}  # fmt: skip
+
+
+def world(seed: int, kind: str, p95_mm: float, samples: float, inside: float) -> WorldScore:
+    figures = MAP | {"p95_mm": p95_mm, "samples": samples, "within_95_pct": inside}
+    errors = {"top": [0.001 * seed, -0.004, float("nan")]}
+    sigmas = {"top": [0.002, 0.001, 0.001]}
+    poses = {"samples": 6.0, "rmse_mm": 2.0, "max_mm": 3.0, "within_95_pct": 50.0}
+    return WorldScore(seed, kind, (), "", "", {"height, seen by two": figures}, poses, COUNTS, errors, sigmas)
+
+
+def test_rows_are_medians_worst_cases_and_weighted_shares() -> None:
+    refused = replace(world(9, "loose", 0.0, 1.0, 0.0), refused="too dark", maps={}, counts={})
+    worlds = [world(1, "loose", 10.0, 100.0, 100.0), world(2, "nested", 30.0, 300.0, 80.0), refused]
+    rows = {(row.kind, row.figure): row for row in world_rows(worlds)}
+    cells = rows["all", "height, seen by two: P95, mm"]
+    assert (cells.n, cells.median, cells.worst, cells.seed) == (400, 20.0, 30.0, 2)
+    assert cells.within_95_pct == pytest.approx(85)
+    assert rows["loose", "height, seen by two: P95, mm"].worst == 10
+    top = rows["all", "bundles: top, mm"]
+    assert (top.n, top.worst, top.seed) == (4, 4.0, 1) and top.median == pytest.approx(3.0)
+    assert top.within_95_pct == pytest.approx(50)
+    found = rows["all", "free bundles found, %"]
+    assert (found.n, found.median) == (8, 75.0)
+    assert rows["all", "said to be free and is not, %"].worst == 25
+    assert ("all", "single bars found, %") not in rows
+
+
+def test_a_mass_is_held_against_the_true_bars() -> None:
+    found = record(laid(0.3))
+    assert found.bars is not None
+    mass = bars_mass(found.bars, found.bar_diameter_m, found.length_m)
+    true = TrueBundle(
+        found.centre_m, found.yaw_rad, found.length_m, found.width_m, found.top_z_m, found.bar_diameter_m,
+        found.bars, 0, True, mass + 30.0,
+    )  # fmt: skip
+    scores = score_bundles((found,), (true,))
+    assert scores.found == 1 and 1e3 * scores.errors["mass"][0] == pytest.approx(-30)
+
+
+def test_poses_are_scored_on_the_ground_below(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A body 5 mm too far along x, and turned by 1 mrad about y: 8 mm on the ground 8 m below."""
+    recording, out = tmp_path / "recording", tmp_path / "out"
+    truth = recording / "mav0/state_groundtruth_estimate0"
+    for folder in (truth, recording / "truth", out):
+        folder.mkdir(parents=True)
+    head = "#timestamp [ns],p_x,p_y,p_z,q_w,q_x,q_y,q_z\n"
+    rows = [f"{10**15 + k * 10**8},{0.1 * k:.4f},0,8,1,0,0,0\n" for k in range(10)]
+    (truth / "data.csv").write_text(head + "".join(rows))
+    (recording / "truth/rig.json").write_text(json.dumps({"time_offset_s": 0.05}))
+    stamps = [10**15 + k * 10**8 - 5 * 10**7 for k in range(2, 8)]
+    tum = [
+        f"{t // 10**9}.{t % 10**9:09d} {0.1 * k + 0.005:.4f} 0 8 0 0.0005 0 1\n"
+        for k, t in enumerate(stamps, 2)
+    ]
+    (out / "trajectory.tum").write_text("# t x y z qx qy qz qw\n" + "".join(tum))
+    travel = {"stamp_ns": stamps, "sigma_m": [[0.01, 0.001, 0.001]] * 6}
+    monkeypatch.setattr(world_scores, "read_summary", lambda _: {"reference": "yard", "travel": travel})
+    poses = world_scores._poses(recording, out)
+    assert poses["samples"] == 18 and poses["within_95_pct"] == 100
+    assert poses["rmse_mm"] == pytest.approx(3.0, abs=0.01)  # 5 mm forward, 8 mm back by the turn
+    travel["sigma_m"] = [[0.001, 0.001, 0.001]] * 6
+    assert world_scores._poses(recording, out)["within_95_pct"] == pytest.approx(200 / 3)
+
+
+def test_a_world_is_done_once_and_a_refusal_is_a_score(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise MeasurementError("too dark")
+
+    folder = tmp_path / "seed_101"
+    folder.mkdir()
+    keys = WorldKeys.of(GIVEN)
+    first = run_world(folder, 101, GIVEN, keys, refuse, "")
+    assert (first.seed, first.refused, first.looked_at) == (101, "too dark", "") and not first.maps
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("done again")
+
+    monkeypatch.setattr(kept_worlds, "simulate_world", never)
+    assert run_world(folder, 101, GIVEN, keys, never, "a threshold") == replace(
+        first, looked_at="a threshold"
+    )
+    assert run_world(folder, 101, GIVEN, keys, never, "").looked_at == "a threshold"
+    with pytest.raises(AssertionError, match="done again"):
+        run_world(folder, 101, GIVEN, replace(keys, measured="other sources"), never, "")
+    with pytest.raises(AssertionError, match="done again"):
+        run_world(folder, 101, GIVEN, replace(keys, recording="other settings"), never, "")
+    assert not (folder / "recording").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match="other things"):
+        run_world(tmp_path / "mine", 1, GIVEN, keys, never, "")
+
+
+def test_keys_follow_settings() -> None:
+    one, two = WorldKeys.of(GIVEN), WorldKeys.of(replace(GIVEN, frames=5))
+    assert one == WorldKeys.of(GIVEN) and one.recording != two.recording and one.score != two.score
+
+
+def test_seeds_that_were_looked_at_are_listed() -> None:
+    listed = looked_at_list()
+    assert listed[0] and 10**6 not in listed
+
+
+@pytest.mark.parametrize("flags", [["--seeds", "5"], ["--seeds", "5:5"], ["--looked-at", "why"]])
+def test_mistakes_end_in_one_line(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["bench", "worlds", *flags]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
