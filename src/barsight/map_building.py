@@ -33,6 +33,7 @@ from barsight.mapping.scene_extent import (
 )
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.tiles import TileStore
+from barsight.mapping.top_photo import TopPhoto
 from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Preview, Refusal, to_json
@@ -99,6 +100,7 @@ class BuiltMap:
 
     store: TileStore
     free: FreeSpace
+    tops: TopPhoto
     placed: tuple[Pose, ...]
     stamps_ns: tuple[int, ...]
     refusals: tuple[Refusal, ...]
@@ -194,7 +196,8 @@ def build_map(
     placer = PointBinner(
         way.stereo, body_from_rect0, probed.cell_m, probed.per_pixel, settings.map.max_sigma_m, watch
     )
-    store, free = TileStore(scratch, settings.map.resident_tiles), FreeSpace(probed.cell_m)
+    store = TileStore(scratch, settings.map.resident_tiles)
+    free, tops = FreeSpace(probed.cell_m), TopPhoto(probed.cell_m)
     preview = None
     placed: list[Pose] = []
     stamps: list[int] = []
@@ -211,6 +214,8 @@ def build_map(
             stamps.append(posed.stamp_ns)
             with watch("free space", 1):
                 free.carve(view.cells, ViewFrusta.of([placed[-1]], camera).eyes[0])
+            with watch("top photo", 1):
+                tops.add(view.cells, frame.pair, placed[-1])
             if preview is None or abs(done - len(way.poses) / 2) < 1:
                 preview = Preview(view.left, view.disparity_px)
         if done % _TIDIED_EVERY == 1:
@@ -218,7 +223,7 @@ def build_map(
         advance("map", done, len(way.poses))
     if not placed:
         raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
-    return BuiltMap(store, free, tuple(placed), tuple(stamps), tuple(refusals), preview)
+    return BuiltMap(store, free, tops, tuple(placed), tuple(stamps), tuple(refusals), preview)
 
 
 def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
