@@ -1,24 +1,35 @@
 """Lay thin loose bars across drawn yards, render and measure them, and score what is found of them.
 
-`python benchmarks/thin_bars.py SEED... --keep DIR`. The bars are drawn from geometry: each lies level on the
-highest solid under it. Nothing that finds them is used to lay them.
+`python benchmarks/thin_bars.py KEEP SEED...`: KEEP takes the yards. The bars are drawn from geometry: each
+lies level on the highest solid under it. Nothing that finds them is used to lay them. A seed after `plain` is
+taken as drawn, with none laid.
 """
 
 from __future__ import annotations
 
 import math
+import sys
+from collections import defaultdict
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from barsight.benchmarks.lift_judge.solids import NOTHING, Solid, SolidYard, cylinder, envelope
+from barsight.benchmarks.lift_judge.solids import Solid, SolidYard, cylinder, envelope
 from barsight.benchmarks.lift_judge.worlds import DrawnWorld, draw_world
+from barsight.benchmarks.yard.drawn_worlds import render_world
+from barsight.measure_folder import measure_into
+from barsight.measure_settings import MeasureSettings
+from barsight.result_folder import read_heights
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lifting.thin_bars import MAX_STRENGTH, line_strengths
+from barsight.yard.types import Bundle
 
-Array = NDArray[np.float64]
 DIAMETERS_M = (0.008, 0.012, 0.016, 0.020, 0.025, 0.030, 0.036)
 FIRST_NUMBER = 2000
 """Owner of the first bar that is laid; none of a drawn world's own is as high."""
+LOOSE_NUMBER = 1000
+"""The same of the single bars that a drawn world has itself."""
 BAR_LENGTH_M, SPAN_M = 5.4, 3.0
 SLOT_M = 0.6
 STANDS_OUT_M = 0.06
@@ -28,6 +39,8 @@ STANDS_OUT_M = 0.06
 def lay_thin_bars(seed: int) -> DrawnWorld:
     """Draw the yard of a seed and lay a thin bar across it every SLOT_M along its bars."""
     world = draw_world(seed, BAR_LENGTH_M, SPAN_M)
+    if not world.free:
+        raise SystemExit(f"seed {seed} draws a yard on which every bundle is covered")
     rng = np.random.default_rng((41, seed))
     number = FIRST_NUMBER
     for slot in np.arange(-2.2, 2.3, SLOT_M):
@@ -63,6 +76,67 @@ def _bar(world: DrawnWorld, slot: float, number: int, rng: np.random.Generator) 
     return cylinder("bar", np.array([*middle[:2], top + 0.0005 + radius]), direction, radius, length, number)
 
 
-def laid(world: DrawnWorld) -> tuple[Solid, ...]:
-    """Return the bars that were laid."""
-    return tuple(s for s in world.yard.solids if s.bundle >= FIRST_NUMBER and s.bundle != NOTHING)
+def crossings(world: DrawnWorld, bundle: Bundle) -> list[tuple[float, float, float, float]]:
+    """List the single bars across a found bundle: place along its axis from its middle, slope, the share of
+    its width that they cover, and diameter: NaN of one more than 0.05 m under or 0.15 m over its top."""
+    axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
+    frame, found = np.array([[axis[1], -axis[0]], axis]), []
+    for bar in (s for s in world.yard.solids if s.part == "bar" and s.bundle >= LOOSE_NUMBER):
+        ends = [bar.centre + side * bar.half[0] * bar.axes[0] - bundle.centre_m for side in (-1, 1)]
+        (u0, v0), (u1, v1) = sorted((frame @ end[:2]).tolist() for end in ends)
+        low, high = max(u0, -bundle.width_m / 2), min(u1, bundle.width_m / 2)
+        slope = (v1 - v0) / max(u1 - u0, 1e-6)
+        at = v0 - slope * u0
+        if high > low and abs(at) < bundle.length_m / 2 - 0.12:
+            on_it = -0.05 < bar.bounds[1, 2] - bundle.top_z_m < 0.15
+            diameter = 2 * float(bar.half[1]) if on_it else math.nan
+            found.append((at, slope, (high - low) / bundle.width_m, diameter))
+    return found
+
+
+def score(world: DrawnWorld, out: Path, found: dict[float, list[bool]], alarms: list[float]) -> None:
+    """Score a measured yard's uncovered bundles of 2 m and more: whether each bar that covers 0.9 of one's
+    width is found, by diameter; the strongest line on each that nothing lies on."""
+    yard = read_heights(out)
+    heights = yard.part(slice(0, yard.shape[0]), slice(0, yard.shape[1]))
+    for bundle in read_bundles(out / "bundles.json"):
+        strengths = line_strengths(heights, bundle)
+        if bundle.length_m < 2 or bundle.on_top is False or strengths is None:
+            continue
+        along, strength = strengths[0], strengths[1].max(axis=0)
+        across = crossings(world, bundle)
+        for at, _, share, diameter in across:
+            if share >= 0.9 and not math.isnan(diameter):
+                near = np.abs(along - at) < 0.06
+                found[round(diameter, 3)].append(bool((strength[near] > MAX_STRENGTH).any()))
+        if not across:
+            alarms.append(float(strength.max()))
+
+
+def main(arguments: list[str]) -> None:
+    """Render, measure and score the seeds; what is finished in the folder is not done again."""
+    found, alarms, plain = defaultdict[float, list[bool]](list), list[float](), False
+    for argument in arguments[1:]:
+        if argument == "plain":
+            plain = True
+            continue
+        seed = int(argument)
+        world = draw_world(seed, BAR_LENGTH_M, SPAN_M) if plain else lay_thin_bars(seed)
+        folder = Path(arguments[0]) / f"seed_{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / "recording").is_dir():
+            render_world(world, folder / "recording")
+        if not (folder / "measured/result.json").is_file():
+            measure_into(
+                folder / "recording", folder / "measured", MeasureSettings(), report=False, judged_at="end"
+            )
+        score(world, folder / "measured", found, alarms)
+    for diameter, hits in sorted(found.items()):
+        print(f"{1e3 * diameter:.0f} mm: {sum(hits)} of {len(hits)} found")
+    over = sum(strength > MAX_STRENGTH for strength in alarms)
+    print(f"false alarms: {over} of {len(alarms)} bundles; strengths P50, P95, max:", end=" ")
+    print(np.percentile(alarms, [50, 95, 100]).round(1) if alarms else "none")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -27,9 +27,10 @@ def photo(
     seed: int, bar_m: float = 0.0, slope: float = 0.0, *, at_m: float = -0.6, to_m: float = 0.7,
     along: bool = False,
 ) -> HeightMap:  # fmt: skip
-    """The yard with a photo of pixels of PIXEL_M: bars of grey 50 with highlights of 160, gaps of 25, straps of
-    35, beams of 110 in the gaps, and a bar as bright as the others on average, bar_m thick, from x = -0.2 on
-    across, or along the first bundle's flank."""
+    """Draw the yard with a photo: bars of grey 50 with highlights of 160, gaps of 25, straps of 35, beams of
+    110 in the gaps, and a bar as bright as the others on average, bar_m thick, from x = -0.2 to to_m across,
+    or along the first bundle's flank.
+    """
     heights, rng = map_of(STOCK), np.random.default_rng(seed)
     x, fine = heights.x_m, 4
     y = heights.y0_m + heights.cell_m * ((np.arange(heights.shape[0] * fine) + 0.5) / fine - 0.5)
@@ -81,7 +82,9 @@ def test_a_lift_onto_a_thin_bar_is_vetoed_and_one_onto_straps_is_not() -> None:
     lift = judged(STOCK, heights=photo(0, 0.02, 0.1))
     assert codes(lift) == {"thin-bar"}
     (failed,) = [check for check in lift.checks if check.result == "failed"]
-    assert failed.value is not None and failed.bound == MAX_STRENGTH and "across the load -0.6" in failed.reason
+    assert (
+        failed.value is not None and failed.bound == MAX_STRENGTH and "across the load -0.6" in failed.reason
+    )
 
 
 def test_without_a_photo_nobody_knows() -> None:

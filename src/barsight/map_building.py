@@ -215,9 +215,9 @@ def build_map(
             with watch("free space", 1):
                 free.carve(view.cells, ViewFrusta.of([placed[-1]], camera).eyes[0])
             with watch("top photo", 1):
-                tops.add(view.cells, frame.pair, placed[-1])
+                tops.add(view.cells, view.pair, placed[-1])
             if preview is None or abs(done - len(way.poses) / 2) < 1:
-                preview = Preview(view.left, view.disparity_px)
+                preview = Preview(view.pair.left, view.disparity_px)
         if done % _TIDIED_EVERY == 1:
             trim_heap()
         advance("map", done, len(way.poses))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, UInt8, UInt16
+from barsight.core.arrays import Bool, Float32, Float64, UInt8, UInt16
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedPair
 from barsight.mapping.free_space import TILE, covering_tiles, tile_overlap
@@ -113,7 +113,7 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
     return np.asarray(cv2.blur(tops, (3, 3)) + np.float32(OVER_TOPS_M), np.float32), held
 
 
-def _finer(at: Float32, coarse: Float32, size: tuple[int, ...]) -> Float32:
+def _finer(at: Float64, coarse: Float32, size: tuple[int, ...]) -> Float32:
     """Interpolate pixels of coarse cells to the map's own, (width, height) of them."""
     return np.asarray(
         cv2.resize(at.reshape(coarse.shape).astype(np.float32), size, interpolation=cv2.INTER_LINEAR),

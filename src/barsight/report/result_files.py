@@ -29,8 +29,9 @@ from barsight.yard.lifting.lift_file import write_lifts
 
 SCHEMA_VERSION = 1
 RESULT_FILES = (
-    "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "contour.csv", "laser.csv", "bundles.json",
-    "lifts.json", "events.csv", "ortho.tif", "ortho.png", "preview.png", "result.json", "report.html",
+    "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "contour.csv", "laser.csv",
+    "bundles.json", "lifts.json", "events.csv", "ortho.tif", "ortho.png", "preview.png", "result.json",
+    "report.html",
 )  # fmt: skip
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")

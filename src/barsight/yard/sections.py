@@ -51,9 +51,7 @@ class PartedMap:
         )
 
 
-def surface_map(
-    surface: Surface, free: FreeSpace | None = None, tops: TopPhoto | None = None
-) -> PartedMap:
+def surface_map(surface: Surface, free: FreeSpace | None = None, tops: TopPhoto | None = None) -> PartedMap:
     """Return all that a surface knows, read from its tiles; free: what lines of sight prove free; tops: the
     pictures at the height of the tops.
     """

@@ -22,8 +22,9 @@ class HeightMap:
     Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
     NaN where unknown. views: float32. source: `Source`. grey: the orthophoto, levels from 1, 0 where nothing
     was seen; None where there is none. free_m: float32, upper bound of what may stand in the cell by lines
-    of sight that passed over it, inf where none did; None where no lines of sight are known. tops: grey levels from 1 of the pictures at the
-    height of the tops around (`TopPhoto`), 0 where nothing was seen; None where there is no such photo.
+    of sight that passed over it, inf where none did; None where no lines of sight are known. tops: grey
+    levels from 1 of the pictures at the height of the tops around (`TopPhoto`), 0 where nothing was seen;
+    None where there is no such photo.
     """
 
     x0_m: float

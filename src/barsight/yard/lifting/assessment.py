@@ -141,7 +141,7 @@ def assess_placement(
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]
     if not vetoes_of(checks):
-        pixel_m = yard.travel.pixel_m if yard.travel else None
+        pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
     scale = 0.0
     if search and not vetoes_of(checks):

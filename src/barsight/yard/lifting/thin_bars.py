@@ -19,10 +19,10 @@ from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_most, check_true
 
 CODE = "thin-bar"
-MAX_STRENGTH = 5.5
-"""Of a line that chance, texture or dunnage makes on a load, in sigmas of a row of cells."""
-FOUND_PX = 1.5
-"""Diameter of a bar, in the photo's pixels, from which on it is found."""
+MAX_STRENGTH = 8.0
+"""Of a line that texture, dunnage or a strap with a bright middle makes on a load, in sigmas of its row."""
+FOUND_PX = 1.8
+"""Diameter of a bar, in the photo's pixels, from which on nine of ten are found."""
 STEP_M = 0.01
 REACH_M = 0.6
 """How far beside a bundle's axis a line may add to what is seen of it on the bundle."""
@@ -38,7 +38,7 @@ DARK, BRIGHT = -2.0, 5.0
 """Contrasts, in sigmas of a column, beyond which more doesn't count."""
 MIN_SIGMA_LOG = 0.05
 HIGHLIGHT_LOG, FADE_LOG = 0.3, 0.4
-"""On highlights, this much brighter than the load's median, a bar doesn't show; they fade out over FADE_LOG."""
+"""A bar doesn't show on highlights, this much over the load's median; they count less from FADE_LOG below."""
 BESIDE_END_M = 0.12
 """Rows nearer to an end tell nothing: what lies before it shows there."""
 MIN_SEEN_RATIO = 0.8
@@ -64,8 +64,8 @@ def thin_bar_checks(
 ) -> list[Check]:  # fmt: skip
     """Check that no thin bar lies across the load, and that the pictures would show one.
 
-    line: of the load, None where the photo doesn't show enough of it. pixel_m: of the pictures at the
-    surface, NaN where it isn't known; None for a map that no pictures made: then nothing is checked where
+    line: of the load, None where the photo doesn't show enough of it. pixel_m: of the pictures on the
+    load, NaN where it isn't known; None for a map that no pictures made: then nothing is checked where
     there is no photo either.
     """
     if not load or (pixel_m is None and heights.tops is None):
@@ -84,7 +84,8 @@ def thin_bar_checks(
         reason = (
             f"a bar of {1e3 * hidden_m:.0f} mm across the load may not show in the pictures, "
             f"{1e3 * settings.max_hidden_bar_m:.0f} mm are allowed"
-            if math.isfinite(hidden_m) else "how fine the pictures are is not known: measure again"
+            if math.isfinite(hidden_m)
+            else "how fine the pictures are is not known: measure again"
         )
         checks.append(
             check_most(
@@ -96,7 +97,19 @@ def thin_bar_checks(
 
 
 def find_thin_line(heights: HeightMap, bundle: Bundle) -> ThinLine | None:
-    """Find the strongest line across a bundle in the top photo; None where too little of it is seen.
+    """Find the strongest line across a bundle in the top photo; None where too little of it is seen."""
+    found = line_strengths(heights, bundle)
+    if found is None:
+        return None
+    along, strength = found
+    number, row = np.unravel_index(int(strength.argmax()), strength.shape)
+    askew_deg = math.degrees(math.atan(_SLOPES[number]))
+    return ThinLine(float(strength[number, row]), float(along[row]), askew_deg)
+
+
+def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32] | None:
+    """Compute where lines cross a bundle's axis (V,), m from its middle, and the strengths (S, V) of each
+    slope; None where too little of it is seen.
 
     Grey levels are taken along the bars: their logarithm less its median over AROUND_M, over the column's
     scatter. A line's strength is its sum over sqrt(columns), of columns that aren't highlights; what lies
@@ -105,21 +118,16 @@ def find_thin_line(heights: HeightMap, bundle: Bundle) -> ThinLine | None:
     if heights.tops is None:
         return None
     along, level = _strip(heights, bundle)
+    rim = round(BESIDE_END_M / STEP_M)
     middle, half = level.shape[1] // 2, max(round(INNER_RATIO * bundle.width_m / 2 / STEP_M), 3)
     first, last = middle - half, middle + half + 1
-    if np.isfinite(level[:, first:last]).mean() < MIN_SEEN_RATIO:
+    if len(along) <= 2 * rim or np.isfinite(level[:, first:last]).mean() < MIN_SEEN_RATIO:
         return None
     contrast, weight = _contrast(level, middle, round(bundle.width_m / 2 / STEP_M))
     strength = np.array([
         _strengths(_sums(contrast, slope), _sums(weight**2, slope), first, last) for slope in _SLOPES
     ])  # fmt: skip
-    rim = round(BESIDE_END_M / STEP_M)
-    inner = strength[:, rim : len(level) - rim]
-    if inner.size == 0:
-        return None
-    number, row = np.unravel_index(int(inner.argmax()), inner.shape)
-    askew_deg = math.degrees(math.atan(_SLOPES[number]))
-    return ThinLine(float(inner.max()), float(along[row + rim]), askew_deg)
+    return along[rim:-rim], strength[:, rim:-rim]
 
 
 def _strengths(total: Float32, known: Float32, first: int, last: int) -> Float32:
