@@ -50,6 +50,11 @@ def map_of(bundles: list[Laid], **changes: Any) -> HeightMap:
     return draw(bundles, **({"x_m": (-1.5, width), "y_m": (-4.0, 4.0), "sigma_m": 0.002} | changes))
 
 
+def bare(heights: HeightMap) -> HeightMap:
+    """The same with a photo on which nothing shows."""
+    return replace(heights, tops=np.full(heights.shape, 90, np.uint8))
+
+
 def yard_of(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSettings = SETTINGS) -> LiftScene:
     return LiftScene(heights, BundleTable.of(bundles), footings(heights, bundles, settings))
 

@@ -24,7 +24,7 @@ def test_a_whole_recording_measures(recording: Path, capsys: pytest.CaptureFixtu
     out = recording.parent / "out"
     names = {path.name for path in out.iterdir()}
     assert names == {
-        "result.json", "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "contour.csv",
+        "result.json", "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "contour.csv",
         "laser.csv", "preview.png", "report.html", "bundles.json", "lifts.json", "ortho.tif", "ortho.png",
     }  # fmt: skip
 

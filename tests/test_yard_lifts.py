@@ -30,7 +30,7 @@ from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, w
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.vetoes import VETOES, Veto
 from barsight.yard.weight import bundle_mass
-from lift_yards import GIVEN, MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
+from lift_yards import GIVEN, MAGNET, SETTINGS, SIGMA, bare, codes, judged, laid, map_of, record
 from yard_maps import Laid
 
 
@@ -344,7 +344,16 @@ def travel(place_m: list[tuple[float, float]], ages_s: list[float]) -> Travel:
     count = len(place_m)
     sure, off = np.full((count, 3), 0.001), np.zeros(count)
     return Travel(
-        np.array(place_m), sure, off, np.empty((0, 2)), 5.0, stamps, np.ones(len(stamps), bool), 3.0
+        np.array(place_m),
+        sure,
+        off,
+        np.empty((0, 2)),
+        5.0,
+        stamps,
+        np.ones(len(stamps), bool),
+        3.0,
+        8.0,
+        0.0008,
     )
 
 
@@ -352,11 +361,11 @@ def test_a_trajectory_less_sure_than_the_magnet_needs() -> None:
     stock = [laid(0.3)]
     bundles = (record(stock[0]),)
     sure = travel([(0, 0)] * 3, [3.0, 2.0, 1.0])
-    assert plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), sure, NOW_NS).offered
+    assert plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), sure, NOW_NS).offered
     unsure = Travel.read({"travel": replace(sure, sigma_m=sure.sigma_m * 30).content()})
     assert unsure is not None and Travel.read({}) is None
     assert Travel.read({"travel": {**sure.content(), "stamp_ns": None}}) is None
-    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), unsure, NOW_NS)
+    plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), unsure, NOW_NS)
     assert plan.offered == () and codes(plan.refused[0]) == {"trajectory-degraded"}
 
 
@@ -364,15 +373,15 @@ def test_a_place_is_as_old_as_the_last_frame_that_saw_it() -> None:
     stock = [laid(0.3)]
     bundles = (record(stock[0]),)
     passed = travel([(0, 0), (0, 0), (30, 0)], [900.0, 590.0, 1.0])
-    (lift,) = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), passed, NOW_NS).offered
+    (lift,) = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), passed, NOW_NS).offered
     assert lift.validity is not None
     assert lift.validity.from_ns == NOW_NS - 590 * NS_PER_S
     assert lift.validity.until_ns == NOW_NS + 10 * NS_PER_S
     gone = travel([(0, 0), (30, 0)], [610.0, 1.0])
-    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), gone, NOW_NS)
+    plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), gone, NOW_NS)
     assert plan.offered == () and codes(plan.refused[0]) == {"map-too-old"}
     ahead = travel([(0, 0), (0, 0)], [1.0, -60.0])
-    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), ahead, NOW_NS)
+    plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), ahead, NOW_NS)
     assert codes(plan.refused[0]) == {"map-from-the-future"}
 
 
@@ -380,11 +389,11 @@ def test_a_place_out_of_the_picture_or_not_measured_again_grows_old() -> None:
     stock = [laid(0.3)]
     bundles = (record(stock[0]),)
     beside = travel([(0, 0), (3.5, 0), (3.5, 0)], [900.0, 300.0, 1.0])
-    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), beside, NOW_NS)
+    plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), beside, NOW_NS)
     assert "map-too-old" in codes(plan.refused[0])
     parked = travel([(0, 0)] * 3, [900.0, 300.0, 1.0])
     parked = replace(parked, measured=np.array([True, False, False]))
-    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, (), parked, NOW_NS)
+    plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), parked, NOW_NS)
     assert codes(plan.refused[0]) == {"map-too-old"}
     assert parked.captured_ns == (NOW_NS - 900 * NS_PER_S,) * 2
 

@@ -49,15 +49,19 @@ def write_folder(
         heights.z_m[np.ix_(rows, columns)] = stock[1].top_z_m + block_m
     bands = np.stack([heights.z_m, heights.sigma_m, heights.views, heights.source.astype(np.float32)])
     top = heights.y0_m + (heights.z_m.shape[0] - 0.5) * heights.cell_m
+    place = [
+        (33550, "d", 3, (heights.cell_m, heights.cell_m, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, heights.x0_m - heights.cell_m / 2, top, 0.0), True),
+    ]
     tifffile.imwrite(
         folder / "height.tif", np.ascontiguousarray(bands[:, ::-1]), photometric="minisblack",
         planarconfig="separate", tile=(256, 256), metadata=None,
-        extratags=[
-            (33550, "d", 3, (heights.cell_m, heights.cell_m, 0.0), True),
-            (33922, "d", 6, (0.0, 0.0, 0.0, heights.x0_m - heights.cell_m / 2, top, 0.0), True),
-        ],
+        extratags=place,
     )  # fmt: skip
     photo = np.full(heights.z_m.shape, 90, np.uint8)
+    tifffile.imwrite(
+        folder / "tops.tif", photo, photometric="minisblack", tile=(256, 256), metadata=None, extratags=place
+    )
     (folder / "ortho.png").write_bytes(cv2.imencode(".png", photo)[1].tobytes())
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
     stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)
@@ -70,6 +74,8 @@ def write_folder(
         stamps,
         np.ones(len(stamps), bool),
         3.0,
+        8.0,
+        0.0008,
     )
     captured = {"captured_from_ns": int(stamps[0]), "captured_to_ns": int(stamps[-1])}
     content = summary() | {"agreement": [], "travel": way.content()} | captured | changes

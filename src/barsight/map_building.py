@@ -100,6 +100,7 @@ class BuiltMap:
 
     store: TileStore
     free: FreeSpace
+    tops: TopPhoto
     placed: tuple[Pose, ...]
     stamps_ns: tuple[int, ...]
     refusals: tuple[Refusal, ...]
@@ -238,7 +239,7 @@ def build_map(
             with watch("free space", 1):
                 free.carve(view.cells, ViewFrusta.of(views.placed[-1:], camera).eyes[0])
             if preview is None or abs(done - len(way.poses) / 2) < 1:
-                preview = Preview(view.left, view.disparity_px)
+                preview = Preview(view.pair.left, view.disparity_px)
         if done % _TIDIED_EVERY == 1:
             trim_heap()
         advance("map", done, len(way.poses))

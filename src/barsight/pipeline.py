@@ -121,7 +121,7 @@ def find_lifts(
     settings, probed, way, built = mapped.settings, mapped.probed, mapped.way, mapped.built
     watch, trajectory, surface, profiles = probed.watch, way.trajectory, mapped.surface, mapped.profiles
     with watch("bundles"):
-        heights = surface_map(surface, built.free)
+        heights = surface_map(surface, built.free, built.tops)
         bundles = find_bundles(heights, settings.bundles)
         placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
         stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None

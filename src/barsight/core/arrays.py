@@ -21,6 +21,7 @@ Int64 = NDArray[np.int64]
 Int32 = NDArray[np.int32]
 Int8 = NDArray[np.int8]
 UInt8 = NDArray[np.uint8]
+UInt16 = NDArray[np.uint16]
 Bool = NDArray[np.bool_]
 
 F = TypeVar("F", bound=Callable[..., Any])

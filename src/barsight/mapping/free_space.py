@@ -58,7 +58,7 @@ class FreeSpace:
                 self._cell_m,
                 bound,
             )
-        for key in self._covering(column, row, bound.shape):
+        for key in covering_tiles(column, row, bound.shape):
             self._merge(key, column, row, bound)
 
     def window(self, column: int, row: int, columns: int, rows: int) -> Float32:
@@ -71,24 +71,17 @@ class FreeSpace:
             (column + columns - 1) // COARSE_CELLS - low_x + 1,
         )
         out = np.full(shape, UNPROVEN)
-        for key in self._covering(low_x, low_y, shape):
+        for key in covering_tiles(low_x, low_y, shape):
             tile = self._tiles.get(key)
             if tile is not None:
-                ours, theirs = _overlap(key, low_x, low_y, shape)
+                ours, theirs = tile_overlap(key, low_x, low_y, shape)
                 out[theirs] = tile[1][ours]
         at_y = np.arange(row, row + rows) // COARSE_CELLS - low_y
         at_x = np.arange(column, column + columns) // COARSE_CELLS - low_x
         return out[at_y[:, None], at_x]
 
-    def _covering(self, column: int, row: int, shape: tuple[int, int]) -> list[TileKey]:
-        return [
-            (i, j)
-            for i in range(column // TILE, (column + shape[1] - 1) // TILE + 1)
-            for j in range(row // TILE, (row + shape[0] - 1) // TILE + 1)
-        ]
-
     def _merge(self, key: TileKey, column: int, row: int, bound: Float32) -> None:
-        ours, theirs = _overlap(key, column, row, bound.shape)
+        ours, theirs = tile_overlap(key, column, row, bound.shape)
         new = bound[theirs]
         if not np.isfinite(new).any():
             return
@@ -110,7 +103,16 @@ def _level(cells: CellObservations) -> Bool:
     return np.asarray(np.maximum(over, under) < LEVEL_M)
 
 
-def _overlap(
+def covering_tiles(column: int, row: int, shape: tuple[int, int]) -> list[TileKey]:
+    """List the tiles that cover an array (rows, columns) whose first cell is (column, row)."""
+    return [
+        (i, j)
+        for i in range(column // TILE, (column + shape[1] - 1) // TILE + 1)
+        for j in range(row // TILE, (row + shape[0] - 1) // TILE + 1)
+    ]
+
+
+def tile_overlap(
     key: TileKey, column: int, row: int, shape: tuple[int, ...]
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Return the same cells as slices [y, x] of the tile and of an array whose first cell is

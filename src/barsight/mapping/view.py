@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from barsight.core.arrays import Float32, UInt8
+from barsight.core.arrays import Float32
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
@@ -36,11 +36,11 @@ class MatchedFrame:
 class PosedView:
     """A posed frame.
 
-    cells: its observations of the map. left, disparity_px: (H, W), for people to look at.
+    cells: its observations of the map. pair: its pictures. disparity_px: (H, W), for people to look at.
     """
 
     cells: CellObservations
-    left: UInt8
+    pair: RectifiedPair
     disparity_px: Float32
 
 
@@ -121,7 +121,7 @@ class PointBinner:
             )  # fmt: skip
         if cells.z_m.size == 0:
             return Failed("no-depth", "no pixel has a depth within max_depth_m and max_sigma_m")
-        return PosedView(cells, pair.left, disparity.disparity_px)
+        return PosedView(cells, pair, disparity.disparity_px)
 
 
 def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:

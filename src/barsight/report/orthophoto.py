@@ -15,6 +15,7 @@ import barsight
 from barsight.core.arrays import UInt8
 from barsight.core.files import atomic_path
 from barsight.mapping.surface.surface import Surface, grey_levels
+from barsight.mapping.top_photo import TopPhoto
 
 NO_DATA = 0
 _COLUMNS = 1024
@@ -50,7 +51,19 @@ def orthophoto(surface: Surface) -> UInt8:
 def write_orthophoto(surface: Surface, folder: Path) -> None:
     """Write ortho.tif and ortho.png, each whole or not at all."""
     picture = orthophoto(surface)
-    with atomic_path(folder / "ortho.tif") as path:
+    _write_grey(surface, picture, folder / "ortho.tif")
+    with atomic_path(folder / "ortho.png") as path:
+        path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+
+
+def write_top_photo(surface: Surface, tops: TopPhoto, target: Path) -> None:
+    """Write the pictures' mean grey level at the height of the tops, on height.tif's grid."""
+    rows, columns = surface.shape
+    _write_grey(surface, tops.window(surface.columns[0], surface.rows[0], columns, rows)[::-1], target)
+
+
+def _write_grey(surface: Surface, picture: UInt8, target: Path) -> None:
+    with atomic_path(target) as path:
         tifffile.imwrite(
             path,
             picture,
@@ -61,5 +74,3 @@ def write_orthophoto(surface: Surface, folder: Path) -> None:
             software=f"barsight {barsight.__version__}",
             extratags=[*georeference(surface), (42113, "s", 0, str(NO_DATA), True)],
         )
-    with atomic_path(folder / "ortho.png") as path:
-        path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())

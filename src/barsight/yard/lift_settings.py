@@ -25,6 +25,8 @@ class LiftSettings:
     """A face nearer than this to steel lies on it."""
     strap_m: float = 0.0012
     """Thickest strap, which may hold a face off the bars."""
+    max_hidden_bar_m: float = 0.022
+    """Thickest bar across a load that the pictures may be too coarse to show."""
     max_refused_ratio: float = 0.5
     """Of the frames that see the place of the lift."""
     max_age_s: float = 600.0

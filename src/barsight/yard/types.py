@@ -22,7 +22,9 @@ class HeightMap:
     Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
     NaN where unknown. views: float32. source: `Source`. grey: the orthophoto, levels from 1, 0 where nothing
     was seen; None where there is none. free_m: float32, upper bound of what may stand in the cell by lines
-    of sight that passed over it, inf where none did; None where no lines of sight are known.
+    of sight that passed over it, inf where none did; None where no lines of sight are known. tops: grey
+    levels from 1 of the pictures at the height of the tops around (`TopPhoto`), 0 where nothing was seen;
+    None where there is no such photo.
     """
 
     x0_m: float
@@ -34,6 +36,7 @@ class HeightMap:
     source: UInt8
     grey: UInt8 | None = None
     free_m: Float32 | None = None
+    tops: UInt8 | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -83,6 +86,7 @@ class HeightMap:
             x0_m, y0_m, self.cell_m, self.z_m[cut], self.sigma_m[cut], self.views[cut], self.source[cut],
             None if self.grey is None else self.grey[cut],
             None if self.free_m is None else self.free_m[cut],
+            None if self.tops is None else self.tops[cut],
         )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from barsight.yard.lifting.checks import (
 )
 from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
 from barsight.yard.lifting.set_down import SetDown
+from barsight.yard.lifting.thin_bars import ThinLine, find_thin_line, thin_bar_checks
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
@@ -47,6 +49,18 @@ class LiftScene:
     travel: Travel | None = None
     now_ns: int = 0
     events: tuple[YardEvent, ...] = ()
+
+    @cached_property
+    def _thin_lines(self) -> dict[int, ThinLine | None]:
+        return {}
+
+    def thin_line(self, load: tuple[Bundle, ...]) -> ThinLine | None:
+        """Return the strongest line across a load, looked for once a bundle; None where one isn't seen."""
+        for bundle in load:
+            if bundle.id not in self._thin_lines:
+                self._thin_lines[bundle.id] = find_thin_line(self.heights, bundle)
+        lines = [line for bundle in load if (line := self._thin_lines[bundle.id]) is not None]
+        return max(lines, key=lambda line: line.strength) if lines and len(lines) == len(load) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +140,9 @@ def assess_placement(
         *load_checks(load, mass, offset, overhang, magnet, settings),
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]
+    if not vetoes_of(checks):
+        pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
+        checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
     scale = 0.0
     if search and not vetoes_of(checks):
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)

@@ -34,7 +34,7 @@ ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
 BETWEEN_M = (0.0075, -0.0075, 0.0225, -0.0225)
 """Across, where some of those hold but not within the crane's tolerance."""
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
-ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight"})
+ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight", "thin-bar"})
 """Vetoes of the load itself: another place of the magnet changes nothing."""
 SAME_TOP_M = 0.03
 SAME_YAW_RAD = np.radians(2.0)

@@ -38,7 +38,8 @@ class Travel:
     much the encoders are off the trajectory, NaN where there are none; what a constant latency explains is
     taken off. refused_m: (R, 2) where the refused frames must have been. reach_m: how far from the body a
     frame may see. stamp_ns: (N,) of the frames, rising. measured: (N,) whether a frame's heights are in the
-    map. sure_reach_m: what is nearer to the body than this is in the picture.
+    map. sure_reach_m: what is nearer to the body than this is in the picture. eye_z_m: the body's median
+    height; pixel_rad: angle of a pixel; both NaN where an earlier version measured.
     """
 
     place_m: Float64
@@ -49,12 +50,18 @@ class Travel:
     stamp_ns: Int64
     measured: Bool
     sure_reach_m: float
+    eye_z_m: float = float("nan")
+    pixel_rad: float = float("nan")
 
     @property
     def captured_ns(self) -> tuple[int, int] | None:
         """Stamps of the first and the last measured frame; None without any."""
         stamps = self.stamp_ns[self.measured]
         return (int(stamps[0]), int(stamps[-1])) if stamps.size else None
+
+    def pixel_m(self, z_m: float) -> float:
+        """Return the size of a pixel at this height below the body; NaN where it isn't known."""
+        return (self.eye_z_m - z_m) * self.pixel_rad
 
     @classmethod
     def of(
@@ -79,6 +86,8 @@ class Travel:
             stamps,
             np.isin(stamps, list(measured_ns)),
             range_m * min(camera.width, camera.height) / 2 / camera.focal_px,
+            float(np.median(places[:, 2])),
+            1 / camera.focal_px,
         )  # fmt: skip
 
     @classmethod
@@ -94,6 +103,7 @@ class Travel:
             place, sigma, refused = place.reshape(-1, 2), sigma.reshape(-1, 3), refused.reshape(-1, 2)
             measured = np.array(content["measured"], dtype=np.bool_)
             reach_m, sure_reach_m = float(content["reach_m"]), float(content["sure_reach_m"])
+            eye_z_m, pixel_rad = (float(content.get(k, np.nan)) for k in ("eye_z_m", "pixel_rad"))
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
         whole = (
@@ -102,7 +112,9 @@ class Travel:
         )
         if not whole or (np.diff(stamps) <= 0).any():
             return None
-        return cls(place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m)
+        return cls(
+            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad
+        )  # fmt: skip
 
     def content(self) -> dict[str, Any]:
         """Convert to what result.json says; NaN is left to the writer."""

@@ -1,0 +1,121 @@
+"""Top photo: the pictures' mean grey level at the height of the tops around each cell.
+
+What lies across the tops is as sharp there as in a single picture, in every view at the same place, be it
+thinner than matching can measure; what lies deeper is blurred, since each view sees it elsewhere.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, UInt8, UInt16
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedPair
+from barsight.mapping.free_space import TILE, covering_tiles, tile_overlap
+from barsight.mapping.observation import CellObservations
+from barsight.mapping.tiles import TileKey
+
+COARSE_CELLS = 5
+"""Cells of the map per cell, to a side, in which the height of the tops is kept."""
+SPAN_M = 0.35
+"""The tops' height spans gaps up to so wide, as a bar would that is laid across."""
+OVER_TOPS_M = 0.01
+"""A thin bar's middle lies about so high over what carries it."""
+MAX_VIEWS = 250
+"""Views of a cell beyond these are not counted, so that their sum fits 16 bits."""
+
+
+class TopPhoto:
+    """Sums of grey levels and how many views made them, per cell of the map.
+
+    cell_m: side of the cells. Memory: 0.75 MiB per 5 m square at cells of 10 mm.
+    """
+
+    def __init__(self, cell_m: float) -> None:
+        self._cell_m = cell_m
+        self._tiles: dict[TileKey, tuple[UInt16, UInt8]] = {}
+
+    def add(self, cells: CellObservations, pair: RectifiedPair, reference_from_rect0: Pose) -> None:
+        """Add both pictures of a view at the height of the tops that the view itself has measured."""
+        if cells.x.size == 0:
+            return
+        column, row = int(cells.x.min()), int(cells.y.min())
+        tops, held = _tops(cells, column, row, self._cell_m)
+        step = COARSE_CELLS * self._cell_m
+        offset = (COARSE_CELLS - 1) / 2 * self._cell_m
+        rows, columns = tops.shape
+        x, y = np.meshgrid(
+            column * self._cell_m + offset + step * np.arange(columns),
+            row * self._cell_m + offset + step * np.arange(rows),
+        )
+        seen = reference_from_rect0.inverse().apply(np.stack([x, y, tops], axis=-1).reshape(-1, 3))
+        camera, depth = pair.camera, np.maximum(seen[:, 2], 1e-3)
+        left_x = camera.focal_px * seen[:, 0] / depth + camera.cx_px
+        right_x = left_x - camera.focal_px * camera.baseline_m / depth + camera.doffs_px
+        fine = tuple(COARSE_CELLS * n for n in reversed(tops.shape))
+        at_y = _finer(camera.focal_px * seen[:, 1] / depth + camera.cy_px, tops, fine)
+        total, count = np.zeros(fine[::-1], np.uint16), np.zeros(fine[::-1], np.uint8)
+        for picture, valid, at in (
+            (pair.left, pair.left_valid, left_x), (pair.right, pair.right_valid, right_x)
+        ):  # fmt: skip
+            places = _finer(at, tops, fine), at_y
+            grey = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderValue=0)
+            inside = cv2.remap(valid.astype(np.uint8), *places, cv2.INTER_NEAREST, borderValue=0) > 0
+            inside &= held
+            total += np.where(inside, grey, 0).astype(np.uint16)
+            count += inside.astype(np.uint8)
+        for key in covering_tiles(column, row, count.shape):
+            self._merge(key, column, row, total, count)
+
+    def window(self, column: int, row: int, columns: int, rows: int) -> UInt8:
+        """Return (rows, columns): mean grey levels from 1, 0 where no view saw the cell, from cell
+        (column, row) on.
+        """
+        out = np.zeros((rows, columns), np.uint8)
+        for key in covering_tiles(column, row, out.shape):
+            if key in self._tiles:
+                ours, theirs = tile_overlap(key, column, row, out.shape)
+                total, count = (part[ours] for part in self._tiles[key])
+                mean = np.rint(total / np.maximum(count, 1)).clip(1, 255)
+                out[theirs] = np.where(count > 0, mean, 0).astype(np.uint8)
+        return out
+
+    def _merge(self, key: TileKey, column: int, row: int, total: UInt16, count: UInt8) -> None:
+        ours, theirs = tile_overlap(key, column, row, count.shape)
+        if not count[theirs].any():
+            return
+        sums, views = self._tiles.setdefault(
+            key, (np.zeros((TILE, TILE), np.uint16), np.zeros((TILE, TILE), np.uint8))
+        )
+        open_ = views[ours] < MAX_VIEWS
+        sums[ours] += np.where(open_, total[theirs], np.uint16(0))
+        views[ours] += np.where(open_, count[theirs], np.uint8(0))
+
+
+def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tuple[Float32, Bool]:
+    """Compute the height of the tops in coarse cells (R, C) from cell (column, row) on, and which cells of
+    the map, COARSE_CELLS as fine, lie between what was seen.
+    """
+    shape = tuple(-(-(int(at.max()) + 1 - first) // COARSE_CELLS)
+                  for at, first in ((cells.y, row), (cells.x, column)))  # fmt: skip
+    lowest = np.float32(cells.z_m.min())
+    heights = np.full(tuple(COARSE_CELLS * n for n in shape), lowest, np.float32)
+    seen = np.zeros(heights.shape, np.uint8)
+    np.maximum.at(heights, (cells.y - row, cells.x - column), cells.z_m)
+    seen[cells.y - row, cells.x - column] = 1
+    # A single wrong match raises nothing.
+    smooth = cv2.medianBlur(heights, 3).reshape(shape[0], COARSE_CELLS, shape[1], COARSE_CELLS)
+    span = round(SPAN_M / (COARSE_CELLS * cell_m)) | 1
+    tops = cv2.morphologyEx(smooth.max(axis=(1, 3)), cv2.MORPH_CLOSE, np.ones((span, span), np.uint8))
+    wide = round(SPAN_M / cell_m) | 1
+    held = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((wide, wide), np.uint8)) > 0
+    return np.asarray(cv2.blur(tops, (3, 3)) + np.float32(OVER_TOPS_M), np.float32), held
+
+
+def _finer(at: Float64, coarse: Float32, size: tuple[int, ...]) -> Float32:
+    """Interpolate pixels of coarse cells to the map's own, (width, height) of them."""
+    return np.asarray(
+        cv2.resize(at.reshape(coarse.shape).astype(np.float32), size, interpolation=cv2.INTER_LINEAR),
+        np.float32,
+    )
