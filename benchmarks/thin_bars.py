@@ -14,9 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
 from barsight.benchmarks.lift_judge.solids import Solid, SolidYard, cylinder, envelope
 from barsight.benchmarks.lift_judge.worlds import DrawnWorld, draw_world
+
 from barsight.benchmarks.yard.drawn_worlds import render_world
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings

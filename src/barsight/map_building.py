@@ -34,6 +34,7 @@ from barsight.mapping.scene_extent import (
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.tiles import TileStore
+from barsight.mapping.top_photo import TopPhoto
 from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner, PosedView
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Preview, Refusal, to_json
@@ -230,7 +231,7 @@ def build_map(
         watch,
     )  # fmt: skip
     views = FusedViews(binner, TileStore(scratch, settings.map.resident_tiles), settings.map)
-    free, preview = FreeSpace(probed.cell_m), None
+    free, tops, preview = FreeSpace(probed.cell_m), TopPhoto(probed.cell_m), None
     for done, (frame, posed, neighbours) in enumerate(_placed(way.matched, way.poses), start=1):
         view = views.add(frame, posed, neighbours)
         if isinstance(view, Refusal):
@@ -238,6 +239,8 @@ def build_map(
         else:
             with watch("free space", 1):
                 free.carve(view.cells, ViewFrusta.of(views.placed[-1:], camera).eyes[0])
+            with watch("top photo", 1):
+                tops.add(view.cells, view.pair, views.placed[-1])
             if preview is None or abs(done - len(way.poses) / 2) < 1:
                 preview = Preview(view.pair.left, view.disparity_px)
         if done % _TIDIED_EVERY == 1:
@@ -246,7 +249,7 @@ def build_map(
     if not views.placed:
         raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
     return BuiltMap(
-        views.store, free, tuple(views.placed), tuple(views.stamps_ns), tuple(refusals), preview
+        views.store, free, tops, tuple(views.placed), tuple(views.stamps_ns), tuple(refusals), preview
     )  # fmt: skip
 
 

@@ -79,7 +79,8 @@ def write_measured(
         scratch.mkdir()
         compile_ahead(advance, "measure")
         mapped = map_yard(recording, settings, scratch, advance, keep)
-        with in_background(lambda: write_surface(mapped.surface, mapped.built.free, staging)):
+        built = mapped.built
+        with in_background(lambda: write_surface(mapped.surface, built.free, built.tops, staging)):
             measured = find_lifts(mapped, magnet, judged_at)
         content = summary(measured)
         write_results(measured, seal_map(content, staging), staging)

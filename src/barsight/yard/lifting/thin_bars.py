@@ -16,7 +16,7 @@ from scipy import ndimage
 from barsight.core.arrays import Float32, Float64
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import Check, check_most, check_true
+from barsight.yard.vetoes import Check, check_max, check_true
 
 CODE = "thin-bar"
 MAX_STRENGTH = 8.0
@@ -78,7 +78,7 @@ def thin_bar_checks(
         f"a line runs across the load {line.along_m:+.2f} m along it from its middle, "
         f"{abs(line.askew_deg):.0f} deg askew: a thin bar may lie there"
     )
-    checks = [check_most(CODE, what, line.strength, MAX_STRENGTH, "sigma", reason)]
+    checks = [check_max(CODE, what, line.strength, MAX_STRENGTH, "sigma", reason)]
     if pixel_m is not None:
         hidden_m = FOUND_PX * max(pixel_m, heights.cell_m)
         reason = (
@@ -88,7 +88,7 @@ def thin_bar_checks(
             else "how fine the pictures are is not known: measure again"
         )
         checks.append(
-            check_most(
+            check_max(
                 CODE, "thickest bar across the load that the pictures may not show", 1e3 * hidden_m,
                 1e3 * settings.max_hidden_bar_m, "mm", reason,
             )
