@@ -19,6 +19,7 @@ from barsight.yard.lifting.checks import (
     unknown_check,
 )
 from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
+from barsight.yard.lifting.labels import label_checks
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
@@ -121,6 +122,7 @@ def assess_placement(
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, settings),
         *share_checks(weakest),
+        *label_checks(place, yard.heights, magnet),
         *clearance_checks(place, yard.heights, magnet, contact, load),
         *resting_checks(place, magnet, contact, load),
         *load_checks(load, mass, offset, overhang, magnet, settings),
@@ -214,7 +216,8 @@ def _tolerance(
         if changed:
             return found, changed
         wider = replace(magnet, tolerance=box)
-        for veto in vetoes_of(clearance_checks(place, yard.heights, wider, contact, load)):
+        clear = clearance_checks(place, yard.heights, wider, contact, load)
+        for veto in vetoes_of([*label_checks(place, yard.heights, wider), *clear]):
             return found, veto.reason
         found = scale
     return found, ""
