@@ -27,7 +27,7 @@ def test_a_label_is_marked_and_a_strap_is_not() -> None:
     assert not mark_labels(grey)[:190].any(), "a bright strap"
     grey[150:156, 8:12] = 250.0
     rows, columns = np.nonzero(mark_labels(grey)[:190])
-    assert 149 <= rows.min() and rows.max() <= 156 and 7 <= columns.min() and columns.max() <= 12
+    assert rows.min() >= 149 and rows.max() <= 156 and columns.min() >= 7 and columns.max() <= 12
 
 
 @pytest.mark.parametrize(("y_m", "under"), [(MAGNET.poles[0].along_m, True), (0.0, False)])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, UInt8
-from barsight.yard.bundles.bar_pitch import PITCH_SIGMA_RATIO
+from barsight.yard.bundles.bar_pitch import DIAMETER_SIGMA_RATIO
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
 from barsight.yard.bundles.fitting.ends import End, find_end
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, LOOSENESS, make_outline
@@ -175,7 +175,7 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
     if abs(bundle.yaw_rad - reading.found.sheet.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
         aside = -aside
     down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
-    diameter = pack.pitch_m if pack.pitch_m > 0 else bundle.bar_diameter_m
+    diameter = pack.diameter_m if pack.diameter_m > 0 else bundle.bar_diameter_m
     packing = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
     return replace(
         bundle,
@@ -194,7 +194,7 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
             lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
             width_m=_PACK_WIDTH_M,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
-            bar_diameter_m=PITCH_SIGMA_RATIO * pack.pitch_m,
+            bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
             section_m2=section_sigma,
         ),
     )
@@ -204,8 +204,8 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None) -> Bundle:
     """Keep a fitted outline that ends where the pack does; they are as sure as they agree."""
     section, section_sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
-    if abs(pack.pitch_m - diameter) > PITCH_SIGMA_RATIO * diameter:
-        diameter, spread = pack.pitch_m, PITCH_SIGMA_RATIO * pack.pitch_m
+    if abs(pack.diameter_m - diameter) > DIAMETER_SIGMA_RATIO * diameter:
+        diameter, spread = pack.diameter_m, DIAMETER_SIGMA_RATIO * pack.diameter_m
     sigma = replace(
         bundle.sigma,
         bar_diameter_m=spread,

@@ -1,4 +1,4 @@
-"""Hold fitted outlines off the packs beside them: where straps and a flank show a pack, no other bundle is."""
+"""Hold fitted outlines off the packs beside them: where straps and flanks show a pack, no other is."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SLIGHT_M = 0.015
 
 
 def hold_off(bundles: list[Bundle], packs: list[bool]) -> list[Bundle]:
-    """Cut the outlines that reach into a pack at its edge. packs: which bundles are seen from flank to flank."""
+    """Cut the outlines that reach into a pack at its edge. packs: which of them are seen whole."""
     seen = [bundle for bundle, is_pack in zip(bundles, packs, strict=True) if is_pack]
     return [
         bundle if is_pack else _cut_at(bundle, seen) for bundle, is_pack in zip(bundles, packs, strict=True)

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.types import HeightSource
-from barsight.yard.bundles.bar_pitch import bar_pitch
+from barsight.yard.bundles.bar_pitch import bar_diameter
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.seen_section import agreeing_rows, is_overhung, mean_section
@@ -261,8 +261,8 @@ def _ends(contrast: Float64, bridged: int) -> Float64 | None:
 class Pack:
     """Bars that straps hold, with their flanks: from low_m to high_m beside a fit's axis. span: of the straps
     themselves; others_m: where other bundles' begin on either side, infinite where none do. top_m: highest
-    place over the axis; sides_seen: both flanks sink before a neighbour begins: the width is whole. pitch_m: way
-    between the dark lines along it, NaN where they aren't seen.
+    place over the axis; sides_seen: both flanks sink before a neighbour begins: the width is whole.
+    diameter_m: of its bars by the dark lines along it, NaN where they aren't seen.
     """
 
     low_m: float
@@ -271,7 +271,7 @@ class Pack:
     others_m: tuple[float, float]
     top_m: float
     sides_seen: bool
-    pitch_m: float = math.nan
+    diameter_m: float = math.nan
 
     @property
     def width_m(self) -> float:
@@ -293,7 +293,7 @@ def strapped_pack(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> Pack | 
     pack = find_pack(strap_spans(height_map, sheet, fit, level), fit.width_m, beside, level)
     if pack is None or not pack.sides_seen:
         return pack
-    return replace(pack, pitch_m=bar_pitch(height_map, sheet, fit, pack.low_m, pack.high_m))
+    return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, pack.low_m, pack.high_m))
 
 
 def find_pack(

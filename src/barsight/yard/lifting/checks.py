@@ -25,7 +25,7 @@ EDGE_M = 0.01
 """Outlines and heights of reach are blurred over this, so that no row of samples goes in or out at once."""
 UNKNOWN_SIGMA = 0.01
 """How well cells tell the part of a face that was seen."""
-MAX_ASIDE_RATIO = 0.4
+MAX_ASIDE_RATIO = 1 / 3
 """Of a face's width: so far beside its middle the faces may rest where the suspension's stop holds them."""
 SURE_OF_SIGMA = 0.1
 """How well sigmas themselves are known, of them."""

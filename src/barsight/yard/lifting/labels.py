@@ -1,4 +1,4 @@
-"""Find labels on the load in the orthophoto: bright plates that hold the faces off, too thin for the heights."""
+"""Find labels on the load in the orthophoto: bright plates that hold the faces off, though they are thin."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from barsight.yard.vetoes import Check, check_true
 
 STEP_M = 0.01
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 6
-"""Steps that a label fills along the bars and across, and from its middle to the bare bar before and behind."""
+"""Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides."""
 BRIGHTER_RATIO, FULL_LEVEL = 2.2, 230.0
 """Grey level of a label over the median of the load, and the level from which on a picture shows no more."""
 MEAN_LOG, LEAST_LOG = 0.3, 0.1
@@ -32,10 +32,12 @@ def label_checks(place: Placement, heights: HeightMap, magnet: Magnet) -> list[C
     if heights.grey is None:
         return []
     found = find_label(place, heights, magnet)
-    reason = (
-        "" if found is None else f"a label or another bright plate lies under a face, {found[0]:+.2f} m along "
-        f"and {found[1]:+.2f} m across the beam: it would hold the faces off the bars"
-    )
+    reason = ""
+    if found is not None:
+        reason = (
+            f"a label or another bright plate lies under a face, {found[0]:+.2f} m along and "
+            f"{found[1]:+.2f} m across the beam: it would hold the faces off the bars"
+        )
     return [check_true("gap", "no label lies under a face", found is None, reason)]
 
 
@@ -48,8 +50,7 @@ def find_label(place: Placement, heights: HeightMap, magnet: Magnet) -> tuple[fl
     long = LENGTH_CELLS * STEP_M / 2 + float(np.abs(place.along) @ slack) + turned * wide
     broad = WIDTH_CELLS * STEP_M / 2 + float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
     reach_v = magnet.half_span_m + long + (APART_CELLS + LENGTH_CELLS) * STEP_M
-    v, u = (STEP_M * np.arange(-math.ceil(a / STEP_M), math.ceil(a / STEP_M) + 1)
-            for a in (reach_v, wide + broad + STEP_M))  # fmt: skip
+    v, u = _steps(reach_v), _steps(wide + broad + STEP_M)
     bright = mark_labels(_grey(place, heights, v, u))
     under = np.zeros(bright.shape, np.bool_)
     for along, across, length, width in poles:
@@ -57,6 +58,12 @@ def find_label(place: Placement, heights: HeightMap, magnet: Magnet) -> tuple[fl
         under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad)
     cells = np.argwhere(bright & under)
     return (float(v[cells[0, 0]]), float(u[cells[0, 1]])) if cells.size else None
+
+
+def _steps(reach_m: float) -> Float64:
+    """List places STEP_M apart to either side of 0."""
+    count = math.ceil(reach_m / STEP_M)
+    return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
 def mark_labels(grey: Float32) -> Bool:
@@ -67,9 +74,9 @@ def mark_labels(grey: Float32) -> Bool:
     inner = ndimage.uniform_filter1d(grey, LENGTH_CELLS, axis=0)
     least = ndimage.minimum_filter1d(grey, LENGTH_CELLS, axis=0)
     bare = ndimage.uniform_filter1d(grey, WIDTH_CELLS, axis=0)
-    bare = np.maximum(np.roll(bare, APART_CELLS, axis=0), np.roll(bare, -APART_CELLS, axis=0)) + _DARK
-    mean = ndimage.uniform_filter1d(np.log((inner + _DARK) / bare), WIDTH_CELLS, axis=1)
-    worst = ndimage.minimum_filter1d(np.log((least + _DARK) / bare), WIDTH_CELLS, axis=1)
+    brighter = np.maximum(np.roll(bare, APART_CELLS, axis=0), np.roll(bare, -APART_CELLS, axis=0)) + _DARK
+    mean = ndimage.uniform_filter1d(np.log((inner + _DARK) / brighter), WIDTH_CELLS, axis=1)
+    worst = ndimage.minimum_filter1d(np.log((least + _DARK) / brighter), WIDTH_CELLS, axis=1)
     level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
     seen = grey[grey > 0]
     needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
