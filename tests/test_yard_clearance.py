@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.types import HeightSource
+from barsight.yard.lifting.clearance import BEAM_CLEAR_M
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, SIGMA, codes, judged, laid, map_of, record
@@ -53,6 +54,14 @@ def test_what_stands_above_the_faces_obstructs(
     x_m: tuple[float, float], y_m: tuple[float, float], rise_m: float
 ) -> None:
     assert "obstructed" in found(with_block(x_m, y_m, TOP_M + rise_m))
+
+
+def test_the_beam_passes_over_what_stands_beside_the_load() -> None:
+    beside = (0.46, 0.9), (-3.0, 3.0)
+    high = MAGNET.beam.above_faces_m - BEAM_CLEAR_M
+    assert found(with_block(*beside, TOP_M + high - 0.02)) == set()
+    assert found(with_block(*beside, TOP_M + high + 0.02)) == {"obstructed"}
+    assert found(with_block((0.36, 0.9), (-0.05, 0.05), TOP_M + 0.1)) == {"obstructed"}, "it lies on the load"
 
 
 def test_what_is_level_or_further_off_obstructs_nothing() -> None:

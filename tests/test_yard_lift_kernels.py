@@ -12,6 +12,7 @@ from scipy import ndimage
 from barsight.core.types import HeightSource
 from barsight.yard.lifting.checks import _stray_shares
 from barsight.yard.lifting.clearance import (
+    BEAM_CLEAR_M,
     MAX_NARROW_RISE_M,
     MAX_RISE_M,
     MAX_THIN_RISE_M,
@@ -23,7 +24,7 @@ from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import _sum_pull
 from barsight.yard.stability.stability import interpolate_height
 from barsight.yard.types import HeightMap
-from lift_yards import MAGNET, map_of
+from lift_yards import MAGNET, Laid, laid, map_of, record
 
 FACES = FacePlane(0.2, 0.01, -0.02, 0.002)
 EIGHT = np.ones((3, 3))
@@ -44,7 +45,7 @@ def rough_yard(seed: int) -> HeightMap:
     return replace(heights, free_m=free.astype(np.float32))
 
 
-def plain_obstacle(heights: HeightMap, place: Placement) -> tuple[str, float, np.ndarray] | None:
+def plain_obstacle(heights: HeightMap, place: Placement, load: Laid) -> tuple[str, float, np.ndarray] | None:
     """Code, mm and places."""
     margin = 120
     around = {"pad_width": margin, "mode": "constant"}
@@ -66,18 +67,24 @@ def plain_obstacle(heights: HeightMap, place: Placement) -> tuple[str, float, np
     over_faces = np.any(faces, axis=0)
     under = over_faces | beam
     near = tuple(slice(at.min() - 20, at.max() + 21) for at in np.nonzero(under))
-    z, free, xy, level, over_faces, under = (a[near] for a in (z, free, xy, level, over_faces, under))
+    cut = z, free, xy, level, over_faces, under
+    z, free, xy, level, over_faces, under = (a[near] for a in cut)
+    over_load = (abs(xy[..., 0] - load.x_m) <= load.width_m / 2) & (abs(xy[..., 1]) <= load.length_m / 2)
     rise, most = (z - level).astype(np.float32), (free - level).astype(np.float32)
-    allowed = np.where(over_faces, MAX_RISE_M, MAGNET.beam.above_faces_m / 2)
+    above_m = MAGNET.beam.above_faces_m - BEAM_CLEAR_M
+    allowed = np.where(over_faces, MAX_RISE_M, above_m)
     blocked = np.where(np.isnan(rise), ~(free - level <= allowed), z - level > allowed)
     seen = np.where(np.isnan(rise), -1, np.maximum(rise, -1))
     filled = np.where(np.isnan(rise), np.fmin(ndimage.maximum_filter(seen, 5), most), seen)
+    spare = np.where(over_faces | over_load, 0.0, above_m - MAX_RISE_M)
+    filled = filled - spare
     for side, limit, least in ((5, MAX_RISE_M, 4), (3, MAX_NARROW_RISE_M, 4), (1, MAX_THIN_RISE_M, 8)):
         smooth = ndimage.median_filter(filled, side)
         label, _ = ndimage.label(under & (smooth > limit), EIGHT)
         large = (np.bincount(label.ravel()) >= least)[label] & (label > 0)
         if large.any():
-            return "obstructed", 1e3 * smooth[large].max(), xy[large]
+            highest = np.argmax(np.where(large, smooth, -np.inf))
+            return "obstructed", 1e3 * (smooth + spare).ravel()[highest], xy[large]
     label, _ = ndimage.label(~blocked)
     unproven = blocked | (np.bincount(label.ravel()) < 4)[label]
     hidden = ndimage.binary_opening(unproven, np.ones((8, 8))) & under
@@ -91,7 +98,9 @@ def test_an_obstacle_is_the_one_that_array_after_array_finds() -> None:
     for seed in range(8):
         rng, heights = np.random.default_rng(seed), rough_yard(seed)
         place = Placement(*rng.uniform(-0.5, 1.5, 2), float(rng.uniform(-0.5, 0.5)))
-        obstacle, plain = find_obstacle(place, heights, MAGNET, FACES), plain_obstacle(heights, place)
+        load = laid(place.x_m + 0.2)
+        obstacle = find_obstacle(place, heights, MAGNET, FACES, (record(load),))
+        plain = plain_obstacle(heights, place, load)
         found.add(obstacle.code if obstacle else "none")
         assert (obstacle is None) == (plain is None)
         if obstacle is not None and plain is not None:

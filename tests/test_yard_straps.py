@@ -8,11 +8,21 @@ import numpy as np
 import pytest
 
 from barsight.core.types import HeightSource
-from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit
+from barsight.yard.bundles.bar_pitch import dark_lines
+from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, ShadeProfile
 from barsight.yard.bundles.fitting.rotated_map import align_map
+from barsight.yard.bundles.pack_edges import hold_off
 from barsight.yard.bundles.seen_section import section_of_pack
-from barsight.yard.bundles.straps import Pack, StrapSpan, contradicts, split_columns, strapped_pack
+from barsight.yard.bundles.straps import (
+    Pack,
+    StrapSpan,
+    contradicts,
+    find_pack,
+    split_columns,
+    strapped_pack,
+)
 from barsight.yard.types import HeightMap
+from lift_yards import laid, record
 
 CELL = 0.01
 LENGTH_M, WIDE_M = 5.0, 1.2
@@ -120,3 +130,70 @@ def test_a_place_belongs_to_the_straps_that_it_shares() -> None:
     found = split_columns(contrast, 7, np.zeros(60, bool), np.zeros(60, bool))
     assert [(first, last) for first, last, _ in found] == [(0, 25), (25, 60)]
     assert [len(rows) for _, _, rows in found] == [3, 2]
+
+
+BESIDE = CELL * np.arange(-40, 41)
+ROWS, OTHER_ROWS = (0.5, 2.0, 3.5), (1.0, 2.6, 4.1)
+
+
+def level_of(*points: tuple[float, float]) -> np.ndarray:
+    """Heights over the places beside an axis, linear between points."""
+    return np.interp(BESIDE, *np.array(points).T)
+
+
+def pack_beside(level: np.ndarray, rows: tuple[float, ...], begins_m: float) -> Pack:
+    spans = StrapSpan(-0.12, 0.09, ROWS, 0.0), StrapSpan(begins_m, begins_m + 0.15, rows, 0.0)
+    pack = find_pack(spans, 0.24, BESIDE, level)
+    assert pack is not None
+    return pack
+
+
+LEFT = (-0.4, -1.0), (-0.14, -1.0), (-0.13, -0.06), (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("right", "rows", "seen"),
+    [
+        (((0.09, -0.04), (0.13, -0.09), (0.2, -0.03), (0.4, 0.0)), OTHER_ROWS, True),
+        (((0.09, -0.04), (0.13, -0.09), (0.2, -0.03), (0.4, 0.0)), ROWS, False),
+        (((0.09, -0.04), (0.11, -0.08), (0.14, -0.04), (0.17, -0.08), (0.2, -0.03), (0.4, 0.0)), OTHER_ROWS,
+         False),
+        (((0.09, -0.04), (0.13, -0.05), (0.2, -0.06), (0.4, -0.06)), OTHER_ROWS, False),
+        (((0.09, -0.04), (0.13, -0.04), (0.14, 0.3), (0.4, 0.3)), OTHER_ROWS, False),
+    ],
+    ids=["a gully", "straps in line", "two gullies", "no gully", "something higher begins"],
+)  # fmt: skip
+def test_a_single_gully_before_other_straps_is_the_flank(
+    right: tuple[tuple[float, float], ...], rows: tuple[float, ...], seen: bool
+) -> None:
+    pack = pack_beside(level_of(*LEFT, *right), rows, 0.21)
+    assert pack.sides_seen == seen
+    if seen:
+        assert pack.low_m == pytest.approx(-0.135, abs=CELL)
+        assert pack.high_m == pytest.approx(0.13, abs=1.1 * CELL)
+
+
+def test_a_low_bar_at_the_flank_is_still_the_bundle_s() -> None:
+    low_bar = (0.04, -0.05), (0.09, -0.13), (0.1, -0.16), (0.15, -0.17), (0.16, -1.0), (0.4, -1.0)
+    pack = pack_beside(level_of(*LEFT, *low_bar), ROWS, 0.35)
+    assert pack.sides_seen and 0.1 < pack.high_m < 0.17
+
+
+def test_the_way_between_dark_lines_is_a_bar_s_diameter() -> None:
+    places = 0.002 * np.arange(-65, 66)
+    arches = np.log(60 + 60 * np.cos(np.pi * ((places + 0.03) / 0.06 % 1 - 0.5)))
+    noise = np.random.default_rng(0).normal(0, 0.03, places.size)
+    lines = dark_lines(ShadeProfile(places, arches + noise))
+    assert np.diff(lines) == pytest.approx(0.06, abs=0.006) and lines.size >= 3
+    assert dark_lines(ShadeProfile(places, 4 + noise)).size == 0
+
+
+def test_an_outline_that_reaches_into_a_pack_is_cut_and_doubtful() -> None:
+    pack, other = record(laid(0.0)), record(laid(0.22), 1)
+    reach = (pack.width_m + other.width_m) / 2 - 0.22
+    kept, cut = hold_off([pack, other], [True, False])
+    assert kept is pack and cut.confidence < 0.5 and cut.bars is None
+    assert cut.width_m == pytest.approx(other.width_m - reach)
+    assert cut.centre_m[0] - cut.width_m / 2 == pytest.approx(pack.width_m / 2)
+    higher = record(laid(0.22, 0.2 + pack.width_m), 1)
+    assert hold_off([pack, higher], [True, False])[1] is higher

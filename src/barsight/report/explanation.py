@@ -154,7 +154,8 @@ def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tu
         along, across = away @ place.along, away @ place.across
         return np.stack([(along + long) * PIXELS_PER_M, (across + wide) * PIXELS_PER_M], axis=-1)
 
-    obstacle = find_obstacle(place, part, magnet, faces)
+    load = tuple(bundle for bundle in bundles if bundle.id in record["bundles"])
+    obstacle = find_obstacle(place, part, magnet, faces, load)
     if obstacle is not None:
         half = math.ceil(0.005 * PIXELS_PER_M)
         for x, y in np.round(pixels(obstacle.places_m)).astype(int):

@@ -31,7 +31,7 @@ VETOES = {
     "narrow-tolerance": "Within the crane's own tolerance the lift would not stay as checked.",
     "obstructed": "Something stands above the faces' plane under the magnet or beside it.",
     "tilt": "The faces don't lie: they slope too much, or rest beside their middle and tip.",
-    "gap": "A pole hangs above the steel, or too little of the faces lies on it.",
+    "gap": "A pole hangs above the steel, too little of the faces lies on it, or a label holds one off.",
     "weak-pull": "The lower bound of the pull is less than the load's weight times the safety factor.",
     "mass-unknown": "The mass can't be told from what was seen.",
     "overweight": "The load's upper bound is more than the magnet or the crane may carry.",

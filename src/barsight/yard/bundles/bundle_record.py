@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, UInt8
+from barsight.yard.bundles.bar_pitch import DIAMETER_SIGMA_RATIO
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
 from barsight.yard.bundles.fitting.ends import End, find_end
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, LOOSENESS, make_outline
@@ -26,6 +27,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours
+from barsight.yard.bundles.pack_edges import DOUBTFUL, hold_off
 from barsight.yard.bundles.seen_section import (
     SeenSection,
     estimate_section,
@@ -40,7 +42,7 @@ from barsight.yard.types import Bundle, BundleSigma
 _NARROW_M = 0.3
 _SAME_RATIO, _SAME_M = 0.12, 0.005
 """Of the width, and besides: how far an outline's edges lie off those of the pack that it describes."""
-_PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M = 0.009, 0.02, 0.006
+_PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M = 0.009, 0.016, 0.006
 """Standard deviations of a pack's middle, width and top."""
 _CREST_M = 0.006
 """Crest height that a map's mean section cuts off."""
@@ -51,8 +53,6 @@ _PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
 beyond the pack's, sine of its skew."""
 _ASIDE_M = 0.02
 """Straps whose middle lies so far beside an outline's make its place that unsure."""
-_DOUBTFUL = 0.4
-"""The most where straps speak against an outline."""
 _SURE_KNOWN = 0.7
 
 
@@ -157,7 +157,7 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
     if not pack.sides_seen:
         doubt = contradicts(pack, bundle.width_m)
         if doubt:
-            sure = min(bundle.confidence, _DOUBTFUL)
+            sure = min(bundle.confidence, DOUBTFUL)
             bundle = replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
         if abs(pack.middle_m) > _ASIDE_M:
             lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
@@ -166,8 +166,8 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
     if reading.outlines_pack:
         if bundle.bars is not None:
             return bundle
-        section, sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
-        return replace(bundle, section_m2=section, sigma=replace(bundle.sigma, section_m2=sigma))
+        if abs(pack.middle_m) < _PACK_MIDDLE_M:
+            return _confirmed(bundle, pack, floor_m)
     fit = reading.found.fit
     top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
     section, section_sigma = section_of_pack(pack.width_m, _over(top_z, floor_m))
@@ -175,6 +175,7 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
     if abs(bundle.yaw_rad - reading.found.sheet.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
         aside = -aside
     down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
+    diameter = pack.diameter_m if pack.diameter_m > 0 else bundle.bar_diameter_m
     packing = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
     return replace(
         bundle,
@@ -183,6 +184,7 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
         width_m=pack.width_m,
         top_z_m=top_z,
         bars=None,
+        bar_diameter_m=diameter,
         bar_axes=(),
         section_m2=section,
         confidence=_STRAPPED * _agreement(fit.state[fit.first : fit.last + 1]),
@@ -192,10 +194,26 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
             lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
             width_m=_PACK_WIDTH_M,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
-            bar_diameter_m=np.nan,
+            bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
             section_m2=section_sigma,
         ),
     )
+
+
+def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None) -> Bundle:
+    """Keep a fitted outline that ends where the pack does; they are as sure as they agree."""
+    section, section_sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
+    diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
+    if abs(pack.diameter_m - diameter) > DIAMETER_SIGMA_RATIO * diameter:
+        diameter, spread = pack.diameter_m, DIAMETER_SIGMA_RATIO * pack.diameter_m
+    sigma = replace(
+        bundle.sigma,
+        bar_diameter_m=spread,
+        lateral_m=float(np.hypot(bundle.sigma.lateral_m, pack.middle_m)),
+        width_m=float(np.hypot(bundle.sigma.width_m, bundle.width_m - pack.width_m)),
+        section_m2=section_sigma,
+    )
+    return replace(bundle, section_m2=section, bar_diameter_m=diameter, sigma=sigma)
 
 
 def _over(top_z_m: float, floor_m: float | None) -> float:
@@ -203,14 +221,18 @@ def _over(top_z_m: float, floor_m: float | None) -> float:
 
 
 def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:
-    """Remove bundles that are pieces of one that straps hold: their axes run within its flanks."""
+    """Remove bundles that are pieces of one that straps hold: their axes run within its flanks. What else
+    reaches into one is cut.
+    """
     whole = [k for k, one in enumerate(readings) if not one.outlines_pack]
     whole.sort(key=lambda k: -readings[k].weight)
     gone: set[int] = set()
     for k in whole:
         if k not in gone:
             gone |= {n for n, other in enumerate(bundles) if n != k and _is_piece(other, bundles[k])}
-    return [bundle for k, bundle in enumerate(bundles) if k not in gone]
+    left = [k for k in range(len(bundles)) if k not in gone]
+    packs = [pack is not None and pack.sides_seen for pack in (readings[k].pack for k in left)]
+    return hold_off([bundles[k] for k in left], packs)
 
 
 def _is_piece(piece: Bundle, whole: Bundle) -> bool:

@@ -54,19 +54,22 @@ _SMOOTHINGS_M = np.array([0.004, 0.007, 0.010, 0.013, 0.016])
 _MAX_SMOOTHED = 8
 
 
-def shade_profile(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> ShadeProfile | None:
-    """Sample the orthophoto's shades over the rows that agree with the fit; None where too little
-    was seen.
+def shade_profile(
+    height_map: HeightMap, sheet: AlignedMap, fit: Fit, between_m: tuple[float, float] | None = None
+) -> ShadeProfile | None:
+    """Sample the orthophoto's shades over the rows that agree with the fit, across its inside or between two
+    places beside its axis; None where too little was seen.
     """
     if height_map.grey is None:
         return None
     rows = np.flatnonzero(fit.state == AGREES)
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
     cell, half = height_map.cell_m, _INSIDE * fit.width_m
+    first, last = between_m or (-half, half)
     ends = sheet.v0_m + cell * np.array([fit.first, fit.last])
     middle = fit.values[U] + fit.values[SLOPE_U] * (ends - fit.v_m)
     corners = sheet.to_map(
-        np.stack([np.concatenate([middle - half, middle + half]), np.concatenate([ends, ends])], axis=1)
+        np.stack([np.concatenate([middle + first, middle + last]), np.concatenate([ends, ends])], axis=1)
     )
     place = (corners - (height_map.x0_m, height_map.y0_m)) / cell
     low = np.floor(place.min(axis=0)).astype(int).clip(0, None)
@@ -83,7 +86,7 @@ def shade_profile(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> ShadePr
     number = np.rint((v - sheet.v0_m) / cell).astype(int).clip(0, fit.state.size - 1)
     agrees = np.zeros(fit.state.size, bool)
     agrees[rows] = True
-    wanted = agrees[number] & (np.abs(beside) < half)
+    wanted = agrees[number] & (beside > first) & (beside < last)
     places, levels = _medians(beside[wanted], grey[row[wanted], column[wanted]])
     return ShadeProfile(places, levels) if places.size >= _MIN_PLACES else None
 

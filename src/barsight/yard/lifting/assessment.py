@@ -20,6 +20,7 @@ from barsight.yard.lifting.checks import (
     unknown_check,
 )
 from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
+from barsight.yard.lifting.labels import label_checks
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.thin_bars import ThinLine, find_thin_line, thin_bar_checks
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
@@ -135,7 +136,8 @@ def assess_placement(
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, settings),
         *share_checks(weakest),
-        *clearance_checks(place, yard.heights, magnet, contact),
+        *label_checks(place, yard.heights, magnet),
+        *clearance_checks(place, yard.heights, magnet, contact, load),
         *resting_checks(place, magnet, contact, load),
         *load_checks(load, mass, offset, overhang, magnet, settings),
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
@@ -220,7 +222,7 @@ def _tolerance(
     """Find the largest of SCALES times the crane's tolerance within which the lift stays as checked, and what
     ends it there.
     """
-    found = 0.0
+    found, load = 0.0, tuple(near.bundles[k] for k in held.gripped)
     for scale in SCALES:
         box = _scaled(magnet.tolerance, scale)
         sure = count_gripped(place, magnet, box, near, contact.z_m).probability
@@ -231,7 +233,8 @@ def _tolerance(
         if changed:
             return found, changed
         wider = replace(magnet, tolerance=box)
-        for veto in vetoes_of(clearance_checks(place, yard.heights, wider, contact)):
+        clear = clearance_checks(place, yard.heights, wider, contact, load)
+        for veto in vetoes_of([*label_checks(place, yard.heights, wider), *clear]):
             return found, veto.reason
         found = scale
     return found, ""
@@ -268,7 +271,7 @@ def _change(
         for veto in vetoes_of(checks):
             return veto.reason
         # The whole box was held against the limits with their sigmas: here only how the faces rest is new.
-        obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), careful=False)
+        obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), load, careful=False)
         if obstacle is not None:
             return obstacle.reason
         there = count_gripped(moved, magnet, exact.tolerance, near, contact.z_m)

@@ -25,6 +25,8 @@ EDGE_M = 0.01
 """Outlines and heights of reach are blurred over this, so that no row of samples goes in or out at once."""
 UNKNOWN_SIGMA = 0.01
 """How well cells tell the part of a face that was seen."""
+MAX_ASIDE_RATIO = 1 / 3
+"""Of a face's width: so far beside its middle the faces may rest where the suspension's stop holds them."""
 SURE_OF_SIGMA = 0.1
 """How well sigmas themselves are known, of them."""
 
@@ -108,7 +110,7 @@ def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: Lif
         ),
         check_max(
             "tilt", "how far beside their middle the faces rest, leaning as far as the suspension lets them",
-            1e3 * contact.rests_off_m, 1e3 * narrowest / 4, "mm", aside,
+            1e3 * contact.rests_off_m, 1e3 * MAX_ASIDE_RATIO * narrowest, "mm", aside,
             sigma=0.0 if contact.rests_off_m == 0 else 1e3 * EDGE_M / 2,
         ),
         check_max(

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, UInt8, kernel
+from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.unseen import wide_parts
@@ -32,6 +32,8 @@ MAX_NARROW_RISE_M = 0.020
 """The same for what is too narrow for those: by medians over 30 mm squares."""
 MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
 """The same for a connected patch of so many cells that may be a single one wide, as plates on edge are."""
+BEAM_CLEAR_M = 0.1
+"""What stands beside the load must stay so far below the beam, or half the beam's height over the faces."""
 MIN_PATCH_CELLS = 4
 """Cells of STEP_M of the smallest patch that counts."""
 EDGE_SIGMA_M = 0.003
@@ -40,6 +42,7 @@ MAX_HOLE_M = 0.08
 """An unseen place narrower than this is taken to hide nothing that stands."""
 _HOLE_CELLS = round(MAX_HOLE_M / STEP_M)
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
+_BEAM_ONLY = 2
 _NO_BOUNDS = np.empty((0, 0), np.float32)
 
 
@@ -71,13 +74,15 @@ class Obstacle:
     places_m: Float64
 
 
-def clearance_checks(place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact) -> list[Check]:
+def clearance_checks(
+    place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
+) -> list[Check]:
     """Check that nothing stands above the faces' plane under the magnet or beside it, seen or not.
 
     Limits are held with the plane's sigma in height and a cell's in place.
     """
     faces = FacePlane.of(contact)
-    obstacle = find_obstacle(place, heights, magnet, faces)
+    obstacle = find_obstacle(place, heights, magnet, faces, load)
     sigma = 1e3 * contact.gap_sigma_m
     checks = []
     for code, what, bound_mm in (
@@ -92,18 +97,20 @@ def clearance_checks(place: Placement, heights: HeightMap, magnet: Magnet, conta
                 checks.append(Check(code, what, None, sigma, bound_mm, "mm", "passed", ""))
             continue
         reason = obstacle.reason
-        if find_obstacle(place, heights, magnet, faces, careful=False) is None:
+        if find_obstacle(place, heights, magnet, faces, load, careful=False) is None:
             reason += "; it lies within its sigma of the limit"
         checks.append(Check(code, what, obstacle.value_mm, sigma, obstacle.bound_mm, "mm", "failed", reason))
     return checks
 
 
 def find_obstacle(
-    place: Placement, heights: HeightMap, magnet: Magnet, faces: FacePlane, *, careful: bool = True
-) -> Obstacle | None:
+    place: Placement, heights: HeightMap, magnet: Magnet, faces: FacePlane, load: tuple[Bundle, ...], *,
+    careful: bool = True,
+) -> Obstacle | None:  # fmt: skip
     """Find what obstructs the magnet at its contact plane, or an unseen place that could.
 
-    careful: what is within its sigma of a limit obstructs too.
+    Under the faces, and under the beam over the load, nothing may stand above the plane; beside the load the
+    beam passes over what stands there. careful: what is within its sigma of a limit obstructs too.
     """
     region = _region(place, heights, magnet, EDGE_SIGMA_M if careful else 0.0)
     plane = np.array([
@@ -115,7 +122,10 @@ def find_obstacle(
         np.array([heights.x0_m, heights.y0_m, heights.cell_m]), region.x_m, region.y_m, region.frame, plane,
         region.parts, region.under,
     )  # fmt: skip
-    return _obstructed(_filled(rise, most), region) or _unseen(blocked, region)
+    beside = (region.under == _BEAM_ONLY) & ~_over(load, region)
+    np.minimum(region.under, 1, out=region.under)
+    spare = np.where(beside, np.float32(region.parts[-1, 4] - MAX_RISE_M), np.float32(0))
+    return _obstructed(_filled(rise, most) - spare, spare, region) or _unseen(blocked, region)
 
 
 @kernel()
@@ -130,7 +140,7 @@ def _look(
     and its size. x, y: (U,), (V,) of the cells. frame: (3, 2) the magnet's place, unit vectors along and
     across. plane: height at the place, rise along and across, what it may lie lower. parts: (P + 1, 5) poles
     and beam: middle along and across, reach to either side, rise that is allowed over it. Fills under (V, U):
-    1 under a part.
+    1 under a pole, _BEAM_ONLY under the beam alone, else 0.
     """
     rise, most = np.empty((y.size, x.size), np.float32), np.empty((y.size, x.size), np.float32)
     blocked = np.empty((y.size, x.size), np.uint8)
@@ -147,7 +157,8 @@ def _look(
             under[i, k] = 0
             for p in range(len(parts)):
                 if abs(u - parts[p, 1]) <= parts[p, 3] and abs(v - parts[p, 0]) <= parts[p, 2]:
-                    under[i, k], allowed = 1, parts[p, 4]
+                    under[i, k] = 1 if p + 1 < len(parts) else _BEAM_ONLY
+                    allowed = parts[p, 4]
                     break
             height, bound = np.nan, np.inf
             if 0 <= row < z.shape[0] and 0 <= column < z.shape[1]:
@@ -167,6 +178,17 @@ def _filled(rise: Float32, most: Float32) -> Float32:
         return rise
     highest = cv2.dilate(np.where(unseen, np.float32(-1), rise), np.ones((5, 5), np.uint8))
     return np.where(unseen, np.fmin(highest, most), rise)
+
+
+def _over(load: tuple[Bundle, ...], region: Region) -> Bool:
+    """Mark the cells (V, U) over the load's outline; all where no load is known."""
+    over = np.full(region.under.shape, not load)
+    for bundle in load:
+        dx, dy = region.x_m - bundle.centre_m[0], region.y_m[:, None] - bundle.centre_m[1]
+        sin, cos = math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)
+        inside = np.abs(cos * dx + sin * dy) <= bundle.width_m / 2
+        over |= inside & (np.abs(cos * dy - sin * dx) <= bundle.length_m / 2)
+    return over
 
 
 def resting_checks(
@@ -192,8 +214,8 @@ def resting_checks(
     ]  # fmt: skip
 
 
-def _obstructed(rise: Float32, region: Region) -> Obstacle | None:
-    """Find the highest connected patch over the plane. rise: (V, U)."""
+def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | None:
+    """Find the highest connected patch over the plane. rise: (V, U), less `spare`, which is allowed more."""
     for side, allowed_m, cells in (
         (5, MAX_RISE_M, MIN_PATCH_CELLS),
         (3, MAX_NARROW_RISE_M, MIN_PATCH_CELLS),
@@ -211,14 +233,12 @@ def _obstructed(rise: Float32, region: Region) -> Obstacle | None:
             smooth = cv2.medianBlur(rise, side)
             at = np.unravel_index(int(np.argmax(np.where(large, smooth, -np.inf))), smooth.shape)
             _, ((along, across),) = region.places(at)
+            rise_mm, bound_mm = (1e3 * float(least + spare[at]) for least in (smooth[at], allowed_m))
             reason = (
-                f"something stands {1e3 * smooth[at]:.0f} mm above the faces' plane, {along:+.2f} m along "
-                f"and {across:+.2f} m across the beam, {1e3 * allowed_m:.0f} mm are allowed"
+                f"something stands {rise_mm:.0f} mm above the faces' plane, {along:+.2f} m along and "
+                f"{across:+.2f} m across the beam, {bound_mm:.0f} mm are allowed"
             )
-            rise_mm = 1e3 * float(smooth[at])
-            return Obstacle(
-                "obstructed", reason, rise_mm, 1e3 * allowed_m, region.places(np.nonzero(large))[0]
-            )
+            return Obstacle("obstructed", reason, rise_mm, bound_mm, region.places(np.nonzero(large))[0])
     return None
 
 
@@ -274,7 +294,8 @@ def _region(place: Placement, heights: HeightMap, magnet: Magnet, wider_m: float
     parts = np.empty((len(magnet.poles) + 1, 5))
     parts[:-1, :4] = magnet.pole_table * (1, 1, 0.5, 0.5)
     parts[:-1, 4] = MAX_RISE_M
-    parts[-1] = 0, 0, beam.length_m / 2, beam.width_m / 2, max(beam.above_faces_m / 2, MAX_RISE_M)
+    above_m = max(beam.above_faces_m - BEAM_CLEAR_M, beam.above_faces_m / 2, MAX_RISE_M)
+    parts[-1] = 0, 0, beam.length_m / 2, beam.width_m / 2, above_m
     long, wide = (np.abs(parts[:, :2]) + parts[:, 2:4]).max(axis=0)
     more += STRAY_FIELD_M + wider_m + math.radians(magnet.tolerance.yaw_deg) * np.array([wide, long])
     parts[:, 2:4] += more

@@ -1,0 +1,48 @@
+"""Measure how thick a pack's bars are by its shades: from one dark line, where two bars meet, to the next."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from barsight.core.arrays import Float64
+from barsight.yard.bundles.fitting.outline_fit import Fit, ShadeProfile
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
+from barsight.yard.bundles.gully_shading import shade_profile
+from barsight.yard.types import HeightMap
+
+DIAMETER_SIGMA_RATIO = 0.13
+"""Of a diameter by the dark lines: one standard deviation. Bars of drawn packs have 0.78 (P5) to 1.4 (P95)
+of it."""
+_DIAMETER_RATIO = 1.06
+"""Bars' diameter over the median way between dark lines: some bars are hidden in part."""
+_STEP_M, _BLUR_M = 0.002, 0.004
+_DARKER_LOG = 0.15
+"""A line is so much darker, in the logarithm, than the bars on both of its sides."""
+
+
+def bar_diameter(height_map: HeightMap, sheet: AlignedMap, fit: Fit, low_m: float, high_m: float) -> float:
+    """Measure the diameter of a pack's bars by the median way between the dark lines that run along it, from
+    low_m to high_m beside a fit's axis; NaN where fewer than two are seen.
+    """
+    shades = shade_profile(height_map, sheet, fit, (low_m, high_m))
+    lines = np.empty(0) if shades is None else dark_lines(shades)
+    return _DIAMETER_RATIO * float(np.median(np.diff(lines))) if lines.size > 1 else float("nan")
+
+
+def dark_lines(shades: ShadeProfile) -> Float64:
+    """Find the places of the darkest between rises and falls by _DARKER_LOG."""
+    places = np.arange(shades.places_m[0], shades.places_m[-1], _STEP_M)
+    level = np.interp(places, shades.places_m, shades.levels)
+    level = ndimage.gaussian_filter1d(level, _BLUR_M / _STEP_M)
+    lines, darkest, brightest, falling = list[int](), 0, level[0], False
+    for k in range(1, len(level)):
+        if falling and level[k] < level[darkest]:
+            darkest = k
+        elif falling and level[k] > level[darkest] + _DARKER_LOG:
+            lines.append(darkest)
+            falling, brightest = False, level[k]
+        elif not falling and level[k] < brightest - _DARKER_LOG:
+            falling, darkest = True, k
+        brightest = max(brightest, level[k])
+    return np.asarray(places[lines], np.float64)

@@ -1,0 +1,92 @@
+"""Find labels on the load in the orthophoto: bright plates that hold the faces off, though they are thin."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import ndimage
+
+from barsight.core.arrays import Bool, Float32, Float64
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
+from barsight.yard.stability.stability import nearest_cells
+from barsight.yard.types import HeightMap
+from barsight.yard.vetoes import Check, check_true
+
+STEP_M = 0.01
+LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 6
+"""Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides."""
+BRIGHTER_RATIO, FULL_LEVEL = 2.2, 230.0
+"""Grey level of a label over the median of the load, and the level from which on a picture shows no more."""
+MEAN_LOG, LEAST_LOG = 0.3, 0.1
+"""Logarithm of a label's level over that of the brighter end of the bare bar: on average, and everywhere."""
+_DARK = 10.0
+"""Level that is added to both: where hardly any light is, ratios tell nothing."""
+
+
+def label_checks(place: Placement, heights: HeightMap, magnet: Magnet) -> list[Check]:
+    """Check that no label lies under a face, wherever within its tolerance the crane sets it down; empty
+    without an orthophoto.
+    """
+    if heights.grey is None:
+        return []
+    found = find_label(place, heights, magnet)
+    reason = ""
+    if found is not None:
+        reason = (
+            f"a label or another bright plate lies under a face, {found[0]:+.2f} m along and "
+            f"{found[1]:+.2f} m across the beam: it would hold the faces off the bars"
+        )
+    return [check_true("gap", "no label lies under a face", found is None, reason)]
+
+
+def find_label(place: Placement, heights: HeightMap, magnet: Magnet) -> tuple[float, float] | None:
+    """Find a label under the faces, m along and across the beam; None where there is none."""
+    poles, tolerance = magnet.pole_table, magnet.tolerance
+    slack = np.array([tolerance.x_m, tolerance.y_m])
+    turned = math.radians(tolerance.yaw_deg)
+    wide = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max())
+    long = LENGTH_CELLS * STEP_M / 2 + float(np.abs(place.along) @ slack) + turned * wide
+    broad = WIDTH_CELLS * STEP_M / 2 + float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
+    reach_v = magnet.half_span_m + long + (APART_CELLS + LENGTH_CELLS) * STEP_M
+    v, u = _steps(reach_v), _steps(wide + broad + STEP_M)
+    bright = mark_labels(_grey(place, heights, v, u))
+    under = np.zeros(bright.shape, np.bool_)
+    for along, across, length, width in poles:
+        rows = np.abs(v - along) <= length / 2 + long
+        under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad)
+    cells = np.argwhere(bright & under)
+    return (float(v[cells[0, 0]]), float(u[cells[0, 1]])) if cells.size else None
+
+
+def _steps(reach_m: float) -> Float64:
+    """List places STEP_M apart to either side of 0."""
+    count = math.ceil(reach_m / STEP_M)
+    return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
+
+
+def mark_labels(grey: Float32) -> Bool:
+    """Mark the middles (V, U) of labels: bright all over, and darker before and behind along the bars.
+
+    grey: levels, 0 where nothing was seen.
+    """
+    inner = ndimage.uniform_filter1d(grey, LENGTH_CELLS, axis=0)
+    least = ndimage.minimum_filter1d(grey, LENGTH_CELLS, axis=0)
+    bare = ndimage.uniform_filter1d(grey, WIDTH_CELLS, axis=0)
+    brighter = np.maximum(np.roll(bare, APART_CELLS, axis=0), np.roll(bare, -APART_CELLS, axis=0)) + _DARK
+    mean = ndimage.uniform_filter1d(np.log((inner + _DARK) / brighter), WIDTH_CELLS, axis=1)
+    worst = ndimage.minimum_filter1d(np.log((least + _DARK) / brighter), WIDTH_CELLS, axis=1)
+    level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
+    seen = grey[grey > 0]
+    needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
+    return np.asarray((mean > MEAN_LOG) & (worst > LEAST_LOG) & (level > needed))
+
+
+def _grey(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> Float32:
+    """Look up grey levels (V, U) at places along and across; 0 where nothing was seen."""
+    x = place.x_m + v[:, None] * place.along[0] + u * place.across[0]
+    y = place.y_m + v[:, None] * place.along[1] + u * place.across[1]
+    column, row, inside = nearest_cells(heights, x, y)
+    assert heights.grey is not None
+    return np.asarray(np.where(inside, heights.grey[row, column], 0), np.float32)

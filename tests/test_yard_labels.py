@@ -1,0 +1,45 @@
+"""Labels on drawn orthophotos of a load: found under a face, and not mistaken for straps or shine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.yard.lifting.labels import find_label, mark_labels
+from barsight.yard.magnet.footprint import Placement
+from lift_yards import MAGNET, codes, judged, laid, map_of, record
+
+PLACE = Placement(0.3, 0.0, 0.0)
+
+
+def bars(shape: tuple[int, int]) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    return 100 * np.exp(rng.normal(0, 0.12, shape)) * (0.7 + 0.5 * np.sin(np.arange(shape[1])) ** 2)
+
+
+def test_a_label_is_marked_and_a_strap_is_not() -> None:
+    grey = bars((300, 21))
+    assert not mark_labels(grey).any()
+    grey[100:103] = 250.0
+    grey[200:, :4] = 250.0
+    assert not mark_labels(grey)[:190].any(), "a bright strap"
+    grey[150:156, 8:12] = 250.0
+    rows, columns = np.nonzero(mark_labels(grey)[:190])
+    assert rows.min() >= 149 and rows.max() <= 156 and columns.min() >= 7 and columns.max() <= 12
+
+
+@pytest.mark.parametrize(("y_m", "under"), [(MAGNET.poles[0].along_m, True), (0.0, False)])
+def test_a_label_under_a_face_forbids(y_m: float, under: bool) -> None:
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    grey = bars(heights.shape)
+    label = np.ix_(np.abs(heights.y_m - y_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)
+    grey[label] = 250.0
+    heights = replace(heights, grey=np.clip(grey, 1, 255).astype(np.uint8))
+    found = find_label(PLACE, heights, MAGNET)
+    assert (found is not None) == under
+    if found is not None:
+        assert found[0] == pytest.approx(y_m, abs=0.03) and found[1] == pytest.approx(0.0, abs=0.02)
+    lift = judged([laid(0.3)], (record(laid(0.3)),), PLACE, heights=heights)
+    assert codes(lift) == ({"gap"} if under else set())
