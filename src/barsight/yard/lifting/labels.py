@@ -19,7 +19,7 @@ LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 6
 """Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides."""
 BRIGHTER_RATIO, FULL_LEVEL = 2.2, 230.0
 """Grey level of a label over the median of the load, and the level from which on a picture shows no more."""
-MEAN_LOG, LEAST_LOG = 0.3, 0.1
+MEAN_LOG, MIN_LOG = 0.3, 0.1
 """Logarithm of a label's level over that of the brighter end of the bare bar: on average, and everywhere."""
 _DARK = 10.0
 """Level that is added to both: where hardly any light is, ratios tell nothing."""
@@ -80,7 +80,7 @@ def mark_labels(grey: Float32) -> Bool:
     level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
     seen = grey[grey > 0]
     needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
-    return np.asarray((mean > MEAN_LOG) & (worst > LEAST_LOG) & (level > needed))
+    return np.asarray((mean > MEAN_LOG) & (worst > MIN_LOG) & (level > needed))
 
 
 def _grey(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> Float32:
