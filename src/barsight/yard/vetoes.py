@@ -124,6 +124,6 @@ def _checked(
     if figure + sigmas * sigma <= most:
         return check("passed", "")
     if figure <= most:
-        times = "its sigma" if sigmas == 1 else f"{sigmas:.3g} times its sigma"
-        reason = f"{reason}; the figure lies within {times} of the limit"
+        of = f"{1.96 * sigma:.3g} {unit}".rstrip()
+        reason = f"{reason}, but the figure is known to ±{of} (95 %) only"
     return check("failed", reason)

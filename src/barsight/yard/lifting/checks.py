@@ -102,6 +102,9 @@ def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: Lif
     )
     if not held:
         aside += ": the lean lies within its sigma of the limit"
+    needed = (
+        f"{needed_n / 1e3:.1f} kN are needed" if math.isfinite(needed_n) else "the load's weight is not known"
+    )
     return [
         check_max(
             "tilt", "slope of the faces along the beam", pitch, limits.pitch_deg, "deg",
@@ -126,7 +129,7 @@ def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: Lif
         ),
         check_min(
             "weak-pull", "pull on the load", contact.pull_n, needed_n, "N",
-            f"the pull is at least {contact.pull_low_n / 1e3:.1f} kN, {needed_n / 1e3:.1f} kN are needed",
+            f"the pull is at least {contact.pull_low_n / 1e3:.1f} kN, {needed}",
             sigma=(contact.pull_n - contact.pull_low_n) / UPPER, sigmas=UPPER,
         ),
     ]  # fmt: skip
