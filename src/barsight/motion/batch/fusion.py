@@ -207,7 +207,7 @@ class BatchPoses:
             crane, doubts = checked.samples, checked.warnings
         if self._spoiled:
             warnings += (f"{self._spoiled} IMU samples are at the end of their scale and were left out",)
-        if self.reads_pictures and crane is not None:
+        if self.reads_pictures:
             few, most = _untied(sightings, refused)
             warnings, doubts = warnings + few, doubts + most
         return _Inputs(crane, self._imu, sightings, refused, level, warnings, doubts)
@@ -318,7 +318,7 @@ def _detail(
 def _untied(
     sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Warn that pictures don't follow from each other, though encoders place their frames."""
+    """Warn that pictures don't follow from each other, though encoders may place their frames."""
     count = len(refused) + sum(sighting.motion is None for sighting in sightings[1:])
     if count == 0:
         return (), ()
@@ -326,7 +326,9 @@ def _untied(
     told = f"the pictures of {count} of {total} frames can't be tied to those before"
     if 2 * count <= total:
         return (told,), ()
-    return (), (f"{told}: too little texture, or left and right pictures of different times",)
+    return (), (
+        f"{told}: too little texture, too long a step, or left and right pictures of different times",
+    )
 
 
 def _placed_frames(
