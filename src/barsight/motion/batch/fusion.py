@@ -163,7 +163,7 @@ class BatchPoses:
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())
         if len(frames) < 2:
-            return replace(self._simple(inputs), doubts=inputs.doubts)
+            return replace(self._simple(inputs), doubts=inputs.doubts + _jumps_alone(inputs))
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
             estimate, seen, doubts, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
@@ -171,7 +171,8 @@ class BatchPoses:
             simple = self._simple(inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             told = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
-            return replace(simple, warnings=told, doubts=(*inputs.doubts, f"{reason}: estimated one by one"))
+            doubts = inputs.doubts + _jumps_alone(inputs)
+            return replace(simple, warnings=told, doubts=(*doubts, f"{reason}: estimated one by one"))
         placed = tuple(
             PosedFrame(int(stamp), estimate.poses[k], covariance)
             for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
@@ -287,6 +288,16 @@ class BatchPoses:
         warnings += maybe
         encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
         return estimate, warnings, sure, encoders
+
+
+def _jumps_alone(inputs: _Inputs) -> tuple[str, ...]:
+    """Tell of the encoders' jumps where no estimate of all sensors takes them off."""
+    from barsight.motion.problem.encoder_factors import jump_sentences
+
+    if inputs.crane is None:
+        return ()
+    sure, maybe = jump_sentences(inputs.crane.jumps, int(inputs.crane.stamp_ns[0]), None)
+    return sure + maybe
 
 
 def _detail(

@@ -34,8 +34,9 @@ MIN_SIDE = 4
 """So many readings must lie on either side of a step."""
 SURE_SIGMAS, MAYBE_SIGMAS = 4.7, 4.0
 """From here on a step is a jump; from here on it may be one, and binds the readings on its sides less."""
-BLIND_RATIO = 1.25
-"""By how much both are higher where no IMU tells the way: what a crane may do isn't quite normal."""
+BLIND_RATIO = 1.7
+"""By how much both are higher where no IMU tells the way: what a crane may do isn't quite normal, and three
+wild readings on end look like a step."""
 MIN_JUMP_M = 0.004
 WIDE_M = 10.0
 CAUCHY_SIGMAS = 3.0

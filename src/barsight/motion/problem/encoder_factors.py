@@ -144,11 +144,11 @@ def jump_sentences(
             told = f"{1e3 * state.jump_m[k]:.1f} mm (1 sigma {1e3 * state.jump_sigma_m[k]:.1f} mm)"
         match jump.kind:
             case "sure":
-                sure.append(f"{encoder} jumps by {told} {at}; it was taken off what follows")
+                sure.append(f"{encoder} jumps by {told} {at}; the readings before are held to be right")
             case "freeze":
-                sure.append(f"{encoder} goes on {at}, after the freeze, off by {told}; it was taken off")
+                sure.append(f"{encoder} goes on {at}, after the freeze, off by {told}")
             case "maybe":
-                maybe.append(f"{encoder} may jump {at}, by {told}: its readings before and after bind less")
+                maybe.append(f"{encoder} may jump {at}, by {told}: sigma holds it")
     return tuple(sure), tuple(maybe)
 
 
