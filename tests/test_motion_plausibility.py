@@ -109,7 +109,7 @@ def test_drawn_cranes_jump_where_they_do() -> None:
     ("sensors", "count", "sizes_m"),
     [
         ("stereo,imu", 500, ()),
-        ("stereo,imu", 120, (0.008,)),
+        ("stereo,imu", 300, (0.008,)),
         ("stereo,imu", 40, (0.03, 0.1)),
         ("imu", 20, (0.03,)),
         ("stereo", 20, (0.03, 0.1)),
