@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.linalg import skyline
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.types import EncoderJump, RectifiedCamera
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ImuBias
 from barsight.motion.frontend.tracking import Sighting
@@ -148,34 +148,34 @@ def test_nodes_between_frames_are_taken_out() -> None:
     own = np.array([blocks[k, :, k] for k in range(count)])
     link = np.array([blocks[k, :, max(k - 1, 0)] for k in range(count)])
     link[0] = 0
-    gradient, side = rng.normal(size=(2, size * count))
-    kept, latency = np.array([1, 2, 5]), 0.7
-    rows = (count, size)
-    chain = Chain(own, link, gradient.reshape(rows), side.reshape(rows), np.array([9.0, 0.5]))
+    gradient, side = rng.normal(size=size * count), rng.normal(size=(size * count, 2))
+    kept, shared = np.array([1, 2, 5]), np.array([0.7, -0.2])
+    corner, pull = np.array([[9.0, 1.0], [1.0, 7.0]]), np.array([0.5, -0.4])
+    chain = Chain(own, link, gradient.reshape(count, size), side.reshape(count, size, 2), corner, pull)
     left, gaps = eliminate_nodes(chain, kept)
     band = skyline.full(np.zeros((9, 9)))
     add_chain(left, np.arange(0, 9, 3), band)
     small = np.tril(band.values.reshape(9, 9))
     small += np.tril(small, -1).T
-    left_gradient, left_side = left.gradient.ravel(), left.side.ravel()
-    step = -np.linalg.solve(small, left_gradient + latency * left_side)
-    found = back_substitute_nodes(step.reshape(3, 3), latency, kept, gaps, count)
-    np.testing.assert_allclose(found.ravel(), -np.linalg.solve(matrix, gradient + latency * side), atol=1e-12)
+    left_gradient, left_side = left.gradient.ravel(), left.side.reshape(-1, 2)
+    step = -np.linalg.solve(small, left_gradient + left_side @ shared)
+    found = back_substitute_nodes(step.reshape(3, 3), shared, kept, gaps, count)
+    np.testing.assert_allclose(found.ravel(), -np.linalg.solve(matrix, gradient + side @ shared), atol=1e-12)
     whole = np.linalg.solve(matrix, np.column_stack([side, gradient]))
     rest = np.linalg.solve(small, np.column_stack([left_side, left_gradient]))
-    np.testing.assert_allclose(left.corner[0] - left_side @ rest[:, 0], 9.0 - side @ whole[:, 0])
-    np.testing.assert_allclose(left.corner[1] - left_side @ rest[:, 1], 0.5 - side @ whole[:, 1])
+    np.testing.assert_allclose(left.corner - left_side.T @ rest[:, :2], corner - side.T @ whole[:, :2])
+    np.testing.assert_allclose(left.corner_gradient - left_side.T @ rest[:, 2], pull - side.T @ whole[:, 2])
 
 
 def test_sparse_rows_are_added_to_a_chain() -> None:
-    """Four nodes of two unknowns; each row binds two neighbours and the latency."""
+    """Four nodes of two unknowns; each row binds two neighbours and two of the encoders' unknowns."""
     rng = np.random.default_rng(8)
-    dense = np.zeros((15, 9))
+    dense = np.zeros((15, 10))
     for r, row in enumerate(dense):
-        row[2 * (r % 3) : 2 * (r % 3) + 4], row[8] = rng.normal(size=4), rng.normal()
+        row[2 * (r % 3) : 2 * (r % 3) + 4], row[8:] = rng.normal(size=4), rng.normal(size=2)
     row, at = np.nonzero(dense)
     right = rng.normal(size=15)
-    chain = Chain.empty(4, 2)
+    chain = Chain.empty(4, 2, 2)
     add_products(np.searchsorted(row, np.arange(16)), at, dense[row, at], right, chain)
     matrix, gradient = dense.T @ dense, -dense.T @ right
     for k in range(4):
@@ -183,8 +183,9 @@ def test_sparse_rows_are_added_to_a_chain() -> None:
         np.testing.assert_allclose(chain.own[k], matrix[own, own])
         np.testing.assert_allclose(chain.link[k], matrix[own, 2 * k - 2 : 2 * k] if k else np.zeros((2, 2)))
     np.testing.assert_allclose(chain.gradient.ravel(), gradient[:8])
-    np.testing.assert_allclose(chain.side.ravel(), matrix[8, :8])
-    np.testing.assert_allclose(chain.corner, [matrix[8, 8], gradient[8]])
+    np.testing.assert_allclose(chain.side.reshape(8, 2), matrix[:8, 8:])
+    np.testing.assert_allclose(chain.corner, matrix[8:, 8:])
+    np.testing.assert_allclose(chain.corner_gradient, gradient[8:])
 
 
 def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple[Problem, np.ndarray]:
@@ -209,31 +210,36 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
         places.append((rect0 @ MOUNT.inverse()).translation + rng.normal(0, 0.0005, 3))
     seen = StereoObservations.of(sightings, range(count), CAMERA, MOUNT)
     stamps = np.arange(count) * 500_000_000
-    placed, attitudes = (), ()
+    placed, attitudes, jumps = (), (), ()
     if with_crane:
+        jumps = EncoderJump(stamps[5], 0, 0.0, 1.0), EncoderJump(stamps[3], 1, 0.0, 0.02)
+        places = [place + np.array([0.03 * (k >= 5), 0.02 * (k >= 3), 0]) for k, place in enumerate(places)]
         v, a = np.array([0.8, 0, 0]), np.array([0.3, 0.1, 0])
         places[2] += 0.01 * (wrong_px > 0)  # beyond Huber's length
         placed = tuple(EncoderPosition(k, place, v * (k % 3 - 1), a, 0.002) for k, place in enumerate(places))
         attitudes = tuple(AttitudePrior(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
     problem = Problem(
         tuple(poses), stamps, not with_crane, seen, (None,) * (count - 1), placed, attitudes, (),
-        ImuBias.none(), has_latency=with_crane,
+        ImuBias.none(), has_latency=with_crane, jumps=jumps,
     )  # fmt: skip
     return problem, well_observed(seen, np.ones(len(seen.node), np.bool_))
 
 
 def encoder_error(
-    place: EncoderPosition,
+    place: EncoderPosition, share: np.ndarray
 ) -> Callable[[Any, gtsam.Values, list[np.ndarray] | None], np.ndarray]:
-    """The body's place minus the encoders' reading `latency` later, and its derivatives."""
+    """The body's place minus the encoders' reading `latency` later without its jumps, of which bridge and
+    trolley have a share (2,), and its derivatives."""
 
     def error(factor: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
-        pose, latency = values.atPose3(factor.keys()[0]), values.atVector(factor.keys()[1])[0]
+        pose, (latency, *jumped) = values.atPose3(factor.keys()[0]), values.atVector(factor.keys()[1])
+        by_jumps = np.diag([*share, 1.0])[:, :2]
         if jacobians is not None:
             jacobians[0] = np.hstack([np.zeros((3, 3)), pose.rotation().matrix()])
-            jacobians[1] = -(place.velocity_mps + place.acceleration_mps2 * latency)[:, None]
+            speed = place.velocity_mps + place.acceleration_mps2 * latency
+            jacobians[1] = np.column_stack([-speed, by_jumps])
         way = place.velocity_mps * latency + place.acceleration_mps2 * latency**2 / 2
-        return pose.translation() - place.position_m - way
+        return pose.translation() - place.position_m - way + by_jumps @ jumped
 
     return error
 
@@ -250,7 +256,8 @@ def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Ma
     points = initial_points(problem)
     for place in problem.placed:
         model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, place.sigma_m))
-        graph.add(gtsam.CustomFactor(model, [X(place.node), E(0)], encoder_error(place)))
+        share = np.array([float(place.node >= 5), float(place.node >= 3)])
+        graph.add(gtsam.CustomFactor(model, [X(place.node), E(0)], encoder_error(place, share)))
     for k in np.flatnonzero(used):
         model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, seen.sigma_px[k]))
         u, v, right = seen.stereo[k]
@@ -279,6 +286,10 @@ def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
         sigma = np.sqrt(np.diag(covariance.marginalCovariance(X(k))))
         assert (np.abs(off) < 0.01 * sigma + 1e-9).all()
         np.testing.assert_allclose(np.sqrt(np.diag(found.poses[k])), sigma, rtol=0.01)
+    if with_crane:
+        sigma = np.sqrt(np.diag(covariance.marginalCovariance(E(0))))
+        assert (np.abs(expected.atVector(E(0)) - state.values.atVector(E(0))) < 0.01 * sigma).all()
+        np.testing.assert_allclose(found.encoder_sigmas, sigma, rtol=0.01)
 
 
 def moved_by(step: np.ndarray) -> np.ndarray:
@@ -412,7 +423,7 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
     def check(pulls: np.ndarray, variance: float) -> None:
         gradient = np.zeros_like(system.gradient)
         gradient[at] = pulls / np.sqrt(variance)
-        pulled = replace(system, gradient=gradient, corner_gradient=np.zeros(4))
+        pulled = replace(system, gradient=gradient, corner_gradient=np.zeros(problem.border))
         step = pulled.step(problem.free)
         np.testing.assert_allclose(step[1] @ pulls, -np.sqrt(variance), rtol=1e-6)
         costs = []
@@ -425,8 +436,8 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
         check(np.eye(6)[axis], variances[axis])
     check(weights, of_sum)
     own, _ = system.schur(system.forward)
-    for axis in (2, 3):
-        by = np.zeros(4)
+    for axis in (problem.border - 2, problem.border - 1):
+        by = np.zeros(problem.border)
         by[axis] = 0.3 / np.sqrt(own[axis, axis])
         costs = [
             cost_of(
@@ -434,7 +445,7 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
             )
             for s in (0.0, 1.0, -1.0)
         ]
-        left = own[axis, axis] - own[axis, :2] @ np.linalg.solve(own[:2, :2], own[:2, axis])
+        left = own[axis, axis] - own[axis, :-2] @ np.linalg.solve(own[:-2, :-2], own[:-2, axis])
         rise = (costs[1] + costs[2] - 2 * costs[0]) / by[axis] ** 2
         np.testing.assert_allclose(rise, left, rtol=0.02)
 

@@ -7,6 +7,7 @@ after rectification) and `crane`; docs/reference/conventions.md defines them. No
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -62,6 +63,25 @@ class ImuSamples:
     accel_mps2: Float64
 
 
+@dataclass(frozen=True)
+class EncoderJump:
+    """A jump of one encoder's readings, from `stamp_ns` on: bridge, trolley or hoist (axis 0, 1, 2).
+
+    size_m: by how much the readings are taken to have jumped; sigma_m: of that. kind: whether it is sure, may
+    be one, or might be since the readings stood still before.
+    """
+
+    stamp_ns: int
+    axis: int
+    size_m: float
+    sigma_m: float
+    kind: Literal["sure", "maybe", "freeze"] = "sure"
+
+    def share(self, stamp_ns: Int64) -> Float64:
+        """Return (N,) by how many times its size readings of these stamps are off: 0 or, from it on, 1."""
+        return np.where(stamp_ns >= self.stamp_ns, 1.0, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class CraneSamples:
     """The encoders' place of the crane's reference point.
@@ -69,6 +89,7 @@ class CraneSamples:
     stamp_ns: (N,) int64 increasing. position_m: (N, 3) in `yard`: bridge x, trolley y, hoist z.
     crane_to_body_m: (3,) the body's origin minus the crane point, yard axes.
     yard_from_body_nominal: (3, 3) attitude of the body as mounted. position_std_m: one reading's sigma.
+    jumps: found in the readings and taken off them, in time's order; no fit may reach across one.
     """
 
     stamp_ns: Int64
@@ -76,6 +97,7 @@ class CraneSamples:
     crane_to_body_m: Float64
     yard_from_body_nominal: Float64
     position_std_m: float
+    jumps: tuple[EncoderJump, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -139,7 +139,7 @@ def _estimate(
         sigma,
         drift and with_matching_bias(drift, problem),
         used,
-        encoder_state(state.values, found.latency_sigma_s) if problem.has_latency else None,
+        encoder_state(state.values, problem.jumps, found.encoder_sigmas) if problem.has_latency else None,
         everywhere.placed,
         encoder_residuals(state.values, everywhere),
         encoder_inliers(state.values, everywhere),

@@ -6,16 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
-from barsight.core.types import CraneSamples, ImuSamples
-from barsight.motion.crane.encoder_jumps import find_jumps
+from barsight.core.types import CraneSamples, EncoderJump, ImuSamples
+from barsight.motion.crane.encoder_jumps import find_jumps, lost_counts, take_off_jumps
 from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.motion.crane.jump_window import WIDE_M
+from barsight.motion.crane.known_motion import KnownMotion
 from barsight.motion.crane.sway import turned_angle
+from barsight.motion.frontend.seen_steps import seen_steps
 from barsight.motion.frontend.tracking import Sighting
 
 MIN_FROZEN = 5
@@ -37,38 +39,50 @@ CLEARLY_BETTER = 0.1
 
 @dataclass(frozen=True, eq=False)
 class CheckedCrane:
-    """Usable readings, and sentences on what was left out."""
+    """Usable readings, their jumps told and taken off, and sentences on what was left out."""
 
     samples: CraneSamples
     warnings: tuple[str, ...]
 
 
-def check_crane(crane: CraneSamples) -> CheckedCrane:
-    """Remove readings that stand still while the crane must be moving, and those beyond a jump.
+def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> CheckedCrane:
+    """Remove readings that stand still while the crane must be moving, and find the jumps.
 
-    Which side of a jump is right can't be told from the encoders: the longer one stays.
+    known: what pictures and IMU say of the way. After a freeze an encoder may have lost count by any size,
+    unless these show that it has not.
     """
-    samples, warnings = crane, []
-    for first, last in _frozen(crane):
-        seconds = [(crane.stamp_ns[k] - crane.stamp_ns[0]) / NS_PER_S for k in (first, last)]
-        warnings.append(
-            f"the encoders were frozen from {seconds[0]:.1f} s to {seconds[1]:.1f} s while the crane moved"
-        )
-        away = (samples.stamp_ns >= crane.stamp_ns[first]) & (samples.stamp_ns <= crane.stamp_ns[last])
-        samples = _chosen(samples, ~away)
-    jumps = find_jumps(samples)
-    if jumps:
-        bounds = [0, *(k for k, _ in jumps), len(samples.stamp_ns)]
-        longest = int(np.argmax(np.diff(bounds)))
-        for k, size in jumps:
-            at = (samples.stamp_ns[k] - crane.stamp_ns[0]) / NS_PER_S
-            warnings.append(
-                f"the encoders jump by {1e3 * size:.0f} mm at {at:.1f} s; only the longest stretch "
-                "without a jump is used"
-            )
-        index = np.arange(len(samples.stamp_ns))
-        samples = _chosen(samples, (index >= bounds[longest]) & (index < bounds[longest + 1]))
-    return CheckedCrane(samples, tuple(warnings))
+    parts = [(int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen(crane)]
+    samples, after = without_frozen(crane, parts)
+    after = lost_counts(samples, after, known, least_way_m(crane))
+    found = find_jumps(replace(samples, jumps=after), known)
+    warnings = freeze_sentences(parts, int(crane.stamp_ns[0])) if parts else ()
+    return CheckedCrane(take_off_jumps(samples, (*after, *found)), warnings)
+
+
+def freeze_sentences(parts: Sequence[tuple[int, int]], begin_ns: int) -> tuple[str, ...]:
+    """Tell of frozen parts, from one stamp to another; times from `begin_ns` on."""
+    told = [tuple((stamp - begin_ns) / NS_PER_S for stamp in part) for part in parts]
+    return tuple(
+        f"the encoders were frozen from {first:.1f} s to {last:.1f} s while the crane moved"
+        for first, last in told
+    )
+
+
+def least_way_m(crane: CraneSamples) -> float:
+    """Return the way from which on encoders that stand still are held to be frozen."""
+    return max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
+
+
+def without_frozen(
+    crane: CraneSamples, parts: Sequence[tuple[int, int]]
+) -> tuple[CraneSamples, tuple[EncoderJump, ...]]:
+    """Remove the readings of frozen parts, from one stamp to another; also what may have jumped meanwhile."""
+    after: list[EncoderJump] = []
+    for first_ns, last_ns in parts:
+        crane = _chosen(crane, (crane.stamp_ns < first_ns) | (crane.stamp_ns > last_ns))
+        for begins in crane.stamp_ns[crane.stamp_ns > last_ns][:1].tolist():
+            after += [EncoderJump(begins, axis, 0.0, WIDE_M, "freeze") for axis in range(3)]
+    return crane, tuple(after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +110,7 @@ def compare_steps(
     count, ends = len(sightings), max(abs(off) for off in offs)
     steps = [k for k in range(1 + ends, count - ends) if sightings[k].motion is not None]
     stamps = np.array([s.stamp_ns for s in sightings]) + shift_ns
-    turn, way = seen_steps(sightings, steps, rectifier)
+    seen = seen_steps(sightings, steps, rectifier, shift_ns)
     angle, place = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
     if imu is not None:
         angle = interpolate_at(stamps, imu.stamp_ns, turned_angle(imu))
@@ -111,8 +125,8 @@ def compare_steps(
         travel = np.linalg.norm(place[new] - place[old], axis=1)
         found.append(
             StepComparison(
-                turn,
-                np.linalg.norm(way, axis=1),
+                seen.turn,
+                np.linalg.norm(seen.way_m, axis=1),
                 angle[new] - angle[old],
                 travel,
                 (stamps[new] - stamps[old]) / NS_PER_S,
@@ -158,31 +172,11 @@ def _gyro_residual(steps: StepComparison) -> Float64:
     return residual
 
 
-def seen_steps(
-    sightings: Sequence[Sighting], steps: list[int], rectifier: Rectifier
-) -> tuple[Float64, Float64]:
-    """Measure by the pictures: turn old body from new body (K, 3), and the way in m (K, 3), both in the old
-    body's axes.
-    """
-    mount = rectifier.body_from_rect0
-    turns, ways = [], []
-    for k in steps:
-        motion = sightings[k].motion
-        assert motion is not None
-        old_from_new = motion.rotation.T
-        rotation = mount.rotation @ old_from_new @ mount.rotation.T
-        move = mount.rotation @ (-old_from_new @ motion.translation)
-        move = move + mount.translation - rotation @ mount.translation
-        turns.append(Rotation.from_matrix(rotation).as_rotvec())
-        ways.append(move)
-    return np.array(turns).reshape(-1, 3), np.array(ways).reshape(-1, 3)
-
-
 def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
     return replace(crane, stamp_ns=crane.stamp_ns[kept], position_m=crane.position_m[kept])
 
 
-def _frozen(crane: CraneSamples) -> list[tuple[int, int]]:
+def frozen(crane: CraneSamples) -> list[tuple[int, int]]:
     """Find stretches (first, last) of equal readings that a moving crane runs into or comes out of elsewhere.
 
     A crane that turns gives equal readings too, of coarse encoders most of all, but stays near them.
@@ -190,7 +184,7 @@ def _frozen(crane: CraneSamples) -> list[tuple[int, int]]:
     place, time = crane.position_m, (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
     edges = np.flatnonzero(np.diff(same.astype(int)))
-    least = max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
+    least = least_way_m(crane)
     found = []
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         if last - first + 1 < MIN_FROZEN or first < SIDE // 2:

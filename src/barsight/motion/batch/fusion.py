@@ -33,6 +33,7 @@ from barsight.motion.estimator import FrameInput, TrajectoryEstimator
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.board_corners import PointTracker, split_tracks
 from barsight.motion.frontend.motion_prediction import CranePredictor
+from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker, innovations
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
@@ -112,11 +113,12 @@ class BatchPoses:
         self._recording, self._rectifier = recording, rectifier
         self.reads_pictures = "stereo" in use
         self._stated = recording.crane() if "crane" in use else None
-        self._checked = None if self._stated is None else check_crane(reestimate_noise(self._stated))
-        self._crane = None if self._checked is None else self._checked.samples
         self._imu, self._spoiled = recording.imu() if "imu" in use else None, 0
         if self._imu is not None:
             self._imu, self._spoiled = without_saturation(self._imu)
+        self._crane = None
+        if self._stated is not None:
+            self._crane = check_crane(reestimate_noise(self._stated), KnownMotion(None, self._imu)).samples
         if self._crane is None and not self.reads_pictures:
             raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
         self._tracker = Tracker(self._predictor(), settings.front_end)
@@ -160,15 +162,16 @@ class BatchPoses:
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())
         if len(frames) < 2:
-            return replace(self._simple(inputs), doubts=inputs.doubts)
+            return replace(self._simple(inputs), doubts=inputs.doubts + _jumps_alone(inputs))
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
-            estimate, seen, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
+            estimate, seen, doubts, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
         except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
             simple = self._simple(inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             told = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
-            return replace(simple, warnings=told, doubts=(*inputs.doubts, f"{reason}: estimated one by one"))
+            doubts = inputs.doubts + _jumps_alone(inputs)
+            return replace(simple, warnings=told, doubts=(*doubts, f"{reason}: estimated one by one"))
         placed = tuple(
             PosedFrame(int(stamp), estimate.poses[k], covariance)
             for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
@@ -178,7 +181,7 @@ class BatchPoses:
         return Trajectory(
             "world" if inputs.crane is None else "yard", placed, tuple(refused), sensors,
             inputs.warnings + seen, estimate.drift,
-            _detail(estimate, inputs.sightings, nodes, encoders, shift), inputs.doubts,
+            _detail(estimate, inputs.sightings, nodes, encoders, shift), inputs.doubts + doubts,
         )  # fmt: skip
 
     def _simple(self, inputs: _Inputs) -> Trajectory:
@@ -190,16 +193,21 @@ class BatchPoses:
 
     def _inputs(self) -> _Inputs:
         """Gather what was tracked and the checked sensors. Raises InputError where they contradict."""
-        recording, crane = self._recording, self._crane
+        recording, crane, doubts = self._recording, self._crane, tuple[str, ...]()
         sightings, refused = tuple(self._sightings), tuple(self._refused)
         if isinstance(recording, CornerRecording):
             sightings = split_tracks(sightings)
         self._refuse_wrong_sensors(sightings)
-        level, checked = None if crane else align_with_gravity(recording), self._checked
-        warnings, doubts = level.warnings if level else (), checked.warnings if checked else ()
+        level = None if crane else align_with_gravity(recording)
+        warnings = level.warnings if level else ()
+        if self._stated is not None:
+            shift = recording.rig.timeshift_cam_imu_ns
+            known = known_motion(sightings, self._imu, self._rectifier, shift)
+            checked = check_crane(reestimate_noise(self._stated), known)
+            crane, doubts = checked.samples, checked.warnings
         if self._spoiled:
             warnings += (f"{self._spoiled} IMU samples are at the end of their scale and were left out",)
-        if self.reads_pictures and crane is not None:
+        if self.reads_pictures:
             few, most = _untied(sightings, refused)
             warnings, doubts = warnings + few, doubts + most
         return _Inputs(crane, self._imu, sightings, refused, level, warnings, doubts)
@@ -219,10 +227,14 @@ class BatchPoses:
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int
-    ) -> tuple[Estimate, tuple[str, ...], NormalisedResiduals | None]:
+    ) -> tuple[Estimate, tuple[str, ...], tuple[str, ...], NormalisedResiduals | None]:
         # GTSAM is loaded where it is needed: its import takes a quarter of a second.
         from barsight.motion.batch.bundle_adjustment import solve_batch
-        from barsight.motion.problem.encoder_factors import encoder_positions, encoder_warnings
+        from barsight.motion.problem.encoder_factors import (
+            encoder_positions,
+            encoder_warnings,
+            jump_sentences,
+        )
         from barsight.motion.problem.problem import (
             AttitudePrior,
             EncoderPosition,
@@ -251,6 +263,7 @@ class BatchPoses:
                 if k in still:
                     sigma = self._crane_settings.sway_std_deg * len(still) ** 0.5
                 attitudes.append(AttitudePrior(k, nominal, np.full(3, np.deg2rad(sigma))))
+        jumps = inputs.crane.jumps if inputs.crane is not None and placed else ()
         seen = None
         if inputs.sightings:
             at = {int(nodes.stamp_ns[k]) - shift: int(k) for k in nodes.frame}
@@ -262,15 +275,28 @@ class BatchPoses:
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, placed,
             tuple(attitudes), ties.still, ties.bias,
             offset_prior_px=self._settings.offset_prior_px, scale_prior=self._settings.scale_sigma,
-            crane=inputs.crane, has_latency=bool(placed),
+            crane=inputs.crane, has_latency=bool(placed), jumps=jumps,
             has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
         estimate = solve_batch(problem, nodes.frame)
         warnings = encoder_warnings(
             estimate.encoders, nodes.stamp_ns, estimate.placed, estimate.encoder_off_m, estimate.encoder_used
         )
+        begin_ns = 0 if inputs.crane is None else int(inputs.crane.stamp_ns[0])
+        sure, maybe = jump_sentences(jumps, begin_ns, estimate.encoders)
+        warnings += maybe
         encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
-        return estimate, warnings, encoders
+        return estimate, warnings, sure, encoders
+
+
+def _jumps_alone(inputs: _Inputs) -> tuple[str, ...]:
+    """Tell of the encoders' jumps where no estimate of all sensors takes them off."""
+    from barsight.motion.problem.encoder_factors import jump_sentences
+
+    if inputs.crane is None:
+        return ()
+    sure, maybe = jump_sentences(inputs.crane.jumps, int(inputs.crane.stamp_ns[0]), None)
+    return sure + maybe
 
 
 def _detail(
@@ -302,7 +328,7 @@ def _detail(
 def _untied(
     sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Warn that pictures don't follow from each other, though encoders place their frames."""
+    """Warn that pictures don't follow from each other, though encoders may place their frames."""
     count = len(refused) + sum(sighting.motion is None for sighting in sightings[1:])
     if count == 0:
         return (), ()
@@ -310,7 +336,9 @@ def _untied(
     told = f"the pictures of {count} of {total} frames can't be tied to those before"
     if 2 * count <= total:
         return (told,), ()
-    return (), (f"{told}: too little texture, or left and right pictures of different times",)
+    return (), (
+        f"{told}: too little texture, too long a step, or left and right pictures of different times",
+    )
 
 
 def _placed_frames(

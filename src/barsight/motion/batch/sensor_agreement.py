@@ -7,7 +7,6 @@ A wrong unit, axis or clock is off by far more than any noise, so every limit is
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,10 @@ from barsight.motion.batch.fault_detection import (
     CLEARLY_BETTER,
     TURN_SIGMA_RAD,
     WAY_SIGMA_M,
-    seen_steps,
 )
+from barsight.motion.crane.known_motion import SeenSteps
 from barsight.motion.crane.sway import turned_angle
+from barsight.motion.frontend.seen_steps import seen_steps
 from barsight.motion.frontend.tracking import Sighting
 
 MIN_STEPS, MAX_STEPS = 3, 200
@@ -38,23 +38,6 @@ MAX_IMU_LATE_S, MAX_CRANE_LATE_S = 0.05, 0.2
 """The encoders' latency is estimated, so theirs may be longer."""
 LATE_S = np.arange(-50, 51) * 0.02
 """Delays that are tried."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Steps:
-    """K steps between frames: old_ns, new_ns (K,) by the other sensors' clock; turn (K, 3) rotation vector
-    old body from new body and way (K, 3) m in `body`, by the pictures."""
-
-    old_ns: Int64
-    new_ns: Int64
-    turn: Float64
-    way: Float64
-
-    def between(self, stamp_ns: Int64, values: Float64, late_s: float) -> Float64:
-        """Differences (K, 3) of a sensor's values over the steps, its stamps `late_s` late; NaN beyond."""
-        late_ns = seconds_to_ns(late_s)
-        old, new = (interpolate_at(at + late_ns, stamp_ns, values) for at in (self.old_ns, self.new_ns))
-        return np.asarray(new - old)
 
 
 def refuse_contradictions(
@@ -74,12 +57,12 @@ def refuse_contradictions(
         _check_gyro(path, steps, imu)
 
 
-def _check_encoders(path: Path, steps: _Steps, crane: CraneSamples) -> None:
+def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
     place = median_filter(crane.position_m, size=(5, 1), mode="nearest")  # single readings may be wild
-    seen_m = np.linalg.norm(steps.way, axis=1)
+    seen_m = np.linalg.norm(steps.way_m, axis=1)
 
     def travelled(late_s: float) -> Float64:
-        return steps.between(crane.stamp_ns, place, late_s) @ crane.yard_from_body_nominal
+        return _between(steps, crane.stamp_ns, place, late_s) @ crane.yard_from_body_nominal
 
     def compared(late_s: float) -> tuple[float, float] | None:
         """Median of the ratio, third quartile of the angle (deg); None where too few steps are long."""
@@ -88,7 +71,7 @@ def _check_encoders(path: Path, steps: _Steps, crane: CraneSamples) -> None:
         long = np.maximum(read_m, seen_m) > MIN_WAY_M
         if long.sum() < MIN_STEPS:
             return None
-        cosine = (travel * steps.way).sum(axis=1)[long] / np.maximum(read_m * seen_m, 1e-12)[long]
+        cosine = (travel * steps.way_m).sum(axis=1)[long] / np.maximum(read_m * seen_m, 1e-12)[long]
         ratio = float(np.median(read_m[long] / np.maximum(seen_m[long], 1e-6)))
         least = float(np.percentile(cosine, 25))  # diagonal steps hide exchanged axes
         return ratio, float(np.degrees(np.arccos(np.clip(least, -1, 1))))
@@ -122,7 +105,7 @@ def _check_encoders(path: Path, steps: _Steps, crane: CraneSamples) -> None:
         )
 
 
-def _check_gyro(path: Path, steps: _Steps, imu: ImuSamples) -> None:
+def _check_gyro(path: Path, steps: SeenSteps, imu: ImuSamples) -> None:
     angle = turned_angle(imu)
     seconds = (steps.new_ns - steps.old_ns)[:, None] / 1e9
 
@@ -135,7 +118,7 @@ def _check_gyro(path: Path, steps: _Steps, imu: ImuSamples) -> None:
 
     def turned(late_s: float) -> tuple[Float64, Float64]:
         """Turns (K, 3) by gyro and pictures over the steps that both know."""
-        gyro = steps.between(imu.stamp_ns, angle, late_s)
+        gyro = _between(steps, imu.stamp_ns, angle, late_s)
         known = np.asarray(np.isfinite(gyro).all(axis=1))
         return varying(gyro)[known], varying(np.where(known[:, None], steps.turn, np.nan))[known]
 
@@ -196,11 +179,14 @@ def _wrong_clock(path: Path, sensor: str, late_s: float) -> InputError:
     )
 
 
-def _steps(sightings: Sequence[Sighting], rectifier: Rectifier, shift_ns: int) -> _Steps:
+def _steps(sightings: Sequence[Sighting], rectifier: Rectifier, shift_ns: int) -> SeenSteps:
     """Gather the steps that pictures measured, at most `MAX_STEPS`, evenly."""
     known = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
-    known = known[:: -(-len(known) // MAX_STEPS) or 1]
-    stamps = np.array([s.stamp_ns for s in sightings], np.int64) + shift_ns
-    new = np.array(known, np.int64)
-    turn, way = seen_steps(sightings, known, rectifier)
-    return _Steps(stamps[new - 1], stamps[new], turn, way)
+    return seen_steps(sightings, known[:: -(-len(known) // MAX_STEPS) or 1], rectifier, shift_ns)
+
+
+def _between(steps: SeenSteps, stamp_ns: Int64, values: Float64, late_s: float) -> Float64:
+    """Differences (K, 3) of a sensor's values over the steps, its stamps `late_s` late; NaN beyond."""
+    late_ns = seconds_to_ns(late_s)
+    old, new = (interpolate_at(at + late_ns, stamp_ns, values) for at in (steps.old_ns, steps.new_ns))
+    return np.asarray(new - old)

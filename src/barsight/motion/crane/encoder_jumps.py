@@ -1,155 +1,151 @@
-"""Jumps of the encoders: a step between two neighbouring readings that no motion of a crane explains.
-
-Around each place between two readings a polynomial with a step is fitted; the step is a weighted sum of the
-readings, s = sum_i w_i x_i. Noise gives s the standard deviation |w| sigma. An oscillation of amplitude A at
-f Hz gives at most A |sum_i w_i exp(2 pi i f t_i)|, and a kink in the speed at time t, as backlash makes, at
-most its size times |sum_i w_i max(t_i - t, 0)|. What exceeds all three, by a robust fit too, is a jump.
-"""
+"""Find jumps of the encoders and take them off; `jump_window` says what a jump is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, Int64
-from barsight.core.stamps import NS_PER_S
-from barsight.core.types import CraneSamples
-
-MIN_JUMP_M = 0.006
-"""The robust weights of the estimate deal with smaller steps."""
-NOISE_SIGMAS = 7.0
-MAX_FREQUENCY_HZ, MAX_AMPLITUDE_M, MAX_ACCELERATION_MPS2 = 3.2, 0.015, 1.0
-"""A crane oscillates no faster, no further and with no more acceleration than this."""
-MAX_KINK_MPS = 0.05
-"""Change of speed between two readings, by backlash or the end of a ramp."""
-WINDOWS = tuple((degree, side) for degree in (2, 3) for side in range(5, 13))
-"""Degrees and numbers of readings on either side, of which the pair is taken that shows the smallest jump."""
-MAX_WILD, MIN_GAIN = 2, 4
-"""Readings of a window that may lie elsewhere; where some do, a fit without a step leaves so many more."""
-ROBUST_STEPS = 15
-_FREQUENCIES_HZ = np.linspace(0.3, MAX_FREQUENCY_HZ, 12)
-_AMPLITUDES_M = np.minimum(MAX_AMPLITUDE_M, MAX_ACCELERATION_MPS2 / (2 * np.pi * _FREQUENCIES_HZ) ** 2)
-_MAX_GAP = 3.5
-"""Steps in time, over the median one, that a window may hold."""
+from barsight.core.linalg.dense import one_blas_thread
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples, EncoderJump
+from barsight.motion.crane.jump_window import (
+    HALF_S,
+    MAX_RATE_HZ,
+    MAYBE_SIGMAS,
+    MIN_SIDE,
+    STRIDE_S,
+    SURE_SIGMAS,
+    WIDE_M,
+    FoundStep,
+    JumpWindow,
+)
+from barsight.motion.crane.known_motion import KnownMotion
 
 
-@dataclass(frozen=True, eq=False)
-class JumpTest:
-    """The test for jumps on one recording's readings.
+@one_blas_thread()
+def find_jumps(
+    crane: CraneSamples, known: KnownMotion | None = None, first_ns: int | None = None
+) -> tuple[EncoderJump, ...]:
+    """Find jumps in the readings as they stand; those that `crane` has already may have any size.
 
-    degree, side: of the fits. sigma_m: of a reading, on each axis. smallest_m: the size from which on a jump
-    is told, the median over the readings; noise hides it in half the cases, one |w| sigma more in 16 %.
+    first_ns: steps before this stamp aren't sought. The sigma of one that isn't sure is its size, and
+    the size that it is taken to have is 0.
     """
-
-    degree: int
-    side: int
-    sigma_m: float
-    smallest_m: float
-
-
-def find_jumps(crane: CraneSamples) -> list[tuple[int, float]]:
-    """Find the jumps: index of the first reading beyond each, and its size in m."""
-    test = jump_test(crane)
-    if test is None:
-        return []
-    windows = _windows(_seconds(crane), test)
-    size = np.linalg.norm(windows.steps(crane.position_m), axis=1)
-    windows = windows.chosen(size > windows.limit_m)
-    step, agree = windows.robust_fits(crane.position_m, test.sigma_m)
-    _, agree_without = windows.robust_fits(crane.position_m, test.sigma_m, parameters=test.degree + 1)
-    wild = 2 * test.side - agree
-    sure = (step > windows.limit_m) & (wild <= MAX_WILD) & ((wild == 0) | (agree >= agree_without + MIN_GAIN))
-    places = np.flatnonzero(sure)
-    groups = np.split(places, np.flatnonzero(np.diff(windows.middle[places]) > 2 * test.side) + 1)
-    best = [max(group, key=lambda k: (agree[k], step[k])) for group in groups if group.size]
-    return [(int(windows.middle[k]), float(step[k])) for k in best]
-
-
-def jump_test(crane: CraneSamples) -> JumpTest | None:
-    """Choose the window that shows the smallest jump; None where the readings are too few for any."""
-    time = _seconds(crane)
-    sigma = max(crane.position_std_m, _seen_sigma_m(crane))
-    tests = []
-    for degree, side in WINDOWS:
-        if len(time) > 2 * side:
-            regular: Float64 = np.arange(2.0 * side) * float(np.median(np.diff(time)))
-            limit = _windows(regular, JumpTest(degree, side, sigma, 0.0)).limit_m[0]
-            tests.append(JumpTest(degree, side, sigma, float(limit)))
-    return min(tests, key=lambda test: test.smallest_m, default=None)
+    series = _thinned(crane)
+    if len(series.stamp_ns) <= 2 * MIN_SIDE:
+        return ()
+    known, sigma_m = known or KnownMotion(), _noise_m(crane, series)
+    stride = seconds_to_ns(STRIDE_S)
+    middles = np.arange(series.stamp_ns[0], series.stamp_ns[-1] + 1, stride)
+    if first_ns is not None:
+        middles = middles[middles >= first_ns - stride // 2]
+    around = {m: JumpWindow.around(series, sigma_m, m, known) for m in middles.tolist()}
+    windows = {m: window for m, window in around.items() if window is not None and window.beyond.size}
+    jumps = [[jump for jump in crane.jumps if jump.axis == axis] for axis in range(3)]
+    steps = {(m, axis): windows[m].largest_step(axis, jumps[axis]) for m in windows for axis in range(3)}
+    found: list[EncoderJump] = []
+    while told := [step for step in steps.values() if step is not None]:
+        best = max(told, key=lambda step: step.sigmas)
+        stamp, axis = _exact_stamp(crane, series, best), best.axis
+        if best.sigmas > SURE_SIGMAS:
+            found.append(EncoderJump(stamp, axis, best.size_m, WIDE_M))
+        else:
+            found.append(EncoderJump(stamp, axis, 0.0, abs(best.size_m), "maybe"))
+        jumps[axis].append(found[-1])
+        for m in windows:
+            if abs(m - stamp) < seconds_to_ns(HALF_S) + stride:
+                steps[m, axis] = windows[m].largest_step(axis, jumps[axis])
+    return tuple(found)
 
 
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Windows of n = 2 side readings. middle: (K,) index of the first reading beyond each step. design:
-    (K, n, P) of the polynomial and, last, the step. weights: (K, n) of the least-squares step. limit_m: (K,).
+@one_blas_thread()
+def lost_counts(
+    crane: CraneSamples, after: Iterable[EncoderJump], known: KnownMotion | None, least_m: float
+) -> tuple[EncoderJump, ...]:
+    """Select of the jumps after freezes those that are seen, or that could hide: an encoder that loses count
+    misses the way since, `least_m` or more, and one that reads absolute places goes on where it should.
     """
-
-    middle: Int64
-    design: Float64
-    weights: Float64
-    limit_m: Float64
-
-    def steps(self, place_m: Float64) -> Float64:
-        """Return (K, 3): steps by least squares."""
-        steps: Float64 = np.einsum("kn,knj->kj", self.weights, place_m[self._readings])
-        return steps
-
-    def robust_fits(
-        self, place_m: Float64, sigma_m: float, parameters: int | None = None
-    ) -> tuple[Float64, Int64]:
-        """Return (K,): sizes of the last parameter by Cauchy's weights; (K,) how many readings agree with the
-        fit.
-        """
-        places, design = place_m[self._readings], self.design[..., :parameters]
-        root = np.ones_like(self.weights)
-        for _ in range(ROBUST_STEPS):
-            weighted = design * root[..., None]
-            fit = np.linalg.solve(weighted.mT @ weighted, weighted.mT @ (places * root[..., None]))
-            residual = np.linalg.norm(places - design @ fit, axis=2)
-            scale = 3 * np.maximum(np.median(residual, axis=1, keepdims=True), sigma_m)
-            root = 1 / np.sqrt(1 + (residual / scale) ** 2)
-        agree = (residual < np.maximum(self.limit_m / 2, 5 * sigma_m)[:, None]).sum(axis=1)
-        return np.linalg.norm(fit[:, -1], axis=1), agree
-
-    def chosen(self, chosen: Bool) -> Windows:
-        """Some of them."""
-        return Windows(self.middle[chosen], self.design[chosen], self.weights[chosen], self.limit_m[chosen])
-
-    @property
-    def _readings(self) -> Int64:
-        side = self.weights.shape[1] // 2
-        return self.middle[:, None] + np.arange(-side, side)
+    series, lost = _thinned(crane), []
+    known, sigma_m = known or KnownMotion(), _noise_m(crane, series)
+    for jump in after:
+        following = int(np.searchsorted(crane.stamp_ns, jump.stamp_ns))
+        if following == 0:
+            continue
+        gap_ns = jump.stamp_ns - int(crane.stamp_ns[following - 1])
+        half_s = HALF_S + gap_ns / 2 / NS_PER_S
+        window = JumpWindow.around(series, sigma_m, jump.stamp_ns - gap_ns // 2, known, half_s)
+        if window is None:
+            lost.append(jump)
+            continue
+        size, sigma = window.step_at(jump.axis, jump.stamp_ns)
+        read = crane.position_m[:, jump.axis]
+        way = abs(float(np.median(read[following : following + 3]) - np.median(read[:following][-3:])) - size)
+        if abs(size) > MAYBE_SIGMAS * sigma:
+            lost.append(replace(jump, size_m=size))
+        elif least_m < way < MAYBE_SIGMAS * sigma:
+            lost.append(jump)
+    return tuple(lost)
 
 
-def _windows(time: Float64, test: JumpTest) -> Windows:
-    """Lay a window around each place between two readings where none is far from the next."""
-    side, degree = test.side, test.degree
-    middle = np.arange(side, len(time) - side + 1)
-    at = time[middle[:, None] + np.arange(-side, side)]
-    whole = np.diff(at, axis=1).max(axis=1) <= _MAX_GAP * np.median(np.diff(time))
-    middle, at = middle[whole], at[whole]
-    at = at - (at[:, side - 1] + at[:, side])[:, None] / 2
-    unit = at / (at[:, -1] - at[:, 0])[:, None]
-    beyond = np.broadcast_to(np.arange(2 * side) >= side, unit.shape)
-    design = np.stack([*(unit**power for power in range(degree + 1)), beyond], axis=2)
-    last = np.broadcast_to(np.eye(degree + 2)[:, -1:], (len(at), degree + 2, 1))
-    weights = (design @ np.linalg.solve(design.mT @ design, last))[..., 0]
-    wave = np.exp(2j * np.pi * at[..., None] * _FREQUENCIES_HZ)
-    alias = (np.abs(np.einsum("kn,knf->kf", weights, wave)) * _AMPLITUDES_M).max(axis=1)
-    ramps = np.maximum(at[:, :, None] - at[:, None, :], 0)
-    kink = MAX_KINK_MPS * np.abs(np.einsum("kn,knm->km", weights, ramps)).max(axis=1)
-    noise = NOISE_SIGMAS * test.sigma_m * np.linalg.norm(weights, axis=1)
-    return Windows(middle, design, weights, np.maximum(noise + alias + kink, MIN_JUMP_M))
-
-
-def _off_neighbours(crane: CraneSamples) -> tuple[Float64, Float64]:
-    """Return (N - 4, 3): readings minus the cubic through two on either side; (N - 4,) sigmas over a
-    reading's.
+def take_off_jumps(crane: CraneSamples, jumps: Iterable[EncoderJump]) -> CraneSamples:
+    """Take jumps off the readings beyond each: which side is right can't be told, and where the crane began
+    is held to be.
     """
-    time = _seconds(crane)
+    place, jumps = crane.position_m.copy(), tuple(sorted(jumps, key=lambda jump: jump.stamp_ns))
+    for jump in jumps:
+        place[:, jump.axis] -= jump.size_m * jump.share(crane.stamp_ns)
+    return replace(crane, position_m=place, jumps=jumps)
+
+
+def _exact_stamp(crane: CraneSamples, series: CraneSamples, step: FoundStep) -> int:
+    """Find the stamp of the first reading beyond a step, among all readings near it."""
+    count = len(step.way_m)
+    stamps = series.stamp_ns[step.first : step.first + count]
+    way = series.position_m[step.first : step.first + count, step.axis] + step.way_m
+    k = step.reading - step.first
+    if len(series.stamp_ns) == len(crane.stamp_ns):
+        return int(stamps[k])
+    begin, end = np.searchsorted(crane.stamp_ns, (stamps[k - 2], stamps[k + 1]))
+    near = crane.stamp_ns[begin : end + 1]
+    off = crane.position_m[begin : end + 1, step.axis] - np.interp(
+        (near - stamps[0]) / NS_PER_S, (stamps - stamps[0]) / NS_PER_S, way
+    )
+    before, after = np.abs(off), np.abs(off - step.size_m)
+    cost = np.concatenate([[0.0], np.cumsum(before)]) + np.concatenate([np.cumsum(after[::-1])[::-1], [0.0]])
+    return int(near[min(int(cost.argmin()), len(near) - 1)])
+
+
+def _thinned(crane: CraneSamples) -> CraneSamples:
+    """Put readings together that come faster than `MAX_RATE_HZ`, each axis by its median."""
+    spacing = float(np.median(np.diff(crane.stamp_ns))) if len(crane.stamp_ns) > 1 else 1.0
+    together = round(NS_PER_S / MAX_RATE_HZ / spacing)
+    if together < 2:
+        return crane
+    named = (crane.stamp_ns - crane.stamp_ns[0]) // round(together * spacing)
+    parts = np.split(np.arange(len(named)), np.flatnonzero(np.diff(named)) + 1)
+    stamps = np.array(
+        [crane.stamp_ns[0] + int((crane.stamp_ns[p] - crane.stamp_ns[0]).mean()) for p in parts]
+    )
+    place = np.array([np.median(crane.position_m[p], axis=0) for p in parts])
+    return replace(crane, stamp_ns=stamps, position_m=place)
+
+
+def _noise_m(crane: CraneSamples, series: CraneSamples) -> float:
+    """Estimate the sigma of one of the series' readings: as stated, or as seen where that is more."""
+    together = len(crane.stamp_ns) / len(series.stamp_ns)
+    stated = crane.position_std_m * (1.0 if together < 1.5 else (np.pi / 2 / together) ** 0.5)
+    return max(stated, _seen_sigma_m(series))
+
+
+def _seen_sigma_m(crane: CraneSamples) -> float:
+    """Estimate the noise of a reading on the noisiest axis, by the median distance from the cubic through two
+    readings on either side.
+    """
+    time = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
     if len(time) < 9:
-        return np.empty((0, 3)), np.empty(0)
+        return 0.0
     around = np.arange(2, len(time) - 2)[:, None] + np.array([-2, -1, 1, 2])
     unit = (time[around] - time[2:-2, None]) / float(np.median(np.diff(time)))
     weights = np.ones_like(unit)  # Lagrange's, at the reading's own time
@@ -158,16 +154,5 @@ def _off_neighbours(crane: CraneSamples) -> tuple[Float64, Float64]:
             if i != j:
                 weights[:, i] *= -unit[:, j] / (unit[:, i] - unit[:, j])
     off = crane.position_m[2:-2] - np.einsum("kn,knj->kj", weights, crane.position_m[around])
-    return off, np.sqrt(1 + (weights**2).sum(axis=1))
-
-
-def _seen_sigma_m(crane: CraneSamples) -> float:
-    """Noise of a reading on the noisiest axis, by the median distance from its neighbours' cubic."""
-    off, scale = _off_neighbours(crane)
-    if off.size == 0:
-        return 0.0
+    scale = np.sqrt(1 + (weights**2).sum(axis=1))
     return float(1.4826 * np.median(np.abs(off) / scale[:, None], axis=0).max())
-
-
-def _seconds(crane: CraneSamples) -> Float64:
-    return np.asarray((crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, np.float64)

@@ -119,9 +119,15 @@ def fit_position(
     A parabola through the readings within the window (a line where they are fewer than six), by least
     squares with Cauchy's weights, so that single wild readings don't pull however far off they are. Where
     the acceleration (3,) is known, it takes a line, whose middle has 4/9 of the variance. Failed
-    `no-encoder` where the readings don't enclose the stamp.
+    `no-encoder` where the readings don't enclose the stamp; readings beyond a jump don't count.
     """
-    first, last = np.searchsorted(crane.stamp_ns, (stamp_ns - window_ns, stamp_ns + window_ns))
+    begin_ns, end_ns = stamp_ns - window_ns, stamp_ns + window_ns
+    for jump in crane.jumps:
+        if jump.stamp_ns <= stamp_ns:
+            begin_ns = max(begin_ns, jump.stamp_ns)
+        else:
+            end_ns = min(end_ns, jump.stamp_ns)
+    first, last = np.searchsorted(crane.stamp_ns, (begin_ns, end_ns))
     stamps: Int64 = crane.stamp_ns[first:last]
     if stamps.size < 4 or stamps[0] > stamp_ns or stamps[-1] < stamp_ns:
         away = np.abs(crane.stamp_ns - stamp_ns).min(initial=np.iinfo(np.int64).max) / NS_PER_S

@@ -6,7 +6,7 @@ memory don't grow with the way.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
@@ -64,7 +64,6 @@ class FixedLagPoses(ImmediatePoses):
         super().__init__()
         settings = estimator.settings
         self._use, self._recording, self._rectifier = settings.sensors, recording, rectifier
-        self._motions: list[Sighting] = []
         self._noise = recording.imu_noise() or ORDINARY_NOISE
         self.reads_pictures = "stereo" in self._use
         readings = self._readings()
@@ -84,25 +83,23 @@ class FixedLagPoses(ImmediatePoses):
         if isinstance(pair, Failed):
             return self._estimator.take(RefusedFrame(seen.stamp_ns, pair.reason))
         tracked = self._tracker.push(pair)
-        if isinstance(tracked, Sighting):
-            # Without its points: memory doesn't grow with them.
-            none = slice(0, 0)
-            points = {name: getattr(tracked, name)[none] for name in ("track", "stereo", "sigma_px")}
-            self._motions.append(replace(tracked, **points))
         return self._estimator.take(tracked)
 
     def finish(self) -> Trajectory:
         """Return all poses. Raises InputError where the pictures contradict a sensor."""
         readings = self._estimator.readings
         refuse_contradictions(
-            self._recording.path, self._motions, readings.imu, readings.crane, self._rectifier,
+            self._recording.path, self._estimator.motions, readings.imu, readings.crane, self._rectifier,
             self._recording.rig.timeshift_cam_imu_ns,
         )  # fmt: skip
         names = {"crane": readings.crane, "imu": readings.imu, "stereo": self.reads_pictures or None}
         sensors = tuple(name for name, used in names.items() if used is not None)
+        doubts, warnings = self._estimator.encoder_faults()
+        if self._level is not None:
+            warnings += self._level.warnings
         return Trajectory(
             "world" if readings.crane is None else "yard", tuple(self.placed), tuple(self.refused), sensors,
-            () if self._level is None else self._level.warnings,
+            warnings, doubts=doubts,
         )  # fmt: skip
 
     def _readings(self) -> SensorBuffer:

@@ -18,14 +18,17 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import PosedFrame, RefusedFrame
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.batch.fault_detection import freeze_sentences
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
 from barsight.motion.frontend.motion_prediction import CranePredictor, predict_by_imu
+from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.tracking import Sighting
 from barsight.motion.gravity import GravityAlignment
+from barsight.motion.problem.encoder_factors import jump_sentences
 from barsight.motion.problem.gauss_newton import GraphState
 from barsight.motion.problem.gtsam_factors import initial_values
 from barsight.motion.problem.nodes import (
@@ -39,6 +42,8 @@ from barsight.motion.problem.nodes import (
 )
 from barsight.motion.problem.problem import AttitudePrior, EncoderPosition, Problem
 
+RECENT_FRAMES = 40
+"""So many of the last frames' motions are held against the encoders."""
 LOOK_BACK_S = 6.0
 """What is held of IMU and encoders before the first node held."""
 FIT_S = PLACE_SPACING_S / 2 + 0.01
@@ -55,6 +60,8 @@ class FixedLagEstimator:
         self._rectifier, self._shift_ns = rectifier, shift_ns
         self.readings, self._level = readings, level
         self.window: Window | None = None
+        self.motions: list[Sighting] = []
+        self.watch = EncoderWatch()
         self._failed = False
 
     def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
@@ -82,6 +89,12 @@ class FixedLagEstimator:
         """Estimate the frame's pose, or say why it has none."""
         stamp = seen.stamp_ns + self._shift_ns
         sighting = seen if isinstance(seen, Sighting) else None
+        if sighting is not None:
+            # Without its points: memory doesn't grow with them.
+            none = slice(0, 0)
+            points = {name: getattr(sighting, name)[none] for name in ("track", "stereo", "sigma_px")}
+            self.motions.append(replace(sighting, **points))
+        self._check_encoders(seen.stamp_ns)
         now = self._now(seen.stamp_ns)
         covered = now.crane is not None and not isinstance(
             fit_position(now.crane, stamp, seconds_to_ns(self._crane.window_s)), Failed
@@ -112,8 +125,12 @@ class FixedLagEstimator:
 
     def _now(self, stamp_ns: int) -> SensorBuffer:
         """Select the readings that have come when the frame of a stamp is computed, back to before the nodes
-        held.
+        held, without the encoders' faults.
         """
+        now = self._come(stamp_ns)
+        return now if now.crane is None else replace(now, crane=self.watch.usable(now.crane))
+
+    def _come(self, stamp_ns: int) -> ReadingsSoFar:
         last = stamp_ns + self._shift_ns + seconds_to_ns(SENSOR_DELAY_S)
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
         return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
@@ -133,7 +150,7 @@ class FixedLagEstimator:
         problem = Problem(
             start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
             offset_prior_px=settings.offset_prior_px, scale_prior=settings.scale_sigma,
-            has_latency=now.crane is not None, has_imu=now.imu is not None,
+            has_latency=now.crane is not None, has_imu=now.imu is not None, jumps=self.watch.jumps,
         )  # fmt: skip
         state = GraphState(initial_values(problem), np.empty((0, 4)), np.zeros(2))
         window = Window(problem, state, np.empty(0, np.int64))

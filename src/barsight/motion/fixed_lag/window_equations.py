@@ -1,8 +1,8 @@
 """Form and solve the window's normal equations, dense.
 
 Unknowns: node by node of the frames held (pose, with an IMU velocity and biases; nodes between are taken out
-first, `gaps`), then the border: with encoders their latency and the slide that all points in view share
-(`Window.slide`), then the rig's drift.
+first, `gaps`), then the border: with encoders their latency, their jumps and the slide that all points in
+view share (`Window.slide`), then the rig's drift.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from barsight.motion.problem.gauss_newton import (
     rig_of,
 )
 from barsight.motion.problem.gtsam_factors import build_graph, linearise_chain
-from barsight.motion.problem.problem import Problem, latency_of
+from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 from barsight.motion.problem.rig_drift import LOOSE, combine_with_prior
 
 SLIDE_SIGMA_RAD = 2.5e-4
@@ -82,9 +82,9 @@ class WindowSolution:
 
 
 def border_of(problem: Problem, state: GraphState, slide: float) -> Float64:
-    """Collect the border (b,): latency and slide if there are encoders, then the drift."""
+    """Collect the border (b,): the encoders' unknowns and the slide if there are any, then the drift."""
     slides = [slide] if problem.has_latency else []
-    return np.concatenate([latency_of(state.values), slides, state.drift])
+    return np.concatenate([encoder_unknowns_of(state.values), slides, state.drift])
 
 
 def slide_twist(body_from_rect0: Pose) -> Float64:
@@ -105,7 +105,7 @@ def assemble_equations(
     last = min(end, len(problem.start) - 1)
     within = kept[(kept >= first) & (kept <= last)]
     chain, gaps = eliminate_nodes(_chain(problem, state, first, end, last), within - first)
-    border = 4 if problem.has_latency else 2
+    border = problem.encoder_unknowns + (3 if problem.has_latency else 2)
     count = len(kept) * size
     matrix, gradient = np.zeros((count + border, count + border)), np.zeros(count + border)
     if used.any():
@@ -114,10 +114,10 @@ def assemble_equations(
     here = slice(begin, begin + chain.gradient.size)
     add_chain(chain, np.arange(here.start, here.stop, size), skyline.full(matrix))
     gradient[here] += chain.gradient.ravel()
-    if problem.has_latency:
-        matrix[count, here] += chain.side.ravel()
-        matrix[count, count] += chain.corner[0]
-        gradient[count] += chain.corner[1]
+    encoders = slice(count, count + problem.encoder_unknowns)
+    matrix[encoders, here] += chain.side.reshape(chain.gradient.size, -1).T
+    matrix[encoders, encoders] += np.tril(chain.corner)
+    gradient[encoders] += chain.corner_gradient
     matrix += np.tril(matrix, -1).T
     gaps = tuple(replace(gap, first=gap.first + first, end=gap.end + first) for gap in gaps)
     return DenseEquations(matrix, gradient, gaps)
@@ -128,7 +128,7 @@ def _chain(problem: Problem, state: GraphState, first: int, end: int, last: int)
     size = problem.width
     chain = linearise_chain(build_graph(problem, first, end), state.values, size, len(problem.start))
     placed = tuple(place for place in problem.placed if first <= place.node < end)
-    add_encoders(chain, replace(problem, placed=placed), state.poses, latency_of(state.values))
+    add_encoders(chain, replace(problem, placed=placed), state.poses, encoder_unknowns_of(state.values))
     return chain.at(slice(first, last + 1))
 
 
@@ -206,13 +206,13 @@ def _stepped(
     problem: Problem, state: GraphState, used: Bool, step: Float64, gaps: tuple[EliminatedNodes, ...]
 ) -> GraphState:
     size, count = problem.width, len(problem.kept)
-    latency = step[count * size : -3]
+    encoders = step[count * size :][: problem.encoder_unknowns]
     by_node = step[: count * size].reshape(count, size)
-    by_node = back_substitute_nodes(by_node, float(latency.sum()), problem.kept, gaps, len(problem.start))
+    by_node = back_substitute_nodes(by_node, encoders, problem.kept, gaps, len(problem.start))
     pictures = by_node[problem.kept, :6]
     if problem.has_latency and problem.sightings is not None:
         pictures = pictures + step[-3] * slide_twist(problem.sightings.body_from_rect0)
-    border = np.concatenate([latency, step[-2:]])
+    border = np.concatenate([encoders, step[-2:]])
     return retract(problem, state, used, by_node, np.empty(0), border, pictures)
 
 

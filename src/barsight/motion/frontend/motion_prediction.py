@@ -26,6 +26,8 @@ SWAY_RAD = float(np.deg2rad(0.15))
 GYRO_BIAS_SIGMA_RADPS = 5e-4
 SLEW_SIGMA_S = 0.03
 """What isn't known of the encoders' latency, s: it matters while the speed changes only."""
+JUMP_SIGMA_M = 0.005
+"""What isn't known of a jump that was taken off."""
 SPARE_SIGMAS = 1.5
 """By how much a predicted ellipse is wider than the estimate's own covariance says."""
 
@@ -59,11 +61,12 @@ class CranePredictor:
         motion = yard_from_new.inverse() @ yard_from_old
         travel = float(np.linalg.norm(new.position_m - old.position_m))
         slew = float(np.linalg.norm(new.velocity_mps - old.velocity_mps)) * SLEW_SIGMA_S
+        stamps = np.array([old_ns, new_ns]) + self._shift_ns
+        jumped = sum(float(np.ptp(jump.share(stamps))) for jump in self._crane.jumps) * JUMP_SIGMA_M
         covariance = np.eye(6) * turn_sigma**2
-        drift_jacobian_of_pose = (SWAY_RAD * travel) ** 2 + (2e-3) ** 2 + slew**2
+        spread = (SWAY_RAD * travel) ** 2 + (2e-3) ** 2 + slew**2 + jumped**2
         covariance[3:, 3:] = (
-            motion.rotation @ (old.covariance + new.covariance) @ motion.rotation.T
-            + np.eye(3) * drift_jacobian_of_pose
+            motion.rotation @ (old.covariance + new.covariance) @ motion.rotation.T + np.eye(3) * spread
         )
         return PredictedMotion(motion.rotation, motion.translation, covariance)
 

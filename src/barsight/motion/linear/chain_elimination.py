@@ -18,9 +18,9 @@ from barsight.core.linalg.skyline import Skyline
 
 
 class Chain(NamedTuple):
-    """Normal equations of M nodes of n unknowns that bind their neighbours and the latency only. own (M, n,
-    n): each one's; link (M, n, n): of each (rows) with the one before, 0 for the first; gradient (M, n); side
-    (M, n) with the latency; corner (2,): the latency's own, matrix and gradient.
+    """Normal equations of M nodes of n unknowns that bind their neighbours and S unknowns of the encoders
+    only. own (M, n, n): each one's; link (M, n, n): of each (rows) with the one before, 0 for the first;
+    gradient (M, n); side (M, n, S) with the encoders'; corner (S, S), corner_gradient (S,): of these alone.
     """
 
     own: Float64
@@ -28,24 +28,31 @@ class Chain(NamedTuple):
     gradient: Float64
     side: Float64
     corner: Float64
+    corner_gradient: Float64
 
     @classmethod
-    def empty(cls, nodes: int, size: int) -> Chain:
+    def empty(cls, nodes: int, size: int, shared: int) -> Chain:
         """Allocate zeros."""
         blocks, rows = (nodes, size, size), (nodes, size)
-        return cls(np.zeros(blocks), np.zeros(blocks), np.zeros(rows), np.zeros(rows), np.zeros(2))
+        return cls(
+            np.zeros(blocks), np.zeros(blocks), np.zeros(rows), np.zeros((*rows, shared)),
+            np.zeros((shared, shared)), np.zeros(shared),
+        )  # fmt: skip
 
     def at(self, nodes: Int64 | slice) -> Chain:
         """Select nodes. What binds the first of them to one before is no part of it."""
         link = self.link[nodes].copy()
         link[:1] = 0.0
-        return Chain(self.own[nodes], link, self.gradient[nodes], self.side[nodes], self.corner.copy())
+        return Chain(
+            self.own[nodes], link, self.gradient[nodes], self.side[nodes], self.corner.copy(),
+            self.corner_gradient.copy(),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class EliminatedNodes:
-    """Eliminated nodes first...end - 1. answer: (m n, 2 n + 2) by which they follow the kept nodes before and
-    after, the latency, and nothing at all.
+    """Eliminated nodes first...end - 1. answer: (m n, 2 n + S + 1) by which they follow the kept nodes before
+    and after, the encoders' unknowns, and nothing at all.
     """
 
     first: int
@@ -67,11 +74,11 @@ def eliminate_nodes(chain: Chain, kept: Int64) -> tuple[Chain, tuple[EliminatedN
 def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> EliminatedNodes:
     """Eliminate the nodes first...end - 1, between the kept nodes k - 1 and k where there are such."""
     size, here = chain.own.shape[1], slice(first, end)
-    right = np.zeros((end - first, size, 2 * size + 2))
+    right = np.zeros((end - first, size, 2 * size + len(chain.corner) + 1))
     right[0, :, :size] = chain.link[first]
     if end < len(chain.own):
-        right[-1, :, size:-2] = chain.link[end].T
-    right[..., -2], right[..., -1] = chain.side[here], chain.gradient[here]
+        right[-1, :, size : 2 * size] = chain.link[end].T
+    right[..., 2 * size : -1], right[..., -1] = chain.side[here], chain.gradient[here]
     right = right.reshape(-1, right.shape[2])
     at = size * np.arange(end - first)
     band = skyline.empty_skyline(np.repeat(np.maximum(at - size, 0), size))
@@ -84,11 +91,12 @@ def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Elimin
     for node, part in ((k - 1, slice(size)), (k, slice(size, 2 * size))):
         if 0 <= node < len(left.own):
             left.own[node] -= taken[part, part]
-            left.side[node] -= taken[part, -2]
+            left.side[node] -= taken[part, 2 * size : -1]
             left.gradient[node] -= taken[part, -1]
     if 0 < k < len(left.own):
-        left.link[k] = -taken[size:-2, :size]
-    left.corner[:] -= taken[-2, -2:]
+        left.link[k] = -taken[size : 2 * size, :size]
+    left.corner[:] -= taken[2 * size : -1, 2 * size : -1]
+    left.corner_gradient[:] -= taken[2 * size : -1, -1]
     return EliminatedNodes(first, end, right)
 
 
@@ -116,21 +124,21 @@ def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain
 
     first: (R + 1,); at, values: (E,) elements of R rows; right: (R,).
     """
-    own, link, gradient, side, corner = chain
+    own, link, gradient, side, corner, corner_gradient = chain
     size, end = own.shape[1], own.shape[0] * own.shape[1]
     for r in range(len(right)):
         for a in range(first[r], first[r + 1]):
             node, i = at[a] // size, at[a] % size
-            if at[a] == end:
-                corner[1] -= values[a] * right[r]
+            if at[a] >= end:
+                corner_gradient[at[a] - end] -= values[a] * right[r]
             else:
                 gradient[node, i] -= values[a] * right[r]
             for b in range(first[r], first[r + 1]):
                 other, j, product = at[b] // size, at[b] % size, values[a] * values[b]
-                if at[a] == end and at[b] == end:
-                    corner[0] += product
-                elif at[a] == end:
-                    side[other, j] += product
+                if at[a] >= end and at[b] >= end:
+                    corner[at[a] - end, at[b] - end] += product
+                elif at[a] >= end:
+                    side[other, j, at[a] - end] += product
                 elif at[b] < end and other == node:
                     own[node, i, j] += product
                 elif at[b] < end and other == node - 1:
@@ -138,15 +146,17 @@ def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain
 
 
 def back_substitute_nodes(
-    step: Float64, latency: float, kept: Int64, gaps: tuple[EliminatedNodes, ...], nodes: int
+    step: Float64, shared: Float64, kept: Int64, gaps: tuple[EliminatedNodes, ...], nodes: int
 ) -> Float64:
-    """Back-substitute the step (M, n) of all nodes from that of the kept ones (K, n) and of the latency."""
+    """Back-substitute the step (M, n) of all nodes from that of the kept ones (K, n) and of the encoders'
+    unknowns (S,).
+    """
     result = np.zeros((nodes, step.shape[1]))
     result[kept] = step
     for gap in gaps:
         none = np.zeros(step.shape[1])
         before = result[gap.first - 1] if gap.first > 0 else none
         after = result[gap.end] if gap.end < nodes else none
-        moved = gap.answer @ np.concatenate([before, after, [latency, 1.0]])
+        moved = gap.answer @ np.concatenate([before, after, shared, [1.0]])
         result[gap.first : gap.end] = -moved.reshape(-1, step.shape[1])
     return result

@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from gtsam.symbol_shorthand import E, V
+from gtsam.symbol_shorthand import V
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples
+from barsight.core.types import CraneSamples, EncoderJump
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.linear.chain_elimination import Chain
-from barsight.motion.problem.problem import EncoderPosition, Problem, latency_of, poses_of
+from barsight.motion.problem.problem import EncoderPosition, Problem, encoder_unknowns_of, poses_of
 from barsight.motion.problem.rig_drift import HUBER_SIGMAS
 
 FARTHEST_SIGMAS = 5.0
@@ -31,14 +31,19 @@ MIN_AGREEING_SIGMA_M = 0.001
 """What a parabola through the readings may be off by while the crane jerks, which isn't a disagreement."""
 NOTED_LATENCY_SIGMAS = 5.0
 NOTED_LATENCY_S = 0.005
+AXES = ("bridge", "trolley", "hoist")
 
 
 @dataclass(frozen=True)
 class EncoderState:
-    """latency_s and its sigma: zero and the prior's where nothing shows it."""
+    """latency_s and its sigma: zero and the prior's where nothing shows it. jump_m, jump_sigma_m: (J,) of
+    each jump.
+    """
 
     latency_s: float
     latency_sigma_s: float
+    jump_m: Float64
+    jump_sigma_m: Float64
 
 
 def encoder_positions(
@@ -73,14 +78,14 @@ def with_known_curvature(problem: Problem, values: Any) -> Problem:
     return replace(problem, placed=encoder_positions(problem.crane, problem.stamp_ns, nodes, bend))
 
 
-def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Float64) -> None:
-    """Add the Huber-weighted place residuals to the chain's nodes and the latency. poses: (M, 4, 4);
-    latency_s: (1,).
+def add_encoders(chain: Chain, problem: Problem, poses: Float64, unknowns: Float64) -> None:
+    """Add the Huber-weighted place residuals to the chain's nodes and the encoders' `unknowns` (S,). poses:
+    (M, 4, 4).
     """
     if not problem.placed:
         return
     node = _nodes(problem.placed)
-    reading, velocity = _readings(problem.placed, float(latency_s[0]))
+    reading, by_unknowns = _readings(problem, unknowns)
     turn, error = poses[node, :3, :3], poses[node, :3, 3] - reading
     sigma = _sigmas(problem.placed, MIN_SIGMA_M)
     distance = np.linalg.norm(error, axis=1) / sigma
@@ -88,9 +93,9 @@ def add_encoders(chain: Chain, problem: Problem, poses: Float64, latency_s: Floa
     shift = np.arange(3, 6)  # GTSAM's, in body axes
     chain.own[node[:, None], shift, shift] += weight[:, None]
     chain.gradient[node, 3:6] += np.einsum("p,pij,pi->pj", weight, turn, error)
-    chain.side[node, 3:6] -= np.einsum("p,pij,pi->pj", weight, turn, velocity)
-    chain.corner[0] += np.einsum("p,pi,pi", weight, velocity, velocity)
-    chain.corner[1] -= np.einsum("p,pi,pi", weight, velocity, error)
+    chain.side[node, 3:6] -= np.einsum("p,pij,pis->pjs", weight, turn, by_unknowns)
+    chain.corner[:] += np.einsum("p,pis,pit->st", weight, by_unknowns, by_unknowns)
+    chain.corner_gradient[:] -= np.einsum("p,pis,pi->s", weight, by_unknowns, error)
 
 
 def encoders_cost(values: Any, problem: Problem) -> float:
@@ -105,7 +110,7 @@ def encoder_residuals(values: Any, problem: Problem) -> Float64:
     """Compute the encoders' residuals (P, 3) m against the poses."""
     if not problem.placed:
         return np.empty((0, 3))
-    reading, _ = _readings(problem.placed, float(latency_of(values)[0]))
+    reading, _ = _readings(problem, encoder_unknowns_of(values))
     off: Float64 = reading - poses_of(values)[_nodes(problem.placed), :3, 3]
     return off
 
@@ -117,9 +122,34 @@ def encoder_inliers(values: Any, problem: Problem) -> Bool:
     return kept
 
 
-def encoder_state(values: Any, latency_sigma_s: float) -> EncoderState:
-    """Extract the estimated latency of the encoders."""
-    return EncoderState(float(values.atVector(E(0))[0]), latency_sigma_s)
+def encoder_state(values: Any, jumps: Sequence[EncoderJump], sigmas: Float64) -> EncoderState:
+    """Extract the encoders' estimated latency and jumps. sigmas: (S,)."""
+    found = encoder_unknowns_of(values)
+    sizes = np.array([jump.size_m for jump in jumps], np.float64)
+    return EncoderState(float(found[0]), float(sigmas[0]), sizes + found[1:], sigmas[1:])
+
+
+def jump_sentences(
+    jumps: Sequence[EncoderJump], begin_ns: int, state: EncoderState | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Tell of jumps that are sure and of those that may be, with the sizes that the whole estimate shows.
+
+    begin_ns: stamp of the first reading, from which times are told.
+    """
+    sure, maybe = [], []
+    for k, jump in enumerate(jumps):
+        at = f"at {(jump.stamp_ns - begin_ns) / NS_PER_S:.1f} s"
+        encoder, told = f"the {AXES[jump.axis]}'s encoder", f"{1e3 * jump.size_m:.1f} mm"
+        if state is not None:
+            told = f"{1e3 * state.jump_m[k]:.1f} mm (1 sigma {1e3 * state.jump_sigma_m[k]:.1f} mm)"
+        match jump.kind:
+            case "sure":
+                sure.append(f"{encoder} jumps by {told} {at}; the readings before are held to be right")
+            case "freeze":
+                sure.append(f"{encoder} goes on {at}, after the freeze, off by {told}")
+            case "maybe":
+                maybe.append(f"{encoder} may jump {at}, by {told}: sigma holds it")
+    return tuple(sure), tuple(maybe)
 
 
 def encoder_warnings(
@@ -156,12 +186,20 @@ def encoder_warnings(
     return tuple(sentences)
 
 
-def _readings(placed: tuple[EncoderPosition, ...], latency_s: float) -> tuple[Float64, Float64]:
-    """Evaluate the encoders' places `latency_s` later (P, 3) and their speeds (P, 3), by their parabolas."""
+def _readings(problem: Problem, unknowns: Float64) -> tuple[Float64, Float64]:
+    """Evaluate the encoders' places (P, 3) a latency later, by their parabolas, without what the jumps are
+    larger by, and the derivatives (P, 3, S) by these unknowns.
+    """
+    placed, latency_s = problem.placed, float(unknowns[0])
     place = np.array([p.position_m for p in placed])
     velocity = np.array([p.velocity_mps for p in placed])
-    later = velocity + np.array([p.acceleration_mps2 for p in placed]) * latency_s
-    return place + (velocity + later) / 2 * latency_s, later
+    derivative = np.zeros((len(placed), 3, len(unknowns)))
+    derivative[..., 0] = velocity + np.array([p.acceleration_mps2 for p in placed]) * latency_s
+    stamps = problem.stamp_ns[_nodes(placed)]
+    for k, jump in enumerate(problem.jumps, start=1):
+        derivative[:, jump.axis, k] = -jump.share(stamps)
+    reading = place + (velocity + derivative[..., 0]) / 2 * latency_s + derivative[..., 1:] @ unknowns[1:]
+    return reading, derivative
 
 
 def _nodes(placed: tuple[EncoderPosition, ...]) -> Int64:

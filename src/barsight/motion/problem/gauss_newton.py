@@ -1,7 +1,7 @@
 """Optimise all unknowns by Levenberg-Marquardt: points eliminated by kernels, the rest linearised by GTSAM.
 
 Unknowns stand as `layout` has them, so the matrix is a band as wide as the longest track; the encoders'
-latency, what all pieces of the yard share and the rig's drift touch many nodes and stand at its border.
+unknowns, what all pieces of the yard share and the rig's drift touch many nodes and stand at its border.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from barsight.motion.linear.schur_complement import (
 from barsight.motion.problem.encoder_factors import add_encoders, encoders_cost
 from barsight.motion.problem.gtsam_factors import linearise_chain
 from barsight.motion.problem.normal_equations import System
-from barsight.motion.problem.problem import Pieces, Problem, StereoObservations, latency_of, poses_of
+from barsight.motion.problem.problem import Pieces, Problem, StereoObservations, encoder_unknowns_of, poses_of
 from barsight.motion.problem.rig_drift import HUBER_SIGMAS
 
 MAX_ITERATIONS = 25
@@ -142,13 +142,13 @@ def linearise_graph(problem: Problem, graph: Any, state: GraphState, used: Bool)
     gradient, side = np.zeros(size), np.zeros((border, size))
     corner, corner_gradient = np.zeros((border, border)), np.zeros(border)
     whole = linearise_chain(graph, state.values, layout.size, len(problem.start))
-    add_encoders(whole, problem, state.poses, latency_of(state.values))
+    add_encoders(whole, problem, state.poses, encoder_unknowns_of(state.values))
     chain, gaps = eliminate_nodes(whole, problem.kept)
     add_chain(chain, layout.node, rows)
     gradient[layout.nodes] = chain.gradient.ravel()
-    if problem.has_latency:
-        side[0, layout.nodes] = chain.side.ravel()
-        corner[0, 0], corner_gradient[0] = chain.corner
+    own = slice(problem.encoder_unknowns)
+    side[own, layout.nodes] = chain.side.reshape(len(layout.nodes), -1).T
+    corner[own, own], corner_gradient[own] = chain.corner, chain.corner_gradient
     if seen is not None and used.any():
         reduced = ReducedSystem.empty(len(layout.node), layout.reach, layout.seen)
         eliminate_points(
@@ -159,7 +159,7 @@ def linearise_graph(problem: Problem, graph: Any, state: GraphState, used: Bool)
         _hold_pieces(problem.pieces, state.pieces, layout, rows, gradient, side, corner)
     return System(
         rows, gradient, side, corner, corner_gradient, layout, problem.kept, gaps, len(problem.start),
-        problem.has_latency,
+        problem.encoder_unknowns,
     )  # fmt: skip
 
 
@@ -196,7 +196,7 @@ def retract(
             vectors.insert(V(k), part[6:9])
             vectors.insert(B(k), part[9:])
     if problem.has_latency:
-        vectors.insert(E(0), border[:1])
+        vectors.insert(E(0), border[: problem.encoder_unknowns])
     points, shared = state.points, np.concatenate([pieces, border[-2:]])
     if problem.sightings is not None:
         points = points.copy()

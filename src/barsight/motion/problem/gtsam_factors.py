@@ -1,5 +1,6 @@
 """Build GTSAM's factors of all but sightings and encoders: preintegrated IMU between neighbouring nodes,
-priors on attitude, biases, latency and, where the body stands still, velocity; and these linearised.
+priors on attitude, biases, the encoders' unknowns and, where the body stands still, velocity; and these
+linearised.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from gtsam.symbol_shorthand import B, E, V, X
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
 from barsight.motion.linear.chain_elimination import Chain, add_products
-from barsight.motion.problem.problem import Problem
+from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 
-WIDTHS = {"x": 6, "v": 3, "b": 6, "e": 1}
+WIDTHS = {"x": 6, "v": 3, "b": 6}
 OFFSETS = {"x": 0, "v": 6, "b": 9}
 """Where a node's unknowns stand: pose, with an IMU velocity and biases."""
 
@@ -45,19 +46,24 @@ def initial_values(problem: Problem) -> Any:
             values.insert(V(k), velocity[k])
             values.insert(B(k), bias)
     if problem.has_latency:
-        values.insert(E(0), np.zeros(1))
+        values.insert(E(0), np.zeros(problem.encoder_unknowns))
     return values
 
 
 def linearise_chain(graph: Any, values: Any, width: int, nodes: int) -> Chain:
-    """Linearise a graph: each node with the next and the latency. width: unknowns a node."""
-    chain = Chain.empty(nodes, width)
-    add_products(*_sparse_rows(graph, values, width, nodes * width), chain)
+    """Linearise a graph: each node with the next and the encoders' unknowns. width: unknowns a node."""
+    shared = len(encoder_unknowns_of(values))
+    chain = Chain.empty(nodes, width, shared)
+    add_products(*_sparse_rows(graph, values, width, nodes * width, shared), chain)
     return chain
 
 
-def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64, Int64, Float64, Float64]:
-    """Convert GTSAM's whitened rows to the form of `add_products`; the latency is unknown `size`."""
+def _sparse_rows(
+    graph: Any, values: Any, width: int, size: int, shared: int
+) -> tuple[Int64, Int64, Float64, Float64]:
+    """Convert GTSAM's whitened rows to the form of `add_products`; from unknown `size` on are the encoders'
+    (`shared`).
+    """
     linear = graph.linearize(values)
     if linear.size() == 0:
         return np.zeros(1, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)
@@ -65,8 +71,10 @@ def _sparse_rows(graph: Any, values: Any, width: int, size: int) -> tuple[Int64,
     where: list[Int64] = []
     for key in linear.keyVector():
         kind, node = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
-        begin = size if kind == "e" else node * width + OFFSETS[kind]
-        where.append(begin + np.arange(WIDTHS[kind]))
+        if kind == "e":
+            where.append(size + np.arange(shared))
+        else:
+            where.append(node * width + OFFSETS[kind] + np.arange(WIDTHS[kind]))
     unknown = np.concatenate(where)
     row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
     right = np.zeros(int(row.max()) + 1)
@@ -91,7 +99,8 @@ def _add_priors(graph: Any, problem: Problem, nodes: range) -> None:
             sigmas = gtsam.noiseModel.Gaussian.Covariance(whole)
         graph.add(gtsam.PriorFactorPose3(X(0), _gtsam_pose(problem.start[0]), sigmas))
     if problem.has_latency and begins:
-        graph.add(gtsam.PriorFactorVector(E(0), np.zeros(1), _sigmas(problem.encoder_latency_sigma_s)))
+        sigmas = _sigmas(problem.encoder_latency_sigma_s, *(jump.sigma_m for jump in problem.jumps))
+        graph.add(gtsam.PriorFactorVector(E(0), np.zeros(problem.encoder_unknowns), sigmas))
     for attitude in problem.attitudes:
         if attitude.node not in nodes:
             continue

@@ -23,7 +23,7 @@ class Marginals:
     """
 
     poses: Float64
-    latency_sigma_s: float
+    encoder_sigmas: Float64
     drift_jacobian_of_pose: Float64
     nodes: Float64
     cross: Float64
@@ -41,15 +41,15 @@ def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
     cross = cross[:, :6, :6]
     poses = nodes[:, :6, :6]
     by_border = -_to_border(system)[layout.poses].reshape(count, 6, -1)
-    drift_jacobian_of_pose, latency = by_border[:, :, -2:], float("nan")
+    drift_jacobian_of_pose, encoders = by_border[:, :, -2:], np.empty(0)
     if len(own) > 2:
         variance = np.linalg.inv(own[:-2, :-2])
-        latency = float(variance[0, 0] ** 0.5)
+        encoders = np.sqrt(np.diag(variance)[: system.encoder_unknowns])
         to_border = by_border[:, :, :-2]
         poses = poses + to_border @ variance @ to_border.transpose(0, 2, 1)
         drift_jacobian_of_pose = drift_jacobian_of_pose - to_border @ variance @ own[:-2, -2:]
         cross = cross + to_border[pairs[:, 0]] @ variance @ to_border[pairs[:, 1]].transpose(0, 2, 1)
-    return Marginals(poses, latency, drift_jacobian_of_pose, nodes, cross)
+    return Marginals(poses, encoders, drift_jacobian_of_pose, nodes, cross)
 
 
 @one_blas_thread()

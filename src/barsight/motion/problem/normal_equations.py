@@ -19,9 +19,9 @@ from barsight.motion.problem.rig_drift import LOOSE
 @dataclass(frozen=True, eq=False)
 class System:
     """Normal equations at a state. rows: n unknowns, which stand as `layout` has them; gradient (n,). side:
-    (b, n) with the border, corner (b, b) and corner_gradient (b,) of the border: the latency if there is one,
-    what pieces' slides have in common if there are any, then the rig's drift. kept: (K,) the nodes that the
-    band is of; gaps: those between. nodes: how many in all.
+    (b, n) with the border, corner (b, b) and corner_gradient (b,) of the border: the encoders' unknowns if
+    there are any, what pieces' slides have in common if there are any, then the rig's drift. kept: (K,) the
+    nodes that the band is of; gaps: those between. nodes: how many in all.
     """
 
     rows: Skyline
@@ -33,7 +33,7 @@ class System:
     kept: Int64
     gaps: tuple[EliminatedNodes, ...]
     nodes: int
-    has_latency: bool
+    encoder_unknowns: int
 
     @cached_property
     def factor(self) -> Skyline:
@@ -80,7 +80,7 @@ class System:
             border[free] = -solve_positive(left[np.ix_(free, free)], right[free])
         step = -(forward[:, :1] + forward[:, 1:] @ border[:, None])
         skyline.solve_back_dense(factor, step)
-        latency = float(border[0]) if self.has_latency else 0.0
         by_node = step[self.layout.nodes].reshape(-1, self.layout.size)
-        by_node = back_substitute_nodes(by_node, latency, self.kept, self.gaps, self.nodes)
+        shared = border[: self.encoder_unknowns]
+        by_node = back_substitute_nodes(by_node, shared, self.kept, self.gaps, self.nodes)
         return by_node.ravel(), step[self.layout.pieces, 0], border

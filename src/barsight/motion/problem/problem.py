@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, RectifiedCamera
+from barsight.core.types import CraneSamples, EncoderJump, RectifiedCamera
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.frontend.tracking import Sighting
@@ -172,8 +172,10 @@ def inertial_of(values: Any, nodes: Int64) -> Float64:
     return np.column_stack([velocity, [values.atConstantBias(B(k)).vector() for k in nodes.tolist()]])
 
 
-def latency_of(values: Any) -> Float64:
-    """Extract the encoders' latency (1,) of GTSAM's values; (0,) without encoders."""
+def encoder_unknowns_of(values: Any) -> Float64:
+    """Extract the encoders' unknowns (S,) of GTSAM's values: their latency, s, and by how much more than its
+    size each jump is, m; (0,) without encoders.
+    """
     return np.asarray(values.atVector(E(0))) if values.exists(E(0)) else np.empty(0)
 
 
@@ -202,7 +204,7 @@ class Problem:
     scale_prior: float = 5e-4
     """By which share baseline and encoders may disagree (1 sigma)."""
     prior: MarginalPrior | None = None
-    """Takes the place of what fixes the first node, the biases and the latency."""
+    """Takes the place of what fixes the first node, the biases and the encoders' unknowns."""
     crane: CraneSamples | None = None
     """The readings that `placed` are of."""
     pieces: Pieces | None = None
@@ -212,6 +214,8 @@ class Problem:
     taken out of the system beforehand (`chain_elimination`)."""
     has_latency: bool = False
     """Whether the encoders' latency is an unknown."""
+    jumps: tuple[EncoderJump, ...] = ()
+    """Of the encoders' readings, each an unknown."""
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
 
@@ -243,11 +247,16 @@ class Problem:
         return order_unknowns(self.width, len(self.kept), begin, end, piece)
 
     @property
+    def encoder_unknowns(self) -> int:
+        """Count the encoders' unknowns: latency and jumps."""
+        return 1 + len(self.jumps) if self.has_latency else 0
+
+    @property
     def border(self) -> int:
-        """Count the unknowns that all nodes share: the encoders' latency, what pieces' slides have in common,
-        the rig's drift.
+        """Count the unknowns that all nodes share: the encoders', what pieces' slides have in common, the
+        rig's drift.
         """
-        return int(self.has_latency) + int(self.pieces is not None) + 2
+        return self.encoder_unknowns + int(self.pieces is not None) + 2
 
     @property
     def free(self) -> Bool:

@@ -1,0 +1,249 @@
+"""Jumps of the encoders: steps between two neighbouring readings that no motion of the crane explains.
+
+The readings of four seconds are held to be the sum of the way as the IMU knows it, of what it leaves open,
+of noise with single wild readings, and of a step s h, h being 0 before a reading and 1 from it on. What is
+left open is a Gaussian process of covariance K: a parabola and the accelerometer's noise, twice integrated;
+where no IMU tells the way, all that a crane may do: oscillations of 0.3 to 3.2 Hz and changes of its
+acceleration. What pictures see of the way between two frames are rows of the same system. So
+
+    s = h' K^-1 y / h' K^-1 h,    sigma_s^2 = 1 / h' K^-1 h
+
+[generalised least squares: Aitken 1936], with Cauchy's weights on the noise, and a step is told by how much
+less the whole costs with it than without it, in sigma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg.dense import cholesky, solve_lower
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples, EncoderJump
+from barsight.motion.crane.known_motion import KnownMotion, SeenSteps
+
+HALF_S, STRIDE_S = 2.0, 0.5
+"""A window's half, and how far the next one's middle lies."""
+MAX_RATE_HZ = 25.0
+"""Readings that come faster are put together by their median."""
+MIN_SIDE = 4
+"""So many readings must lie on either side of a step."""
+SURE_SIGMAS, MAYBE_SIGMAS = 4.7, 4.0
+"""From here on a step is a jump; from here on it may be one, and binds the readings on its sides less."""
+BLIND_RATIO = 1.7
+"""By how much both are higher where no IMU tells the way: what a crane may do isn't quite normal, and three
+wild readings on end look like a step."""
+MIN_JUMP_M = 0.004
+WIDE_M = 10.0
+CAUCHY_SIGMAS = 3.0
+ROUNDS, MIN_CHANGE = 12, 0.01
+PLAY_M, PLAY_S = 0.0006, 0.4
+"""By how much an encoder follows its crane late or askew (1 sigma), and for how long alike."""
+LATENCY_SIGMA_S = 0.1
+FREQUENCIES_HZ = np.linspace(0.3, 3.2, 12)
+AMPLITUDES_M = np.minimum(0.015, 1.0 / (2 * np.pi * FREQUENCIES_HZ) ** 2)
+"""A crane oscillates no faster, no further and with no more acceleration than this."""
+CHANGE_MPS2 = 0.35
+"""By how much an acceleration changes within a second (1 sigma)."""
+ACCEL_DENSITY = 2.5e-3
+"""Of the accelerometer, m/s^2/sqrt(Hz), with what sway and its own alignment add."""
+JERK_MPS3 = 3e-3
+"""What the trend of the gyro leaves of gravity (1 sigma)."""
+SCALE, ASKEW_RAD = 2e-3, 2.6e-3
+"""By which share the pictures' steps are all too long (1 sigma), and by which angle askew."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundStep:
+    """A step found: on which axis, the first of the series' readings beyond it, by how many sigma (with an
+    IMU; without, so much less), its size, and the way (n,) at the window's readings, which begin at `first`.
+    """
+
+    axis: int
+    reading: int
+    sigmas: float
+    size_m: float
+    first: int
+    way_m: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class JumpWindow:
+    """N readings and then M steps of the pictures as rows: values (N + M, 3) m, variance (N + M,) of each
+    row's noise, open (3, N + M, N + M) the covariance of all else, per axis. steps (N + M, S) columns of the
+    steps that are sought, of which the first readings beyond are `beyond` (S,); stamp_ns: (N,), of which the
+    first is the series' `first`; by_imu: whether that tells the way.
+    """
+
+    values: Float64
+    variance: Float64
+    open: Float64
+    steps: Float64
+    beyond: Int64
+    stamp_ns: Int64
+    first: int
+    by_imu: bool
+
+    @classmethod
+    def around(
+        cls, series: CraneSamples, sigma_m: float, middle_ns: int, known: KnownMotion, half_s: float = HALF_S
+    ) -> JumpWindow | None:
+        """Gather what is known around a stamp; None where that is too little for any step."""
+        first, end = np.searchsorted(series.stamp_ns, known.span(middle_ns, seconds_to_ns(half_s)))
+        stamps, place = series.stamp_ns[first:end], series.position_m[first:end]
+        count = len(stamps)
+        beyond = np.flatnonzero(np.abs(stamps - middle_ns) <= seconds_to_ns(STRIDE_S / 2))
+        beyond = beyond[(beyond >= MIN_SIDE) & (beyond <= count - MIN_SIDE)]
+        if count < 2 * MIN_SIDE:
+            return None
+        begin_ns, last_ns = int(stamps[0]), int(stamps[-1])
+        imu = known.by_imu(series, begin_ns, last_ns)
+        seen = None if known.steps is None else known.steps.chosen(begin_ns, last_ns)
+        values, speed, variance = place - place[:1], np.zeros_like(place), np.full(count, sigma_m**2)
+        way, ends = np.empty((0, 3)), np.empty(0, np.int64)
+        if seen is not None and len(seen.old_ns):
+            way = seen.way_m @ series.yard_from_body_nominal.T
+            ends, speed = np.concatenate([seen.old_ns, seen.new_ns]), _seen_speed(seen, way, stamps)
+            askew = (ASKEW_RAD * np.linalg.norm(way, axis=1)) ** 2
+            variance = np.concatenate([variance, seen.sigma_m**2 + askew])
+        time = (np.concatenate([stamps, ends]) - begin_ns) / NS_PER_S
+        rows = block_diag(np.eye(count), _differences(len(way)))
+        if imu is not None:
+            values, speed = values - imu.place_at(stamps), imu.speed_at(stamps)
+            values -= values[:1]
+        by_imu = 0 if imu is None else _differences(len(way)) @ imu.place_at(ends)
+        open_m2 = rows @ _unknown_way(time, imu is not None) @ rows.T
+        near = np.abs(time[:count, None] - time[:count])
+        open_m2[:count, :count] += PLAY_M**2 * np.exp(-near / PLAY_S)
+        columns = [_columns(speed[:, axis], way, axis) for axis in range(3)]
+        steps = np.zeros((count + len(way), len(beyond)))
+        steps[:count] = np.arange(count)[:, None] >= beyond
+        return cls(
+            np.vstack([values, way - by_imu]), variance, np.stack([open_m2 + c @ c.T for c in columns]),
+            steps, beyond, stamps, int(first), imu is not None,
+        )  # fmt: skip
+
+    def largest_step(self, axis: int, jumps: Sequence[EncoderJump]) -> FoundStep | None:
+        """Find the step on one axis that is most sure, beside the jumps there; None where there is none."""
+        values, open_m2 = self.values[:, axis], self.open[axis]
+        if jumps:
+            open_m2 = open_m2 + self._jumped(jumps)
+        none = np.zeros(len(values))
+        plain = self._weighted(values, open_m2, none, np.ones(len(none)))
+        if np.abs(plain.sigmas).max() < MAYBE_SIGMAS and plain.worst < CAUCHY_SIGMAS + 1:
+            return None
+        without = self._robust(values, open_m2, none)
+        tried = {int(np.abs(fit.sigmas).argmax()) for fit in (plain, without)}
+        fits = [(self._robust(values, open_m2, self.steps[:, k]), k) for k in tried]
+        fit, k = min(fits, key=lambda one: one[0].cost)
+        sigmas = float(np.sqrt(max(0.0, 2 * (without.cost - fit.cost)))) / (1 if self.by_imu else BLIND_RATIO)
+        if sigmas < MAYBE_SIGMAS or abs(fit.size_m) < MIN_JUMP_M:
+            return None
+        way = (fit.way_m - values)[: len(self.stamp_ns)]
+        return FoundStep(axis, self.first + int(self.beyond[k]), sigmas, fit.size_m, self.first, way)
+
+    def step_at(self, axis: int, stamp_ns: int) -> tuple[float, float]:
+        """Fit a step from a stamp on: its size and sigma, m."""
+        step = np.zeros(len(self.values))
+        step[: len(self.stamp_ns)] = self.stamp_ns >= stamp_ns
+        fit = self._robust(self.values[:, axis], self.open[axis], step)
+        return fit.size_m, fit.sigma_m
+
+    def _jumped(self, jumps: Sequence[EncoderJump]) -> Float64:
+        """Compute the covariance (N + M, N + M) of what jumps leave open."""
+        stamps, near = self.stamp_ns, seconds_to_ns(1.3 / MAX_RATE_HZ)
+        columns, unsure = np.zeros((len(self.values), len(jumps))), np.zeros(len(self.values))
+        for k, jump in enumerate(jumps):
+            columns[: len(stamps), k] = jump.sigma_m * jump.share(stamps)
+            # Which side the next readings are on isn't always known.
+            unsure[: len(stamps)][np.abs(stamps - jump.stamp_ns) < near] = WIDE_M**2
+        return np.asarray(columns @ columns.T + np.diag(unsure))
+
+    def _robust(self, values: Float64, open_m2: Float64, step: Float64) -> _Fit:
+        weight = np.ones(len(values))
+        for _ in range(ROUNDS):
+            fit, before = self._weighted(values, open_m2, step, weight), weight
+            weight = 1 / (1 + fit.off**2 / CAUCHY_SIGMAS**2)
+            if np.abs(weight - before).max() < MIN_CHANGE:
+                break
+        return fit
+
+    def _weighted(self, values: Float64, open_m2: Float64, step: Float64, weight: Float64) -> _Fit:
+        """Fit with given weights; a step (N + M,) of zeros fits none."""
+        noise = self.variance / weight
+        factor = cholesky(open_m2 + np.diag(noise))
+        right = solve_lower(factor, np.column_stack([values, step, self.steps]))
+        own, mine = right[:, 0], right[:, 1]
+        size = sigma = 0.0
+        if step.any():
+            power = float(mine @ mine)
+            size, sigma = float(mine @ own) / power, power**-0.5
+            own = own - size * mine
+        each = (right[:, 2:] * own[:, None]).sum(axis=0) / np.sqrt((right[:, 2:] ** 2).sum(axis=0))
+        pull = solve_lower(factor, own, transposed=True)
+        off = noise * pull / np.sqrt(self.variance)
+        cost = CAUCHY_SIGMAS**2 / 2 * float(np.log1p((off / CAUCHY_SIGMAS) ** 2).sum())
+        cost += float(pull @ open_m2 @ pull) / 2
+        way = values - size * step - noise * pull
+        return _Fit(size, sigma, cost, each, off, way)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """size_m, sigma_m: of the step. cost: minus the logarithm of the likelihood. sigmas (S,): of each step
+    that is sought, beside the fitted one. off (N + M,): residuals in sigma; way_m (N + M,) without the step.
+    """
+
+    size_m: float
+    sigma_m: float
+    cost: float
+    sigmas: Float64
+    off: Float64
+    way_m: Float64
+
+    @property
+    def worst(self) -> float:
+        """Return the largest residual in sigma."""
+        return float(np.abs(self.off).max())
+
+
+def _unknown_way(time: Float64, by_imu: bool) -> Float64:
+    """Compute the covariance (n, n) m2 of the way at times (n,) s, but for what the IMU tells."""
+    middle = time - (time[0] + time[-1]) / 2
+    near = np.minimum(time[:, None], time)
+    apart = np.abs(time[:, None] - time)
+    if by_imu:
+        sigmas = np.array([WIDE_M, WIDE_M, 1.0, JERK_MPS3 / 6])
+        drawn = ACCEL_DENSITY**2 * (near**3 / 3 + apart * near**2 / 2)
+    else:
+        sigmas = np.array([WIDE_M, WIDE_M, 1.0, 0.0])
+        drawn = CHANGE_MPS2**2 * (near**5 / 20 + apart * near**4 / 8 + apart**2 * near**3 / 12)
+        waves = np.cos(2 * np.pi * apart[..., None] * FREQUENCIES_HZ)
+        drawn += waves @ (AMPLITUDES_M**2 / 2)
+    powers = middle[:, None] ** np.arange(4) * sigmas
+    return np.asarray(powers @ powers.T + drawn)
+
+
+def _differences(steps: int) -> Float64:
+    """Make the matrix (M, 2 M) that subtracts the first half of the places from the second."""
+    return np.hstack([-np.eye(steps), np.eye(steps)])
+
+
+def _seen_speed(seen: SeenSteps, way: Float64, stamps: Int64) -> Float64:
+    """Interpolate the speed (n, 3) m/s at the stamps by the pictures' ways (M, 3)."""
+    middle, seconds = (seen.old_ns + seen.new_ns) // 2, (seen.new_ns - seen.old_ns) / NS_PER_S
+    return np.column_stack([np.interp(stamps, middle, part) for part in (way / seconds[:, None]).T])
+
+
+def _columns(speed: Float64, way: Float64, axis: int) -> Float64:
+    """Make columns (n + M, 3) of what one axis leaves open beside its way, each in its sigma: the latency,
+    how long and how askew the pictures' steps are.
+    """
+    across = np.linalg.norm(np.delete(way, axis, axis=1), axis=1)
+    return block_diag(
+        -LATENCY_SIGMA_S * speed[:, None], np.column_stack([SCALE * way[:, axis], ASKEW_RAD * across])
+    )

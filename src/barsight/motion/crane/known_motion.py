@@ -1,0 +1,100 @@
+"""Gather what pictures and IMU say of the crane's way, to hold encoder readings against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.motion.crane.sway import MAX_GAP_S, turned_angle
+
+TREND_S = 20.0
+"""The gyro's mean and trend over this long are taken off."""
+MIN_TREND_S = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSteps:
+    """K steps between frames by the pictures. old_ns, new_ns: (K,) by the encoders' clock; turn: (K, 3)
+    rotation vector old body from new body; way_m: (K, 3) in the old body's axes; sigma_m: (K,) on each axis.
+    """
+
+    old_ns: Int64
+    new_ns: Int64
+    turn: Float64
+    way_m: Float64
+    sigma_m: Float64
+
+    def chosen(self, first_ns: int, last_ns: int) -> SeenSteps:
+        """Select the steps that lie within two stamps."""
+        inside = (self.old_ns >= first_ns) & (self.new_ns <= last_ns)
+        return SeenSteps(
+            self.old_ns[inside], self.new_ns[inside], self.turn[inside], self.way_m[inside],
+            self.sigma_m[inside],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMotion:
+    """The way as pictures and IMU know it; either may be None."""
+
+    steps: SeenSteps | None = None
+    imu: ImuSamples | None = None
+
+    def span(self, middle_ns: int, half_ns: int) -> tuple[int, int]:
+        """Return the stamps around one, `half_ns` on either side, but no further than the IMU knows."""
+        first, end = middle_ns - half_ns, middle_ns + half_ns + 1
+        if self.imu is not None and self.imu.stamp_ns[0] <= middle_ns <= self.imu.stamp_ns[-1]:
+            return max(first, int(self.imu.stamp_ns[0])), min(end, int(self.imu.stamp_ns[-1]) + 1)
+        return first, end
+
+    def by_imu(self, crane: CraneSamples, first_ns: int, last_ns: int) -> ImuWay | None:
+        """Integrate the IMU between two stamps; None where it doesn't cover them or has a gap there."""
+        if self.imu is None:
+            return None
+        stamps, trend = self.imu.stamp_ns, seconds_to_ns(TREND_S)
+        middle = (first_ns + last_ns) // 2
+        from_ns = max(min(middle - trend // 2, int(stamps[-1]) - trend), int(stamps[0]))
+        part = slice(*np.searchsorted(stamps, (from_ns, from_ns + trend + 1)))
+        imu = ImuSamples(stamps[part], self.imu.gyro_radps[part], self.imu.accel_mps2[part])
+        stamps = imu.stamp_ns
+        begin, end = np.searchsorted(stamps, (first_ns, last_ns))
+        begin, end = max(0, int(begin) - 1), min(int(end) + 1, len(stamps))
+        if end - begin < 8 or stamps[begin] > first_ns or stamps[end - 1] < last_ns:
+            return None
+        if stamps[-1] - stamps[0] < seconds_to_ns(MIN_TREND_S) or (
+            np.diff(stamps).max() > seconds_to_ns(MAX_GAP_S)
+        ):
+            return None
+        time = (stamps - middle) / NS_PER_S
+        angle = turned_angle(imu)
+        angle -= np.polynomial.polynomial.polyval(time, np.polynomial.polynomial.polyfit(time, angle, 1)).T
+        turned = crane.yard_from_body_nominal @ Rotation.from_rotvec(angle[begin:end]).as_matrix()
+        force = np.einsum("nij,nj->ni", turned, imu.accel_mps2[begin:end])
+        force -= force.mean(axis=0)  # gravity and the biases, which whoever reads this leaves open
+        time = time[begin:end]
+        speed = cumulative_trapezoid(force, time, axis=0, initial=0)
+        speed -= speed.mean(axis=0)
+        return ImuWay(stamps[begin:end], speed, cumulative_trapezoid(speed, time, axis=0, initial=0))
+
+
+@dataclass(frozen=True, eq=False)
+class ImuWay:
+    """The way by the IMU alone, but for a parabola. stamp_ns: (N,); speed_mps, place_m: (N, 3) in `yard`."""
+
+    stamp_ns: Int64
+    speed_mps: Float64
+    place_m: Float64
+
+    def place_at(self, stamp_ns: Int64) -> Float64:
+        """Interpolate the place (M, 3)."""
+        return interpolate_at(stamp_ns, self.stamp_ns, self.place_m)
+
+    def speed_at(self, stamp_ns: Int64) -> Float64:
+        """Interpolate the speed (M, 3)."""
+        return interpolate_at(stamp_ns, self.stamp_ns, self.speed_mps)

@@ -1,0 +1,47 @@
+"""Convert the front end's motions to steps of the body, which other sensors are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.types import ImuSamples
+from barsight.motion.crane.known_motion import KnownMotion, SeenSteps
+from barsight.motion.frontend.tracking import Sighting
+
+
+def seen_steps(
+    sightings: Sequence[Sighting], steps: Sequence[int], rectifier: Rectifier, shift_ns: int
+) -> SeenSteps:
+    """Convert the motions of sightings `steps`, each since the one before, to the body's.
+
+    shift_ns: `timeshift_cam_imu`.
+    """
+    mount = rectifier.body_from_rect0
+    turns, ways, sigmas = [], [], []
+    for k in steps:
+        motion = sightings[k].motion
+        assert motion is not None
+        old_from_new = motion.rotation.T
+        rotation = mount.rotation @ old_from_new @ mount.rotation.T
+        move = mount.rotation @ (-old_from_new @ motion.translation)
+        turns.append(Rotation.from_matrix(rotation).as_rotvec())
+        ways.append(move + mount.translation - rotation @ mount.translation)
+        sigmas.append(np.sqrt(np.diag(motion.covariance)[3:].max()))
+    stamps = np.array([s.stamp_ns for s in sightings], np.int64) + shift_ns
+    new = np.array(steps, np.int64)
+    return SeenSteps(
+        stamps[new - 1], stamps[new], np.array(turns).reshape(-1, 3), np.array(ways).reshape(-1, 3),
+        np.array(sigmas, np.float64),
+    )  # fmt: skip
+
+
+def known_motion(
+    sightings: Sequence[Sighting], imu: ImuSamples | None, rectifier: Rectifier, shift_ns: int
+) -> KnownMotion:
+    """Gather what the sightings' motions and the IMU know of the way."""
+    told = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
+    return KnownMotion(seen_steps(sightings, told, rectifier, shift_ns) if told else None, imu)
