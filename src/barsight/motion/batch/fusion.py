@@ -29,6 +29,7 @@ from barsight.motion.crane.encoder_trajectory import (
     fit_position,
     reestimate_noise,
 )
+from barsight.motion.crane.known_motion import KnownMotion
 from barsight.motion.estimator import FrameInput, TrajectoryEstimator
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.board_corners import PointTracker, split_tracks

@@ -18,7 +18,7 @@ from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
-from barsight.motion.frontend.tracking import Sighting, Tracker
+from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
 

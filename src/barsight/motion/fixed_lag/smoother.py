@@ -21,6 +21,7 @@ from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fault_detection import freeze_sentences
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
+from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
@@ -123,6 +124,33 @@ class FixedLagEstimator:
         self.window = marginalise(window, leaving) if leaving else window
         return PosedFrame(seen.stamp_ns, pose, covariance)
 
+    def _check_encoders(self, stamp_ns: int) -> None:
+        """Look for faults in the encoders' newest readings; places that were taken beyond a jump leave."""
+        now, before = self._come(stamp_ns), self.watch.jumps
+        if now.crane is None:
+            return
+        recent = self.motions[-RECENT_FRAMES:]
+        known = known_motion(recent, now.imu, self._rectifier, self._shift_ns)
+        self.watch.check(reestimate_noise(now.crane), known)
+        new, window = [jump for jump in self.watch.jumps if jump not in before], self.window
+        if not new or window is None:
+            return
+        window = with_jumps(window, self.watch.jumps)
+        since = min(jump.stamp_ns for jump in new) - seconds_to_ns(FIT_S)
+        problem = window.problem
+        kept = tuple(place for place in problem.placed if problem.stamp_ns[place.node] < since)
+        placed_ns = None if not kept else int(problem.stamp_ns[kept[-1].node])
+        self.window = replace(window, problem=replace(problem, placed=kept), placed_ns=placed_ns)
+
+    def encoder_faults(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Tell of the encoders' faults: those that make all doubtful, and those that may be."""
+        crane = self.readings.crane
+        if crane is None or not len(crane.stamp_ns):
+            return (), ()
+        begin_ns = int(crane.stamp_ns[0])
+        sure, maybe = jump_sentences(self.watch.jumps, begin_ns, None)
+        return (*freeze_sentences(self.watch.frozen, begin_ns), *sure), maybe
+
     def _now(self, stamp_ns: int) -> SensorBuffer:
         """Select the readings that have come when the frame of a stamp is computed, back to before the nodes
         held, without the encoders' faults.
@@ -130,7 +158,7 @@ class FixedLagEstimator:
         now = self._come(stamp_ns)
         return now if now.crane is None else replace(now, crane=self.watch.usable(now.crane))
 
-    def _come(self, stamp_ns: int) -> ReadingsSoFar:
+    def _come(self, stamp_ns: int) -> SensorBuffer:
         last = stamp_ns + self._shift_ns + seconds_to_ns(SENSOR_DELAY_S)
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
         return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)

@@ -120,7 +120,8 @@ def add_chain(chain: Chain, at: Int64, band: Skyline) -> None:
 @kernel()
 def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain: Chain) -> None:
     """Add the normal equations of sparse rows: row r has `right` and values[k] at unknown at[k], where
-    first[r] <= k < first[r + 1]. Unknown M n, after the nodes', is the latency.
+    first[r] <= k < first[r + 1]. From unknown M n on, after the nodes', are the
+    encoders'.
 
     first: (R + 1,); at, values: (E,) elements of R rows; right: (R,).
     """
