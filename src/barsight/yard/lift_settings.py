@@ -67,6 +67,8 @@ class LiftSettings:
             raise ConfigError("lift: shares, min_confidence and min_count_probability lie in 0...1")
         if not 0 <= self.strap_m <= 0.05:
             raise ConfigError(f"lift.strap_m must lie in 0...0.05, not {self.strap_m}")
+        if not 0 < self.max_hidden_bar_m <= 0.1:
+            raise ConfigError(f"lift.max_hidden_bar_m must lie in 0...0.1, not {self.max_hidden_bar_m}")
         if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
             raise ConfigError("lift.contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
         if not 0 <= self.disturbed_reach_m <= 100:
