@@ -18,8 +18,9 @@ NO_PAIRS = np.empty((0, 2), np.int64)
 class Marginals:
     """Marginal covariances of the system's K nodes. poses: (K, 6, 6) in GTSAM's order and body axes, the
     rig's drift taken as known. encoder_sigmas: (S,) of the encoders' unknowns. drift_jacobian_of_pose:
-    (K, 6, 2) how the poses move with the drift. nodes: (K, n, n) of all that a node has, what the border shares taken
-    as known too. cross: (P, 6, 6) of pairs of poses, as `poses`; NaN for those too far apart for the band.
+    (K, 6, 2) how the poses move with the drift. nodes: (K, n, n) of all that a node has, what the border
+    shares taken as known too. cross: (P, 6, 6) of pairs of poses, as `poses`; NaN for those too far apart for
+    the band.
     """
 
     poses: Float64
