@@ -26,7 +26,7 @@ INSTALLED = packages_distributions()
 EXTRAS = {
     "view": {"viewer/view.py"},
     "export": {"report/export.py"},
-    "bench": {"features/detectors.py"},
+    "bench": {"features/detectors.py", "simulation/worlds/settling.py"},
     "notebook": {"yard/types.py"},
 }
 """Which modules may import what an extra installs."""

@@ -54,8 +54,7 @@ def test_packets_with_snapshots_end_as_the_batch(
     pictures = len(recording.index.stamps_ns)
     assert (len(rectified), len(tracked)) == (pictures, pictures)
     batch = bs.measure(whole, **settings)
-    # Two threads may meet at the first pair.
-    assert len(rectified) <= 2 * pictures + 1
+    assert len(rectified) == 2 * pictures
     for name in FILES:
         assert (yard.folder / name).read_bytes() == (batch.folder / name).read_bytes(), name
     found, expected = (json.loads((one.folder / "bundles.json").read_text()) for one in (yard, batch))

@@ -32,7 +32,7 @@ class RectifiedPairs:
     ) -> None:  # fmt: skip
         self.recording, self.rectifier = recording, rectifier
         self._folder, self._watch, self._bytes = folder, watch or Stopwatch(), 0
-        self._lock = Lock()
+        self._lock, self._turns = Lock(), dict[int, Lock]()
 
     def __call__(self, wanted: Container[int] | None = None) -> Iterator[RectifiedPair | RefusedFrame]:
         """Yield the pairs in time's order; a frame that can't be decoded or rectified is refused.
@@ -54,17 +54,23 @@ class RectifiedPairs:
             yield frame if isinstance(frame, RefusedFrame) else self.rectify(frame)
 
     def rectify(self, frame: StereoFrame) -> RectifiedPair | RefusedFrame:
-        """Rectify a frame, and store it for who asks later."""
-        with self._watch("rectify", 1):
-            pair = self.rectifier(frame)
-        if isinstance(pair, Failed):
-            return RefusedFrame(frame.stamp_ns, pair.reason)
+        """Rectify a frame once for all threads, and store it for who asks later."""
+        with self._turns.setdefault(frame.stamp_ns, Lock()):
+            if self.has(frame.stamp_ns):
+                return self._read(frame.stamp_ns)
+            with self._watch("rectify", 1):
+                pair = self.rectifier(frame)
+            if isinstance(pair, Failed):
+                return RefusedFrame(frame.stamp_ns, pair.reason)
+            self._store(pair)
+            return pair
+
+    def _store(self, pair: RectifiedPair) -> None:
         with self._lock:
-            if self._folder is not None and self._bytes < MAX_STORED_BYTES and not self.has(frame.stamp_ns):
+            if self._folder is not None and self._bytes < MAX_STORED_BYTES:
                 self._bytes += pair.left.nbytes + pair.right.nbytes
-                with atomic_path(self._file(frame.stamp_ns)) as path, path.open("wb") as stream:
+                with atomic_path(self._file(pair.stamp_ns)) as path, path.open("wb") as stream:
                     np.save(stream, np.stack([pair.left, pair.right]))
-        return pair
 
     def has(self, stamp_ns: int) -> bool:
         """Check whether a pair lies in the folder."""

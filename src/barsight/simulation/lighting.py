@@ -173,7 +173,10 @@ def lamp_beam(lamps: Lamps, along_x: float) -> float:
 
 @kernel()
 def sun_patch(sun: Float64, x: float, y: float, z: float) -> float:
-    """Compute how much of the sun's patch (`Lamps.sun`) reaches (x, y, z) m: 1 inside, soft edges."""
+    """Compute how much of the sun's patch reaches (x, y, z) m: 1 inside, soft edges.
+
+    sun: (8,), see `Lamps`.
+    """
     px, py = x - z * sun[0] / sun[2], y - z * sun[1] / sun[2]
     inside = min(px - sun[3], sun[4] - px, py - sun[5], sun[6] - py)
     share: float = min(max(inside / SUN_EDGE_M + 0.5, 0.0), 1.0)

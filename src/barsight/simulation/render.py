@@ -178,7 +178,8 @@ def _mirrored(
 ) -> float:
     """Compute how much bar `p` mirrors where `half` points between light and eye, 1 at the most [Ward 1992].
 
-    turn: cosine and sine of the normal's angle around the bar, and its roughness over the ordinary.
+    shape: (P, 15), see `Primitives`. turn: cosine and sine of the normal's angle around the bar, and its
+    roughness over the ordinary.
     """
     c, d, rough = turn
     hx, hy, hz = half

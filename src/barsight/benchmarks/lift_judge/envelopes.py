@@ -87,7 +87,10 @@ def _draw_underside(solid: Float64, x0: float, y0: float, step: float, out: Floa
 
 @kernel()
 def cut(solid: Float64, x: float, y: float) -> tuple[float, float]:
-    """Cut a row of `SolidYard.table` by the vertical line at (x, y): from z to z, empty where it misses."""
+    """Cut a solid by the vertical line at (x, y): from z to z, empty where it misses.
+
+    solid: (16,), a row of `SolidYard.table`.
+    """
     qx, qy = x - solid[1], y - solid[2]
     low, high = -np.inf, np.inf
     for k in range(1 if solid[0] else 3):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING
 
@@ -257,13 +258,8 @@ class BatchPoses:
             chosen = _apart(nodes.stamp_ns, seconds_to_ns(PLACE_SPACING_S))
             placed = encoder_positions(inputs.crane, nodes.stamp_ns, chosen)
             nominal = inputs.crane.yard_from_body_nominal
-            still = [k for k in chosen if k in ties.still]
-            for k in chosen:
-                # Sway turns round within a second or so: nodes nearer than that aren't independent.
-                sigma = self._crane_settings.attitude_std_deg * 1.6
-                if k in still:
-                    sigma = self._crane_settings.sway_std_deg * len(still) ** 0.5
-                attitudes.append(AttitudePrior(k, nominal, np.full(3, np.deg2rad(sigma))))
+            sigmas = self._attitude_sigmas_deg(chosen, ties.still)
+            attitudes = [AttitudePrior(k, nominal, np.full(3, np.deg2rad(s))) for k, s in sigmas.items()]
         jumps = inputs.crane.jumps if inputs.crane is not None and placed else ()
         seen = None
         if inputs.sightings:
@@ -288,6 +284,14 @@ class BatchPoses:
         warnings += maybe
         encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
         return estimate, warnings, sure, encoders
+
+    def _attitude_sigmas_deg(self, chosen: list[int], still: Container[int]) -> dict[int, float]:
+        """Choose the sigma of the nominal attitude at the chosen nodes: sway turns round within a second or
+        so, so nodes nearer than that aren't independent.
+        """
+        moving, standing = self._crane_settings.attitude_std_deg * 1.6, [k for k in chosen if k in still]
+        at_rest = self._crane_settings.sway_std_deg * len(standing) ** 0.5
+        return {k: at_rest if k in standing else moving for k in chosen}
 
 
 def _jumps_alone(inputs: _Inputs) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ from barsight.yard.lifting.validity import Validity, age_checks, disturbed_check
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
 from barsight.yard.magnet.description import Magnet, Tolerance
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
-from barsight.yard.magnet.holding import hold_load, share_checks, weakest_pole
+from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, weakest_pole
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_min, check_true, vetoes_of
@@ -114,11 +114,7 @@ def assess_placement(
     near = nearby_bundles(yard.table, place, magnet)
     contact = rest_magnet(yard.heights, place, magnet, settings.contact_gap_m)
     if contact is None:
-        nothing = Tolerance(0.0, 0.0, 0.0)
-        nan = math.nan
-        reason = "nothing is known under the magnet"
-        unseen = check_true("unknown-under-footprint", "something was seen under the magnet", None, reason)
-        return Lift(place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0, (unseen,))
+        return _unseen_lift(place)
     held = count_gripped(place, magnet, magnet.tolerance, near, contact.z_m)
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
@@ -151,23 +147,41 @@ def assess_placement(
         reason = f"within the crane's tolerance {end}"
         what = "the box within which the lift stays as checked, over the crane's tolerance"
         checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
-    ratios = (
-        contact.pull_low_n / needed if needed > 0 else 0.0,
-        weakest.ratio if weakest else 0.0,
-        min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg) / mass.upper_kg
-        if mass.upper_kg > 0 else 0.0,
-        scale if search else math.inf,
-    )  # fmt: skip
+    safety = _safety(contact, weakest, needed, mass, magnet, scale if search else math.inf)
     return Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
         contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
         _scaled(magnet.tolerance, scale),
-        float(np.nan_to_num(min(ratios))), tuple(checks), valid,
+        safety, tuple(checks), valid,
         target_covariance(
             place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
         ),
     )  # fmt: skip
+
+
+def _unseen_lift(place: Placement) -> Lift:
+    """Refuse a placement under which nothing is known."""
+    nan, nothing = math.nan, Tolerance(0.0, 0.0, 0.0)
+    reason = "nothing is known under the magnet"
+    unseen = check_true("unknown-under-footprint", "something was seen under the magnet", None, reason)
+    return Lift(place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0, (unseen,))
+
+
+def _safety(
+    contact: Contact, weakest: WeakestPole | None, needed_n: float, mass: Mass, magnet: Magnet, scale: float
+) -> float:
+    """Compute a lift's safety: the least of pull over what is needed, the weakest pole's pull over its share,
+    capacity over load, and `scale`, the tolerance over the crane's.
+    """
+    capacity_kg = min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
+    ratios = (
+        contact.pull_low_n / needed_n if needed_n > 0 else 0.0,
+        weakest.ratio if weakest else 0.0,
+        capacity_kg / mass.upper_kg if mass.upper_kg > 0 else 0.0,
+        scale,
+    )
+    return float(np.nan_to_num(min(ratios)))
 
 
 def nearby_bundles(table: BundleTable, place: Placement, magnet: Magnet) -> BundleTable:
