@@ -35,14 +35,22 @@ def dark_lines(shades: ShadeProfile) -> Float64:
     places = np.arange(shades.places_m[0], shades.places_m[-1], _STEP_M)
     level = np.interp(places, shades.places_m, shades.levels)
     level = ndimage.gaussian_filter1d(level, _BLUR_M / _STEP_M)
-    lines, darkest, brightest, falling = list[int](), 0, level[0], False
+    return np.asarray(places[find_minima(level, _DARKER_LOG, falling=False)], np.float64)
+
+
+def find_minima(level: Float64, depth: float, *, falling: bool) -> list[int]:
+    """Find the minima of a profile (N,) between falls and rises by `depth`.
+
+    falling: whether its beginning counts as a fall.
+    """
+    minima, lowest, highest = list[int](), 0, level[0]
     for k in range(1, len(level)):
-        if falling and level[k] < level[darkest]:
-            darkest = k
-        elif falling and level[k] > level[darkest] + _DARKER_LOG:
-            lines.append(darkest)
-            falling, brightest = False, level[k]
-        elif not falling and level[k] < brightest - _DARKER_LOG:
-            falling, darkest = True, k
-        brightest = max(brightest, level[k])
-    return np.asarray(places[lines], np.float64)
+        if falling and level[k] < level[lowest]:
+            lowest = k
+        elif falling and level[k] > level[lowest] + depth:
+            minima.append(lowest)
+            falling, highest = False, level[k]
+        elif not falling and level[k] < highest - depth:
+            falling, lowest = True, k
+        highest = max(highest, level[k])
+    return minima

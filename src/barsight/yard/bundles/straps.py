@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.types import HeightSource
-from barsight.yard.bundles.bar_pitch import bar_diameter
+from barsight.yard.bundles.bar_pitch import bar_diameter, find_minima
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.seen_section import agreeing_rows, is_overhung, mean_section
@@ -435,7 +435,7 @@ def _gully(level: Float64, top: float, alone: bool) -> int | None:
     bottom = int(np.argmin(filled))
     if not alone:
         return bottom
-    dips = _dips(filled)
+    dips = find_minima(filled, _TWIN_M, falling=True)
     if len(dips) != 1:
         return None
     deep = min(top - filled[bottom], filled[bottom:].max() - filled[bottom]) >= _GULLY_M
@@ -452,18 +452,3 @@ def _fill_hidden(level: Float64) -> Float64:
         floor = np.isneginf(level[own]).any()
         filled[own] = min(around) - (_FLOOR_M if floor else _HIDDEN_DEPTH_M)
     return filled
-
-
-def _dips(level: Float64) -> list[int]:
-    """Find the places of the lowest between rises by _TWIN_M."""
-    dips, lowest, highest, falling = list[int](), 0, level[0], True
-    for k in range(1, len(level)):
-        if falling and level[k] < level[lowest]:
-            lowest = k
-        elif falling and level[k] > level[lowest] + _TWIN_M:
-            dips.append(lowest)
-            falling, highest = False, level[k]
-        elif not falling and level[k] < highest - _TWIN_M:
-            falling, lowest = True, k
-        highest = max(highest, level[k])
-    return dips
