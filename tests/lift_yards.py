@@ -10,6 +10,7 @@ import numpy as np
 from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.magnet.footprint import BundleTable, Placement
 from barsight.yard.stability.stability import footings
@@ -73,3 +74,12 @@ def judged(
 
 def codes(lift: Lift) -> set[str]:
     return {veto.code for veto in lift.vetoes}
+
+
+def sure_travel(place_m: np.ndarray, stamp_ns: np.ndarray) -> Travel:
+    """Travel of measured frames at places (N, 2), each known to 1 mm and as its encoders say."""
+    count = len(place_m)
+    return Travel(
+        place_m, np.full((count, 3), 0.001), np.zeros(count), np.empty((0, 2)), 5.0, stamp_ns,
+        np.ones(len(stamp_ns), bool), 3.0, 8.0, 0.0008,
+    )  # fmt: skip

@@ -30,7 +30,7 @@ from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, w
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.vetoes import VETOES, Veto
 from barsight.yard.weight import bundle_mass
-from lift_yards import GIVEN, MAGNET, SETTINGS, SIGMA, bare, codes, judged, laid, map_of, record
+from lift_yards import GIVEN, MAGNET, SETTINGS, SIGMA, bare, codes, judged, laid, map_of, record, sure_travel
 from yard_maps import Laid
 
 
@@ -341,20 +341,7 @@ def test_a_bundle_that_the_stock_list_contradicts_is_not_offered() -> None:
 def travel(place_m: list[tuple[float, float]], ages_s: list[float]) -> Travel:
     """Sure frames at these places, so long ago."""
     stamps = np.array([NOW_NS - round(age * NS_PER_S) for age in ages_s], np.int64)
-    count = len(place_m)
-    sure, off = np.full((count, 3), 0.001), np.zeros(count)
-    return Travel(
-        np.array(place_m),
-        sure,
-        off,
-        np.empty((0, 2)),
-        5.0,
-        stamps,
-        np.ones(len(stamps), bool),
-        3.0,
-        8.0,
-        0.0008,
-    )
+    return sure_travel(np.array(place_m), stamps)
 
 
 def test_a_trajectory_less_sure_than_the_magnet_needs() -> None:

@@ -14,9 +14,8 @@ from barsight.cli.main import run
 from barsight.core.stamps import NS_PER_S
 from barsight.result_folder import seal_map
 from barsight.yard.inventory.bundle_file import write_bundles
-from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import example_magnet
-from lift_yards import laid, map_of, record
+from lift_yards import laid, map_of, record, sure_travel
 from result_folders import summary
 from yard_maps import Laid
 
@@ -65,18 +64,7 @@ def write_folder(
     (folder / "ortho.png").write_bytes(cv2.imencode(".png", photo)[1].tobytes())
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
     stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)
-    way = Travel(
-        np.zeros((3, 2)),
-        np.full((3, 3), 0.001),
-        np.zeros(3),
-        np.empty((0, 2)),
-        5.0,
-        stamps,
-        np.ones(len(stamps), bool),
-        3.0,
-        8.0,
-        0.0008,
-    )
+    way = sure_travel(np.zeros((3, 2)), stamps)
     captured = {"captured_from_ns": int(stamps[0]), "captured_to_ns": int(stamps[-1])}
     content = summary() | {"agreement": [], "travel": way.content()} | captured | changes
     identity = seal_map(content, folder)

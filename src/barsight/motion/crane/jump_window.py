@@ -35,7 +35,7 @@ MIN_SIDE = 4
 SURE_SIGMAS, MAYBE_SIGMAS = 4.7, 4.0
 """From here on a step is a jump; from here on it may be one, and binds the readings on its sides less."""
 BLIND_RATIO = 1.7
-"""By how much both are higher where no IMU tells the way: what a crane may do isn't quite normal, and three
+"""Factor on both limits where no IMU tells the way: what a crane may do isn't quite normal, and three
 wild readings on end look like a step."""
 MIN_JUMP_M = 0.004
 WIDE_M = 10.0
@@ -48,13 +48,13 @@ FREQUENCIES_HZ = np.linspace(0.3, 3.2, 12)
 AMPLITUDES_M = np.minimum(0.015, 1.0 / (2 * np.pi * FREQUENCIES_HZ) ** 2)
 """A crane oscillates no faster, no further and with no more acceleration than this."""
 CHANGE_MPS2 = 0.35
-"""By how much an acceleration changes within a second (1 sigma)."""
+"""Standard deviation of an acceleration's change within a second."""
 ACCEL_DENSITY = 2.5e-3
 """Of the accelerometer, m/s^2/sqrt(Hz), with what sway and its own alignment add."""
 JERK_MPS3 = 3e-3
-"""What the trend of the gyro leaves of gravity (1 sigma)."""
+"""Standard deviation of gravity left by the gyro's trend."""
 SCALE, ASKEW_RAD = 2e-3, 2.6e-3
-"""By which share the pictures' steps are all too long (1 sigma), and by which angle askew."""
+"""Standard deviations of the scale common to the pictures' steps, and of their common angle."""
 
 
 @dataclass(frozen=True, eq=False)

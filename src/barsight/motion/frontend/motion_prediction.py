@@ -27,7 +27,7 @@ GYRO_BIAS_SIGMA_RADPS = 5e-4
 SLEW_SIGMA_S = 0.03
 """What isn't known of the encoders' latency, s: it matters while the speed changes only."""
 JUMP_SIGMA_M = 0.005
-"""What isn't known of a jump that was taken off."""
+"""Standard deviation left of a jump that was taken off."""
 SPARE_SIGMAS = 1.5
 """By how much a predicted ellipse is wider than the estimate's own covariance says."""
 
