@@ -176,7 +176,7 @@ def _doubled(disparity: Float32, shape: tuple[int, ...]) -> Float32:
 
 
 def _contrast(image: UInt8) -> float:
-    """Compute the standard deviation of the grey values; a black or a blown-out image has none."""
+    """Compute the standard deviation of the gray values; a black or a blown-out image has none."""
     return float(image[::2, ::2].std())
 
 

@@ -1,4 +1,4 @@
-"""Compute the semi-global start's cost: 5x5 census [Zabih 1994], x gradient and grey value."""
+"""Compute the semi-global start's cost: 5x5 census [Zabih 1994], x gradient and gray value."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _BAND_ROWS = 64
 
 class PixelDescriptors(NamedTuple):
     """Descriptors of each pixel. codes: (H, 3, W) the census' 24 bits. slope: (H, W) difference of the
-    neighbours in the row. grey: (H, W).
+    neighbours in the row. gray: (H, W).
     """
 
     codes: UInt8
     slope: Int16
-    grey: UInt8
+    gray: UInt8
 
 
 def describe_pixels(image: UInt8) -> PixelDescriptors:
@@ -54,7 +54,7 @@ def reverse_rows(right: PixelDescriptors, lowest: int, places: int) -> PixelDesc
         return np.pad(array[..., ::-1], margins)[..., before + lowest :]
 
     return PixelDescriptors(
-        *(np.ascontiguousarray(turned(a)) for a in (right.codes, right.slope, right.grey))
+        *(np.ascontiguousarray(turned(a)) for a in (right.codes, right.slope, right.gray))
     )
 
 
@@ -92,10 +92,10 @@ def _write_costs(
 ) -> None:  # fmt: skip
     """Compute the costs (places,) of one left pixel with the right ones from column `at` on.
 
-    own, row: the three bytes of the census, slope and grey, of the pixel and of the right row.
+    own, row: the three bytes of the census, slope and gray, of the pixel and of the right row.
     """
-    one, two, three, slope, grey = own
-    ones, twos, threes, slopes, greys = row
+    one, two, three, slope, gray = own
+    ones, twos, threes, slopes, grays = row
     # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
     first, most = np.uint64(at), np.int16(_MAX_APART)
     for part in range(0, cost.shape[0], LANES):
@@ -113,7 +113,7 @@ def _write_costs(
             halves = np.uint8(halves + np.uint8(twice + twice))
             hamming = np.uint8(np.uint8(halves & np.uint8(0x0F)) + np.uint8(halves >> np.uint8(4)))
             steep = np.int16(slope - slopes[k])
-            bright = np.int16(np.int16(grey) - np.int16(greys[k]))
+            bright = np.int16(np.int16(gray) - np.int16(grays[k]))
             steep = steep if steep > 0 else np.int16(-steep)
             bright = bright if bright > 0 else np.int16(-bright)
             steep = steep if steep < most else most
@@ -127,13 +127,13 @@ def row_costs(
 ) -> None:
     """Compute costs (W, places) of row y, of which `count` are candidates. right: see `reverse_rows`."""
     width = cost.shape[0]
-    code, slope, grey = left.codes[y], left.slope[y], left.grey[y]
-    row = right.codes[y, 0], right.codes[y, 1], right.codes[y, 2], right.slope[y], right.grey[y]
+    code, slope, gray = left.codes[y], left.slope[y], left.gray[y]
+    row = right.codes[y, 0], right.codes[y, 1], right.codes[y, 2], right.slope[y], right.gray[y]
     for x in range(width):
         base = width - 1 - x + lowest
         first, end = max(0, -base), min(count, width - base)
         here = cost[x]
-        own = code[0, x], code[1, x], code[2, x], slope[x], grey[x]
+        own = code[0, x], code[1, x], code[2, x], slope[x], gray[x]
         _write_costs(own, row, width - 1 - x, here)
         if end <= first:
             here[:count] = _UNKNOWN_COST
