@@ -114,7 +114,7 @@ def refine_disparity(
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
     at_half_size = settings.first_at_half_size and min(left.shape) >= _MIN_HALVED_PX and settings.steps > 1
     if at_half_size:
-        start = _after_half_size_step(left, right, start, matched, settings)
+        start = refine_at_half_size(left, right, start, matched, settings)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
     noise = _noise(left, right)
     variance = np.full_like(start, np.inf)
@@ -125,7 +125,7 @@ def refine_disparity(
     return RefinedDisparity(inside(work.disparity, start.shape).copy(), variance)
 
 
-def _after_half_size_step(
+def refine_at_half_size(
     left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
 ) -> Float32:
     """Run one step at half the size with the long support: a quarter of the work, and softer images carry

@@ -13,7 +13,7 @@ from barsight.core.parallel import parallel_bands
 
 Int16 = NDArray[np.int16]
 
-_UNKNOWN_COST = 60
+UNKNOWN_COST = 60
 BESIDE_COST = 61
 """Of the places that fill up the last vector: dearer than any candidate, so that no path goes there."""
 LANES = 16
@@ -86,6 +86,22 @@ def _bits_in_halves(byte: np.uint8) -> np.uint8:
 
 
 @kernel()
+def descriptor_cost(left: PixelDescriptors, right: PixelDescriptors, y: int, x: int, column: int) -> int:
+    """Compute the cost of matching left pixel (y, x) with the right one in `column`: Hamming distance of the
+    census and half the truncated differences of slope and gray value.
+    """
+    hamming = 0
+    for part in range(_CODE_BYTES):
+        changed = left.codes[y, part, x] ^ right.codes[y, part, column]
+        while changed:
+            changed &= changed - np.uint8(1)
+            hamming += 1
+    steep = min(abs(int(left.slope[y, x]) - int(right.slope[y, column])), _MAX_APART)
+    bright = min(abs(int(left.gray[y, x]) - int(right.gray[y, column])), _MAX_APART)
+    return hamming + (steep + bright) // 2
+
+
+@kernel()
 def _write_costs(
     own: tuple[np.uint8, np.uint8, np.uint8, np.int16, np.uint8],
     row: tuple[UInt8, UInt8, UInt8, Int16, UInt8], at: int, cost: UInt8,
@@ -136,7 +152,7 @@ def row_costs(
         own = code[0, x], code[1, x], code[2, x], slope[x], gray[x]
         _write_costs(own, row, width - 1 - x, here)
         if end <= first:
-            here[:count] = _UNKNOWN_COST
+            here[:count] = UNKNOWN_COST
         else:
             here[:first] = here[first]
             here[end:count] = here[end - 1]
