@@ -22,6 +22,7 @@ _SAME_SURFACE_PX = np.float32(1.0)
 _MAX_OFF_PX = np.float32(1.5)
 _ROUNDS = 2
 _BAND_ROWS = 64
+_NOWHERE = -1e6
 _NAN = np.float32(np.nan)
 
 
@@ -49,8 +50,8 @@ def predict_disparity(before: Disparity, camera: RectifiedCamera, now_from_befor
     there, back = _transfer(camera, now_from_before), _transfer(camera, now_from_before.inverse())
     first = np.full(known.shape, _NAN, dtype=np.float32)
     _splat(known, there, first)
-    spread = cv2.dilate(np.nan_to_num(first, nan=-np.inf), np.ones((3, 3), dtype=np.uint8))
-    first = np.where(np.isfinite(first), first, np.where(np.isfinite(spread), spread, _NAN))
+    spread = cv2.dilate(np.nan_to_num(first, nan=_NOWHERE), np.ones((3, 3), dtype=np.uint8))
+    first = np.where(np.isfinite(first), first, np.where(spread > _NOWHERE, spread, _NAN))
     predicted = np.empty_like(first)
 
     def work(start: int, end: int) -> None:

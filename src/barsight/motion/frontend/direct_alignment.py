@@ -22,6 +22,7 @@ from barsight.core.types import Disparity, RectifiedCamera
 _SHRINKS = (16, 8, 4)
 """Sizes that the pictures are shrunk to, one after the other: the first ones see past the next bar."""
 _MAX_SIGMA_PX = 0.3
+_MIN_SHRUNK_PX = 24
 _EVERY_PX = 16
 _MIN_POINTS = 200
 _MIN_INSIDE_RATIO = 0.3
@@ -54,6 +55,8 @@ def align_views(
     """
     motion, tone = guess, np.array([1.0, 0.0])
     for shrink in _SHRINKS:
+        if min(now.shape) < shrink * _MIN_SHRUNK_PX and shrink > _SHRINKS[-1]:
+            continue
         places = _places(before, disparity, camera, shrink)
         image = _shrink(now, shrink)
         principal = _principal(camera, shrink)

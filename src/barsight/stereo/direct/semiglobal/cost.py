@@ -90,15 +90,14 @@ def descriptor_cost(left: PixelDescriptors, right: PixelDescriptors, y: int, x: 
     """Compute the cost of matching left pixel (y, x) with the right one in `column`: Hamming distance of the
     census and half the truncated differences of slope and gray value.
     """
-    hamming = 0
+    # Signed: a difference of unsigned numbers would wrap.
+    hamming = np.int64(0)
     for part in range(_CODE_BYTES):
-        changed = left.codes[y, part, x] ^ right.codes[y, part, column]
-        while changed:
-            changed &= changed - np.uint8(1)
-            hamming += 1
-    steep = min(abs(int(left.slope[y, x]) - int(right.slope[y, column])), _MAX_APART)
-    bright = min(abs(int(left.gray[y, x]) - int(right.gray[y, column])), _MAX_APART)
-    return hamming + (steep + bright) // 2
+        halves = _bits_in_halves(np.uint8(left.codes[y, part, x] ^ right.codes[y, part, column]))
+        hamming += np.int64(halves & np.uint8(0x0F)) + np.int64(halves >> np.uint8(4))
+    steep = min(abs(np.int64(left.slope[y, x]) - np.int64(right.slope[y, column])), np.int64(_MAX_APART))
+    bright = min(abs(np.int64(left.gray[y, x]) - np.int64(right.gray[y, column])), np.int64(_MAX_APART))
+    return int(hamming + (steep + bright) // 2)
 
 
 @kernel()
