@@ -58,7 +58,7 @@ _TIDIED_EVERY = 8
 @dataclass(frozen=True, eq=False)
 class ProbedRecording:
     """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
-    doubts: what can't be right in the samples. inputs: SHA-256 of the files. kept: folder of checkpoints, if
+    doubts: what can't be right in the samples. inputs: SHA-256 of the files. checkpoints: their folder, if
     any. watch: times the stages.
     """
 
@@ -70,7 +70,7 @@ class ProbedRecording:
     doubts: tuple[Notice, ...]
     configuration: dict[str, Any]
     inputs: dict[str, str]
-    kept: Path | None
+    checkpoints: Path | None
     watch: Stopwatch
 
     @property
@@ -145,18 +145,19 @@ def inspect_recording(
     if faults := clock_faults(source):
         raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
     configuration, inputs = to_json(asdict(settings)), source.digests()
-    kept = None
+    checkpoints = None
     if resume is not None:
-        kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
+        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
     with watch("look"):
-        pairs = RectifiedPairs(source, Rectifier(source.rig), kept or scratch, watch)
+        pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
         first = probe_recording(pairs)
         cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
     known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
     calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
     return ProbedRecording(
-        source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, kept, watch
-    )
+        source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, checkpoints,
+        watch,
+    )  # fmt: skip
 
 
 @contextmanager
@@ -167,7 +168,7 @@ def estimate_trajectory(
     source, pairs, watch = probed.source, probed.pairs, probed.watch
     rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
     matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), watch)
-    match = matching(matcher, probed.kept)
+    match = matching_once(matcher, probed.checkpoints)
     early = _known_early(source, settings, rectifier, probed.first.range_m)
     begun = islice(pairs(early), len(early))
     with ExitStack() as pools:
@@ -177,7 +178,7 @@ def estimate_trajectory(
             count = count_frames("trajectory", total, advance)
             with _naming(probed):
                 trajectory = checkpointed(
-                    probed.kept, "trajectory", lambda: estimate(source, rectifier, count, pairs)
+                    probed.checkpoints, "trajectory", lambda: estimate(source, rectifier, count, pairs)
                 )
             trim_heap()
             calibrated = self_calibrate(
@@ -279,15 +280,15 @@ def _known_early(
     return frozenset(chosen[:_MATCHED_AHEAD])
 
 
-def matching(
-    matcher: Matcher, kept: Path | None
+def matching_once(
+    matcher: Matcher, checkpoints: Path | None
 ) -> Callable[[RectifiedPair | RefusedFrame], MatchedFrame | Refusal]:
-    """Match pairs, each once for all runs that keep checkpoints in `kept`."""
+    """Match pairs, each once for all runs that keep checkpoints in `checkpoints`."""
 
     def match(pair: RectifiedPair | RefusedFrame) -> MatchedFrame | Refusal:
         if isinstance(pair, RefusedFrame):
             return Refusal("recording", pair)
-        return checkpointed(kept, f"matched_{pair.stamp_ns}", lambda: matcher(pair))
+        return checkpointed(checkpoints, f"matched_{pair.stamp_ns}", lambda: matcher(pair))
 
     return match
 

@@ -22,7 +22,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
 from barsight.live_map import LiveMap, Snapshot
-from barsight.map_building import checkpoint_key, matching
+from barsight.map_building import checkpoint_key, matching_once
 from barsight.mapping.view import Matcher
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
@@ -70,11 +70,12 @@ class Session:
         self._recording = PacketRecording(rig, self._folder, imu_noise, is_simulated=is_simulated)
         self._source = SelectedSensors(self._recording, self._settings.use)
         key = checkpoint_key(self._recording, to_json(asdict(self._settings)), {})
-        self._kept = checkpoint_folder(self._folder / "checkpoints", key)
-        self._pairs = RectifiedPairs(self._source, Rectifier(rig), self._kept)
+        self._checkpoints = checkpoint_folder(self._folder / "checkpoints", key)
+        self._pairs = RectifiedPairs(self._source, Rectifier(rig), self._checkpoints)
         matcher = Matcher(self._settings.stereo, make_method(self._settings.stereo.for_map()), Stopwatch())
         # A rig that is to be turned at the end gives other disparities then.
-        self._match = matching(matcher, self._kept if self._settings.self_calibrate == "none" else None)
+        is_final = self._settings.self_calibrate == "none"
+        self._match = matching_once(matcher, self._checkpoints if is_final else None)
         self._waiting: deque[RectifiedPair | RefusedFrame] = deque()
         self._poses: PoseEstimator | None = None
         self._map: LiveMap | None = None
@@ -106,9 +107,9 @@ class Session:
             while self._waiting:
                 self._place(self._waiting.popleft())
             if self._poses is not None:
-                checkpointed(self._kept, "trajectory", self._poses.finish)
+                checkpointed(self._checkpoints, "trajectory", self._poses.finish)
         write_measured(
-            self._recording, self._yard, self._asked, keep=self._kept.parent, magnet=self._magnet,
+            self._recording, self._yard, self._asked, keep=self._checkpoints.parent, magnet=self._magnet,
             report=False,
         )  # fmt: skip
         return Yard(self._yard, self)

@@ -8,8 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from barsight.calibration.files.euroc import write_imu as write_imu_description
-from barsight.calibration.files.euroc import write_rig
+from barsight.calibration.files.euroc import write_imu_description, write_rig
 from barsight.calibration.files.yaml_document import write_document
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig

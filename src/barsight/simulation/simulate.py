@@ -28,7 +28,7 @@ from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.stock import stack_yard
 from barsight.simulation.textures import surface_tile
 from barsight.simulation.trajectory import SimulatedTrajectory
-from barsight.simulation.truth import SurfaceTruth, bundle_rows, true_depth, write_rig
+from barsight.simulation.truth import SurfaceTruth, bundle_rows, true_depth, write_rig_truth
 
 CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
 GROUND_TRUTH_HZ = 200
@@ -122,7 +122,7 @@ def simulate(
         surface.write(truth_folder)
         for name, content in world.laid.truth.items():
             (truth_folder / name).write_text(json.dumps(content, indent=1), encoding="utf-8")
-        write_rig(
+        write_rig_truth(
             world.mounted.rig, imu.gyro_bias_radps, imu.accel_bias_mps2, np.array(CRANE_TO_BODY_M), settings,
             truth_folder,
         )  # fmt: skip

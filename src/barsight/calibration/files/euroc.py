@@ -122,7 +122,9 @@ def write_rig(mav0: Path, rig: StereoRig, rate_hz: float, *, block_lists: bool =
         )
 
 
-def write_imu(path: Path, noise: ImuNoise | None, rate_hz: float, *, block_lists: bool = False) -> None:
+def write_imu_description(
+    path: Path, noise: ImuNoise | None, rate_hz: float, *, block_lists: bool = False
+) -> None:
     """Write an IMU's `sensor.yaml` for samples that are in `body` already."""
     values: dict[str, object] = {
         "sensor_type": "imu",

@@ -51,7 +51,9 @@ def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> Checke
     known: what pictures and IMU say of the way. After a freeze an encoder may have lost count by any size,
     unless these show that it has not.
     """
-    parts = [(int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen(crane)]
+    parts = [
+        (int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen_stretches(crane)
+    ]
     samples, after = without_frozen(crane, parts)
     after = lost_counts(samples, after, known, least_way_m(crane))
     found = find_jumps(replace(samples, jumps=after), known)
@@ -176,7 +178,7 @@ def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
     return replace(crane, stamp_ns=crane.stamp_ns[kept], position_m=crane.position_m[kept])
 
 
-def frozen(crane: CraneSamples) -> list[tuple[int, int]]:
+def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
     """Find stretches (first, last) of equal readings that a moving crane runs into or comes out of elsewhere.
 
     A crane that turns gives equal readings too, of coarse encoders most of all, but stays near them.

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.errors import Failed, MeasurementError
+from barsight.core.settings.values import expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE
@@ -31,8 +32,7 @@ class FixedLagSettings:
     """Frames held at a time."""
 
     def __post_init__(self) -> None:
-        if not 3 <= self.frames <= 100:
-            raise ConfigError(f"live.frames must lie in 3...100, not {self.frames}")
+        expect_ranges(self, "live.", frames=(3, 100))
 
 
 @dataclass(frozen=True)
