@@ -149,7 +149,7 @@ def frames_off(
     """
     most = MAX_FRAMES_OFF if len(sightings) > 2 * MAX_FRAMES_OFF + MANY_STEPS else 1
     offs = tuple(range(-most, most + 1))
-    cost = {}
+    cost, worst = {}, {}
     for off, steps in zip(offs, compare_steps(sightings, imu, crane, rectifier, shift_ns, offs), strict=True):
         turned = _gyro_residual(steps)
         travelled = np.isfinite(steps.travel)
@@ -159,10 +159,11 @@ def frames_off(
         if travelled.sum() >= MIN_STEPS:
             wrong = (steps.travel - steps.way)[travelled]
             terms.append(float((wrong**2).mean()) / WAY_SIGMA_M**2)
-        cost[off] = float(np.mean(terms)) if terms else 0.0
+        cost[off], worst[off] = (float(np.mean(terms)), max(terms)) if terms else (0.0, 0.0)
     best = min(cost, key=lambda off: cost[off])
     clear = cost[best] < CLEARLY_BETTER * cost[0] and cost[0] > 1 / CLEARLY_BETTER
-    return -best if clear else 0
+    # Late stamps alone leave no sensor in doubt once they are shifted back.
+    return -best if clear and worst[best] < 1 / CLEARLY_BETTER else 0
 
 
 def _gyro_residual(steps: StepComparison) -> Float64:
