@@ -106,7 +106,7 @@ class YardSettings:
     skew_deg: float = 0.3
     """Standard deviation of the bundles' yaw; they stay within 1 degree, or within twice this."""
     uneven_ends_m: float = 0.03
-    """How far the ends of a bundle's bars stand apart."""
+    """Largest shift of a bar along its bundle, either way."""
     missing_ratio: float = 0.08
     """Share of places on the lowest layer that are empty (gullies)."""
     crossed_ratio: float = 0.0
@@ -145,7 +145,7 @@ class TravelSettings:
     standstill_s: float = 2.0
     """Time at rest before the start and after the end."""
     overrun_m: float = 0.6
-    """How far the travel begins before the stack and ends behind it."""
+    """Travel beyond either end of the stack."""
     sway_deg: float = 0.15
     """Amplitude of the body's swing."""
     sway_hz: float = 0.4
@@ -157,15 +157,15 @@ class TravelSettings:
     stops: int = 0
     """Times that the crane stops under way, at places drawn from the seed."""
     stop_s: float = 2.0
-    """Time of a stop, from standing still to starting anew."""
+    """Duration of a stop."""
     trolley_m: float = 0.0
-    """How far the trolley travels during the pass."""
+    """Travel of the trolley during the pass."""
     oscillation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Amplitudes of bridge, trolley and hoist on their springs, which their encoders don't see."""
+    """Amplitudes at which bridge, trolley and hoist oscillate, unseen by their encoders."""
     oscillation_hz: tuple[float, float, float] = (0.7, 1.1, 1.9)
-    """Frequencies of these."""
+    """Frequencies of these oscillations."""
     rail_m: float = 0.0
-    """Amplitude by which the rails rise and fall and lead aside, with a wave every few metres."""
+    """Amplitude of the rails' errors in height and straightness, with a wave every few metres."""
     skew_deg: float = 0.0
     """Amplitude by which the bridge skews as it travels."""
 
@@ -205,17 +205,17 @@ class SensorSettings:
     encoder_step_m: float = 0.001
     """Quantisation of a reading."""
     encoder_latency_s: float = 0.0
-    """A reading stamped t says where the crane was at t minus this."""
+    """Latency: a reading stamped t gives the position at t minus this."""
     encoder_jitter_s: float = 0.0
-    """How much later still a reading may be, evenly between 0 and this."""
+    """Jitter on top of the latency, uniform between 0 and this."""
     encoder_scale: float = 1.0
-    """A metre of the bridge as its encoder reads it."""
+    """Scale of the bridge's encoder: metres read per metre travelled."""
     encoder_backlash_m: float = 0.0
-    """Play between bridge and encoder: it reads the middle of it, and follows at its end."""
+    """Backlash between bridge and encoder, centred at the start."""
     laser_std_m: float = 0.001
     """Noise of a laser point."""
     laser_y_m: tuple[float, ...] = (0.45, -1.15)
-    """Where the laser's profiles lie across the travel; none leaves the laser out."""
+    """y of the laser's profiles; none leaves the laser out."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -239,13 +239,13 @@ class MagnetSettings:
     size_m: tuple[float, float] = (0.0, 0.0)
     """Along the travel and across; 0 0 leaves it out."""
     below_body_m: float = 3.0
-    """How far it hangs under the body."""
+    """Distance below the body."""
     offset_m: tuple[float, float] = (0.6, 0.3)
-    """Where its middle hangs from the body, along the travel and across."""
+    """Its middle relative to the body, along the travel and across."""
     first_ratio: float = 0.3
-    """Share of the frames from which it hangs there."""
+    """Share of the frames after which it appears."""
     last_ratio: float = 0.6
-    """Share of the frames until which it hangs there."""
+    """Share of the frames after which it disappears."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -263,7 +263,7 @@ class SimulationSettings:
     frames: int = 20
     """Stereo pairs, spread evenly over the travel."""
     seed: int = 0
-    """Seed of everything that is drawn by chance."""
+    """Random seed."""
     bars: str = "90mm:7"
     """Kinds of bundles, diameter and bars: 90mm:7,40mm:37; each section of the stack takes one."""
     depth_views: int = 2

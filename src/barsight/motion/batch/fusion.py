@@ -120,7 +120,7 @@ class BatchPoses:
         if self._stated is not None:
             self._crane = check_crane(reestimate_noise(self._stated), KnownMotion(None, self._imu)).samples
         if self._crane is None and not self.reads_pictures:
-            raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
+            raise MeasurementError(f"{recording.path}: no crane encoders; measure with use: stereo")
         self._tracker = Tracker(self._predictor(), settings.front_end)
         self._points = PointTracker(rectifier, settings.front_end.rough)
         self._sightings: list[Sighting] = []
@@ -221,7 +221,7 @@ class BatchPoses:
                 path,
                 f"the cameras' stamps are {abs(late)} frame(s) {'late' if late > 0 else 'early'} "
                 "against gyro and encoders",
-                "repair the stamps, or use the pictures alone (--use stereo)",
+                "repair the stamps, or use the pictures alone (use: stereo)",
             )
         refuse_contradictions(path, sightings, self._imu, self._stated, self._rectifier, shift)
 

@@ -53,9 +53,7 @@ class EncoderOdometry(TrajectoryEstimator):
     def begin(self, recording: Recording, rectifier: Rectifier) -> EncoderPoses:
         """Begin. Raises MeasurementError where the recording has no encoders."""
         if recording.crane() is None:
-            raise MeasurementError(
-                f"{recording.path}: no crane encoders; measure without them (--use stereo)"
-            )
+            raise MeasurementError(f"{recording.path}: no crane encoders; measure without them (use: stereo)")
         return EncoderPoses(self.settings, recording)
 
 

@@ -68,7 +68,7 @@ class FixedLagPoses(ImmediatePoses):
         self.reads_pictures = "stereo" in self._use
         readings = self._readings()
         if readings.crane is None and not self.reads_pictures:
-            raise MeasurementError(f"{recording.path}: no crane encoders; estimate with --use stereo")
+            raise MeasurementError(f"{recording.path}: no crane encoders; estimate with use: stereo")
         self._level = None if readings.crane is not None else align_with_gravity(recording)
         self._estimator = FixedLagEstimator(
             settings, estimator.crane, estimator.live.frames, rectifier,

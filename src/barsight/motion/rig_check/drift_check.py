@@ -155,7 +155,7 @@ def _travel_lines(
     bad = abs(yaw) > 3 * sigma and abs(cost) > settings.max_depth_error_mm
     reason = "the crane's known travel against the disparities"
     if bad:
-        reason += "; measure --self-calibrate yaw takes it off"
+        reason += "; measuring with self_calibrate: yaw takes it off"
     lines = [
         CheckLine("yaw", yaw, sigma, "deg", cost, DriftState.RECALIBRATE if bad else DriftState.GOOD, reason),
         _scale_line(drift, range_m),
