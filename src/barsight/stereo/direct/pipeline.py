@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement, vertical_error_px
 from barsight.stereo.direct.confirmation import confirmed_start
@@ -71,19 +71,13 @@ class BarsightSettings:
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
 
     def __post_init__(self) -> None:
-        if min(self.consistency_px, self.max_sigma_px) <= 0:
-            raise ConfigError("stereo.barsight.consistency_px and max_sigma_px must be positive")
-        shares = (
-            self.vertical_error_ratio,
-            self.edge_error_ratio,
-            self.start_error_ratio,
-            self.other_side_error_ratio,
-        )
-        lengths = (self.max_edge_px, self.wrong_side_px)
-        if min(self.model_sigma_px, self.island_px, *shares, *lengths) < 0:
-            raise ConfigError(
-                "stereo.barsight.model_sigma_px, island_px and the shares of sigma can't be negative"
-            )
+        expect_ranges(
+            self, "barsight.", consistency_px=POSITIVE, max_sigma_px=POSITIVE,
+            vertical_error_ratio=NOT_NEGATIVE, edge_error_ratio=NOT_NEGATIVE,
+            start_error_ratio=NOT_NEGATIVE, other_side_error_ratio=NOT_NEGATIVE,
+            max_edge_px=NOT_NEGATIVE, wrong_side_px=NOT_NEGATIVE, model_sigma_px=NOT_NEGATIVE,
+            island_px=NOT_NEGATIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
