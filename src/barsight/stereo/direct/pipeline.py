@@ -26,7 +26,7 @@ _NAN = np.float32(np.nan)
 _FAST_STEPS = 2
 _JUMP_PX = 1.0
 _FURTHEST_FROM_START_PX = 2.0
-_MIN_CONTRAST_GREY = 0.5
+_MIN_CONTRAST_GRAY = 0.5
 _MIN_HALVED_PX = 128
 
 
@@ -93,7 +93,7 @@ class BarsightStereo:
         """
         settings = self.settings
         candidates = _inside(candidates, pair.camera.width)
-        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GREY:
+        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY:
             nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
             return Disparity(nothing, nothing.copy())
         start = self._start(pair, candidates)
