@@ -32,7 +32,7 @@ _NAN = np.float32(np.nan)
 _FAST_STEPS = 2
 _JUMP_PX = 1.0
 _FURTHEST_FROM_START_PX = 2.0
-_MIN_CONTRAST_GREY = 0.5
+_MIN_CONTRAST_GRAY = 0.5
 _MIN_HALVED_PX = 128
 _FAR_STEP_PX, _MAX_FAR_RATIO = 0.3, 0.15
 """A prediction from which more than this share of the pixels step further is off as a whole."""
@@ -101,7 +101,7 @@ class BarsightStereo:
         """
         settings = self.settings
         candidates = _inside(candidates, pair.camera.width)
-        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GREY:
+        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY:
             nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
             return Disparity(nothing, nothing.copy())
         refinement = settings.refinement
