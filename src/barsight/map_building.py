@@ -17,10 +17,10 @@ from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.json_values import json_digest
 from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
-from barsight.core.parallel import prefetched_map
+from barsight.core.parallel import WORKERS, prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch, count_frames
-from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
+from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.scene_extent import (
@@ -172,7 +172,7 @@ def estimate_trajectory(
     early = _known_early(source, settings, rectifier, probed.first.range_m)
     begun = islice(pairs(early), len(early))
     with ExitStack() as pools:
-        ahead = pools.enter_context(prefetched_map(match, begun, _MATCHED_AHEAD))
+        ahead = pools.enter_context(_matched_ahead(match, begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
             estimate = make_estimator(settings.motion)
             count = count_frames("trajectory", total, advance)
@@ -196,7 +196,7 @@ def estimate_trajectory(
         matched: Iterator[MatchedFrame | Refusal] = ahead
         if late is not None:
             rest = pairs({stamp for stamp in poses if stamp >= late})
-            after = pools.enter_context(prefetched_map(match, rest, _MATCHED_AFTER))
+            after = pools.enter_context(_matched_ahead(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
         yield TrackedRecording(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
 
@@ -289,6 +289,16 @@ def matching(
     chained = every and stereo.method == "barsight" and stereo.barsight.preset == "best"
     matcher = Matcher(stereo, make_method(stereo.for_map()), watch)
     return PairChain(pairs, matcher, stereo.confirmed_pairs + 1 if chained else 1, checkpoints)
+
+
+@contextmanager
+def _matched_ahead(
+    match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], most: int
+) -> Iterator[Iterator[MatchedFrame | Refusal]]:
+    """Match pairs ahead, whole chains side by side; about `most` of them may wait."""
+    chains = max(most // match.length, WORKERS)
+    with prefetched_map(match.match_all, match.split(pairs), chains) as matched:
+        yield chain.from_iterable(matched)
 
 
 def _placed(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from threading import Lock
 
@@ -32,28 +34,42 @@ class PairChain:
     def __init__(
         self, pairs: RectifiedPairs, matcher: Matcher, length: int, checkpoints: Path | None
     ) -> None:
-        self._pairs, self._matcher, self._length, self._checkpoints = pairs, matcher, length, checkpoints
+        self._pairs, self._matcher, self.length, self._checkpoints = pairs, matcher, length, checkpoints
         self._turns: dict[int, Lock] = {}
         self._last: dict[int, tuple[int, MatchedFrame | Refusal]] = {}
 
     def __call__(self, pair: RectifiedPair | RefusedFrame) -> MatchedFrame | Refusal:
         """Match a pair of the recording."""
-        if self._length == 1:
+        if self.length == 1:
             return self._matched(pair, None)
-        place = bisect_left(self._pairs.recording.index.stamps_ns, pair.stamp_ns)
-        chain = place // self._length
+        place = self._place(pair)
+        chain = place // self.length
         with self._turns.setdefault(chain, Lock()):
             frame = self._at(pair, place)
             for old in [number for number in self._last if number < chain - _KEPT_CHAINS]:
                 self._last.pop(old, None)
             return frame
 
+    def match_all(self, pairs: Sequence[RectifiedPair | RefusedFrame]) -> list[MatchedFrame | Refusal]:
+        """Match pairs one after the other."""
+        return [self(pair) for pair in pairs]
+
+    def split(
+        self, pairs: Iterable[RectifiedPair | RefusedFrame]
+    ) -> Iterator[list[RectifiedPair | RefusedFrame]]:
+        """Split pairs in time's order into those of each chain, which can be matched side by side."""
+        for _, together in groupby(pairs, lambda pair: self._place(pair) // self.length):
+            yield list(together)
+
+    def _place(self, pair: RectifiedPair | RefusedFrame) -> int:
+        return bisect_left(self._pairs.recording.index.stamps_ns, pair.stamp_ns)
+
     def _at(self, pair: RectifiedPair | RefusedFrame, place: int) -> MatchedFrame | Refusal:
-        chain = place // self._length
+        chain = place // self.length
         at, frame = self._last.get(chain, (-1, None))
         if at == place and frame is not None:
             return frame
-        if place % self._length == 0:
+        if place % self.length == 0:
             frame = None
         elif at != place - 1:
             stamp = self._pairs.recording.index.stamps_ns[place - 1]

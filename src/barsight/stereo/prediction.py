@@ -20,7 +20,7 @@ from barsight.core.types import Disparity, RectifiedCamera
 _MAX_SIGMA_PX = 0.5
 _SAME_SURFACE_PX = np.float32(1.0)
 _MAX_OFF_PX = np.float32(1.5)
-_ROUNDS = 2
+_ROUNDS = 1
 _BAND_ROWS = 64
 _NOWHERE = -1e6
 _NAN = np.float32(np.nan)
