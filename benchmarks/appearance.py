@@ -5,7 +5,7 @@
 Each argument is a path-traced recording with truth whose bundles are hexagonal (`bundles.json` with `lay`).
 Its bundles are drawn anew as `simulate` draws them, seen by the same rig from the same pose: what differs is
 light and surface. For each view with true depth: errors of the default stereo against true disparity (px), on
-the stack (over 0.2 m) and on the floor; grey levels; contrast along and across the bars at 1 to 8 px.
+the stack (over 0.2 m) and on the floor; gray levels; contrast along and across the bars at 1 to 8 px.
 """
 
 from __future__ import annotations
@@ -145,29 +145,29 @@ def _tell(name: str, rig: StereoRig, yard_from_body: Pose, pictures: list[UInt8]
     for place, mask in (("stack", height > STACK_M), ("floor", np.abs(height) < 0.02)):
         asked = mask & steady & np.isfinite(truth)
         known = asked & np.isfinite(error)
-        e, grey = error[known], pair.left[asked]
+        e, gray = error[known], pair.left[asked]
         size = np.abs(e)
         print(
             f"  {place}: {known.sum() / asked.sum():6.1%} matched, median |e| {np.median(size):.3f} px, bias "
             f"{np.median(e):+.3f}, P95 {np.percentile(size, 95):.3f}, over 1 px {np.mean(size > 1):.2%}, "
-            f"in 95 % {np.mean(size <= 1.96 * sigma[known]):.1%}; grey {grey.mean():.0f}, P5 "
-            f"{np.percentile(grey, 5):.0f}, P95 {np.percentile(grey, 95):.0f}; contrast % at {SCALES_PX} px "
+            f"in 95 % {np.mean(size <= 1.96 * sigma[known]):.1%}; gray {gray.mean():.0f}, P5 "
+            f"{np.percentile(gray, 5):.0f}, P95 {np.percentile(gray, 95):.0f}; contrast % at {SCALES_PX} px "
             f"along {_contrast(pair.left, asked, 0)} across {_contrast(pair.left, asked, 1)}"
         )
 
 
 def _contrast(image: UInt8, mask: Bool, axis: int) -> list[float]:
     """Measure the spread of the differences between Gaussian means of widths s and 2 s along an axis, as a
-    percentage of the local grey level: median of the size over the mask.
+    percentage of the local gray level: median of the size over the mask.
     """
-    grey = image.astype(np.float32)
-    mean = cv2.GaussianBlur(grey, (0, 0), 20)
+    gray = image.astype(np.float32)
+    mean = cv2.GaussianBlur(gray, (0, 0), 20)
     out = []
     for scale in SCALES_PX:
         parts = []
         for width in (scale, 2 * scale):
             sigmas = (0.01, width) if axis == 0 else (width, 0.01)
-            parts.append(cv2.GaussianBlur(grey, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1]))
+            parts.append(cv2.GaussianBlur(gray, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1]))
         out.append(round(100 * float(np.median((np.abs(parts[0] - parts[1]) / mean)[mask])), 2))
     return out
 

@@ -12,7 +12,7 @@ WAVES = 100
 
 
 class Texture:
-    """Grey levels at any place (px): a sum of waves no shorter than 4 px, so that sampling loses nothing."""
+    """Gray levels at any place (px): a sum of waves no shorter than 4 px, so that sampling loses nothing."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -23,14 +23,14 @@ class Texture:
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         x, y = np.asarray(x, np.float32), np.asarray(y, np.float32)
-        grey = np.zeros(np.broadcast(x, y).shape, np.float32)
+        gray = np.zeros(np.broadcast(x, y).shape, np.float32)
         for kx, ky, phase in zip(*self._wave.astype(np.float32), self._phase.astype(np.float32), strict=True):
-            grey += np.cos(kx * x + ky * y + phase)
-        return 128 + grey * 40 / np.sqrt(WAVES / 2)
+            gray += np.cos(kx * x + ky * y + phase)
+        return 128 + gray * 40 / np.sqrt(WAVES / 2)
 
 
-def quantised(grey: np.ndarray) -> np.ndarray:
-    return grey.round().clip(0, 255).astype(np.uint8)
+def quantised(gray: np.ndarray) -> np.ndarray:
+    return gray.round().clip(0, 255).astype(np.uint8)
 
 
 def camera(width: int, height: int, doffs_px: float = 0.0) -> RectifiedCamera:

@@ -42,7 +42,7 @@ RIGS = {
 
 
 def ramps(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Images whose grey level says the column or the row they were taken from."""
+    """Images whose gray level says the column or the row they were taken from."""
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     return (u * 255 / (width - 1)).astype(np.uint8), (v * 255 / (height - 1)).astype(np.uint8)
 

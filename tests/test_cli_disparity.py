@@ -45,7 +45,7 @@ def test_a_wall_has_one_disparity(pair: tuple[Path, Path], tmp_path: Path, name:
     assert cv2.imread(str(preview)).shape == (150, 520, 3)
 
 
-def test_colour_and_16_bits_are_turned_to_grey(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_colour_and_16_bits_are_turned_to_gray(pair: tuple[Path, Path], tmp_path: Path) -> None:
     left, right = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pair)
     colour, deep = tmp_path / "colour.png", tmp_path / "deep.png"
     cv2.imwrite(str(colour), cv2.cvtColor(left, cv2.COLOR_GRAY2BGR))
@@ -59,8 +59,8 @@ def test_colour_and_16_bits_are_turned_to_grey(pair: tuple[Path, Path], tmp_path
 def test_csca_looks_at_the_colours_of_raw_pictures_too(pair: tuple[Path, Path], tmp_path: Path) -> None:
     tinted = [tmp_path / "left tinted.png", tmp_path / "right tinted.png"]
     for path, out in zip(pair, tinted, strict=True):
-        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        cv2.imwrite(str(out), np.dstack([grey, grey, grey // 2]))
+        gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(out), np.dstack([gray, gray, gray // 2]))
     rig = tmp_path / "rig.yaml"
     write_rig_file(rig, ideal_rig(260, 150))
     plain, raw = tmp_path / "plain.pfm", tmp_path / "raw.pfm"
@@ -75,14 +75,14 @@ def test_what_shows_nothing_is_told(
     pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     left, right = map(str, pair)
-    black, grey, white = (str(tmp_path / name) for name in ("black.png", "grey.png", "white.png"))
+    black, gray, white = (str(tmp_path / name) for name in ("black.png", "gray.png", "white.png"))
     cv2.imwrite(black, np.zeros((150, 260), np.uint8))
-    cv2.imwrite(grey, np.full((150, 260), 128, np.uint8))
+    cv2.imwrite(gray, np.full((150, 260), 128, np.uint8))
     cv2.imwrite(white, np.full((150, 260), 65535, np.uint16))
     out = ["-o", str(tmp_path / "d.tif")]
     refused([black, black, *out], capsys, "black.png", "nothing can be matched", "left image is black")
     refused([black, black, *out, "--range", "0:16"], capsys, "left image is black")
-    refused([left, grey, *out], capsys, "right image is grey 128")
+    refused([left, gray, *out], capsys, "right image is gray 128")
     refused([white, right, *out], capsys, "left image is white")
     refused([left, left, *out], capsys, "the same image", "two pictures of one pair")
     assert not any(tmp_path.glob("d.*"))

@@ -42,7 +42,7 @@ def observed_slowly(
     """Cell by cell from the lowest y and x on, and within each cell from the top down."""
     cells: dict[tuple[int, int], list[tuple[float, ...]]] = {}
     xyz = seen.xyz_m.astype(np.float64)
-    for ray, point, sigma, shared, grey in zip(
+    for ray, point, sigma, shared, gray in zip(
         xyz @ pose.rotation.T,
         pose.apply(xyz),
         seen.range_sigma_m,
@@ -58,7 +58,7 @@ def observed_slowly(
         depth = (point - pose.translation) @ pose.rotation[:, 2]
         middle = aside <= 0.5 * SPACING_RAD * depth
         height, noise = np.float32(point[2]), (sigma * slope) ** 2
-        values = (height, noise, swing @ cov @ swing, abs(shared * slope), grey, middle)
+        values = (height, noise, swing @ cov @ swing, abs(shared * slope), gray, middle)
         cells.setdefault((row, column), []).append(tuple(float(v) for v in values))
     result = []
     for (row, column), members in sorted(cells.items()):

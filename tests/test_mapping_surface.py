@@ -50,7 +50,7 @@ def test_a_folder_used_again_shows_the_new_surface(tmp_path: Path) -> None:
 
 
 def test_the_intensity_is_that_of_the_elected_height(tmp_path: Path) -> None:
-    """Two views of a bar at 150 and 160, one stray height at 20; a filled gap has no grey level."""
+    """Two views of a bar at 150 and 160, one stray height at 20; a filled gap has no gray level."""
     x, y = block(9, 1)
     seen = x != 4
     views = [replace(view(x[seen], y[seen], 1.0), intensity=np.full(8, g, np.float32)) for g in (150, 160)]

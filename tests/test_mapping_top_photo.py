@@ -26,15 +26,15 @@ def seen() -> CellObservations:
 
 
 def view(x_m: float) -> tuple[RectifiedPair, Pose]:
-    """What a pair over x_m sees of a line 0.02 m wide along X on the tops: grey 200 on 50, without the left
+    """What a pair over x_m sees of a line 0.02 m wide along X on the tops: gray 200 on 50, without the left
     picture's first columns."""
     pose = Pose("yard", "rect0", DOWN, np.array([x_m, 0.1, EYE_M]))
     v = np.arange(CAMERA.height)[:, None] + np.zeros(CAMERA.width)
     y = 0.1 - (v - CAMERA.cy_px) * (EYE_M - TOP_M - OVER_TOPS_M) / CAMERA.focal_px
-    grey = (50 + 150 * np.clip(1.5 - np.abs(y) / 0.01, 0, 1)).astype(np.uint8)
-    valid = np.ones(grey.shape, bool)
+    gray = (50 + 150 * np.clip(1.5 - np.abs(y) / 0.01, 0, 1)).astype(np.uint8)
+    valid = np.ones(gray.shape, bool)
     valid[:, :20] = False
-    return RectifiedPair(0, grey, grey, valid, np.ones_like(valid), CAMERA), pose
+    return RectifiedPair(0, gray, gray, valid, np.ones_like(valid), CAMERA), pose
 
 
 def test_what_lies_on_the_tops_is_sharp_over_a_gap_where_only_the_floor_was_measured() -> None:

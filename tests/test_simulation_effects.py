@@ -35,22 +35,22 @@ def test_motion_smears_along_the_way_and_keeps_the_light() -> None:
 
 def test_haze_takes_contrast() -> None:
     settings = FaultSettings(haze_ratio=0.2)
-    grey = np.linspace(0, 1, 4800, dtype=np.float32).reshape(60, 80)
+    gray = np.linspace(0, 1, 4800, dtype=np.float32).reshape(60, 80)
     np.testing.assert_allclose(
-        lens(settings).spoil(grey, settings, STILL), 0.8 * grey + 0.2 * HAZE_GREY, atol=1e-6
+        lens(settings).spoil(gray, settings, STILL), 0.8 * gray + 0.2 * HAZE_GREY, atol=1e-6
     )
 
 
 def test_dirt_darkens_drops_blur_and_glare_lightens() -> None:
-    grey = np.random.default_rng(1).uniform(0.2, 0.6, (60, 80)).astype(np.float32)
+    gray = np.random.default_rng(1).uniform(0.2, 0.6, (60, 80)).astype(np.float32)
     for settings, sign in ((FaultSettings(dirt_spots=3), -1), (FaultSettings(glare_ratio=0.3), 1)):
-        change = lens(settings).spoil(grey, settings, STILL) - grey
+        change = lens(settings).spoil(gray, settings, STILL) - gray
         assert (sign * change >= -1e-6).all() and 0.05 < np.abs(change).max() <= 0.6
     settings = FaultSettings(drops=2, dirt_px=12)
     one = lens(settings)
-    out, inside = one.spoil(grey, settings, STILL), one.drop == 1
-    assert inside.sum() > 50 and out[inside].std() < 0.4 * grey[inside].std()
-    np.testing.assert_array_equal(out[one.drop == 0], grey[one.drop == 0])
+    out, inside = one.spoil(gray, settings, STILL), one.drop == 1
+    assert inside.sum() > 50 and out[inside].std() < 0.4 * gray[inside].std()
+    np.testing.assert_array_equal(out[one.drop == 0], gray[one.drop == 0])
 
 
 def test_dead_pixels_are_always_the_same() -> None:

@@ -186,9 +186,9 @@ def test_vertical_error_sees_a_vertical_shift_and_nothing_on_a_clean_pair() -> N
 
 
 @presets
-@pytest.mark.parametrize("grey", [0, 128, 255])
-def test_an_image_without_contrast_gives_nothing(method: BarsightStereo, grey: int) -> None:
-    flat = np.full((60, 90), grey, dtype=np.uint8)
+@pytest.mark.parametrize("gray", [0, 128, 255])
+def test_an_image_without_contrast_gives_nothing(method: BarsightStereo, gray: int) -> None:
+    flat = np.full((60, 90), gray, dtype=np.uint8)
     found = method(_pair(flat, flat), DisparityRange(0, 16))
     assert np.isnan(found.disparity_px).all()
     assert np.isnan(found.sigma_px).all()

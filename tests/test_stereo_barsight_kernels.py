@@ -193,7 +193,7 @@ def _slow_semiglobal(left: np.ndarray, right: np.ndarray, lowest: int, count: in
     slopes = [
         cv2.filter2D(i, cv2.CV_16S, np.array([[-1, 0, 1]], np.float32)).astype(int) for i in (left, right)
     ]
-    greys = [left.astype(int), right.astype(int)]
+    grays = [left.astype(int), right.astype(int)]
     cost = np.full((height, width, count), -1)
     for x in range(width):
         for k in range(count):
@@ -201,7 +201,7 @@ def _slow_semiglobal(left: np.ndarray, right: np.ndarray, lowest: int, count: in
             if 0 <= there < width:
                 hamming = (bits[0][:, x] != bits[1][:, there]).sum(axis=-1)
                 steep = np.minimum(np.abs(slopes[0][:, x] - slopes[1][:, there]), 20)
-                bright = np.minimum(np.abs(greys[0][:, x] - greys[1][:, there]), 20)
+                bright = np.minimum(np.abs(grays[0][:, x] - grays[1][:, there]), 20)
                 cost[:, x, k] = hamming + (steep + bright) // 2
         inside = np.flatnonzero(cost[0, x] >= 0)
         if inside.size == 0:
@@ -219,7 +219,7 @@ def _slow_semiglobal(left: np.ndarray, right: np.ndarray, lowest: int, count: in
                     path[y, x] = cost[y, x]
                     continue
                 before = path[row, column]
-                contrast = abs(greys[0][y, x] - greys[0][row, column])
+                contrast = abs(grays[0][y, x] - grays[0][row, column])
                 jump = max(settings.p2 * 8 // (8 + contrast), settings.min_p2)
                 near = np.minimum(np.append(before[1:], 10**6), np.append(10**6, before[:-1]))
                 best = np.minimum(np.minimum(before, near + settings.p1), before.min() + jump)
@@ -254,7 +254,7 @@ def test_costs_are_hamming_distance_and_truncated_differences() -> None:
         describe_pixels(left), reverse_rows(describe_pixels(right), lowest, places), 4, lowest, count, found
     )
     framed = [np.pad(image, 2, mode="edge") for image in (left, right)]
-    grey, slope = (
+    gray, slope = (
         [image[4].astype(int) for image in (left, right)],
         [np.gradient(np.pad(image[4].astype(int), 1, mode="reflect"))[1:-1] * 2 for image in (left, right)],
     )
@@ -264,7 +264,7 @@ def test_costs_are_hamming_distance_and_truncated_differences() -> None:
             if 0 <= there < 40:
                 codes = [f[4:9, at : at + 5] > f[6, at + 2] for f, at in zip(framed, (x, there), strict=True)]
                 steep = min(abs(slope[0][x] - slope[1][there]), 20)
-                bright = min(abs(grey[0][x] - grey[1][there]), 20)
+                bright = min(abs(gray[0][x] - gray[1][there]), 20)
                 assert found[x, k] == (codes[0] != codes[1]).sum() + (steep + bright) // 2
     assert (found[:, count:] == BESIDE_COST).all()
 
@@ -273,29 +273,29 @@ def test_costs_are_hamming_distance_and_truncated_differences() -> None:
 def test_rows_of_paths_follow_the_recursion(backwards: bool) -> None:
     rng = np.random.default_rng(13)
     width, places, small, jumps = 9, 48, 22, p2_table(150, 28)
-    costs, greys = rng.integers(0, 61, (3, width, places)), rng.integers(0, 256, (3, width))
+    costs, grays = rng.integers(0, 61, (3, width, places)), rng.integers(0, 256, (3, width))
     paths, leasts = allocate_paths(width, places, small), np.empty((2, width, 3), dtype=np.uint8)
     sums = np.empty((width, places), dtype=np.uint16)
     above: dict[tuple[int, int], np.ndarray] = {}
     for y in range(3):
         extend_row(
-            costs[y].astype(np.uint8), greys[y].astype(np.uint8), greys[max(y - 1, 0)].astype(np.uint8),
+            costs[y].astype(np.uint8), grays[y].astype(np.uint8), grays[max(y - 1, 0)].astype(np.uint8),
             Penalties(small, jumps), y == 0, (y & 1) == 1, backwards, paths, leasts, sums,
         )  # fmt: skip
         here: dict[tuple[int, int], np.ndarray] = {}
         beside: np.ndarray | None = None
         for x in range(width)[:: -1 if backwards else 1]:
             befores = [
-                (above.get((way, x + way)), greys[y - 1, min(max(x + way, 0), width - 1)])
+                (above.get((way, x + way)), grays[y - 1, min(max(x + way, 0), width - 1)])
                 for way in (-1, 0, 1)
             ]
-            befores.append((beside, greys[y, min(max(x + (1 if backwards else -1), 0), width - 1)]))
+            befores.append((beside, grays[y, min(max(x + (1 if backwards else -1), 0), width - 1)]))
             values = []
-            for before, grey in befores:
+            for before, gray in befores:
                 value = costs[y, x]
                 if before is not None:
                     near = np.minimum(np.append(before[1:], 10**6), np.append(10**6, before[:-1]))
-                    jump = before.min() + int(jumps[abs(greys[y, x] - grey)])
+                    jump = before.min() + int(jumps[abs(grays[y, x] - gray)])
                     value = value + np.minimum(np.minimum(before, near + small), jump) - before.min()
                 values.append(value)
             for way, value in zip((-1, 0, 1), values, strict=False):
@@ -345,8 +345,8 @@ def test_weighted_median_beside_jumps_agrees_with_sorting() -> None:
     disparity = np.where(np.arange(WIDTH) < 30, 10.0, 14.0) + rng.uniform(0, 0.4, (HEIGHT, WIDTH))
     disparity = disparity.astype(np.float32)
     disparity[5:9, 20:26] = np.nan
-    grey = (60 + 80 * (np.arange(WIDTH) < 32) + rng.integers(0, 8, (HEIGHT, WIDTH))).astype(np.uint8)
-    sharp = sharpen_edges(disparity, grey, 1.0)
+    gray = (60 + 80 * (np.arange(WIDTH) < 32) + rng.integers(0, 8, (HEIGHT, WIDTH))).astype(np.uint8)
+    sharp = sharpen_edges(disparity, gray, 1.0)
     assert np.array_equal(np.isnan(sharp), np.isnan(disparity))
     far = np.abs(np.arange(WIDTH) - 29.5) > _BESIDE_PX + 2
     assert np.array_equal(sharp[:, far], disparity[:, far], equal_nan=True)
@@ -356,7 +356,7 @@ def test_weighted_median_beside_jumps_agrees_with_sorting() -> None:
         there = disparity[rows, columns]
         row, column = np.indices(there.shape)
         distance = (row + rows.start - y) ** 2 + (column + columns.start - x) ** 2
-        contrast = np.abs(grey[rows, columns].astype(float) - float(grey[y, x]))
+        contrast = np.abs(gray[rows, columns].astype(float) - float(gray[y, x]))
         weight = np.exp(-distance / (2 * _DISTANCE_PX**2) - contrast / _GREY)
         known = np.isfinite(there)
         order = np.argsort(there[known])

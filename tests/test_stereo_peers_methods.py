@@ -152,11 +152,11 @@ def test_csca_sees_an_edge_that_only_colour_shows() -> None:
     truth[:, 80:120] = 18
     dull = [(128 + (image.astype(float) - 128) / 8).astype(np.uint8) for image in (pair.left, pair.right)]
     rng = np.random.default_rng(6)
-    grey = [cv2.add(image, rng.integers(0, 8, image.shape).astype(np.uint8)) for image in dull]
+    gray = [cv2.add(image, rng.integers(0, 8, image.shape).astype(np.uint8)) for image in dull]
     red = [np.zeros_like(pair.left), np.zeros_like(pair.right)]
     red[0][:, 80:120] = red[1][:, 62:102] = 100
-    plain = pair_from_images(*grey)
-    coloured = pair_from_images(*grey, *(np.dstack([g, g, r]) for g, r in zip(grey, red, strict=True)))
+    plain = pair_from_images(*gray)
+    coloured = pair_from_images(*gray, *(np.dstack([g, g, r]) for g, r in zip(gray, red, strict=True)))
     wrong = [
         (np.abs(METHODS["csca"](one, DisparityRange(0, 32)).disparity_px - truth) > 1)[:, 30:].mean()
         for one in (plain, coloured)

@@ -37,7 +37,7 @@ def test_the_picture_tells_bars_that_the_surface_does_not_show(aside: float) -> 
         assert abs(bundle.top_z_m - one.top_z_m) < 0.004
         axes = np.array([bar.centre_m for bar in bundle.bar_axes])
         assert len(axes) == bundle.visible_bars
-    blind = find_bundles(replace(heights, grey=None), SETTINGS)
+    blind = find_bundles(replace(heights, gray=None), SETTINGS)
     off = [b.bar_diameter_m / one.diameter_m - 1 for b, one in zip(blind, LAID, strict=True)]
     assert max(np.abs(off)) > 0.2
 
@@ -45,8 +45,8 @@ def test_the_picture_tells_bars_that_the_surface_does_not_show(aside: float) -> 
 def test_a_picture_without_lines_counts_nothing() -> None:
     heights = photographed(draw(LAID), LAID)
     noise = np.random.default_rng(2).normal(120, 12, heights.z_m.shape).clip(1, 255).astype(np.uint8)
-    blank = [(b.bars, b.width_m) for b in find_bundles(replace(heights, grey=noise), SETTINGS)]
-    assert blank == [(b.bars, b.width_m) for b in find_bundles(replace(heights, grey=None), SETTINGS)]
+    blank = [(b.bars, b.width_m) for b in find_bundles(replace(heights, gray=noise), SETTINGS)]
+    assert blank == [(b.bars, b.width_m) for b in find_bundles(replace(heights, gray=None), SETTINGS)]
 
 
 def test_shading_is_that_of_the_highest_bar_blurred() -> None:

@@ -20,23 +20,23 @@ def bars(shape: tuple[int, int]) -> np.ndarray:
 
 
 def test_a_label_is_marked_and_a_strap_is_not() -> None:
-    grey = bars((300, 21))
-    assert not mark_labels(grey).any()
-    grey[100:103] = 250.0
-    grey[200:, :4] = 250.0
-    assert not mark_labels(grey)[:190].any(), "a bright strap"
-    grey[150:156, 8:12] = 250.0
-    rows, columns = np.nonzero(mark_labels(grey)[:190])
+    gray = bars((300, 21))
+    assert not mark_labels(gray).any()
+    gray[100:103] = 250.0
+    gray[200:, :4] = 250.0
+    assert not mark_labels(gray)[:190].any(), "a bright strap"
+    gray[150:156, 8:12] = 250.0
+    rows, columns = np.nonzero(mark_labels(gray)[:190])
     assert rows.min() >= 149 and rows.max() <= 156 and columns.min() >= 7 and columns.max() <= 12
 
 
 @pytest.mark.parametrize(("y_m", "under"), [(MAGNET.poles[0].along_m, True), (0.0, False)])
 def test_a_label_under_a_face_forbids(y_m: float, under: bool) -> None:
     heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
-    grey = bars(heights.shape)
+    gray = bars(heights.shape)
     label = np.ix_(np.abs(heights.y_m - y_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)
-    grey[label] = 250.0
-    heights = replace(heights, grey=np.clip(grey, 1, 255).astype(np.uint8))
+    gray[label] = 250.0
+    heights = replace(heights, gray=np.clip(gray, 1, 255).astype(np.uint8))
     found = find_label(PLACE, heights, MAGNET)
     assert (found is not None) == under
     if found is not None:

@@ -31,25 +31,25 @@ LENGTH_M, WIDE_M = 5.0, 1.2
 def drawn(
     packs: list[tuple[float, float, tuple[float, ...]]], rng: np.random.Generator, *, beside_m: float = 0.0
 ) -> HeightMap:
-    """Draw round-topped packs (low x, high x, y of straps) on the floor, their grey levels with noise; straps
+    """Draw round-topped packs (low x, high x, y of straps) on the floor, their gray levels with noise; straps
     are darker or brighter by a third. beside_m: height of what fills the rest."""
     x = CELL * np.arange(round(WIDE_M / CELL)) - WIDE_M / 2
     y = CELL * np.arange(round(LENGTH_M / CELL)) - LENGTH_M / 2
     z = np.full((len(y), len(x)), beside_m)
-    grey = 60 * np.exp(rng.normal(0, 0.12, z.shape))
+    gray = 60 * np.exp(rng.normal(0, 0.12, z.shape))
     for low, high, straps in packs:
         own = (x >= low) & (x < high)
         away = (x[own] - (low + high) / 2) / (high - low)
         z[:, own] = 0.3 - 0.3 * (2 * away) ** 4 * (high - low)
         for at in straps:
             rows = np.abs(y - at) < 0.016
-            grey[np.ix_(rows, own)] *= rng.choice([0.5, 1.8], own.sum())
+            gray[np.ix_(rows, own)] *= rng.choice([0.5, 1.8], own.sum())
     z += rng.normal(0, 0.001, z.shape)
     shape = z.shape
     return HeightMap(
         float(x[0]), float(y[0]), CELL, z.astype(np.float32), np.full(shape, 0.003, np.float32),
         np.full(shape, 4, np.float32), np.full(shape, HeightSource.VISION, np.uint8),
-        np.clip(grey, 1, 255).astype(np.uint8),
+        np.clip(gray, 1, 255).astype(np.uint8),
     )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ def photo(
     seed: int, bar_m: float = 0.0, slope: float = 0.0, *, at_m: float = -0.6, to_m: float = 0.7,
     along: bool = False,
 ) -> HeightMap:  # fmt: skip
-    """Draw the yard with a photo: bars of grey 50 with highlights of 160, gaps of 25, straps of 35, beams of
+    """Draw the yard with a photo: bars of gray 50 with highlights of 160, gaps of 25, straps of 35, beams of
     110 in the gaps, and a bar as bright as the others on average, bar_m thick, from x = -0.2 to to_m across,
     or along the first bundle's flank.
     """
@@ -35,22 +35,22 @@ def photo(
     x, fine = heights.x_m, 4
     y = heights.y0_m + heights.cell_m * ((np.arange(heights.shape[0] * fine) + 0.5) / fine - 0.5)
     mottle = ndimage.gaussian_filter1d(rng.normal(0, 1, (y.size, x.size)), 1.5 * fine, axis=0)
-    grey = np.full((y.size, x.size), 25.0)
+    gray = np.full((y.size, x.size), 25.0)
     for low in DUNNAGE_M:
-        grey[(y > low) & (y < low + 0.09)] = 110.0
+        gray[(y > low) & (y < low + 0.09)] = 110.0
     profile = 50 + 110 * np.cos(np.pi * (x - STOCK[0].x_m) / 0.09) ** 4
     for one, shift in zip(STOCK, (0.0, 0.08), strict=True):
         over = np.abs(x - one.x_m) < HALF_M
-        grey[:, over] = profile[over] * np.exp(0.12 * mottle[:, over] / mottle.std())
+        gray[:, over] = profile[over] * np.exp(0.12 * mottle[:, over] / mottle.std())
         for strap in STRAPS_M:
-            grey[np.ix_(np.abs(y - strap - shift) < 0.016, over)] = 35.0
+            gray[np.ix_(np.abs(y - strap - shift) < 0.016, over)] = 35.0
     if bar_m and along:
-        grey[:, np.abs(x - STOCK[0].x_m + HALF_M + 0.02) < bar_m / 2] = profile.mean()
+        gray[:, np.abs(x - STOCK[0].x_m + HALF_M + 0.02) < bar_m / 2] = profile.mean()
     elif bar_m:
         away = (y[:, None] - at_m - slope * x) / math.hypot(1, slope)
-        grey[(np.abs(away) < bar_m / 2) & (x > -0.2) & (x < to_m)] = profile.mean()
+        gray[(np.abs(away) < bar_m / 2) & (x > -0.2) & (x < to_m)] = profile.mean()
     pixels = 0.5 * PIXEL_M / heights.cell_m
-    cells = ndimage.gaussian_filter(grey, (pixels * fine, pixels)).reshape(-1, fine, x.size).mean(axis=1)
+    cells = ndimage.gaussian_filter(gray, (pixels * fine, pixels)).reshape(-1, fine, x.size).mean(axis=1)
     noisy = np.rint(cells + rng.normal(0, 0.7, cells.shape)).clip(1, 255).astype(np.uint8)
     return replace(heights, tops=noisy)
 

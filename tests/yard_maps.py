@@ -91,7 +91,7 @@ def photographed(
     """
     x = height_map.x0_m + height_map.cell_m * np.arange(height_map.z_m.shape[1])
     y = height_map.y0_m + height_map.cell_m * np.arange(height_map.z_m.shape[0])
-    grey = np.zeros(height_map.z_m.shape)
+    gray = np.zeros(height_map.z_m.shape)
     for part in np.linspace(-0.4, 0.4, 5) * height_map.cell_m:
         xx, yy = np.meshgrid(x + part, y)
         top, light = np.full(xx.shape, 0.0), np.full(xx.shape, 0.6)
@@ -106,10 +106,10 @@ def photographed(
                 seen = (np.abs(turned) < 1) & (np.abs(along) < bundle.length_m / 2) & (height > top)
                 top = np.where(seen, height, top)
                 light = np.where(seen, np.maximum(rise + aside * turned, 0), light)
-        grey += light / 5
-    noise = np.random.default_rng(5).normal(0, 6, grey.shape)
+        gray += light / 5
+    noise = np.random.default_rng(5).normal(0, 6, gray.shape)
     steel = height_map.z_m > 0.05
     share = ndimage.gaussian_filter1d(steel.astype(float), blur_m / height_map.cell_m, axis=1)
     total = ndimage.gaussian_filter1d(height_map.z_m * steel, blur_m / height_map.cell_m, axis=1)
     z = np.where(steel, total / np.maximum(share, 1e-9), height_map.z_m).astype(np.float32)
-    return replace(height_map, z_m=z, grey=(40 + 100 * grey + noise).clip(1, 255).astype(np.uint8))
+    return replace(height_map, z_m=z, gray=(40 + 100 * gray + noise).clip(1, 255).astype(np.uint8))

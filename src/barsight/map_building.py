@@ -20,7 +20,7 @@ from barsight.core.notices import Notice
 from barsight.core.parallel import prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch, count_frames
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
+from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.scene_extent import (
@@ -40,6 +40,7 @@ from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Preview, Refusal, to_json
 from barsight.motion.rig_check.self_calibration import self_calibrate
 from barsight.motion.settings import make_estimator
+from barsight.pair_chain import PairChain
 from barsight.recording.base import Recording
 from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -166,8 +167,7 @@ def estimate_trajectory(
     """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
     source, pairs, watch = probed.source, probed.pairs, probed.watch
     rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
-    matcher = Matcher(settings.stereo, make_method(settings.stereo.for_map()), watch)
-    match = matching(matcher, probed.kept)
+    match = matching(pairs, settings, probed.kept, watch)
     early = _known_early(source, settings, rectifier, probed.first.range_m)
     begun = islice(pairs(early), len(early))
     with ExitStack() as pools:
@@ -187,6 +187,7 @@ def estimate_trajectory(
         if calibrated.rectifier is not rectifier:
             rectifier = calibrated.rectifier
             pairs = RectifiedPairs(source, rectifier, watch=watch)
+            match = matching(pairs, settings, probed.kept, watch)
         stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
         taken = select_keyframes(trajectory.frames, rectifier, probed.first.range_m, settings.map.min_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
@@ -280,16 +281,13 @@ def _known_early(
 
 
 def matching(
-    matcher: Matcher, kept: Path | None
-) -> Callable[[RectifiedPair | RefusedFrame], MatchedFrame | Refusal]:
-    """Match pairs, each once for all runs that keep checkpoints in `kept`."""
-
-    def match(pair: RectifiedPair | RefusedFrame) -> MatchedFrame | Refusal:
-        if isinstance(pair, RefusedFrame):
-            return Refusal("recording", pair)
-        return checkpointed(kept, f"matched_{pair.stamp_ns}", lambda: matcher(pair))
-
-    return match
+    pairs: RectifiedPairs, settings: MeasureSettings, kept: Path | None, watch: Stopwatch
+) -> PairChain:
+    """Make what matches the pairs of a recording for its map."""
+    stereo, every = settings.stereo, settings.map.min_shift == 0
+    chained = every and stereo.method == "barsight" and stereo.barsight.preset == "best"
+    matcher = Matcher(stereo, make_method(stereo.for_map()), watch)
+    return PairChain(pairs, matcher, stereo.confirmed_pairs + 1 if chained else 1, kept)
 
 
 def _placed(

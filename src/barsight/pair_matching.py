@@ -59,8 +59,8 @@ def _name(picture: Picture) -> Path:
 
 def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: MethodName) -> RectifiedPair:
     """Load the rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
-    (left_grey, left_colour), (right_grey, right_colour) = _read(left), _read(right)
-    frame = StereoFrame(0, left_grey, right_grey)
+    (left_gray, left_colour), (right_gray, right_colour) = _read(left), _read(right)
+    frame = StereoFrame(0, left_gray, right_gray)
     colours = None
     if method in _IN_COLOUR and left_colour is not None and right_colour is not None:
         colours = left_colour, right_colour
@@ -104,7 +104,7 @@ def _with_colours(pair: RectifiedPair, rectifier: Rectifier, left: UInt8, right:
 def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
     if not isinstance(path, Path):
         if path.dtype != np.uint8 or path.ndim != 2:
-            raise InputError("picture", "is no (H, W) array of uint8", "give grey levels, or a file")
+            raise InputError("picture", "is no (H, W) array of uint8", "give gray levels, or a file")
         return path, None
     try:
         return decode_with_colour(path.read_bytes())

@@ -186,9 +186,9 @@ def read_heights(folder: Path) -> PartedMap:
     def read(rows: slice, columns: slice) -> HeightMap:
         with open_geotiff(path, HEIGHT_BANDS) as file:
             z, sigma, views, source = file.rectangle(HEIGHT_BANDS, rows, columns)
-        grey, bounds, over = (layer(other, rows, columns) for other in (photo, free, tops))
+        gray, bounds, over = (layer(other, rows, columns) for other in (photo, free, tops))
         x, y = x0_m + cell_m * columns.start, y0_m + cell_m * rows.start
-        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), grey, bounds, over)
+        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), gray, bounds, over)
 
     return PartedMap(x0_m, y0_m, cell_m, size, read)
 

@@ -23,7 +23,6 @@ from barsight.core.timing import Stopwatch
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
 from barsight.live_map import LiveMap, Snapshot
 from barsight.map_building import checkpoint_key, matching
-from barsight.mapping.view import Matcher
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import to_json
@@ -33,7 +32,6 @@ from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.result import Yard
-from barsight.stereo.settings import make_method
 from barsight.yard.magnet.description import load_magnet
 
 GRACE_NS = NS_PER_S
@@ -72,9 +70,9 @@ class Session:
         key = checkpoint_key(self._recording, to_json(asdict(self._settings)), {})
         self._kept = checkpoint_folder(self._folder / "checkpoints", key)
         self._pairs = RectifiedPairs(self._source, Rectifier(rig), self._kept)
-        matcher = Matcher(self._settings.stereo, make_method(self._settings.stereo.for_map()), Stopwatch())
         # A rig that is to be turned at the end gives other disparities then.
-        self._match = matching(matcher, self._kept if self._settings.self_calibrate == "none" else None)
+        kept = self._kept if self._settings.self_calibrate == "none" else None
+        self._match = matching(self._pairs, self._settings, kept, Stopwatch())
         self._waiting: deque[RectifiedPair | RefusedFrame] = deque()
         self._poses: PoseEstimator | None = None
         self._map: LiveMap | None = None

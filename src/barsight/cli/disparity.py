@@ -43,7 +43,7 @@ def run(arguments: Sequence[str]) -> None:
         """Match one pair: the left picture's disparity, in pixels, with a sigma per pixel in a .tif.
 
         Args:
-            left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to grey,
+            left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to gray,
                 but `csca` looks at the colours too.
             right: The right picture.
             out: The file to write: .pfm, .png (16 bits, disparity times 256) or .tif (disparity and sigma).

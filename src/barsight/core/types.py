@@ -133,7 +133,7 @@ class RectifiedPair:
     """left, right: (H, W) uint8 with matches on the same row, x_right = x_left - disparity.
 
     left_valid, right_valid: (H, W) bool, False where the raw image has no such pixel.
-    left_colour, right_colour: (H, W, 3) uint8, the same in colour (BGR), or None; most methods look at grey.
+    left_colour, right_colour: (H, W, 3) uint8, the same in colour (BGR), or None; most methods look at gray.
     """
 
     stamp_ns: int

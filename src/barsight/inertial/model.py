@@ -13,6 +13,7 @@ from scipy.ndimage import binary_opening
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.types import ImuSamples
 
 GRAVITY_MPS2 = 9.80665
@@ -52,7 +53,7 @@ def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
     wrong = np.zeros(imu.stamp_ns.size, dtype=np.bool_)
     for axis in np.hstack([imu.gyro_radps, imu.accel_mps2]).T:
         middle = np.median(axis)
-        usual = 1.4826 * np.median(np.abs(axis - middle)) + 1e-6
+        usual = mad_sigma(axis - middle) + 1e-6
         for end in (axis.min(initial=np.inf), axis.max(initial=-np.inf)):
             if axis.size and abs(end - middle) > SATURATED_SIGMAS * usual:
                 there = axis == end

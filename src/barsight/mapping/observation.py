@@ -25,7 +25,7 @@ class CellObservations:
     x, y: (N,) int32 cell numbers (a cell's centre is its number times the cell's side). central: (N,)
     bool, whether the view sees this height in the cell's middle and not only at its border. z_m, variance_m2:
     height and its noise (matching and pose), float32. shared_m: what the calibration may add, float32.
-    intensity: (N,) float32 grey levels.
+    intensity: (N,) float32 gray levels.
     """
 
     x: Int32
@@ -80,7 +80,7 @@ def _in_reference(
     translation: Float64, origin: Float64, about: Float64, cell_m: float, half_rad: float,
 ) -> tuple[Int32, Int32, Float32]:  # fmt: skip
     """Transform and pack: cell numbers (N,) and, side by side in memory, what each point says (N, _SAID): its
-    height, matching variance, pose variance and shared sigma of the height, its grey level and whether it
+    height, matching variance, pose variance and shared sigma of the height, its gray level and whether it
     lies within half_rad (half a pixel) of the cell's middle, along x and along y.
 
     The height's error is the range error along the ray times the ray's slope, plus that of the pose:
@@ -147,7 +147,7 @@ def _gather(
 
     said: (N, _SAID) and starts: (cells + 1,), of `_by_cell`; said's order changes. Returns (M,) each: a
     surface's cell, whether a point lies at the cell's middle, height (m), its variance (m^2), shared sigma
-    (m), grey level.
+    (m), gray level.
     """
     count = said.shape[0]
     cell, middle = np.empty(count, np.int64), np.zeros(count, np.bool_)
@@ -161,7 +161,7 @@ def _gather(
                 if said[i, _HEIGHT] > said[top, _HEIGHT]:
                     top = i
             floor = said[top, _HEIGHT] - max(4 * np.sqrt(said[top, _NOISE]), 2 * cell_m)
-            weights = heights = variances = extra = grey = 0.0
+            weights = heights = variances = extra = gray = 0.0
             left = first
             for i in range(first, last):
                 if said[i, _HEIGHT] < floor:
@@ -173,14 +173,14 @@ def _gather(
                 heights += w * said[i, _HEIGHT]
                 variances += said[i, _NOISE] + said[i, _POSE]
                 extra += said[i, _SHARED]
-                grey += said[i, _GREY]
+                gray += said[i, _GREY]
                 middle[n] |= said[i, _MIDDLE] > 0
             held = last - left
             cell[n] = k
             out[0, n] = heights / weights
             out[1, n] = variances / held
             out[2, n] = extra / held
-            out[3, n] = grey / held
+            out[3, n] = gray / held
             n += 1
             last = left
     return cell[:n], middle[:n], out[0, :n], out[1, :n], out[2, :n], out[3, :n]

@@ -14,7 +14,7 @@ SLOTS = 4
 """Heights kept per cell."""
 FIELDS = 7
 """Of each height: mean z, weight (sum of 1 / variance), weighted squares about the mean, views, shared sigma,
-grey level, views that see it in the cell's middle."""
+gray level, views that see it in the cell's middle."""
 Z, WEIGHT, SQUARES, VIEWS, SHARED, GREY, CENTRAL = range(FIELDS)
 
 TileKey = tuple[int, int]

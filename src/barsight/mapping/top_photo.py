@@ -1,4 +1,4 @@
-"""Top photo: the pictures' mean grey level at the height of the tops around each cell.
+"""Top photo: the pictures' mean gray level at the height of the tops around each cell.
 
 What lies across the tops is as sharp there as in a single picture, in every view at the same place, be it
 thinner than matching can measure; what lies deeper is blurred, since each view sees it elsewhere.
@@ -27,7 +27,7 @@ MAX_VIEWS = 250
 
 
 class TopPhoto:
-    """Sums of grey levels and how many views made them, per cell of the map.
+    """Sums of gray levels and how many views made them, per cell of the map.
 
     cell_m: side of the cells. Memory: 0.75 MiB per 5 m square at cells of 10 mm.
     """
@@ -60,16 +60,16 @@ class TopPhoto:
             (pair.left, pair.left_valid, left_x), (pair.right, pair.right_valid, right_x)
         ):  # fmt: skip
             places = _finer(at, tops, fine), at_y
-            grey = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderValue=0)
+            gray = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderValue=0)
             inside = cv2.remap(valid.astype(np.uint8), *places, cv2.INTER_NEAREST, borderValue=0) > 0
             inside &= held
-            total += np.where(inside, grey, 0).astype(np.uint16)
+            total += np.where(inside, gray, 0).astype(np.uint16)
             count += inside.astype(np.uint8)
         for key in covering_tiles(column, row, count.shape):
             self._merge(key, column, row, total, count)
 
     def window(self, column: int, row: int, columns: int, rows: int) -> UInt8:
-        """Return (rows, columns): mean grey levels from 1, 0 where no view saw the cell, from cell
+        """Return (rows, columns): mean gray levels from 1, 0 where no view saw the cell, from cell
         (column, row) on.
         """
         out = np.zeros((rows, columns), np.uint8)

@@ -12,8 +12,11 @@ from barsight.core.timing import Stopwatch
 from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair
 from barsight.mapping.ego_mask import mask_carried
 from barsight.mapping.observation import CellObservations, bin_points
+from barsight.motion.frontend.direct_alignment import align_views
+from barsight.stereo.direct.pipeline import BarsightStereo
 from barsight.stereo.masking import mask_disparity, mask_gaps, mask_unsure
 from barsight.stereo.method import StereoMethod
+from barsight.stereo.prediction import predict_disparity
 from barsight.stereo.search_range import find_disparity_range
 from barsight.stereo.settings import StereoSettings
 from barsight.stereo.triangulation import triangulate_disparity
@@ -33,6 +36,14 @@ class MatchedFrame:
 
 
 @dataclass(frozen=True, eq=False)
+class Preceding:
+    """The frame before, and a guess of the rectified left camera's motion since."""
+
+    frame: MatchedFrame
+    now_from_before: Pose
+
+
+@dataclass(frozen=True, eq=False)
 class PosedView:
     """A posed frame.
 
@@ -49,17 +60,20 @@ Neighbour = tuple[MatchedFrame, PosedFrame]
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """Match a rectified pair: without state, so that pairs run side by side."""
+    """Match a rectified pair; it keeps no state, so that pairs run side by side."""
 
     stereo: StereoSettings
     method: StereoMethod
     watch: Stopwatch
 
-    def __call__(self, pair: RectifiedPair) -> MatchedFrame:
-        """Match; the disparity is Failed where the pictures are swapped or have no texture."""
-        return MatchedFrame(pair, self._disparity(pair))
+    def __call__(self, pair: RectifiedPair, preceding: Preceding | None = None) -> MatchedFrame:
+        """Match; the disparity is Failed where the pictures are swapped or have no texture.
 
-    def _disparity(self, pair: RectifiedPair) -> Disparity | Failed:
+        preceding: where there is one whose places look the same now, the pair is only held against it.
+        """
+        return MatchedFrame(pair, self._disparity(pair, preceding))
+
+    def _disparity(self, pair: RectifiedPair, preceding: Preceding | None) -> Disparity | Failed:
         candidates = disparity_range(pair, self.stereo)
         if isinstance(candidates, Failed):
             return candidates
@@ -68,8 +82,24 @@ class Matcher:
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.watch("stereo", 1):
-            sure = mask_unsure(self.method(pair, candidates), self.stereo.max_sigma_px)
-            return mask_gaps(sure, pair.left, self.stereo.gap_darkness)
+            predicted = None if preceding is None else self._predicted(pair, preceding)
+            if predicted is not None and isinstance(self.method, BarsightStereo):
+                found = self.method.confirm(pair, candidates, predicted)
+            else:
+                found = self.method(pair, candidates)
+            return mask_gaps(
+                mask_unsure(found, self.stereo.max_sigma_px), pair.left, self.stereo.gap_darkness
+            )
+
+    def _predicted(self, pair: RectifiedPair, preceding: Preceding) -> Float32 | None:
+        """Predict the disparity (H, W) px, NaN where not; None where the views don't look alike."""
+        before, camera = preceding.frame, pair.camera
+        if isinstance(before.disparity, Failed) or not isinstance(self.method, BarsightStereo):
+            return None
+        motion = align_views(
+            before.pair.left, before.disparity, pair.left, camera, preceding.now_from_before
+        )  # fmt: skip
+        return None if isinstance(motion, Failed) else predict_disparity(before.disparity, camera, motion)
 
 
 @dataclass(frozen=True, eq=False)

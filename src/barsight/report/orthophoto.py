@@ -1,4 +1,4 @@
-"""Write the orthophoto: the grey level of each cell's height, as a GeoTIFF on height.tif's grid and
+"""Write the orthophoto: the gray level of each cell's height, as a GeoTIFF on height.tif's grid and
 as a PNG.
 """
 
@@ -14,7 +14,7 @@ import tifffile
 import barsight
 from barsight.core.arrays import UInt8
 from barsight.core.files import atomic_path
-from barsight.mapping.surface.surface import Surface, grey_levels
+from barsight.mapping.surface.surface import Surface, gray_levels
 from barsight.mapping.top_photo import TopPhoto
 
 NO_DATA = 0
@@ -36,7 +36,7 @@ def georeference(surface: Surface) -> list[tuple[int, str, int, Any, bool]]:
 
 
 def orthophoto(surface: Surface) -> UInt8:
-    """Render grey levels (rows, columns) from 1, NO_DATA where no view saw the cell; row 0 at the
+    """Render gray levels (rows, columns) from 1, NO_DATA where no view saw the cell; row 0 at the
     highest y.
     """
     rows, columns = surface.shape
@@ -44,25 +44,25 @@ def orthophoto(surface: Surface) -> UInt8:
     for column in range(0, columns, _COLUMNS):
         width = min(_COLUMNS, columns - column)
         part = surface.window(surface.columns[0] + column, surface.rows[0], width, rows)
-        picture[:, column : column + width] = grey_levels(part.intensity)[::-1]
+        picture[:, column : column + width] = gray_levels(part.intensity)[::-1]
     return picture
 
 
 def write_orthophoto(surface: Surface, folder: Path) -> None:
     """Write ortho.tif and ortho.png, each whole or not at all."""
     picture = orthophoto(surface)
-    _write_grey(surface, picture, folder / "ortho.tif")
+    _write_gray(surface, picture, folder / "ortho.tif")
     with atomic_path(folder / "ortho.png") as path:
         path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 
 def write_top_photo(surface: Surface, tops: TopPhoto, target: Path) -> None:
-    """Write the pictures' mean grey level at the height of the tops, on height.tif's grid."""
+    """Write the pictures' mean gray level at the height of the tops, on height.tif's grid."""
     rows, columns = surface.shape
-    _write_grey(surface, tops.window(surface.columns[0], surface.rows[0], columns, rows)[::-1], target)
+    _write_gray(surface, tops.window(surface.columns[0], surface.rows[0], columns, rows)[::-1], target)
 
 
-def _write_grey(surface: Surface, picture: UInt8, target: Path) -> None:
+def _write_gray(surface: Surface, picture: UInt8, target: Path) -> None:
     with atomic_path(target) as path:
         tifffile.imwrite(
             path,

@@ -70,12 +70,12 @@ def yard_part(out_dir: Path, pictures: tuple[MapFigure, ...]) -> YardPart | None
 
 def _orthophoto(path: Path, raster: Raster) -> UInt8:
     """Resample the orthophoto (H, W, 4) to the raster's size, transparent where nothing was seen."""
-    grey = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
+    gray = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    if gray is None:
         raise InputError(path, "is torn", "measure the recording again")
     step, (rows, columns) = raster.step, raster.z_m.shape
     whole = np.zeros((rows * step, columns * step), np.uint8)
-    whole[: grey.shape[0], : grey.shape[1]] = grey[: rows * step, : columns * step]
+    whole[: gray.shape[0], : gray.shape[1]] = gray[: rows * step, : columns * step]
     small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
     bright = np.clip(small.astype(np.float32) * (235 / max(np.percentile(small[small > 0], 99), 1)
                      if (small > 0).any() else 1), 0, 255).astype(np.uint8)  # fmt: skip

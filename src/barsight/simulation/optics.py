@@ -18,7 +18,7 @@ from barsight.simulation.settings import CameraSettings, SimulationSettings
 
 LATTICE_PX = 8
 WHITE_DN = 215.0
-"""Grey level of radiance 1 in cam0 before it is clipped."""
+"""Gray level of radiance 1 in cam0 before it is clipped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,5 +101,5 @@ def expose(
     signal = blurred * share * np.float32(gain * WHITE_DN)
     noise = rng.standard_normal(signal.shape, dtype=np.float32)
     noise *= np.sqrt(settings.shot_noise_dn**2 * signal + settings.read_noise_dn**2, dtype=np.float32)
-    grey: UInt8 = np.clip(np.rint(signal + noise), 0, 255).astype(np.uint8)
-    return grey
+    gray: UInt8 = np.clip(np.rint(signal + noise), 0, 255).astype(np.uint8)
+    return gray

@@ -1,4 +1,4 @@
-"""Render a camera's view of the yard as linear grey levels: four rays a pixel, textured and lightmapped."""
+"""Render a camera's view of the yard as linear gray levels: four rays a pixel, textured and lightmapped."""
 
 from __future__ import annotations
 

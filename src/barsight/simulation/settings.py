@@ -79,9 +79,9 @@ class CameraSettings:
     cam1_gain: float = 0.95
     """Exposure of cam1 relative to cam0."""
     shot_noise_dn: float = 0.18
-    """Shot noise of one grey level; it grows with the root of the signal."""
+    """Shot noise of one gray level; it grows with the root of the signal."""
     read_noise_dn: float = 0.9
-    """Noise that doesn't depend on the signal, in grey levels."""
+    """Noise that doesn't depend on the signal, in gray levels."""
 
     def __post_init__(self) -> None:
         _expect(min(self.width_px, self.height_px) >= 64, "camera width and height must be at least 64 px")

@@ -41,7 +41,7 @@ def _is_textured(image: UInt8, valid: Bool) -> bool:
 
 
 def image_noise(image: UInt8 | Float32) -> float:
-    """Estimate the image's noise, one sigma in grey levels: robust, from a Laplacian that planes don't excite
+    """Estimate the image's noise, one sigma in gray levels: robust, from a Laplacian that planes don't excite
     [Immerkaer 1996], with the median instead of the mean so that texture counts less.
     """
     response = _bends(_bends(image.astype(np.float32)).T)

@@ -63,13 +63,13 @@ def find_disparity_range(pair: RectifiedPair) -> DisparityRange | Failed:
 
 
 def check_matchable(pair: RectifiedPair) -> Failed | None:
-    """Return Failed `no-texture` where an image is one grey all over, `same-image` where both are the same
+    """Return Failed `no-texture` where an image is one gray all over, `same-image` where both are the same
     one.
     """
     for name, image in (("left", pair.left), ("right", pair.right)):
-        grey = int(image[0, 0])
-        if (image == grey).all():
-            shade = {0: "black", 255: "white"}.get(grey, f"grey {grey}")
+        gray = int(image[0, 0])
+        if (image == gray).all():
+            shade = {0: "black", 255: "white"}.get(gray, f"gray {gray}")
             return Failed("no-texture", f"nothing can be matched: the {name} image is {shade} all over")
     if np.array_equal(pair.left, pair.right):
         return Failed("same-image", "nothing has a depth: left and right are the same image")

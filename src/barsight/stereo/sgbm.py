@@ -105,7 +105,7 @@ def _lands_on_valid(disparity: Float32, pair: RectifiedPair) -> Bool:
 
 
 def _texture(image: UInt8, block: int) -> Float32:
-    """Sum squared gradients along the row (H, W), grey levels per px, over each block."""
+    """Sum squared gradients along the row (H, W), gray levels per px, over each block."""
     gradient = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     texture: Float32 = cv2.boxFilter(gradient * gradient, -1, (block, block), normalize=False)
     return texture

@@ -54,7 +54,7 @@ def _points(
     max_depth_m: float,
     max_sigma_m: float,
 ) -> tuple[Float32, Float32, Float32, UInt8]:
-    """Compute points, noise and shared sigma along the ray, and grey levels, row by row.
+    """Compute points, noise and shared sigma along the ray, and gray levels, row by row.
 
     shift: (H per_pixel, W per_pixel) disparity + doffs, px; sigma_px, left: (H, W). lens: (4,) focal px, cx,
     cy, baseline m. Returns (N, 3) m in `rect0`, (N,) m, (N,) m and (N,).

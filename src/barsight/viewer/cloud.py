@@ -84,7 +84,7 @@ def colour_layer(layer: Layer, by: str) -> Colouring:
         return _by_source(values)
     scale, unit = {
         "height": (cv2.COLORMAP_VIRIDIS, "mm"),
-        "intensity": (None, "grey levels"),
+        "intensity": (None, "gray levels"),
         "sigma": (cv2.COLORMAP_MAGMA, "mm"),
         "views": (cv2.COLORMAP_CIVIDIS, "views"),
     }[by]
@@ -110,7 +110,7 @@ def _by_source(codes: Float32) -> Colouring:
 
 
 def _ramp(scale: int | None) -> UInt8:
-    """Sample (256, 3) RGB from low to high on one of OpenCV's scales; None is grey."""
+    """Sample (256, 3) RGB from low to high on one of OpenCV's scales; None is gray."""
     levels = np.arange(256, dtype=np.uint8)[:, None]
     painted = np.repeat(levels, 3, axis=1) if scale is None else cv2.applyColorMap(levels, scale)[:, 0, ::-1]
     return np.ascontiguousarray(painted, dtype=np.uint8)

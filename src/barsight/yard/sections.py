@@ -10,7 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.mapping.free_space import FreeSpace
-from barsight.mapping.surface.surface import Surface, grey_levels
+from barsight.mapping.surface.surface import Surface, gray_levels
 from barsight.mapping.top_photo import TopPhoto
 from barsight.yard.types import HeightMap, YardMap
 
@@ -60,13 +60,13 @@ def surface_map(surface: Surface, free: FreeSpace | None = None, tops: TopPhoto 
     def read(rows: slice, columns: slice) -> HeightMap:
         column, row = surface.columns[0] + columns.start, surface.rows[0] + rows.start
         layers = surface.window(column, row, columns.stop - columns.start, rows.stop - rows.start)
-        grey = grey_levels(layers.intensity)
+        gray = gray_levels(layers.intensity)
         size = layers.z_m.shape[1], layers.z_m.shape[0]
         bounds = None if free is None else free.window(column, row, *size)
         photo = None if tops is None else tops.window(column, row, *size)
         return HeightMap(
             column * cell_m, row * cell_m, cell_m,
-            layers.z_m, layers.sigma_m, layers.views, layers.source, grey, bounds, photo,
+            layers.z_m, layers.sigma_m, layers.views, layers.source, gray, bounds, photo,
         )  # fmt: skip
 
     return PartedMap(surface.columns[0] * cell_m, surface.rows[0] * cell_m, cell_m, surface.shape, read)

@@ -20,9 +20,9 @@ class HeightMap:
     """The map that the yard's stages read: arrays [y, x] with y rising.
 
     Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
-    NaN where unknown. views: float32. source: `Source`. grey: the orthophoto, levels from 1, 0 where nothing
+    NaN where unknown. views: float32. source: `Source`. gray: the orthophoto, levels from 1, 0 where nothing
     was seen; None where there is none. free_m: float32, upper bound of what may stand in the cell by lines
-    of sight that passed over it, inf where none did; None where no lines of sight are known. tops: grey
+    of sight that passed over it, inf where none did; None where no lines of sight are known. tops: gray
     levels from 1 of the pictures at the height of the tops around (`TopPhoto`), 0 where nothing was seen;
     None where there is no such photo.
     """
@@ -34,7 +34,7 @@ class HeightMap:
     sigma_m: Float32
     views: Float32
     source: UInt8
-    grey: UInt8 | None = None
+    gray: UInt8 | None = None
     free_m: Float32 | None = None
     tops: UInt8 | None = None
 
@@ -84,7 +84,7 @@ class HeightMap:
         cut = rows, columns
         return HeightMap(
             x0_m, y0_m, self.cell_m, self.z_m[cut], self.sigma_m[cut], self.views[cut], self.source[cut],
-            None if self.grey is None else self.grey[cut],
+            None if self.gray is None else self.gray[cut],
             None if self.free_m is None else self.free_m[cut],
             None if self.tops is None else self.tops[cut],
         )  # fmt: skip

@@ -15,6 +15,7 @@ from barsight.benchmarks.stereo.bar_fit import BarFit
 from barsight.benchmarks.stereo.bar_outline import OutlineSearch, find_outline
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.types import Disparity, RectifiedCamera, RectifiedPair
 
 _MIN_REACH_PX = 4.0
@@ -152,7 +153,7 @@ def _distance(
     found = float(np.median(inverse))
     for _ in range(20):
         away = (inverse - found) / (sigma * found)
-        kappa = max(1.4826 * float(np.median(np.abs(away))), 1e-6)
+        kappa = max(mad_sigma(away), 1e-6)
         robust = weight / (1 + (away / (2.4 * kappa)) ** 2)
         found = float((robust * inverse).sum() / robust.sum())
     return 1 / found

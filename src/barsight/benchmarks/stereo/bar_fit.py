@@ -17,6 +17,7 @@ from scipy.optimize import fmin
 
 from barsight.core.arrays import Bool, Float64, kernel
 from barsight.core.errors import Failed
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.types import Disparity, RectifiedCamera
 
 _ROUNDS = 3
@@ -73,7 +74,7 @@ def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> B
     for _ in range(_ROUNDS):
         predicted = _predict(place, frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px)
         residual = np.abs(found - predicted)
-        kappa = max(1.4826 * float(np.median(residual / sigma)), 1e-3)
+        kappa = max(mad_sigma(residual / sigma), 1e-3)
         weight = 1 / (_CAUCHY_SIGMAS * kappa * sigma)
         place = _descend(
             place, (frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px, found, weight)
@@ -115,7 +116,7 @@ def _fit_floor(disparity: Disparity, where: Bool) -> Float64 | None:
     plane = np.array([0.0, 0.0, float(np.median(values))])
     for step in range(15):
         residual = np.abs(values - design @ plane) / sigma
-        kappa = max(1.4826 * float(np.median(residual)), 1e-3) * (4 if step < 5 else _CAUCHY_SIGMAS)
+        kappa = max(mad_sigma(residual), 1e-3) * (4 if step < 5 else _CAUCHY_SIGMAS)
         root = 1 / (sigma * np.sqrt(1 + (residual / kappa) ** 2))
         plane = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
     return plane

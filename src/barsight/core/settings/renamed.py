@@ -8,6 +8,7 @@ from typing import Any
 from barsight.core.errors import ConfigError
 
 RENAMED = {
+    "alike_grey": "alike_gray",
     "along_share": "along_ratio",
     "coarsest_cell_m": "max_cell_m",
     "crossed_share": "crossed_ratio",
@@ -48,6 +49,7 @@ RENAMED = {
     "nearest_m": "min_range_m",
     "odometry.calibration_sigma_px": "offset_sigma_px",
     "other_side_share": "other_side_error_ratio",
+    "outlier_grey": "outlier_gray",
     "own_share": "own_ratio",
     "packing_share": "packing_error_ratio",
     "ribbed_share": "ribbed_ratio",

@@ -21,7 +21,7 @@ from barsight.mapping.tiles import FIELDS, GREY, TILE_CELLS, VIEWS, TileKey, Z
 class Layers:
     """A rectangle of the surface, [y, x] with y rising: z_m, sigma_m (NaN where unknown), views, source.
 
-    intensity: mean grey level of the views that make the height, NaN where no view does.
+    intensity: mean gray level of the views that make the height, NaN where no view does.
     """
 
     z_m: Float32
@@ -38,8 +38,8 @@ class Layers:
         return cls(nan, nan.copy(), none, none.astype(np.uint8), nan.copy())
 
 
-def grey_levels(intensity: Float32) -> UInt8:
-    """Round to grey levels from 1, 0 where no view saw the cell."""
+def gray_levels(intensity: Float32) -> UInt8:
+    """Round to gray levels from 1, 0 where no view saw the cell."""
     return np.where(np.isfinite(intensity), np.rint(intensity).clip(1, 255), 0).astype(np.uint8)
 
 

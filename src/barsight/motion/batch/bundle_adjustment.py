@@ -9,6 +9,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.motion_detail import InertialStates, NormalisedResiduals
 from barsight.core.pose import Pose, skew
 from barsight.core.types import RigDrift
@@ -188,7 +189,7 @@ def relative_covariances(
 def robust_noise(residual: Float64, seen: StereoObservations, used: Bool) -> tuple[float, Bool]:
     """Estimate the factor on the sightings' sigmas from their residuals (N, 3) px, and drop outliers."""
     share = np.abs(residual) / seen.sigma_px[:, None]
-    factor = max(MIN_FACTOR, 1.4826 * float(np.median(share[used])) * dof_correction(seen, used))
+    factor = max(MIN_FACTOR, mad_sigma(share[used]) * dof_correction(seen, used))
     return factor, well_observed(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
 
 

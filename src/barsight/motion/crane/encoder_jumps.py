@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.linalg.dense import one_blas_thread
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, EncoderJump
 from barsight.motion.crane.jump_window import (
@@ -155,4 +156,4 @@ def _seen_sigma_m(crane: CraneSamples) -> float:
                 weights[:, i] *= -unit[:, j] / (unit[:, i] - unit[:, j])
     off = crane.position_m[2:-2] - np.einsum("kn,knj->kj", weights, crane.position_m[around])
     scale = np.sqrt(1 + (weights**2).sum(axis=1))
-    return float(1.4826 * np.median(np.abs(off) / scale[:, None], axis=0).max())
+    return float(mad_sigma(off / scale[:, None], axis=0).max())

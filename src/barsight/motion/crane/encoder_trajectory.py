@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame, Trajectory
@@ -159,7 +160,7 @@ def reestimate_noise(crane: CraneSamples) -> CraneSamples:
     fourth = np.abs(np.diff(crane.position_m, n=4, axis=0))
     kept = fourth
     for _ in range(3):
-        spread = 1.4826 * float(np.median(kept))
+        spread = mad_sigma(kept)
         kept = fourth[fourth <= 4 * spread]
     seen = spread / 70**0.5
     stated = crane.position_std_m

@@ -14,6 +14,7 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
 from barsight.features.patch_alignment import align_patches, patch_image
 from barsight.features.tracks import TrackSettings, detect_corners
@@ -102,7 +103,7 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
         values = np.linalg.lstsq(design[kept], matches[kept, 2], rcond=None)[0]
         off = matches[:, 2] - design @ values
         middle = float(np.median(off[kept]))
-        spread = 1.4826 * float(np.median(np.abs(off[kept] - middle)))
+        spread = mad_sigma(off[kept] - middle)
         kept = np.abs(off - middle) < TRIM_SIGMAS * max(spread, 0.01)
     cells, rows, means, variances = _cells(matches[kept], design[kept], camera)
     if len(means) < MIN_CELLS:

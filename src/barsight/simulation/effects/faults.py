@@ -22,7 +22,7 @@ class SpoiledLens:
     """Faults of one camera, the same in every picture. clear: (H, W) share of light that comes through.
 
     stray: (H, W) light that is added. drop: (H, W) weight of the picture without focus. dead: (N, 2) row and
-    column; stuck: (N,) their grey levels.
+    column; stuck: (N,) their gray levels.
     """
 
     clear: Float32

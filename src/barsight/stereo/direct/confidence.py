@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.linalg.robust import mad_sigma
 from barsight.stereo.direct.kernels.box_sums import window_means
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, value_and_slope
 
@@ -48,7 +49,7 @@ def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bo
     shift, variance = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if shift.size < _FEWEST_WINDOWS:
         return 0.0
-    spread = 1.4826 * float(np.median(np.abs(shift)))
+    spread = mad_sigma(shift)
     return float(np.sqrt(max(spread * spread - _NOISE_RATIO * float(np.median(variance)), 0.0)))
 
 
@@ -106,15 +107,15 @@ def _vertical_shifts(
     left: UInt8, right: UInt8, disparity: Float32, usable: Float32
 ) -> tuple[Float32, Float32]:
     """Solve vertical shifts (N,) and their noise variances with the horizontal ones in windows."""
-    left_grey, right_grey = (
+    left_gray, right_gray = (
         cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR_PX) for image in (left, right)
     )
-    warped, right_x = value_and_slope(row_coefficients(right_grey), disparity)
-    right_y, _ = value_and_slope(row_coefficients(_derivative(right_grey, (0, 1))), disparity)
-    x = (_derivative(left_grey, (1, 0)) + right_x) * np.float32(0.5)
-    y = (_derivative(left_grey, (0, 1)) + right_y) * np.float32(0.5)
+    warped, right_x = value_and_slope(row_coefficients(right_gray), disparity)
+    right_y, _ = value_and_slope(row_coefficients(_derivative(right_gray, (0, 1))), disparity)
+    x = (_derivative(left_gray, (1, 0)) + right_x) * np.float32(0.5)
+    y = (_derivative(left_gray, (0, 1)) + right_y) * np.float32(0.5)
     share = _mean(usable) + np.float32(1e-6)
-    residual = (left_grey - _mean(usable * left_grey) / share) - (warped - _mean(usable * warped) / share)
+    residual = (left_gray - _mean(usable * left_gray) / share) - (warped - _mean(usable * warped) / share)
     trust = usable / (1 + np.square(residual / _OUTLIER_GREY))
     products = np.stack([x * x, x * y, y * y, x * residual, y * residual, trust * np.square(y * residual)])
     xx, xy, yy, xr, yr, power = window_means(products, trust, _WINDOW_PX, _EVERY_PX)

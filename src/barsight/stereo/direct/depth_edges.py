@@ -25,9 +25,9 @@ _EXACT_PX = 0.02
 _BAND_ROWS = 32
 
 
-def sharpen_edges(disparity: Float32, grey: UInt8, jump_px: float) -> Float32:
+def sharpen_edges(disparity: Float32, gray: UInt8, jump_px: float) -> Float32:
     """Apply, beside jumps of more than jump_px, the weighted median of the known disparities around: near and
-    alike in grey counts more [Ma 2013], to 0.02 px. NaN stays NaN; elsewhere nothing changes.
+    alike in gray counts more [Ma 2013], to 0.02 px. NaN stays NaN; elsewhere nothing changes.
     """
     sharpened = disparity.copy()
     offset = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
@@ -37,7 +37,7 @@ def sharpen_edges(disparity: Float32, grey: UInt8, jump_px: float) -> Float32:
     margins = _RADIUS_PX, _RADIUS_PX, _RADIUS_PX, FLOAT_LANES
     known = np.where(np.isfinite(disparity), disparity, np.float32(_UNKNOWN))
     around = cv2.copyMakeBorder(known, *margins, cv2.BORDER_CONSTANT, value=_UNKNOWN)
-    shades = cv2.copyMakeBorder(grey, *margins, cv2.BORDER_CONSTANT, value=0)
+    shades = cv2.copyMakeBorder(gray, *margins, cv2.BORDER_CONSTANT, value=0)
 
     def work(first: int, end: int) -> None:
         _weighted_medians(around, shades, wanted, near.reshape(-1), sharpened, first, end)
@@ -100,15 +100,15 @@ def _load_window(v: Vectors, at: Any, stride: Any) -> tuple[list[Any], list[Any]
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def _median(_: Any, theres: Any, greys: Any, at: Any, stride: Any, near: Any) -> Any:
+def _median(_: Any, theres: Any, grays: Any, at: Any, stride: Any, near: Any) -> Any:
     """Compute the weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GREY),
-    of its grey's gap to that of the window's middle, times `near`. All arrays are flat.
+    of its gray's gap to that of the window's middle, times `near`. All arrays are flat.
 
     The interval of values is quartered until it is short enough: faster than to sort a hundred of them. In
     vector instructions, so that the window stays in registers, where there are as many. Plain loops take 2.1
     to 2.8 times as long for the same bits (benchmarks/results/2026-11-23-kernels.md).
     """
-    signature = types.float32(theres, greys, at, stride, near)
+    signature = types.float32(theres, grays, at, stride, near)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
@@ -157,16 +157,16 @@ def _summed(v: Vectors, terms: list[Any]) -> Any:
 
 @kernel()
 def _weighted_medians(
-    disparity: Float32, grey: UInt8, wanted: Bool, near: Float32, medians: Float32, first: int,
+    disparity: Float32, gray: UInt8, wanted: Bool, near: Float32, medians: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
     """Fill in the medians of the pixels `wanted`, in rows first...end.
 
-    disparity, grey: (H, W) with a margin of _RADIUS_PX before and FLOAT_LANES after; the unknown is _UNKNOWN.
+    disparity, gray: (H, W) with a margin of _RADIUS_PX before and FLOAT_LANES after; the unknown is _UNKNOWN.
     near: (_SIDE_PX * FLOAT_LANES,) weights by place, 0 beside the window. wanted, medians: (H, W).
     """
     framed_width = disparity.shape[1]
-    theres, shades = disparity.reshape(-1), grey.reshape(-1)
+    theres, shades = disparity.reshape(-1), gray.reshape(-1)
     for y in range(first, end):
         for x in range(wanted.shape[1]):
             if wanted[y, x]:

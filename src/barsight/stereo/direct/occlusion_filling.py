@@ -1,7 +1,7 @@
 """Fill occlusions by extrapolating the surfaces around, marked as guesses.
 
 From a hole, rays go out in 16 directions to the first matched pixel; the plane through the surface there is
-continued into the hole. The guess is a weighted quantile of these candidates: near and alike in grey counts
+continued into the hole. The guess is a weighted quantile of these candidates: near and alike in gray counts
 more. What one image hides lies behind what hides it, so a low quantile is taken; beside the image's border
 nothing hides it, and the median is taken.
 """
@@ -31,7 +31,7 @@ _BAND_ROWS = 32
 
 
 def fill_occlusions_by_planes(
-    disparity: Float32, grey: UInt8, right_px: Float32, lowest_px: float, highest_px: float
+    disparity: Float32, gray: UInt8, right_px: Float32, lowest_px: float, highest_px: float
 ) -> tuple[Float32, Float32]:
     """Fill the NaN of `disparity` (H, W), as far as any ray finds a match, and give the guesses' sigma (px;
     NaN where nothing was guessed): twice the spread of the candidates, since the truth may be none of them,
@@ -47,7 +47,7 @@ def fill_occlusions_by_planes(
 
     parallel_bands(find_slopes, len(disparity), _BAND_ROWS)
     filled = disparity.copy()
-    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS
     rays = np.column_stack([np.cos(angle), np.sin(angle)])
     rays /= np.abs(rays).max(axis=1, keepdims=True)
@@ -182,7 +182,7 @@ def _sort_by_value(values: Float64, weights: Float64, count: int) -> None:
 @kernel()
 def _fill(
     disparity: Float32,
-    grey: Float32,
+    gray: Float32,
     leaps: Int32,
     slopes: tuple[Float32, Float32],
     right_px: Float32,
@@ -194,7 +194,7 @@ def _fill(
 ) -> None:
     """Fill the holes (NaN) of rows first...end by planes, see `fill_occlusions_by_planes`.
 
-    disparity, right_px: (H, W) px. grey: (H, W) smoothed grey levels. leaps: (H, W) px to the nearest match,
+    disparity, right_px: (H, W) px. gray: (H, W) smoothed gray levels. leaps: (H, W) px to the nearest match,
     0 at one. slopes: in x and y, (H, W) px per px. rays: (_RAYS, 2) x, y, the larger of them 1. limits: the
     least and the greatest px. Fills the guesses and
     their sigmas (H, W) px in the holes; a hole whose rays find nothing keeps NaN in both.
@@ -224,7 +224,7 @@ def _fill(
                     fade = _SLOPE_LENGTH_PX * (1.0 - math.exp(-distance / _SLOPE_LENGTH_PX)) / distance
                     value = there + fade * (slope_x[yy, xx] * (x - xx) + slope_y[yy, xx] * (y - yy))
                     value = min(max(value, lowest), highest)
-                    weight = math.exp(-abs(grey[yy, xx] - grey[y, x]) / _GREY) / (distance + 2.0)
+                    weight = math.exp(-abs(gray[yy, xx] - gray[y, x]) / _GREY) / (distance + 2.0)
                     column = round(x - value)
                     if column >= 0:
                         beyond_border = False

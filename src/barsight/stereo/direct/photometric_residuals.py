@@ -28,16 +28,16 @@ _MAX_UNDAMPED = np.float32(3)
 
 
 def photometric_residual(
-    left: Float32, right: Float32, usable: Float32, side: int, outlier_grey: float, residual: Float32,
+    left: Float32, right: Float32, usable: Float32, side: int, outlier_gray: float, residual: Float32,
     trust: Float32,
 ) -> None:  # fmt: skip
     """Subtract right from left after the means and contrasts of what is `usable` (0...1) in a window of side
-    x side pixels are made equal, and how far that is to be trusted: half at outlier_grey. Both contrasts are
-    raised by 2 grey levels. (H, W) in, frames out.
+    x side pixels are made equal, and how far that is to be trusted: half at outlier_gray. Both contrasts are
+    raised by 2 gray levels. (H, W) in, frames out.
     """
 
     def work(first: int, end: int) -> None:
-        _compare(left, right, usable, side // 2, np.float32(outlier_grey), residual, trust, first, end)
+        _compare(left, right, usable, side // 2, np.float32(outlier_gray), residual, trust, first, end)
 
     parallel_bands(work, len(left), BAND_ROWS)
 
@@ -49,8 +49,8 @@ def _compare(
 ) -> None:  # fmt: skip
     """Compute photometric residuals and Cauchy weights in rows first...end, see `photometric_residual`.
 
-    left, right: (H, W) grey levels; usable: (H, W) 0...1. Mean and contrast are those of windows of 2 reach +
-    1 px; outlier: grey levels. Fills the frames residual (grey levels) and trust (0...1).
+    left, right: (H, W) gray levels; usable: (H, W) 0...1. Mean and contrast are those of windows of 2 reach +
+    1 px; outlier: gray levels. Fills the frames residual (gray levels) and trust (0...1).
     """
     height, width = left.shape
     columns = allocate_columns(5, width, reach)
@@ -114,9 +114,9 @@ def _weigh(
 ) -> None:  # fmt: skip
     """Compute the Gauss-Newton weights and pulls of rows first...end, see `robust_weights`.
 
-    residual (grey levels), slope (grey levels per px), trust (0...1): frames. means: of residual and slope
+    residual (gray levels), slope (gray levels per px), trust (0...1): frames. means: of residual and slope
     along the axis, (H, W). samples: independent pixels behind a mean; windows are 2 reach + 1 px. Fills the
-    evidence, two frames: weight ((grey levels / px)^2) and pull (grey levels^2 / px).
+    evidence, two frames: weight ((gray levels / px)^2) and pull (gray levels^2 / px).
     """
     (residual_mean, slope_mean), (weight, pull) = means, evidence
     height, width = residual_mean.shape
@@ -198,7 +198,7 @@ def _apply_step_gain(
     """Compute the step's gain in rows first...end, see `step_gain`.
 
     weight, trust, pull: frames; pull is multiplied by the gain unless the step is the last. slope_noise:
-    variance of a slope, (grey levels / px)^2. Windows are 2 reach + 1 px. Fills mean_weight and short_of (the
+    variance of a slope, (gray levels / px)^2. Windows are 2 reach + 1 px. Fills mean_weight and short_of (the
     gain, 3 at most), (H, W).
     """
     height, width = mean_weight.shape
@@ -228,7 +228,7 @@ def _apply_step_gain(
 def noise_power(
     pull: Float32, usable: Float32, mean_usable: Float32, mean_weight: Float32, hold: float, side: int
 ) -> Float32:
-    """Estimate the noise power (H, W) (grey levels^2) that the pulls show, per unit of what holds a disparity
+    """Estimate the noise power (H, W) (gray levels^2) that the pulls show, per unit of what holds a disparity
     in place: from their sums over blocks, so that neighbours which err alike count as what they are. Where
     the images say little the plain hold takes their place and the power grows. pull is a frame.
     """
@@ -263,7 +263,7 @@ def _noise_power(
     """Estimate the noise power in rows first...end, see `noise_power`.
 
     pull: a frame. usable (0...1), mean_usable, mean_weight: (H, W), the means over windows of 2 reach + 1 px.
-    hold: the plain hold's weight. Fills power (H, W), grey levels^2.
+    hold: the plain hold's weight. Fills power (H, W), gray levels^2.
     """
     height, width = usable.shape
     column = allocate_columns(1, width, reach)[0]

@@ -15,11 +15,17 @@ from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement, vertical_error_px
+from barsight.stereo.direct.confirmation import confirmed_start
 from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove_islands
 from barsight.stereo.direct.depth_edges import sharpen_edges
 from barsight.stereo.direct.kernels.pyramid import halve
 from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes, fill_row_holes
-from barsight.stereo.direct.refinement import RefinedDisparity, RefinementSettings, refine_disparity
+from barsight.stereo.direct.refinement import (
+    RefinedDisparity,
+    RefinementSettings,
+    refine_at_half_size,
+    refine_disparity,
+)
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 
 _NAN = np.float32(np.nan)
@@ -28,6 +34,8 @@ _JUMP_PX = 1.0
 _FURTHEST_FROM_START_PX = 2.0
 _MIN_CONTRAST_GREY = 0.5
 _MIN_HALVED_PX = 128
+_FAR_STEP_PX, _MAX_FAR_RATIO = 0.3, 0.15
+"""A prediction from which more than this share of the pixels step further is off as a whole."""
 
 
 @dataclass(frozen=True)
@@ -102,13 +110,38 @@ class BarsightStereo:
         if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GREY:
             nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
             return Disparity(nothing, nothing.copy())
-        start = self._start(pair, candidates)
-        matched = np.isfinite(start.left_px)
         refinement = settings.refinement
         if settings.preset == "fast":
             steps = min(refinement.steps, _FAST_STEPS)
             refinement = replace(refinement, steps=steps, short_px=0.0, first_at_half_size=True)
-        refined = refine_disparity(pair.left, pair.right, fill_row_holes(start.left_px), matched, refinement)
+        start = self._start(pair, candidates)
+        return self._finish(pair, candidates, start, _refined(pair, start.left_px, refinement))
+
+    def confirm(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32) -> Disparity:
+        """Match a pair whose disparity is predicted, (H, W) px, NaN where not: in one step of refinement,
+        where the pair's own pictures confirm it. In all steps, where that one goes far in many places.
+        """
+        candidates = _inside(candidates, pair.camera.width)
+        flat = min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GREY
+        if flat or min(pair.left.shape) < _MIN_HALVED_PX:
+            return self(pair, candidates)
+        own, refinement = self._start_at_half_size(pair, candidates), self.settings.refinement
+        matched = np.isfinite(own.left_px)
+        own_px = refine_at_half_size(pair.left, pair.right, fill_row_holes(own.left_px), matched, refinement)
+        own_px = np.where(matched, own_px, _NAN)
+        started = confirmed_start(pair.left, pair.right, predicted, own_px, own.right_px)
+        started = np.where(pair.left_valid, started, _NAN)
+        refined = _refined(pair, started, replace(refinement, steps=1))
+        moved = np.abs(refined.disparity_px - started)[np.isfinite(started)] > _FAR_STEP_PX
+        if moved.size and moved.mean() > _MAX_FAR_RATIO:
+            refined = _refined(pair, started, refinement)
+        return self._finish(pair, candidates, _Start(started, own.right_px), refined)
+
+    def _finish(
+        self, pair: RectifiedPair, candidates: DisparityRange, start: _Start, refined: RefinedDisparity
+    ) -> Disparity:
+        """Judge a refined start: its sigma, occlusions, edges."""
+        settings, matched = self.settings, np.isfinite(start.left_px)
         sigma = self._sigma(pair, refined, start.left_px)
         kept = matched & (np.abs(refined.disparity_px - start.left_px) < _FURTHEST_FROM_START_PX)
         if not settings.fill_occlusions:
@@ -170,13 +203,19 @@ class BarsightStereo:
         return _Start(np.where(believed, left_px, _NAN), _doubled(found.right_px, shape))
 
 
+def _refined(pair: RectifiedPair, start_px: Float32, settings: RefinementSettings) -> RefinedDisparity:
+    return refine_disparity(
+        pair.left, pair.right, fill_row_holes(start_px), np.isfinite(start_px), settings
+    )  # fmt: skip
+
+
 def _doubled(disparity: Float32, shape: tuple[int, ...]) -> Float32:
     doubled: Float32 = 2 * disparity.repeat(2, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]]
     return np.ascontiguousarray(doubled)
 
 
 def _contrast(image: UInt8) -> float:
-    """Compute the standard deviation of the grey values; a black or a blown-out image has none."""
+    """Compute the standard deviation of the gray values; a black or a blown-out image has none."""
     return float(image[::2, ::2].std())
 
 

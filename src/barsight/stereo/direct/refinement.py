@@ -10,7 +10,7 @@ its own gradient turns that into pixel locking.
 Gloss: a highlight is constant along a bar but lies behind its surface, so what is constant along the axis
 bends the match. Residual and gradient are therefore split into their mean along the axis and the detail; the
 mean counts only as far as it agrees with the detail: in the ratio of the residual that noise explains to the
-residual that is there. The mean is taken over places alike in grey: a strap or a shadow across the bars would
+residual that is there. The mean is taken over places alike in gray: a strap or a shadow across the bars would
 turn the highlights beside it into detail.
 """
 
@@ -76,12 +76,12 @@ class RefinementSettings:
     """The short support across the axis."""
     gloss_px: float = 10.0
     """Length along the axis over which what is constant counts as gloss, one sigma; 0 trusts everything."""
-    alike_grey: float = 20.0
-    """Places along the axis whose grey values differ by this are not one highlight: a strap, a shadow."""
+    alike_gray: float = 20.0
+    """Places along the axis whose gray values differ by this are not one highlight: a strap, a shadow."""
     gloss_trust: float = 0.02
     """Weight of the evidence that is constant along the axis, where noise explains its residual."""
-    outlier_grey: float = 8.0
-    """Residual at which a pixel's weight is halved, grey levels."""
+    outlier_gray: float = 8.0
+    """Residual at which a pixel's weight is halved, gray levels."""
     same_surface_px: float = 1.0
     """Disparities further apart belong to different surfaces."""
     window_px: int = 21
@@ -90,9 +90,9 @@ class RefinementSettings:
     def __post_init__(self) -> None:
         if self.steps < 0:
             raise ConfigError(f"refinement steps can't be negative, {self.steps} is")
-        if min(self.along_px, self.across_px, self.outlier_grey, self.same_surface_px, self.alike_grey) <= 0:
+        if min(self.along_px, self.across_px, self.outlier_gray, self.same_surface_px, self.alike_gray) <= 0:
             raise ConfigError(
-                "the long support, outlier_grey, same_surface_px and alike_grey must be positive"
+                "the long support, outlier_gray, same_surface_px and alike_gray must be positive"
             )
         if min(self.short_px, self.gloss_px, self.gloss_trust) < 0 or self.short_across_px <= 0:
             raise ConfigError("the short support and the gloss settings can't be negative")
@@ -114,7 +114,7 @@ def refine_disparity(
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
     at_half_size = settings.first_at_half_size and min(left.shape) >= _MIN_HALVED_PX and settings.steps > 1
     if at_half_size:
-        start = _after_half_size_step(left, right, start, matched, settings)
+        start = refine_at_half_size(left, right, start, matched, settings)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
     noise = _noise(left, right)
     variance = np.full_like(start, np.inf)
@@ -125,7 +125,7 @@ def refine_disparity(
     return RefinedDisparity(inside(work.disparity, start.shape).copy(), variance)
 
 
-def _after_half_size_step(
+def refine_at_half_size(
     left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
 ) -> Float32:
     """Run one step at half the size with the long support: a quarter of the work, and softer images carry
@@ -197,7 +197,7 @@ class _Work:
         What a step falls short by, and the weights' means over windows, (H, W).
         """
         settings, shape = self.settings, self.usable.shape
-        left_grey = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
+        left_gray = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
         warped, right_slope = value_and_slope(row_coefficients(right, blur_px), self.disparity, MARGIN)
         slope = inside(self.slope, shape)
         slope[:] = row_slope(left, blur_px)
@@ -207,11 +207,11 @@ class _Work:
             slope_noise *= 0.5
         side = settings.window_px
         photometric_residual(
-            left_grey, warped, self.usable, side, settings.outlier_grey, self.residual, self.trust
+            left_gray, warped, self.usable, side, settings.outlier_gray, self.residual, self.trust
         )
         gloss = settings.gloss_px, settings.gloss_trust
         evidence = self.residual, self.slope, self.trust
-        robust_weights(*evidence, self._along(left_grey), side, *gloss, self.weight, self.pull)
+        robust_weights(*evidence, self._along(left_gray), side, *gloss, self.weight, self.pull)
         mean_weight = np.empty(shape, dtype=np.float32)
         short_of = step_gain(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
         weight = inside(self.weight, shape)
@@ -226,13 +226,13 @@ class _Work:
         moved = cv2.boxFilter(self.usable * (now - before), -1, (side, side))
         now += (short_of - 1) * moved / (self.mean_usable + np.float32(1e-6))
 
-    def _along(self, grey: Float32) -> tuple[Float32, Float32]:
+    def _along(self, gray: Float32) -> tuple[Float32, Float32]:
         """Average residual and slope along the axis, (H, W)."""
-        settings, shape = self.settings, grey.shape
+        settings, shape = self.settings, gray.shape
         means = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         if settings.gloss_px > 0:
-            blurred = cv2.GaussianBlur(grey, (0, 0), _ALIKE_BLUR_PX)
-            np.multiply(blurred, np.float32(1 / settings.alike_grey), out=inside(self.alike, shape))
+            blurred = cv2.GaussianBlur(gray, (0, 0), _ALIKE_BLUR_PX)
+            np.multiply(blurred, np.float32(1 / settings.alike_gray), out=inside(self.alike, shape))
             images = self.residual, self.slope, self.trust, self.alike
             axis_means(*images, self.axes, settings.gloss_px, means)
         return means

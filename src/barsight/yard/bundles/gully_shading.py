@@ -60,7 +60,7 @@ def shade_profile(
     """Sample the orthophoto's shades over the rows that agree with the fit, across its inside or between two
     places beside its axis; None where too little was seen.
     """
-    if height_map.grey is None:
+    if height_map.gray is None:
         return None
     rows = np.flatnonzero(fit.state == AGREES)
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
@@ -74,8 +74,8 @@ def shade_profile(
     place = (corners - (height_map.x0_m, height_map.y0_m)) / cell
     low = np.floor(place.min(axis=0)).astype(int).clip(0, None)
     high = np.ceil(place.max(axis=0)).astype(int) + 1
-    grey = height_map.grey[low[1] : high[1], low[0] : high[0]]
-    row, column = np.nonzero(grey)
+    gray = height_map.gray[low[1] : high[1], low[0] : high[0]]
+    row, column = np.nonzero(gray)
     x = height_map.x0_m + cell * (column + low[0])
     y = height_map.y0_m + cell * (row + low[1])
     c, s = np.cos(sheet.heading_rad), np.sin(sheet.heading_rad)
@@ -87,19 +87,19 @@ def shade_profile(
     agrees = np.zeros(fit.state.size, bool)
     agrees[rows] = True
     wanted = agrees[number] & (beside > first) & (beside < last)
-    places, levels = _medians(beside[wanted], grey[row[wanted], column[wanted]])
+    places, levels = _medians(beside[wanted], gray[row[wanted], column[wanted]])
     return ShadeProfile(places, levels) if places.size >= _MIN_PLACES else None
 
 
-def _medians(beside: Float64, grey: UInt8) -> tuple[Float64, Float64]:
-    """Compute mean place and logarithm of the median grey level of each 2 mm that has enough cells."""
+def _medians(beside: Float64, gray: UInt8) -> tuple[Float64, Float64]:
+    """Compute mean place and logarithm of the median gray level of each 2 mm that has enough cells."""
     number = np.floor(beside / _BIN_M).astype(np.int64)
-    order = np.lexsort((grey, number))
+    order = np.lexsort((gray, number))
     first = np.flatnonzero(np.diff(number[order], prepend=np.iinfo(np.int64).min))
     count = np.diff(first, append=order.size)
     places = np.add.reduceat(beside[order], first) / count if order.size else np.empty(0)
     enough = count >= _MIN_CELLS
-    middle = grey[order][(first + count // 2)[enough]].astype(np.float64)
+    middle = gray[order][(first + count // 2)[enough]].astype(np.float64)
     return places[enough], np.log(middle + 5.0)
 
 

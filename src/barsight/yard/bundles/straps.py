@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bar_pitch import bar_diameter, find_minima
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
@@ -24,7 +25,7 @@ from barsight.yard.types import HeightMap
 REACH_M = 0.55
 """Search reach to either side of a bundle's axis, its neighbours' straps included."""
 _AROUND_M = 0.2
-"""Length along the bars over which the steel's own grey level is taken."""
+"""Length along the bars over which the steel's own gray level is taken."""
 _MIN_SIGMA_LOG = 0.05
 _CLIPPED, _NOISE = 6.0, 2.0
 """Contrasts over noise: from where more counts no more, and what a line must have more of."""
@@ -106,8 +107,8 @@ def strap_spans(
 
     height_map: one with an orthophoto. level_m: mean heights over the axis at the same places.
     """
-    beside, grey, stock = _around(height_map, sheet, fit)
-    contrast = line_contrast(grey, sheet.cell_m)
+    beside, gray, stock = _around(height_map, sheet, fit)
+    contrast = line_contrast(gray, sheet.cell_m)
     near = 2 * round(_CLOSE_M / sheet.cell_m) + 1
     other = np.isin(fit.state[fit.first : fit.last + 1], (ABOVE, BELOW, MIXED))
     contrast[~stock] = 0.0
@@ -131,7 +132,7 @@ def strap_spans(
 
 
 def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Bool]:
-    """Resample grey levels (rows, places), NaN where unseen, along a bundle's axis: its rows, and places (m)
+    """Resample gray levels (rows, places), NaN where unseen, along a bundle's axis: its rows, and places (m)
     beside it; and which of them lie over the floor.
     """
     half = round(REACH_M / sheet.cell_m)
@@ -142,10 +143,10 @@ def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64
     x, y = c * u - s * v[:, None], s * u + c * v[:, None]
     column = np.asarray((x - height_map.x0_m) / height_map.cell_m, np.float32)
     row = np.asarray((y - height_map.y0_m) / height_map.cell_m, np.float32)
-    assert height_map.grey is not None
+    assert height_map.gray is not None
     low = [max(int(a.min()) - 1, 0) for a in (row, column)]
     high = [int(a.max()) + 2 for a in (row, column)]
-    part = height_map.grey[low[0] : high[0], low[1] : high[1]]
+    part = height_map.gray[low[0] : high[0], low[1] : high[1]]
     heights = height_map.z_m[low[0] : high[0], low[1] : high[1]]
     sources = height_map.source[low[0] : high[0], low[1] : high[1]]
     if part.size == 0:
@@ -153,31 +154,31 @@ def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64
         return beside, nothing, np.zeros(u.shape, bool)
     seen = np.where(part > 0, part, np.nan).astype(np.float32)
     places = column - low[1], row - low[0]
-    grey = cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan)
+    gray = cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan)
     z = cv2.remap(
         np.where(sources == HeightSource.VISION, heights, np.float32(np.nan)),
         *places,
         cv2.INTER_NEAREST,
         borderValue=np.nan,
     )
-    stock: Bool = np.asarray(np.isfinite(grey) & (z > sheet.stock_over_m))
-    return beside, np.asarray(grey, np.float32), stock
+    stock: Bool = np.asarray(np.isfinite(gray) & (z > sheet.stock_over_m))
+    return beside, np.asarray(gray, np.float32), stock
 
 
-def line_contrast(grey: Float32, cell_m: float) -> Float64:
+def line_contrast(gray: Float32, cell_m: float) -> Float64:
     """Compute contrasts (rows, places) of lines across the bars over noise, beyond _NOISE.
 
-    The logarithm of a grey level less its median along the bar, over the bar's own scatter; NaN counts as
+    The logarithm of a gray level less its median along the bar, over the bar's own scatter; NaN counts as
     the bar's median. Lines may lie a cell off from bar to bar.
     """
-    level = np.log(grey + 2.0)
+    level = np.log(gray + 2.0)
     known = np.isfinite(level).sum(axis=0)
     # NaN sorts last.
     middle = np.take_along_axis(np.sort(level, axis=0), np.maximum(known - 1, 0)[None] // 2, axis=0)
     level = np.where(np.isfinite(level), level, np.nan_to_num(middle))
     around = 2 * round(_AROUND_M / cell_m / 2) + 1
     off = np.abs(level - ndimage.median_filter(level, (around, 1), mode="nearest"))
-    sigma = np.maximum(1.4826 * np.median(off, axis=0), _MIN_SIGMA_LOG)
+    sigma = np.maximum(mad_sigma(off, axis=0), _MIN_SIGMA_LOG)
     beyond = np.minimum(off / sigma, _CLIPPED) - _NOISE
     lines: Float64 = ndimage.maximum_filter1d(ndimage.uniform_filter1d(beyond, 3, axis=0), 3, axis=0)
     return lines
@@ -287,7 +288,7 @@ class Pack:
 def strapped_pack(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> Pack | None:
     """Find what straps hold together over a fit's axis; None where none are seen."""
     rows = agreeing_rows(fit)
-    if height_map.grey is None or rows.size < MIN_ROWS:
+    if height_map.gray is None or rows.size < MIN_ROWS:
         return None
     beside, level = mean_section(sheet, fit, rows, round(REACH_M / sheet.cell_m))
     pack = find_pack(strap_spans(height_map, sheet, fit, level), fit.width_m, beside, level)

@@ -18,7 +18,7 @@ STEP_M = 0.01
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 6
 """Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides."""
 BRIGHTER_RATIO, FULL_LEVEL = 2.2, 230.0
-"""Grey level of a label over the median of the load, and the level from which on a picture shows no more."""
+"""Gray level of a label over the median of the load, and the level from which on a picture shows no more."""
 MEAN_LOG, MIN_LOG = 0.3, 0.1
 """Logarithm of a label's level over that of the brighter end of the bare bar: on average, and everywhere."""
 _DARK = 10.0
@@ -29,7 +29,7 @@ def label_checks(place: Placement, heights: HeightMap, magnet: Magnet) -> list[C
     """Check that no label lies under a face, wherever within its tolerance the crane sets it down; empty
     without an orthophoto.
     """
-    if heights.grey is None:
+    if heights.gray is None:
         return []
     found = find_label(place, heights, magnet)
     reason = ""
@@ -51,7 +51,7 @@ def find_label(place: Placement, heights: HeightMap, magnet: Magnet) -> tuple[fl
     broad = WIDTH_CELLS * STEP_M / 2 + float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
     reach_v = magnet.half_span_m + long + (APART_CELLS + LENGTH_CELLS) * STEP_M
     v, u = _steps(reach_v), _steps(wide + broad + STEP_M)
-    bright = mark_labels(_grey(place, heights, v, u))
+    bright = mark_labels(_gray(place, heights, v, u))
     under = np.zeros(bright.shape, np.bool_)
     for along, across, length, width in poles:
         rows = np.abs(v - along) <= length / 2 + long
@@ -66,27 +66,27 @@ def _steps(reach_m: float) -> Float64:
     return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
-def mark_labels(grey: Float32) -> Bool:
+def mark_labels(gray: Float32) -> Bool:
     """Mark the middles (V, U) of labels: bright all over, and darker before and behind along the bars.
 
-    grey: levels, 0 where nothing was seen.
+    gray: levels, 0 where nothing was seen.
     """
-    inner = ndimage.uniform_filter1d(grey, LENGTH_CELLS, axis=0)
-    least = ndimage.minimum_filter1d(grey, LENGTH_CELLS, axis=0)
-    bare = ndimage.uniform_filter1d(grey, WIDTH_CELLS, axis=0)
+    inner = ndimage.uniform_filter1d(gray, LENGTH_CELLS, axis=0)
+    least = ndimage.minimum_filter1d(gray, LENGTH_CELLS, axis=0)
+    bare = ndimage.uniform_filter1d(gray, WIDTH_CELLS, axis=0)
     brighter = np.maximum(np.roll(bare, APART_CELLS, axis=0), np.roll(bare, -APART_CELLS, axis=0)) + _DARK
     mean = ndimage.uniform_filter1d(np.log((inner + _DARK) / brighter), WIDTH_CELLS, axis=1)
     worst = ndimage.minimum_filter1d(np.log((least + _DARK) / brighter), WIDTH_CELLS, axis=1)
     level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
-    seen = grey[grey > 0]
+    seen = gray[gray > 0]
     needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
     return np.asarray((mean > MEAN_LOG) & (worst > MIN_LOG) & (level > needed))
 
 
-def _grey(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> Float32:
-    """Look up grey levels (V, U) at places along and across; 0 where nothing was seen."""
+def _gray(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> Float32:
+    """Look up gray levels (V, U) at places along and across; 0 where nothing was seen."""
     x = place.x_m + v[:, None] * place.along[0] + u * place.across[0]
     y = place.y_m + v[:, None] * place.along[1] + u * place.across[1]
     column, row, inside = nearest_cells(heights, x, y)
-    assert heights.grey is not None
-    return np.asarray(np.where(inside, heights.grey[row, column], 0), np.float32)
+    assert heights.gray is not None
+    return np.asarray(np.where(inside, heights.gray[row, column], 0), np.float32)

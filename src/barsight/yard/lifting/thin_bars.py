@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Float32, Float64
+from barsight.core.linalg.robust import mad_sigma
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_true
@@ -27,7 +28,7 @@ STEP_M = 0.01
 REACH_M = 0.6
 """How far beside a bundle's axis a line may add to what is seen of it on the bundle."""
 AROUND_M = 0.07
-"""Length along the bars over which the steel's own grey level is taken: a line is far narrower."""
+"""Length along the bars over which the steel's own gray level is taken: a line is far narrower."""
 INNER_RATIO = 0.84
 """Of the load's width, its middle: a line must show there. Dunnage may show beside it."""
 BESIDE_M = (0.0, 0.1, 0.2, 0.35, 0.55)
@@ -111,7 +112,7 @@ def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32
     """Compute where lines cross a bundle's axis (V,), m from its middle, and the strengths (S, V) of each
     slope; None where too little of it is seen.
 
-    Grey levels are taken along the bars: their logarithm less its median over AROUND_M, over the column's
+    Gray levels are taken along the bars: their logarithm less its median over AROUND_M, over the column's
     scatter. A line's strength is its sum over sqrt(columns), of columns that aren't highlights; what lies
     beside the load adds to what lies on it, up to BESIDE_RATIO of it.
     """
@@ -148,7 +149,7 @@ def _strengths(total: Float32, known: Float32, first: int, last: int) -> Float32
 
 
 def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
-    """Resample the photo along a bundle's axis: places along it (V,), logarithms of grey levels (V, U), NaN
+    """Resample the photo along a bundle's axis: places along it (V,), logarithms of gray levels (V, U), NaN
     where unseen.
     """
     assert heights.tops is not None
@@ -180,7 +181,7 @@ def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]
     around = ndimage.median_filter(filled, (2 * round(AROUND_M / STEP_M / 2 - 0.5) + 1, 1), mode="nearest")
     off = np.where(seen, filled - around, 0)
     off -= np.median(off, axis=0)
-    sigma = np.maximum(1.4826 * np.median(np.abs(off), axis=0), MIN_SIGMA_LOG)
+    sigma = np.maximum(mad_sigma(off, axis=0), MIN_SIGMA_LOG)
     contrast = np.clip(off / sigma, DARK, BRIGHT)
     base = float(np.median(around[:, middle - half : middle + half + 1]))
     weight = np.clip((base + HIGHLIGHT_LOG - around) / FADE_LOG, 0, 1)

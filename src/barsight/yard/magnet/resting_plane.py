@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int64, UInt8, kernel
+from barsight.core.linalg.robust import SIGMA_PER_MAD
 from barsight.core.types import HeightSource
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
@@ -201,7 +202,7 @@ def _profile(
             if 2 * count >= samples:
                 middle = np.median(values[:count])
                 own[Z] = middle
-                own[SCATTER] = 1.4826 * np.median(np.abs(values[:count] - middle))
+                own[SCATTER] = SIGMA_PER_MAD * np.median(np.abs(values[:count] - middle))
 
 
 @kernel()

@@ -1,4 +1,4 @@
-"""Compute the semi-global start's cost: 5x5 census [Zabih 1994], x gradient and grey value."""
+"""Compute the semi-global start's cost: 5x5 census [Zabih 1994], x gradient and gray value."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from barsight.core.parallel import parallel_bands
 
 Int16 = NDArray[np.int16]
 
-_UNKNOWN_COST = 60
+UNKNOWN_COST = 60
 BESIDE_COST = 61
 """Of the places that fill up the last vector: dearer than any candidate, so that no path goes there."""
 LANES = 16
@@ -25,12 +25,12 @@ _BAND_ROWS = 64
 
 class PixelDescriptors(NamedTuple):
     """Descriptors of each pixel. codes: (H, 3, W) the census' 24 bits. slope: (H, W) difference of the
-    neighbours in the row. grey: (H, W).
+    neighbours in the row. gray: (H, W).
     """
 
     codes: UInt8
     slope: Int16
-    grey: UInt8
+    gray: UInt8
 
 
 def describe_pixels(image: UInt8) -> PixelDescriptors:
@@ -54,7 +54,7 @@ def reverse_rows(right: PixelDescriptors, lowest: int, places: int) -> PixelDesc
         return np.pad(array[..., ::-1], margins)[..., before + lowest :]
 
     return PixelDescriptors(
-        *(np.ascontiguousarray(turned(a)) for a in (right.codes, right.slope, right.grey))
+        *(np.ascontiguousarray(turned(a)) for a in (right.codes, right.slope, right.gray))
     )
 
 
@@ -86,16 +86,31 @@ def _bits_in_halves(byte: np.uint8) -> np.uint8:
 
 
 @kernel()
+def descriptor_cost(left: PixelDescriptors, right: PixelDescriptors, y: int, x: int, column: int) -> int:
+    """Compute the cost of matching left pixel (y, x) with the right one in `column`: Hamming distance of the
+    census and half the truncated differences of slope and gray value.
+    """
+    # Signed: a difference of unsigned numbers would wrap.
+    hamming = np.int64(0)
+    for part in range(_CODE_BYTES):
+        halves = _bits_in_halves(np.uint8(left.codes[y, part, x] ^ right.codes[y, part, column]))
+        hamming += np.int64(halves & np.uint8(0x0F)) + np.int64(halves >> np.uint8(4))
+    steep = min(abs(np.int64(left.slope[y, x]) - np.int64(right.slope[y, column])), np.int64(_MAX_APART))
+    bright = min(abs(np.int64(left.gray[y, x]) - np.int64(right.gray[y, column])), np.int64(_MAX_APART))
+    return int(hamming + (steep + bright) // 2)
+
+
+@kernel()
 def _write_costs(
     own: tuple[np.uint8, np.uint8, np.uint8, np.int16, np.uint8],
     row: tuple[UInt8, UInt8, UInt8, Int16, UInt8], at: int, cost: UInt8,
 ) -> None:  # fmt: skip
     """Compute the costs (places,) of one left pixel with the right ones from column `at` on.
 
-    own, row: the three bytes of the census, slope and grey, of the pixel and of the right row.
+    own, row: the three bytes of the census, slope and gray, of the pixel and of the right row.
     """
-    one, two, three, slope, grey = own
-    ones, twos, threes, slopes, greys = row
+    one, two, three, slope, gray = own
+    ones, twos, threes, slopes, grays = row
     # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
     first, most = np.uint64(at), np.int16(_MAX_APART)
     for part in range(0, cost.shape[0], LANES):
@@ -113,7 +128,7 @@ def _write_costs(
             halves = np.uint8(halves + np.uint8(twice + twice))
             hamming = np.uint8(np.uint8(halves & np.uint8(0x0F)) + np.uint8(halves >> np.uint8(4)))
             steep = np.int16(slope - slopes[k])
-            bright = np.int16(np.int16(grey) - np.int16(greys[k]))
+            bright = np.int16(np.int16(gray) - np.int16(grays[k]))
             steep = steep if steep > 0 else np.int16(-steep)
             bright = bright if bright > 0 else np.int16(-bright)
             steep = steep if steep < most else most
@@ -127,16 +142,16 @@ def row_costs(
 ) -> None:
     """Compute costs (W, places) of row y, of which `count` are candidates. right: see `reverse_rows`."""
     width = cost.shape[0]
-    code, slope, grey = left.codes[y], left.slope[y], left.grey[y]
-    row = right.codes[y, 0], right.codes[y, 1], right.codes[y, 2], right.slope[y], right.grey[y]
+    code, slope, gray = left.codes[y], left.slope[y], left.gray[y]
+    row = right.codes[y, 0], right.codes[y, 1], right.codes[y, 2], right.slope[y], right.gray[y]
     for x in range(width):
         base = width - 1 - x + lowest
         first, end = max(0, -base), min(count, width - base)
         here = cost[x]
-        own = code[0, x], code[1, x], code[2, x], slope[x], grey[x]
+        own = code[0, x], code[1, x], code[2, x], slope[x], gray[x]
         _write_costs(own, row, width - 1 - x, here)
         if end <= first:
-            here[:count] = _UNKNOWN_COST
+            here[:count] = UNKNOWN_COST
         else:
             here[:first] = here[first]
             here[end:count] = here[end - 1]

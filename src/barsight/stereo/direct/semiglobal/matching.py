@@ -1,7 +1,7 @@
 """Match semi-globally [Hirschmueller 2008] on a cost that neither gain nor single bright pixels upset.
 
 Cost of a candidate: Hamming distance of the 5x5 census [Zabih 1994], plus truncated differences of the x
-gradient and of the grey value. Eight paths; the penalty of a jump falls where the image has an edge. The
+gradient and of the gray value. Eight paths; the penalty of a jump falls where the image has an edge. The
 image is worked through in stripes of rows, each with its own cost volume, so memory doesn't grow with the
 height.
 """
@@ -40,7 +40,7 @@ class SemiGlobalSettings:
     p1: int = 22
     """Penalty of a change by one candidate between neighbours."""
     p2: int = 150
-    """Penalty of a larger change where the image is flat; an edge of 8 grey levels halves it."""
+    """Penalty of a larger change where the image is flat; an edge of 8 gray levels halves it."""
     min_p2: int = 28
     """Penalty of a larger change across a strong image edge."""
 
@@ -159,8 +159,8 @@ def _match_stripe(
     """
     cost, down = room
     left_px, right_px = px
-    grey = left.grey
-    height, width = grey.shape
+    gray = left.gray
+    height, width = gray.shape
     places = cost.shape[2]
     paths = allocate_paths(width, places, penalties.small)
     leasts = np.empty((2, width, 3), dtype=np.uint8)
@@ -171,12 +171,12 @@ def _match_stripe(
         here = cost[y - above]
         row_costs(left, right, y, lowest, count, here)
         extend_row(
-            here, grey[y], grey[max(y - 1, 0)], penalties, y == above, (y & 1) == 1, False, paths, leasts,
+            here, gray[y], gray[max(y - 1, 0)], penalties, y == above, (y & 1) == 1, False, paths, leasts,
             down[y - above],
         )  # fmt: skip
     for y in range(below - 1, start - 1, -1):
         extend_row(
-            cost[y - above], grey[y], grey[min(y + 1, height - 1)], penalties, y == below - 1, (y & 1) == 1,
+            cost[y - above], gray[y], gray[min(y + 1, height - 1)], penalties, y == below - 1, (y & 1) == 1,
             True, paths, leasts, up,
         )  # fmt: skip
         if y < end:

@@ -85,7 +85,7 @@ def _extend_paths(
 
 @kernel()
 def p2_table(large: int, least: int) -> UInt8:
-    """Tabulate the penalty P2 (256,) by the grey levels that the image changes there."""
+    """Tabulate the penalty P2 (256,) by the gray levels that the image changes there."""
     jumps = np.empty(256, dtype=np.uint8)
     for contrast in range(256):
         jumps[contrast] = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least)
@@ -106,12 +106,12 @@ def allocate_paths(width: int, places: int, small: int) -> UInt8:
 
 @kernel()
 def extend_row(
-    cost: UInt8, grey: UInt8, grey_before: UInt8, penalties: Penalties, is_first: bool, is_odd: bool,
+    cost: UInt8, gray: UInt8, gray_before: UInt8, penalties: Penalties, is_first: bool, is_odd: bool,
     backwards: bool, paths: UInt8, leasts: UInt8, sums: UInt16,
 ) -> None:  # fmt: skip
     """Extend four paths through one row: along it and from the three neighbours in the row before.
 
-    cost: (W, places). grey, grey_before: (W,) of this row and the one before. paths (`allocate_paths`),
+    cost: (W, places). gray, gray_before: (W,) of this row and the one before. paths (`allocate_paths`),
     leasts (2, W, 3): kept from row to row. Fills sums (W, places).
     """
     small, jumps = penalties
@@ -124,23 +124,23 @@ def extend_row(
     min_along, dearest = zero, jumps[0]
     for j in range(width):
         x = width - 1 - j if backwards else j
-        here, at = np.int32(grey[x]), x * places
+        here, at = np.int32(gray[x]), x * places
         start_a, base_a, top_a = begin, zero, dearest
         if j > 0:
             start_a, base_a = along + (1 - (j & 1)) * side, min_along
-            top_a = np.uint8(base_a + jumps[abs(here - np.int32(grey[x + 1 if backwards else x - 1]))])
+            top_a = np.uint8(base_a + jumps[abs(here - np.int32(gray[x + 1 if backwards else x - 1]))])
         start_l, base_l, top_l = begin, zero, dearest
         if not is_first and x > 0:
             start_l, base_l = ((old * 3) * width + x - 1) * side, leasts[old, x - 1, 0]
-            top_l = np.uint8(base_l + jumps[abs(here - np.int32(grey_before[x - 1]))])
+            top_l = np.uint8(base_l + jumps[abs(here - np.int32(gray_before[x - 1]))])
         start_m, base_m, top_m = begin, zero, dearest
         if not is_first:
             start_m, base_m = ((old * 3 + 1) * width + x) * side, leasts[old, x, 1]
-            top_m = np.uint8(base_m + jumps[abs(here - np.int32(grey_before[x]))])
+            top_m = np.uint8(base_m + jumps[abs(here - np.int32(gray_before[x]))])
         start_r, base_r, top_r = begin, zero, dearest
         if not is_first and x < width - 1:
             start_r, base_r = ((old * 3 + 2) * width + x + 1) * side, leasts[old, x + 1, 2]
-            top_r = np.uint8(base_r + jumps[abs(here - np.int32(grey_before[x + 1]))])
+            top_r = np.uint8(base_r + jumps[abs(here - np.int32(gray_before[x + 1]))])
         ends = (
             along + (j & 1) * side, (new * 3 * width + x) * side,
             ((new * 3 + 1) * width + x) * side, ((new * 3 + 2) * width + x) * side,

@@ -57,7 +57,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class ShadeProfile:
-    """Logarithms of grey levels (N,) at places (N,) across a bundle from its axis: medians along it."""
+    """Logarithms of gray levels (N,) at places (N,) across a bundle from its axis: medians along it."""
 
     places_m: Float64
     levels: Float64

@@ -1,0 +1,96 @@
+"""Start a pair from a predicted disparity, where its own pictures confirm it.
+
+The evidence is the pair's: it is matched from nothing at half the size, and where prediction and match differ
+by more than a pixel, the one stays whose 5x5 census, slopes and gray values fit better at full size. What the
+half size alone has matched beside depth edges is left unknown: it is blurred there, and other views see it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, UInt8, kernel
+from barsight.core.parallel import parallel_bands
+from barsight.stereo.direct.consistency import is_consistent
+from barsight.stereo.direct.semiglobal.cost import (
+    UNKNOWN_COST,
+    PixelDescriptors,
+    describe_pixels,
+    descriptor_cost,
+)
+
+_SAME_PX = np.float32(1.0)
+_CONSISTENT_PX = 2.0
+_COST_WINDOW_PX = 7
+_EDGE_WINDOW_PX = 9
+_BAND_ROWS = 64
+_LEAST = np.float32(1e-3)
+_NAN = np.float32(np.nan)
+_FAR = -1e6
+
+
+def confirmed_start(
+    left: UInt8, right: UInt8, predicted: Float32, matched: Float32, matched_right: Float32
+) -> Float32:
+    """Merge a prediction and the pair's own match at half the size into a start (H, W), NaN where unknown.
+
+    predicted, matched: (H, W) px of the left picture, NaN where unknown; matched_right: (H, W) of the right
+    one. Where the match has nothing, the prediction stays if the right picture's match agrees within 2 px.
+    """
+    differ = np.abs(predicted - matched)
+    disputed = differ >= _SAME_PX
+    if disputed.any():
+        seen, others = describe_pixels(left), describe_pixels(right)
+        better = _mean_cost(seen, others, predicted, disputed) < _mean_cost(seen, others, matched, disputed)
+        disputed &= better
+    confirmed = (differ < _SAME_PX) | disputed
+    alone = np.isfinite(predicted) & ~np.isfinite(matched)
+    alone &= is_consistent(np.nan_to_num(predicted, nan=_FAR), matched_right, _CONSISTENT_PX)
+    return np.where(confirmed | alone, predicted, np.where(_is_edge(matched), _NAN, matched))
+
+
+def _is_edge(disparity: Float32) -> Bool:
+    """Check (H, W) for a jump of more than 1 px, or a hole's border, within 4 px."""
+    filled = np.nan_to_num(disparity, nan=_FAR)
+    window = np.ones((_EDGE_WINDOW_PX, _EDGE_WINDOW_PX), dtype=np.uint8)
+    edge: Bool = cv2.dilate(filled, window) - cv2.erode(filled, window) > _SAME_PX
+    return edge
+
+
+def _mean_cost(
+    left: PixelDescriptors, right: PixelDescriptors, disparity: Float32, asked: Bool
+) -> Float32:  # fmt: skip
+    """Average the cost (H, W) of a disparity over the known pixels of windows of 7 px, where it is asked."""
+    window = (_COST_WINDOW_PX, _COST_WINDOW_PX)
+    near = cv2.dilate(asked.view(np.uint8), np.ones(window, dtype=np.uint8)).view(np.bool_)
+    near &= np.isfinite(disparity)
+    costs = np.zeros(disparity.shape, dtype=np.float32)
+
+    def work(first: int, end: int) -> None:
+        _pixel_costs(left, right, disparity, near, costs, first, end)
+
+    parallel_bands(work, len(disparity), _BAND_ROWS)
+    known = cv2.boxFilter(near.astype(np.float32), -1, window)
+    mean: Float32 = cv2.boxFilter(costs, -1, window) / np.maximum(known, _LEAST)
+    return mean
+
+
+@kernel()
+def _pixel_costs(
+    left: PixelDescriptors, right: PixelDescriptors, disparity: Float32, asked: Bool, costs: Float32,
+    first: int, end: int,
+) -> None:  # fmt: skip
+    """Compute the cost of each asked pixel's disparity (H, W) px at the nearest column, rows first...end.
+
+    Fills costs (H, W) where asked (H, W): UNKNOWN_COST where the disparity leaves the picture.
+    """
+    width = disparity.shape[1]
+    for y in range(first, end):
+        for x in range(width):
+            if not asked[y, x]:
+                continue
+            costs[y, x] = UNKNOWN_COST
+            there = np.float32(x) - disparity[y, x]
+            if there > np.float32(-0.5) and there < np.float32(width) - np.float32(0.5):
+                costs[y, x] = descriptor_cost(left, right, y, x, int(there + np.float32(0.5)))

@@ -1,0 +1,148 @@
+"""Predict a pair's disparity from that of the pair before and the motion between them.
+
+A pixel with disparity d sees the place q = d + doffs at depth f b / q. In homogeneous coordinates scaled by
+q / b the motion is X' = R (u - cx, v - cy, f) + t q / b, which gives the pixel there and its q' = f q / X'_z
+without a division by the depth.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Float32, kernel
+from barsight.core.parallel import parallel_bands
+from barsight.core.pose import Pose
+from barsight.core.types import Disparity, RectifiedCamera
+
+_MAX_SIGMA_PX = 0.5
+_SAME_SURFACE_PX = np.float32(1.0)
+_MAX_OFF_PX = np.float32(1.5)
+_ROUNDS = 2
+_BAND_ROWS = 64
+_NOWHERE = -1e6
+_NAN = np.float32(np.nan)
+
+
+class _Transfer(NamedTuple):
+    """The motion of pixels between two views: rotation (3, 3), translation over the baseline (3,), focal
+    length, principal point and doffs in px.
+    """
+
+    rotation: Float32
+    shift: Float32
+    focal: np.float32
+    cx: np.float32
+    cy: np.float32
+    doffs: np.float32
+
+
+def predict_disparity(before: Disparity, camera: RectifiedCamera, now_from_before: Pose) -> Float32:
+    """Predict the disparity (H, W) of the left picture now, NaN where nothing is known.
+
+    Each sure place of the view before is moved to the nearest pixel of the view now; what is nearest to the
+    camera wins. Each pixel then looks up where it lay before and takes the disparity from there, interpolated
+    where the pixels around are one surface (1 px).
+    """
+    known = np.where(before.sigma_px <= _MAX_SIGMA_PX, before.disparity_px, _NAN).astype(np.float32)
+    there, back = _transfer(camera, now_from_before), _transfer(camera, now_from_before.inverse())
+    first = np.full(known.shape, _NAN, dtype=np.float32)
+    _splat(known, there, first)
+    spread = cv2.dilate(np.nan_to_num(first, nan=_NOWHERE), np.ones((3, 3), dtype=np.uint8))
+    first = np.where(np.isfinite(first), first, np.where(spread > _NOWHERE, spread, _NAN))
+    predicted = np.empty_like(first)
+
+    def work(start: int, end: int) -> None:
+        _look_up(known, first, there, back, predicted, start, end)
+
+    parallel_bands(work, len(known), _BAND_ROWS)
+    return predicted
+
+
+def _transfer(camera: RectifiedCamera, motion: Pose) -> _Transfer:
+    single = np.float32
+    return _Transfer(
+        np.ascontiguousarray(motion.rotation, dtype=single),
+        (motion.translation / camera.baseline_m).astype(single),
+        single(camera.focal_px), single(camera.cx_px), single(camera.cy_px), single(camera.doffs_px),
+    )  # fmt: skip
+
+
+@kernel(inline=True)
+def _move(
+    u: np.float32, v: np.float32, q: np.float32, motion: _Transfer
+) -> tuple[np.float32, np.float32, np.float32]:
+    """Move a pixel (u, v) with q = disparity + doffs to the other view; q is 0 behind its camera."""
+    r, s, focal = motion.rotation, motion.shift, motion.focal
+    x, y = u - motion.cx, v - motion.cy
+    ahead = r[2, 0] * x + r[2, 1] * y + r[2, 2] * focal + s[2] * q
+    scale = focal / ahead if ahead > np.float32(0) else np.float32(0)
+    along = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * focal + s[0] * q) * scale + motion.cx
+    down = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * focal + s[1] * q) * scale + motion.cy
+    return along, down, q * scale
+
+
+@kernel()
+def _splat(known: Float32, motion: _Transfer, first: Float32) -> None:
+    """Move each pixel's place to the nearest pixel of the other view; the largest disparity stays.
+
+    known: (H, W) px, NaN where unknown. Raises first (H, W) px, NaN where nothing lands.
+    """
+    height, width = known.shape
+    half = np.float32(0.5)
+    for v in range(height):
+        for u in range(width):
+            disparity = known[v, u]
+            if not np.isfinite(disparity):
+                continue
+            along, down, q = _move(np.float32(u), np.float32(v), disparity + motion.doffs, motion)
+            if not (-half <= along < width - half and -half <= down < height - half) or q <= 0:
+                continue
+            column, row = int(along + half), int(down + half)
+            if not first[row, column] >= q - motion.doffs:
+                first[row, column] = q - motion.doffs
+
+
+@kernel()
+def _look_up(
+    known: Float32,
+    first: Float32,
+    there: _Transfer,
+    back: _Transfer,
+    predicted: Float32,
+    start: int,
+    end: int,
+) -> None:
+    """Look up in rows start...end where each pixel lay before, and its disparity.
+
+    known: (H, W) px of the view before; first: (H, W) px, a guess for the view now. there: the motion from
+    before to now, back: from now to before. Fills predicted (H, W) px: the guess where the place before lies
+    beside an edge or a hole.
+    """
+    height, width = known.shape
+    for v in range(start, end):
+        for u in range(width):
+            guess = first[v, u]
+            predicted[v, u] = guess
+            if not np.isfinite(guess):
+                continue
+            for _ in range(_ROUNDS):
+                along, down, q = _move(np.float32(u), np.float32(v), guess + back.doffs, back)
+                if not (0 <= along < width - 1 and 0 <= down < height - 1) or q <= 0:
+                    break
+                column, row = int(along), int(down)
+                one, two = known[row, column], known[row, column + 1]
+                three, four = known[row + 1, column], known[row + 1, column + 1]
+                low, high = min(min(one, two), min(three, four)), max(max(one, two), max(three, four))
+                if not high - low < _SAME_SURFACE_PX:
+                    break
+                right, below = along - np.float32(column), down - np.float32(row)
+                upper, lower = one + right * (two - one), three + right * (four - three)
+                seen = upper + below * (lower - upper)
+                if not abs(seen + back.doffs - q) <= _MAX_OFF_PX:
+                    break
+                _, _, q = _move(along, down, seen + there.doffs, there)
+                guess = q - there.doffs
+                predicted[v, u] = guess

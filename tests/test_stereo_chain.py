@@ -1,0 +1,210 @@
+"""Pairs started from the one before: prediction, alignment, what the pictures confirm, chains."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import barsight as bs
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.errors import Failed
+from barsight.core.pose import Pose
+from barsight.core.timing import Stopwatch
+from barsight.core.types import Disparity, DisparityRange, RectifiedCamera, RectifiedPair
+from barsight.map_building import matching
+from barsight.mapping.view import MatchedFrame
+from barsight.measure_settings import MeasureSettings
+from barsight.measurement import Refusal
+from barsight.motion.frontend.direct_alignment import align_views
+from barsight.recording.base import Recording
+from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.recording.sensor_selection import SelectedSensors
+from barsight.stereo.direct.confirmation import confirmed_start
+from barsight.stereo.direct.pipeline import BarsightSettings, BarsightStereo
+from barsight.stereo.direct.semiglobal.cost import describe_pixels, descriptor_cost, reverse_rows, row_costs
+from barsight.stereo.prediction import predict_disparity
+from synthetic_scenes import Texture, quantised
+
+WIDTH, HEIGHT, FOCAL, BASELINE = 480, 352, 500.0, 0.5
+CAMERA = RectifiedCamera(FOCAL, WIDTH / 2 - 5, HEIGHT / 2 + 3, BASELINE, 0.0, WIDTH, HEIGHT)
+FLOOR_M, TOP_M, BOX_M = 8.0, 6.8, (-1.2, 0.9, -0.8, 1.1)
+METHOD = BarsightStereo(BarsightSettings(fill_occlusions=False, other_side_error_ratio=0.0))
+RANGE = DisparityRange(24, 48)
+MOVED = Pose(
+    "now", "before", Rotation.from_euler("xyz", [0.3, -0.4, 0.2], degrees=True).as_matrix(),
+    [0.31, -0.02, 0.01],
+)  # fmt: skip
+
+
+def seen_from(cam_from_world: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Gray values and true disparity (H, W) of a box on a floor; the world is the first left camera."""
+    u, v = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
+    rays = np.stack([(u - CAMERA.cx_px) / FOCAL, (v - CAMERA.cy_px) / FOCAL, np.ones_like(u)], axis=-1)
+    world = cam_from_world.inverse()
+    heading = rays @ world.rotation.T
+    eye = world.translation
+    far, near = ((z - eye[2]) / heading[..., 2] for z in (FLOOR_M, TOP_M))
+    x, y = (eye[k] + near * heading[..., k] for k in (0, 1))
+    low_x, high_x, low_y, high_y = BOX_M
+    on_top = (x > low_x) & (x < high_x) & (y > low_y) & (y < high_y)
+    depth = np.where(on_top, near, far)
+    fine, coarse = Texture(5), Texture(6)
+    x, y = (60 * (eye[k] + depth * heading[..., k]) for k in (0, 1))
+    gray = 0.7 * fine(x + 300 * on_top, y) + 0.3 * coarse(x / 5, y / 5 + 40 * on_top)
+    return quantised(gray), FOCAL * BASELINE / depth
+
+
+@lru_cache
+def pair_at(moved: bool) -> tuple[RectifiedPair, np.ndarray]:
+    """The pair before or now, and the left picture's true disparity."""
+    left_from_world = MOVED if moved else Pose("now", "before", np.eye(3), np.zeros(3))
+    beside = Pose("right", "now", np.eye(3), [-BASELINE, 0, 0])
+    left, truth = seen_from(left_from_world)
+    right, _ = seen_from(beside @ left_from_world)
+    valid = np.ones(left.shape, dtype=np.bool_)
+    return RectifiedPair(int(moved), left, right, valid, valid, CAMERA), truth
+
+
+def exact(disparity: np.ndarray) -> Disparity:
+    return Disparity(disparity.astype(np.float32), np.full(disparity.shape, 0.05, dtype=np.float32))
+
+
+def test_prediction_is_the_disparity_there() -> None:
+    (_, before), (_, now) = pair_at(False), pair_at(True)
+    predicted = predict_disparity(exact(before), CAMERA, MOVED)
+    known = np.isfinite(predicted)
+    error = np.abs(predicted - now)[known]
+    assert known.mean() > 0.85
+    assert np.median(error) < 1e-3
+    assert np.quantile(error, 0.98) < 0.05
+    unsure = Disparity(before.astype(np.float32), np.full(before.shape, 0.6, dtype=np.float32))
+    assert not np.isfinite(predict_disparity(unsure, CAMERA, MOVED)).any()
+
+
+def test_views_are_aligned_from_what_encoders_know() -> None:
+    (before, disparity), (now, _) = pair_at(False), pair_at(True)
+    guess = Pose("now", "before", np.eye(3), MOVED.translation + np.array([0.004, -0.003, 0.006]))
+    found = align_views(before.left, exact(disparity), now.left, CAMERA, guess)
+    assert isinstance(found, Pose)
+    places = np.random.default_rng(1).uniform([-2, -2, 6.8], [2, 2, 8], (50, 3))
+    true, seen = (FOCAL * p[:, :2] / p[:, 2:] for p in (MOVED.apply(places), found.apply(places)))
+    assert np.linalg.norm(seen - true, axis=1).mean() < 0.3
+    brighter = (now.left * 0.8 + 10).astype(np.uint8)
+    again = align_views(before.left, exact(disparity), brighter, CAMERA, guess)
+    assert isinstance(again, Pose)
+    assert np.abs(again.translation - found.translation).max() < 0.005
+
+
+def test_views_of_other_places_are_not_aligned() -> None:
+    before, disparity = pair_at(False)
+    other = np.ascontiguousarray(before.left[::-1, ::-1])
+    assert isinstance(align_views(before.left, exact(disparity), other, CAMERA, MOVED), Failed)
+    unknown = exact(np.full(disparity.shape, np.nan))
+    assert isinstance(align_views(before.left, unknown, before.left, CAMERA, MOVED), Failed)
+
+
+def errors_of(found: Disparity, truth: np.ndarray) -> np.ndarray:
+    return np.abs(found.disparity_px - truth)[np.isfinite(found.disparity_px)]
+
+
+def test_a_confirmed_pair_is_as_good_as_one_matched_from_nothing() -> None:
+    (before, _), (now, truth) = pair_at(False), pair_at(True)
+    predicted = predict_disparity(METHOD(before, RANGE), CAMERA, MOVED)
+    confirmed, fresh = METHOD.confirm(now, RANGE, predicted), METHOD(now, RANGE)
+    ours, theirs = errors_of(confirmed, truth), errors_of(fresh, truth)
+    assert np.median(ours) < 1.1 * np.median(theirs)
+    assert np.quantile(ours, 0.99) < np.quantile(theirs, 0.99)
+    assert ours.size > 0.95 * theirs.size
+
+
+@pytest.mark.parametrize("wrong_px", [-6.0, -3.0, -1.5, 1.5, 3.0, 6.0])
+def test_a_wrong_prediction_dies(wrong_px: float) -> None:
+    now, truth = pair_at(True)
+    predicted = truth.astype(np.float32)
+    patch = np.s_[60:200, 60:220]
+    predicted[patch] += np.float32(wrong_px)
+    found = METHOD.confirm(now, RANGE, predicted)
+    off = np.abs(found.disparity_px - truth)[patch]
+    seen = np.isfinite(off)
+    assert np.median(off[seen]) < 0.1
+    assert np.mean(off[seen] > abs(wrong_px) / 2) < 0.02
+
+
+@pytest.mark.parametrize("off_px", [-0.8, -0.3, 0.3, 0.8])
+def test_a_prediction_that_is_off_everywhere_does_not_confirm_itself(off_px: float) -> None:
+    now, truth = pair_at(True)
+    found = METHOD.confirm(now, RANGE, (truth + off_px).astype(np.float32))
+    bias = np.nanmedian(found.disparity_px - truth)
+    assert abs(bias) < 0.1 * abs(off_px)
+
+
+def test_without_a_prediction_only_sure_places_remain() -> None:
+    now, truth = pair_at(True)
+    found = METHOD.confirm(now, RANGE, np.full(truth.shape, np.nan, dtype=np.float32))
+    error = errors_of(found, truth)
+    assert error.size > 0.6 * truth.size
+    assert np.quantile(error, 0.98) < 0.5
+
+
+def test_what_the_pictures_like_better_stays() -> None:
+    now, truth = pair_at(True)
+    right, wrong = truth.astype(np.float32), (truth + 4).astype(np.float32)
+    nothing = np.full(truth.shape, np.float32(-1e6))
+    for predicted, matched in ((right, wrong), (wrong, right)):
+        start = confirmed_start(now.left, now.right, predicted, matched, nothing)
+        assert np.mean(np.abs(start - right)[8:-8, 60:-8] < 0.5) > 0.95
+
+
+def test_a_pixel_costs_what_its_row_does() -> None:
+    now, _ = pair_at(True)
+    left, right = describe_pixels(now.left), describe_pixels(now.right)
+    costs = np.empty((WIDTH, 16), dtype=np.uint8)
+    row_costs(left, reverse_rows(right, 20, 16), 100, 20, 16, costs)
+    for x, k in ((100, 0), (200, 5), (300, 15)):
+        assert costs[x, k] == descriptor_cost(left, right, 100, x, x - 20 - k)
+
+
+def match_all(
+    recording: Recording, use: tuple[str, ...] = ("stereo", "imu", "crane"), kept: Path | None = None,
+    backwards: bool = False,
+) -> list[MatchedFrame | Refusal]:  # fmt: skip
+    """Match all pairs of a recording by one chain, asked for in time's order or against it."""
+    source = SelectedSensors(recording, use)
+    pairs = RectifiedPairs(source, Rectifier(source.rig))
+    chain = matching(pairs, MeasureSettings(), kept, Stopwatch())
+    asked = list(pairs())
+    found = [chain(pair) for pair in (reversed(asked) if backwards else asked)]
+    return found[::-1] if backwards else found
+
+
+def test_a_chain_gives_the_same_in_any_order(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    confirmed: list[int] = []
+    plain = BarsightStereo.confirm
+
+    def counted(self: BarsightStereo, pair: RectifiedPair, *rest: Any) -> Disparity:
+        confirmed.append(pair.stamp_ns)
+        return plain(self, pair, *rest)
+
+    monkeypatch.setattr(BarsightStereo, "confirm", counted)
+    recording = bs.open_recording(whole)
+    stamps = recording.index.stamps_ns
+    forth = match_all(recording, kept=tmp_path)
+    assert confirmed == [stamp for place, stamp in enumerate(stamps) if place % 6]
+    back = match_all(recording, backwards=True)
+    for one, other in zip(forth, back, strict=True):
+        assert isinstance(one, MatchedFrame) and isinstance(other, MatchedFrame)
+        assert isinstance(one.disparity, Disparity) and isinstance(other.disparity, Disparity)
+        np.testing.assert_array_equal(one.disparity.disparity_px, other.disparity.disparity_px)
+        np.testing.assert_array_equal(one.disparity.sigma_px, other.disparity.sigma_px)
+    confirmed.clear()
+    kept = match_all(recording, kept=tmp_path)
+    assert [frame.stamp_ns for frame in kept] == list(stamps) and not confirmed
+    match_all(recording, ("stereo", "imu"))
+    assert not confirmed
