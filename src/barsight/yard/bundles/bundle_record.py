@@ -40,6 +40,7 @@ from barsight.yard.bundles.seen_section import (
 )
 from barsight.yard.bundles.straps import Pack, contradicts
 from barsight.yard.sections import MapStretch
+from barsight.yard.thin_lines import KNOWN_ACROSS
 from barsight.yard.types import Bundle, BundleSigma
 
 _NARROW_M = 0.3
@@ -354,7 +355,7 @@ def _doubts(reading: Reading, rows: UInt8, ends: list[End], settings: BundleSett
     if narrow == 1:
         out.append("something narrow lies across it at one place")
     elif narrow:
-        out.append(f"something narrow crosses over it at {narrow} places, such as dunnage")
+        out.append(f"something narrow {KNOWN_ACROSS} at {narrow} places, such as dunnage")
     out += [f"something {n * cell:.2f} m long covers a part of it" for n in wide]
     sunken = (rows == BELOW).sum() * cell
     if sunken > 0.1:

@@ -39,6 +39,7 @@ from barsight.yard.bundles.layers import same_place
 from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
 from barsight.yard.bundles.straps import strapped_pack
 from barsight.yard.sections import split_map
+from barsight.yard.thin_lines import with_thin_lines
 from barsight.yard.types import Bundle, HeightMap, YardMap
 
 _EDGE_CELLS = 3.0
@@ -98,7 +99,8 @@ def _search(
     readings = _settled(found, without_slivers(places, _SLIVER_RATIO), height_map, settings)
     chosen_ones = [reading.found for reading in readings]
     bundles = [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
-    return join_pieces(without_pieces(bundles, readings))
+    joined = join_pieces(without_pieces(bundles, readings))
+    return list(ordered_map(lambda bundle: with_thin_lines(bundle, height_map), joined))
 
 
 def _found(
