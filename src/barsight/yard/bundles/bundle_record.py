@@ -349,7 +349,7 @@ def _doubts(reading: Reading, rows: UInt8, ends: list[End], settings: BundleSett
     crossed = _runs(rows == ABOVE)
     cell = reading.found.sheet.cell_m
     narrow = _places(
-        [run for run in crossed if 2 * cell < (run[1] - run[0]) * cell <= _NARROW_M], reading, settings
+        [run for run in crossed if cell < (run[1] - run[0]) * cell <= _NARROW_M], reading, settings
     )
     wide = [b - a for a, b in crossed if (b - a) * cell > _NARROW_M]
     if narrow == 1:
