@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.boards.board import Board, parse_board
 from barsight.calibration.boards.board_views import BoardView, Corners
-from barsight.calibration.files.euroc import write_imu, write_rig
+from barsight.calibration.files.euroc import write_imu_description, write_rig
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
@@ -150,7 +150,7 @@ def draw_recording(folder: Path, seconds: float = 4.0) -> StereoRig:
         (folder / "mav0" / name / "data.csv").write_text("\n".join(lines) + "\n")
     write_rig(folder / "mav0", without_extrinsics(rig), 20.0)
     (folder / "mav0" / "imu0").mkdir()
-    write_imu(folder / "mav0" / "imu0" / "sensor.yaml", NOISE, 200.0)
+    write_imu_description(folder / "mav0" / "imu0" / "sensor.yaml", NOISE, 200.0)
     rows = [
         f"{stamp}," + ",".join(f"{value:.9g}" for value in (*gyro, *accel))
         for stamp, gyro, accel in zip(imu.stamp_ns, imu.gyro_radps, imu.accel_mps2, strict=True)

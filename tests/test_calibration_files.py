@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from barsight.calibration.files.euroc import read_imu, read_rig, write_imu, write_rig
+from barsight.calibration.files.euroc import read_imu, read_rig, write_imu_description, write_rig
 from barsight.calibration.files.kalibr import read_camchain, read_imu_file, write_camchain, write_imu_file
 from barsight.calibration.files.yaml_document import canonical_pose, read_document
 from barsight.calibration.geometry.camera import Camera, Distortion
@@ -196,9 +196,9 @@ def test_imu_files(tmp_path: Path) -> None:
     nested = {"imu0": {**NOISE, "update_rate": 100, "rostopic": "/imu/data"}}
     (tmp_path / "nested.yaml").write_text(yaml.safe_dump(nested))
     assert read_imu_file(tmp_path / "nested.yaml").noise.rate_hz == 100
-    write_imu(tmp_path / "sensor.yaml", noise, 200.0)
+    write_imu_description(tmp_path / "sensor.yaml", noise, 200.0)
     assert read_imu(tmp_path / "sensor.yaml").noise == noise
-    write_imu(tmp_path / "sensor.yaml", None, 200.0)
+    write_imu_description(tmp_path / "sensor.yaml", None, 200.0)
     assert read_imu(tmp_path / "sensor.yaml").noise is None
     (tmp_path / "imu.yaml").write_text("update_rate: 200\n")
     with pytest.raises(CalibrationError, match="gyroscope_noise_density: is missing"):

@@ -43,7 +43,7 @@ def test_without_encoders_the_rows_are_checked(data: Path, capsys: pytest.Captur
     [
         (["nowhere"], 3, "no such file"),
         (["nowhere", "-o", "check.txt"], 4, "ends in .json"),
-        (["nowhere", "--range-m", "0"], 2, "can't be"),
+        (["nowhere", "--range-m", "0"], 2, "must lie in 0.1...1000"),
         (["nowhere", "--frames", "0"], 2, "must be positive"),
         (["nowhere", "--max-depth-error-mm", "-1"], 2, "must be positive"),
     ],

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barsight.benchmarks.provenance import write_json
-from barsight.benchmarks.stereo.bar_edges import bar_diameter, find_outlines, tangent_planes
+from barsight.benchmarks.stereo.bar_edges import edge_diameter, find_outlines, tangent_planes
 from barsight.benchmarks.stereo.bar_fit import BarFit, BarGuess, fit_bar
 from barsight.benchmarks.stereo.bar_outline import _FINE_PX, _basis, _misfits
 from barsight.benchmarks.stereo.bar_renderer import (
@@ -179,7 +179,7 @@ def test_outlines_are_found_below_a_pixel_from_a_wrong_radius(bar: tuple[PosedSc
     middle = steel.centre_m / np.linalg.norm(steel.centre_m)
     away_px = (outlines.normals - true) @ middle * posed.scene.camera.focal_px
     assert np.abs(away_px).max() < 0.2
-    diameter = bar_diameter(_exact(rendered), rendered.pair, start)
+    diameter = edge_diameter(_exact(rendered), rendered.pair, start)
     assert diameter == pytest.approx(2 * steel.radius_m, rel=0.005)
 
 
@@ -237,7 +237,7 @@ def test_maps_without_floor_or_bar_fail_with_a_reason(bar: tuple[PosedScene, Ren
     no_bar = fit_bar(bare, posed.scene.camera, guess)
     assert isinstance(no_bar, Failed) and no_bar.code == "no-bar"
     outside = BarFit(steel.centre_m + np.array([5, 0, 0]), steel.axis, steel.radius_m)
-    no_outline = bar_diameter(exact, rendered.pair, outside)
+    no_outline = edge_diameter(exact, rendered.pair, outside)
     assert isinstance(no_outline, Failed) and no_outline.code == "no-outline"
     assert np.isnan(measure_bar(empty, rendered.pair, guess)).all()
 

@@ -80,16 +80,14 @@ def test_the_slow_one_is_exact_for_a_fall() -> None:
     np.testing.assert_allclose(end.rotation, STATE.rotation, atol=1e-12)
 
 
-def test_the_bias_jacobian_is_the_difference_quotient() -> None:
+def test_another_bias_enters_to_first_order() -> None:
     imu, end = lively(), START + 1_000_000_000
     whole = between(imu, START, end)
-    jacobian = whole.by_bias(STATE)
     for axis in range(6):
         step = np.zeros(6)
         step[axis] = 1e-4
         other = ImuBias(BIAS.gyro_radps + step[3:], BIAS.accel_mps2 + step[:3])
         moved = error(between(imu, START, end, other).predict(STATE), whole.predict(STATE))
-        np.testing.assert_allclose(jacobian @ step, moved, atol=2e-8)
         first_order = error(whole.predict(STATE, other), whole.predict(STATE))
         np.testing.assert_allclose(first_order, moved, atol=2e-8)
 
@@ -138,6 +136,13 @@ def euroc(data: Path, imu_name: str, truth_name: str) -> tuple[ImuSamples, np.nd
     return ImuSamples(stamps, table[:, 1:4], table[:, 4:7]), np.array(edges), states
 
 
+def by_bias(window: Preintegrated, state: BodyState) -> np.ndarray:
+    """(9, 6): the predicted state by the accelerometer's and the gyroscope's bias."""
+    steps = 1e-4 * np.eye(6)
+    moved = [window.predict(state, ImuBias(step[3:], step[:3])) for step in steps]
+    return np.column_stack([error(end, window.predict(state)) for end in moved]) / 1e-4
+
+
 def euroc_sigmas(imu: ImuSamples, edges: np.ndarray, states: list[BodyState]) -> np.ndarray:
     """(W, 9) errors in sigmas; each window's bias is found from its neighbours, never from itself."""
     integrator = Preintegrator(imu, EUROC_NOISE, 9.81)
@@ -147,7 +152,7 @@ def euroc_sigmas(imu: ImuSamples, edges: np.ndarray, states: list[BodyState]) ->
         assert isinstance(window, Preintegrated)
         windows.append(window)
         errors.append(error(window.predict(state), states[k + 1]))
-        jacobians.append(window.by_bias(state))
+        jacobians.append(by_bias(window, state))
     ratios = []
     for k, window in enumerate(windows):
         near = [j for j in range(max(0, k - 4), min(len(windows), k + 5)) if j != k]

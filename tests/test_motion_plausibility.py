@@ -13,7 +13,7 @@ from barsight.core.types import CraneSamples, EncoderJump, ImuSamples, RefusedFr
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import without_saturation
 from barsight.motion.batch import fusion
-from barsight.motion.batch.fault_detection import check_crane, frozen
+from barsight.motion.batch.fault_detection import check_crane, frozen_stretches
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings, _untied
 from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
@@ -135,12 +135,12 @@ def test_jumps_of_drawn_cranes(sensors: str, count: int, sizes_m: tuple[float, .
 @pytest.mark.slow
 def test_freezes_of_five_hundred_drawn_cranes() -> None:
     seeds = range(20000, 20500)
-    clean = [seed for seed in seeds if list(frozen(drawn_crane(seed).readings))]
+    clean = [seed for seed in seeds if list(frozen_stretches(drawn_crane(seed).readings))]
     print(f"clean cranes that lose a reading: {len(clean)} of {len(seeds)} {clean}")
     assert not clean
     still = [drawn_crane(seed, frozen_s=0.5) for seed in seeds]
     still = [one for one in still if one.fault is not None]
-    told = sum(len(frozen(one.readings)) > 0 for one in still)
+    told = sum(len(frozen_stretches(one.readings)) > 0 for one in still)
     print(f"freezes of 0.5 s found: {told} of {len(still)}")
     assert told >= 0.98 * len(still)
 

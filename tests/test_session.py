@@ -32,11 +32,13 @@ def counted(patch: pytest.MonkeyPatch, owner: type, name: str) -> list[str]:
     return calls
 
 
-@pytest.mark.parametrize("estimator", ["fused", "live"])
+@pytest.mark.parametrize(
+    ("estimator", "method"), [("fused", "sgbm"), ("live", "sgbm"), ("fused", "barsight")]
+)
 def test_packets_with_snapshots_end_as_the_batch(
-    whole: Path, estimator: str, monkeypatch: pytest.MonkeyPatch
+    whole: Path, estimator: str, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = {**SETTINGS, "motion": {"estimator": estimator}}
+    settings = {**SETTINGS, "motion": {"estimator": estimator}, "stereo": {"method": method}}
     recording = bs.open_recording(whole)
     session = bs.Session(recording.rig, imu_noise=recording.imu_noise(), **settings)
     rectified = counted(monkeypatch, Rectifier, "__call__")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
-from barsight.simulation.effects.faults import HAZE_GREY, SpoiledLens, exposure_gain
+from barsight.simulation.effects.faults import HAZE_GRAY, SpoiledLens, exposure_gain
 from barsight.simulation.effects.settings import FaultSettings, LightSettings
 from barsight.simulation.lighting import Lamps, bake, hall_lamps, sun_patch
 from barsight.simulation.render import DUST_ALBEDO, Shading, shade
@@ -37,7 +37,7 @@ def test_haze_takes_contrast() -> None:
     settings = FaultSettings(haze_ratio=0.2)
     gray = np.linspace(0, 1, 4800, dtype=np.float32).reshape(60, 80)
     np.testing.assert_allclose(
-        lens(settings).spoil(gray, settings, STILL), 0.8 * gray + 0.2 * HAZE_GREY, atol=1e-6
+        lens(settings).spoil(gray, settings, STILL), 0.8 * gray + 0.2 * HAZE_GRAY, atol=1e-6
     )
 
 

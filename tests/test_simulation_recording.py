@@ -276,7 +276,7 @@ def test_bars_are_read_from_text() -> None:
         (lambda: SimulationSettings(length_m=0.2), "length_m"),
         (lambda: SimulationSettings(frames=1), "frames"),
         (lambda: SimulationSettings(camera=CameraSettings(above_floor_m=2)), "above_floor_m"),
-        (lambda: CameraSettings(width_px=10), "64 px"),
+        (lambda: CameraSettings(width_px=10), "camera.width_px must lie in 64"),
         (lambda: YardSettings(max_layers=9), "max_layers"),
         (lambda: TravelSettings(speed_mps=0), "speed_mps"),
         (lambda: SensorSettings(timeshift_cam_imu_s=2), "timeshift"),

@@ -228,7 +228,7 @@ def test_settings_are_checked_and_make_the_method() -> None:
     assert isinstance(make_method(StereoSettings(method="barsight")), BarsightStereo)
     with pytest.raises(ConfigError, match="max_sigma_px"):
         BarsightSettings(max_sigma_px=0)
-    with pytest.raises(ConfigError, match="negative"):
+    with pytest.raises(ConfigError, match="must be at least 0"):
         BarsightSettings(island_px=-1)
     with pytest.raises(ConfigError, match="window_px"):
         RefinementSettings(window_px=20)

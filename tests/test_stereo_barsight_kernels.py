@@ -11,7 +11,7 @@ from barsight.core.errors import ConfigError
 from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement
 from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove_islands
 from barsight.stereo.direct.curvature import curvature_row
-from barsight.stereo.direct.depth_edges import _BESIDE_PX, _DISTANCE_PX, _GREY, _RADIUS_PX, sharpen_edges
+from barsight.stereo.direct.depth_edges import _BESIDE_PX, _DISTANCE_PX, _GRAY, _RADIUS_PX, sharpen_edges
 from barsight.stereo.direct.disparity_update import blend_fits, fit_variance, update_disparity
 from barsight.stereo.direct.kernels.box_sums import (
     allocate_columns,
@@ -357,7 +357,7 @@ def test_weighted_median_beside_jumps_agrees_with_sorting() -> None:
         row, column = np.indices(there.shape)
         distance = (row + rows.start - y) ** 2 + (column + columns.start - x) ** 2
         contrast = np.abs(gray[rows, columns].astype(float) - float(gray[y, x]))
-        weight = np.exp(-distance / (2 * _DISTANCE_PX**2) - contrast / _GREY)
+        weight = np.exp(-distance / (2 * _DISTANCE_PX**2) - contrast / _GRAY)
         known = np.isfinite(there)
         order = np.argsort(there[known])
         passed = np.cumsum(weight[known][order])

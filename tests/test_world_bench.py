@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from barsight.benchmarks.yard import kept_worlds, world_scores
+from barsight.benchmarks.yard import world_runs, world_scores
 from barsight.benchmarks.yard.bundle_scores import TrueBundle, bars_mass, score_bundles
-from barsight.benchmarks.yard.kept_worlds import WorldKeys, looked_at_list, run_world
+from barsight.benchmarks.yard.world_runs import WorldKeys, looked_at_list, run_world
 from barsight.benchmarks.yard.world_scores import WorldScore, world_rows
 from barsight.cli.main import run
 from barsight.core.errors import MeasurementError, OutputError
@@ -105,7 +105,7 @@ def test_a_world_is_done_once_and_a_refusal_is_a_score(
     def never(*_: object, **__: object) -> None:
         raise AssertionError("done again")
 
-    monkeypatch.setattr(kept_worlds, "simulate_world", never)
+    monkeypatch.setattr(world_runs, "simulate_world", never)
     assert run_world(folder, 101, GIVEN, keys, never, "a threshold") == replace(
         first, looked_at="a threshold"
     )

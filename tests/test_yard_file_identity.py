@@ -14,10 +14,8 @@ import barsight as bs
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.result_folder import file_digest
-from barsight.yard.inventory.bundle_file import schema as bundle_schema
-from barsight.yard.lifting.lift_file import schema
 from lift_yards import laid
-from yard_folders import lifts, write_folder
+from yard_folders import lifts, schema, write_folder
 
 
 def content(path: Path) -> dict:  # type: ignore[type-arg]
@@ -34,8 +32,8 @@ def folder(tmp_path: Path) -> Path:
 
 def test_all_three_files_carry_the_same_ids_and_fit_their_schemas(folder: Path) -> None:
     result, bundles, chosen = (content(folder / f"{n}.json") for n in ("result", "bundles", "lifts"))
-    jsonschema.validate(bundles, bundle_schema())
-    jsonschema.validate(chosen, schema())
+    jsonschema.validate(bundles, schema("bundles"))
+    jsonschema.validate(chosen, schema("lifts"))
     for name in ("map_id", "calibration_id", "yard_frame_id", "captured_from_ns", "captured_to_ns"):
         assert result[name] == bundles[name] == chosen[name]
     assert bundles["height_sha256"] == chosen["height_sha256"] == result["files"]["height.tif"]

@@ -20,7 +20,7 @@ from barsight.core.types import HeightSource
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.lift_file import lifts_content, read_lifts, schema, write_lifts
+from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.contact import rest_magnet
@@ -31,6 +31,7 @@ from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.vetoes import VETOES, Veto
 from barsight.yard.weight import bundle_mass
 from lift_yards import GIVEN, MAGNET, SETTINGS, SIGMA, bare, codes, judged, laid, map_of, record, sure_travel
+from yard_folders import schema
 from yard_maps import Laid
 
 
@@ -409,7 +410,7 @@ def test_the_file_fits_its_schema_and_comes_back(tmp_path: Path) -> None:
     bundles = (record(stock[0], 0), record(stock[1], 1, ends_open=(True, False)))
     plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, ())
     content = lifts_content(plan, "yard", GIVEN, "0")
-    jsonschema.validate(content | {"content_sha256": ""}, schema())
+    jsonschema.validate(content | {"content_sha256": ""}, schema("lifts"))
     assert content["magnet"]["name"].startswith("example")
     assert [lift["rank"] for lift in content["lifts"]] == [1]
     assert content["refused"][0]["vetoes"][0]["code"] == "end-open"

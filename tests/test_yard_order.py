@@ -13,7 +13,7 @@ from barsight.core.errors import Failed
 from barsight.core.types import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.lift_file import lifts_content, schema
+from barsight.yard.lifting.lift_file import lifts_content
 from barsight.yard.lifting.order import LiftOrder, order_lifts
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.stability.blockers import find_blocked
@@ -21,6 +21,7 @@ from barsight.yard.stability.stability import footing_checks, footings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto, vetoes_of
 from lift_yards import GIVEN, LENGTH_M, MAGNET, SETTINGS, SIGMA, laid, map_of, record
+from yard_folders import schema
 from yard_maps import Laid
 
 STOCK = [laid(0.3), laid(0.6), laid(0.9), laid(0.45, z=0.56), laid(0.75, z=0.56), laid(0.6, z=0.92)]
@@ -114,7 +115,7 @@ def test_lifts_json_says_the_order_and_what_is_in_the_way() -> None:
     order = order_lifts(3, heights, bundles, plan)
     assert isinstance(order, LiftOrder)
     content = json.loads(json.dumps(lifts_content(plan, "yard", GIVEN, "0", order=order)))
-    jsonschema.validate(content | {"content_sha256": ""}, schema())
+    jsonschema.validate(content | {"content_sha256": ""}, schema("lifts"))
     assert [step["bundle"] for step in content["fetch"]["steps"]] == [5, 3]
     assert content["blocked"][1] == {"bundle": 1, "blockers": [3, 4, 5]}
     assert content["lifts"][0]["set_down"]["z_m"] < 0.02

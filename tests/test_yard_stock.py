@@ -12,7 +12,7 @@ import pytest
 from barsight.core.errors import InputError
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.inventory.bundle_file import read_bundles, read_match, schema, write_bundles
+from barsight.yard.inventory.bundle_file import read_bundles, read_match, write_bundles
 from barsight.yard.inventory.stock_list import (
     ListedBundle,
     contradicted_bundles,
@@ -23,6 +23,7 @@ from barsight.yard.inventory.stock_list import (
 )
 from barsight.yard.types import Bundle
 from lift_yards import GIVEN
+from yard_folders import schema
 from yard_maps import Laid, draw
 
 LAID = (Laid(0.3, 0.0, 0.2, 0.2), Laid(0.9, 0.0, 0.2, -0.3), Laid(1.5, 0.1, 0.2, 0.0))
@@ -128,8 +129,8 @@ def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ..
     match = match_stock((ListedBundle("gone", 9.0, 0.0),), bundles)
     write_bundles(bundles, match, "yard", GIVEN, path)
     content = json.loads(path.read_text(encoding="utf-8"))
-    jsonschema.Draft202012Validator.check_schema(schema())
-    jsonschema.validate(content, schema())
+    jsonschema.Draft202012Validator.check_schema(schema("bundles"))
+    jsonschema.validate(content, schema("bundles"))
     assert content["stock"]["missing"] == ["gone"]
     assert read_match(path) == match
     for one, back in zip(bundles, read_bundles(path), strict=True):
@@ -144,7 +145,7 @@ def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ..
 def test_no_bundles_make_a_valid_file(tmp_path: Path) -> None:
     write_bundles((), None, "world", GIVEN, tmp_path / "bundles.json")
     content = json.loads((tmp_path / "bundles.json").read_text(encoding="utf-8"))
-    jsonschema.validate(content, schema())
+    jsonschema.validate(content, schema("bundles"))
     assert read_bundles(tmp_path / "bundles.json") == ()
     assert read_match(tmp_path / "bundles.json") is None
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import time
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +22,13 @@ from result_folders import summary
 from yard_maps import Laid
 
 STOCK = [laid(0.3), laid(0.65)]
+
+
+def schema(name: str) -> dict[str, Any]:
+    """The JSON Schema of `bundles` or `lifts`."""
+    text = files("barsight.yard").joinpath(f"schemas/{name}.schema.json").read_text("utf-8")
+    content: dict[str, Any] = json.loads(text)
+    return content
 
 
 def lifts(folder: Path, *arguments: str) -> int:

@@ -32,7 +32,7 @@ from barsight.recording.formats.image_folders import PictureFiles
 
 T = TypeVar("T")
 
-_KEPT: dict[str, Any] = {
+_RECORDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
         Trajectory,
@@ -123,7 +123,7 @@ def _plain(value: Any, arrays: dict[str, Any]) -> Any:
     if is_dataclass(value):
         kind = type(value).__name__
         content = {field.name: _plain(getattr(value, field.name), arrays) for field in fields(value)}
-        assert kind in _KEPT, f"{kind} is kept nowhere"
+        assert kind in _RECORDS, f"{kind} is kept nowhere"
         return {"kind": kind, "fields": content}
     if isinstance(value, tuple):
         return [_plain(item, arrays) for item in value]
@@ -137,4 +137,4 @@ def _record(tree: Any, arrays: Any) -> Any:
         return tree
     if "array" in tree:
         return arrays[tree["array"]]
-    return _KEPT[tree["kind"]](**{name: _record(item, arrays) for name, item in tree["fields"].items()})
+    return _RECORDS[tree["kind"]](**{name: _record(item, arrays) for name, item in tree["fields"].items()})

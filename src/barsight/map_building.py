@@ -59,7 +59,7 @@ _TIDIED_EVERY = 8
 @dataclass(frozen=True, eq=False)
 class ProbedRecording:
     """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
-    doubts: what can't be right in the samples. inputs: SHA-256 of the files. kept: folder of checkpoints, if
+    doubts: what can't be right in the samples. inputs: SHA-256 of the files. checkpoints: their folder, if
     any. watch: times the stages.
     """
 
@@ -71,7 +71,7 @@ class ProbedRecording:
     doubts: tuple[Notice, ...]
     configuration: dict[str, Any]
     inputs: dict[str, str]
-    kept: Path | None
+    checkpoints: Path | None
     watch: Stopwatch
 
     @property
@@ -146,18 +146,19 @@ def inspect_recording(
     if faults := clock_faults(source):
         raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
     configuration, inputs = to_json(asdict(settings)), source.digests()
-    kept = None
+    checkpoints = None
     if resume is not None:
-        kept = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
+        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
     with watch("look"):
-        pairs = RectifiedPairs(source, Rectifier(source.rig), kept or scratch, watch)
+        pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
         first = probe_recording(pairs)
         cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
     known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
     calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
     return ProbedRecording(
-        source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, kept, watch
-    )
+        source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, checkpoints,
+        watch,
+    )  # fmt: skip
 
 
 @contextmanager
@@ -167,7 +168,7 @@ def estimate_trajectory(
     """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
     source, pairs, watch = probed.source, probed.pairs, probed.watch
     rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
-    match = matching(pairs, settings, probed.kept, watch)
+    match = matching(pairs, settings, probed.checkpoints, watch)
     early = _known_early(source, settings, rectifier, probed.first.range_m)
     begun = islice(pairs(early), len(early))
     with ExitStack() as pools:
@@ -177,7 +178,7 @@ def estimate_trajectory(
             count = count_frames("trajectory", total, advance)
             with _naming(probed):
                 trajectory = checkpointed(
-                    probed.kept, "trajectory", lambda: estimate(source, rectifier, count, pairs)
+                    probed.checkpoints, "trajectory", lambda: estimate(source, rectifier, count, pairs)
                 )
             trim_heap()
             calibrated = self_calibrate(
@@ -187,7 +188,7 @@ def estimate_trajectory(
         if calibrated.rectifier is not rectifier:
             rectifier = calibrated.rectifier
             pairs = RectifiedPairs(source, rectifier, watch=watch)
-            match = matching(pairs, settings, probed.kept, watch)
+            match = matching(pairs, settings, probed.checkpoints, watch)
         stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
         taken = select_keyframes(trajectory.frames, rectifier, probed.first.range_m, settings.map.min_shift)
         poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
@@ -281,13 +282,13 @@ def _known_early(
 
 
 def matching(
-    pairs: RectifiedPairs, settings: MeasureSettings, kept: Path | None, watch: Stopwatch
+    pairs: RectifiedPairs, settings: MeasureSettings, checkpoints: Path | None, watch: Stopwatch
 ) -> PairChain:
     """Make what matches the pairs of a recording for its map."""
     stereo, every = settings.stereo, settings.map.min_shift == 0
     chained = every and stereo.method == "barsight" and stereo.barsight.preset == "best"
     matcher = Matcher(stereo, make_method(stereo.for_map()), watch)
-    return PairChain(pairs, matcher, stereo.confirmed_pairs + 1 if chained else 1, kept)
+    return PairChain(pairs, matcher, stereo.confirmed_pairs + 1 if chained else 1, checkpoints)
 
 
 def _placed(

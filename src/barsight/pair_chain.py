@@ -22,15 +22,17 @@ _KEPT_CHAINS = 4
 
 
 class PairChain:
-    """Matches the pairs of `pairs`, each once for all runs that keep checkpoints in `kept`.
+    """Matches the pairs of `pairs`, each once for all runs that keep checkpoints in that folder.
 
     Results depend on the recording alone, not on which pairs are asked for or in what order: a pair whose
     predecessor wasn't asked for matches that one too. A chain begins every `length` pairs, and where encoders
     don't say how the camera moved. Several threads may ask at once.
     """
 
-    def __init__(self, pairs: RectifiedPairs, matcher: Matcher, length: int, kept: Path | None) -> None:
-        self._pairs, self._matcher, self._length, self._kept = pairs, matcher, length, kept
+    def __init__(
+        self, pairs: RectifiedPairs, matcher: Matcher, length: int, checkpoints: Path | None
+    ) -> None:
+        self._pairs, self._matcher, self._length, self._checkpoints = pairs, matcher, length, checkpoints
         self._turns: dict[int, Lock] = {}
         self._last: dict[int, tuple[int, MatchedFrame | Refusal]] = {}
 
@@ -73,7 +75,7 @@ class PairChain:
                 return self._matcher(pair)
             return self._matcher(pair, Preceding(known, guess))
 
-        return checkpointed(self._kept, f"matched_{pair.stamp_ns}", match)
+        return checkpointed(self._checkpoints, f"matched_{pair.stamp_ns}", match)
 
     def _motion(self, before_ns: int, now_ns: int) -> Pose | None:
         """Predict now_from_before of the rectified left camera by the encoders, at the nominal attitude; None

@@ -68,11 +68,11 @@ class Session:
         self._recording = PacketRecording(rig, self._folder, imu_noise, is_simulated=is_simulated)
         self._source = SelectedSensors(self._recording, self._settings.use)
         key = checkpoint_key(self._recording, to_json(asdict(self._settings)), {})
-        self._kept = checkpoint_folder(self._folder / "checkpoints", key)
-        self._pairs = RectifiedPairs(self._source, Rectifier(rig), self._kept)
+        self._checkpoints = checkpoint_folder(self._folder / "checkpoints", key)
+        self._pairs = RectifiedPairs(self._source, Rectifier(rig), self._checkpoints)
         # A rig that is to be turned at the end gives other disparities then.
-        kept = self._kept if self._settings.self_calibrate == "none" else None
-        self._match = matching(self._pairs, self._settings, kept, Stopwatch())
+        checkpoints = self._checkpoints if self._settings.self_calibrate == "none" else None
+        self._match = matching(self._pairs, self._settings, checkpoints, Stopwatch())
         self._waiting: deque[RectifiedPair | RefusedFrame] = deque()
         self._poses: PoseEstimator | None = None
         self._map: LiveMap | None = None
@@ -104,9 +104,9 @@ class Session:
             while self._waiting:
                 self._place(self._waiting.popleft())
             if self._poses is not None:
-                checkpointed(self._kept, "trajectory", self._poses.finish)
+                checkpointed(self._checkpoints, "trajectory", self._poses.finish)
         write_measured(
-            self._recording, self._yard, self._asked, keep=self._kept.parent, magnet=self._magnet,
+            self._recording, self._yard, self._asked, keep=self._checkpoints.parent, magnet=self._magnet,
             report=False,
         )  # fmt: skip
         return Yard(self._yard, self)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
+from math import inf
 
 import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.core.types import RectifiedPair
 from barsight.features.guided_matching import (
     GuidedMatches,
@@ -48,10 +49,10 @@ class TrackSettings:
     """Points further than this many baselines aren't used for motion."""
 
     def __post_init__(self) -> None:
-        if self.points < 50 or self.spacing_px < 3:
-            raise ConfigError("tracks.points must be at least 50 and tracks.spacing_px at least 3")
-        if min(self.sigma_px, self.min_range_m, self.max_range_baselines) <= 0 or self.max_scale <= 1:
-            raise ConfigError("the tracks' distances must be positive and max_scale over 1")
+        expect_ranges(
+            self, "tracks.", points=(50, inf), spacing_px=(3, inf), sigma_px=POSITIVE, min_range_m=POSITIVE,
+            max_range_baselines=POSITIVE, max_scale=(1, inf),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

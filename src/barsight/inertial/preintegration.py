@@ -57,16 +57,6 @@ class Preintegrated:
         end = self.measurements.predict(start, _gtsam_bias(bias or self.bias))
         return BodyState(end.attitude().matrix(), np.asarray(end.position()), np.asarray(end.velocity()))
 
-    def by_bias(self, state: BodyState) -> Float64:
-        """Differentiate rotation, position and velocity (body axes at the end) by accel and gyro
-        bias (9, 6).
-        """
-        pose = gtsam.Pose3(gtsam.Rot3(state.rotation), state.position_m)
-        by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
-        start = gtsam.NavState(pose, state.velocity_mps)
-        self.measurements.predict(start, _gtsam_bias(self.bias), by_state, by_bias)
-        return by_bias
-
 
 class Preintegrator:
     """Integrates one recording's IMU between any two stamps of its clock."""

@@ -13,7 +13,7 @@ from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import (
     CENTRAL,
-    GREY,
+    GRAY,
     SHARED,
     SLOTS,
     SQUARES,
@@ -88,7 +88,7 @@ def _vote(
             slots[best, VIEWS] += 1
             slots[best, CENTRAL] += central[m]
             slots[best, SHARED] += share * (shared[m] - slots[best, SHARED])
-            slots[best, GREY] += share * (intensity[m] - slots[best, GREY])
+            slots[best, GRAY] += share * (intensity[m] - slots[best, GRAY])
             continue
         if target < 0:
             continue
@@ -97,7 +97,7 @@ def _vote(
         slots[target, SQUARES] = 0
         slots[target, VIEWS] = 1
         slots[target, SHARED] = shared[m]
-        slots[target, GREY] = intensity[m]
+        slots[target, GRAY] = intensity[m]
         slots[target, CENTRAL] = central[m]
 
 

@@ -15,7 +15,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import StereoPoints
 
 _SAID = 6
-_HEIGHT, _NOISE, _POSE, _SHARED, _GREY, _MIDDLE = range(_SAID)
+_HEIGHT, _NOISE, _POSE, _SHARED, _GRAY, _MIDDLE = range(_SAID)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ def _in_reference(
             + 2 * (about[0, 1] * jx * jy + about[0, 2] * jx + about[1, 2] * jy)
         )
         said[i, _SHARED] = np.abs(shared_sigma[i] * slope)
-        said[i, _GREY] = np.float32(intensity[i])
+        said[i, _GRAY] = np.float32(intensity[i])
         off = np.float32(max(abs(px - column * cell_m), abs(py - row * cell_m)))
         said[i, _MIDDLE] = np.float32(off <= half * xyz[i, 2])
     return x, y, said
@@ -173,7 +173,7 @@ def _gather(
                 heights += w * said[i, _HEIGHT]
                 variances += said[i, _NOISE] + said[i, _POSE]
                 extra += said[i, _SHARED]
-                gray += said[i, _GREY]
+                gray += said[i, _GRAY]
                 middle[n] |= said[i, _MIDDLE] > 0
             held = last - left
             cell[n] = k

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, POSITIVE, expect_ranges
 
 
 @dataclass(frozen=True)
@@ -48,18 +49,9 @@ class MapSettings:
     """Where to cut contours; at the laser's profiles when not given, else in the middle."""
 
     def __post_init__(self) -> None:
-        if self.cell_m is not None and not 0.001 <= self.cell_m <= 10:
-            raise ConfigError(f"map.cell_m must lie in 0.001...10, not {self.cell_m}")
-        if self.min_views < 1 or self.resident_tiles < 16:
-            raise ConfigError("map.min_views must be at least 1 and resident_tiles at least 16")
-        if not 0 <= self.min_shift <= 0.5:
-            raise ConfigError(f"map.min_shift must lie in 0...0.5, not {self.min_shift}")
-        if not 0 <= self.sharpen_px <= 5:
-            raise ConfigError(f"map.sharpen_px must lie in 0...5, not {self.sharpen_px}")
-        for name in ("top_ratio", "own_ratio", "along_ratio"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ConfigError(f"map.{name} must lie in 0...1, not {getattr(self, name)}")
-        if self.gate_sigma <= 0 or self.max_sigma_m <= 0:
-            raise ConfigError("map.gate_sigma and max_sigma_m must be positive")
-        if min(self.min_gate_m, self.along_m, self.fill_m) < 0:
-            raise ConfigError("map.min_gate_m, along_m and fill_m can't be negative")
+        expect_ranges(
+            self, "map.", cell_m=(0.001, 10), min_views=(1, inf), resident_tiles=(16, inf),
+            min_shift=(0, 0.5), sharpen_px=(0, 5), top_ratio=(OVER_0, 1), own_ratio=(OVER_0, 1),
+            along_ratio=(OVER_0, 1), gate_sigma=POSITIVE, max_sigma_m=POSITIVE, min_gate_m=NOT_NEGATIVE,
+            along_m=NOT_NEGATIVE, fill_m=NOT_NEGATIVE,
+        )  # fmt: skip

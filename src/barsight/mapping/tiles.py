@@ -15,7 +15,7 @@ SLOTS = 4
 FIELDS = 7
 """Of each height: mean z, weight (sum of 1 / variance), weighted squares about the mean, views, shared sigma,
 gray level, views that see it in the cell's middle."""
-Z, WEIGHT, SQUARES, VIEWS, SHARED, GREY, CENTRAL = range(FIELDS)
+Z, WEIGHT, SQUARES, VIEWS, SHARED, GRAY, CENTRAL = range(FIELDS)
 
 TileKey = tuple[int, int]
 

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import UNDER_1, expect_ranges
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 
 
@@ -35,10 +35,7 @@ class RecordingSettings:
     """A bag's topic of the IMU, likewise."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.pair_tolerance_s < 1:
-            raise ConfigError(
-                f"recording.pair_tolerance_s is {self.pair_tolerance_s} s; give a value from 0 to below 1 s"
-            )
+        expect_ranges(self, "recording.", pair_tolerance_s=(0, UNDER_1))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""View a recording with some of its sensors left out, as `--use` asks."""
+"""View a recording with some of its sensors left out, as `use` asks."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ SHIFT = 4
 """OpenCV draws at fractions of a pixel in 16ths."""
 
 
-def match_pictures(example: MatchingExample) -> tuple[Picture, ...]:
+def draw_matches(example: MatchingExample) -> tuple[Picture, ...]:
     """Draw features, raw and filtered matches, guided matches whole and enlarged."""
     scale = min(1.0, LONGEST_PX / max(example.old.shape))
     wrong = ~example.filtered

@@ -18,7 +18,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.core.types import Trajectory
 from barsight.evaluation.trajectory_error import Drift, FrameErrors
 from barsight.motion.frontend.matching_example import MatchingExample
-from barsight.report.match_images import match_pictures
+from barsight.report.match_images import draw_matches
 from barsight.report.page import KeyFigure, format_number, write_summary_page
 from barsight.report.page_trajectory import path_plots
 from barsight.report.plots import SERIES, Plot, Trace, json_numbers, keep_extremes
@@ -44,7 +44,7 @@ class OdometryResult:
 
 def write_odometry_page(result: OdometryResult, html: Path, data: Path) -> None:
     """Write the page to `html` and its numbers to `data`, each whole or not at all."""
-    pictures = () if isinstance(result.example, Failed) else match_pictures(result.example)
+    pictures = () if isinstance(result.example, Failed) else draw_matches(result.example)
     summary = odometry_summary(result)
     plots = [*_path(result.trajectory), *_states(result), *_in_sigmas(result), *_sigma(result)]
     write_summary_page(

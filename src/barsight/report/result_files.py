@@ -60,7 +60,7 @@ def write_results(measurement: Measurement, identity: MapIdentity, folder: Path)
     digest = write_bundles(measurement.bundles, measurement.stock, reference, identity, path)
     write_lifts(measurement.lifts, reference, identity, digest, folder / "lifts.json")
     if measurement.laser:
-        write_laser(measurement.laser, folder / "laser.csv")
+        write_laser_csv(measurement.laser, folder / "laser.csv")
     if measurement.preview is not None:
         write_preview(measurement.preview, folder / "preview.png")
 
@@ -209,7 +209,7 @@ def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
                 file.write(f"{contour.profile},{x:.4f},{y:.4f},{height},{source}\n")
 
 
-def write_laser(laser: tuple[LaserProfile, ...], target: Path) -> None:
+def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path) -> None:
     """Write the reference profiles as they were read: `profile,x_m,y_m,z_m`."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write("profile,x_m,y_m,z_m\n")

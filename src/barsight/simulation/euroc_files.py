@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from barsight.calibration.files.euroc import write_imu as write_imu_description
-from barsight.calibration.files.euroc import write_rig
+from barsight.calibration.files.euroc import write_imu_description, write_rig
 from barsight.calibration.files.yaml_document import write_document
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64, UInt8
 from barsight.core.stamps import NS_PER_S
+from barsight.core.types import CraneSamples, LaserProfile
 from barsight.recording.formats.ground_truth import EUROC_HEADER
 from barsight.recording.writers import euroc
 from barsight.simulation.sensors import ImuRecord
@@ -32,14 +32,13 @@ def write_png(path: Path, image: UInt8) -> None:
 def write_body(folder: Path) -> None:
     """Write `mav0/body.yaml`, which says that nothing of this is real."""
     comment = "simulated bar yard: rendered images and computed sensors, not a real recording"
-    values = {"comment": comment, "is_simulated": True}
-    write_document(folder / "body.yaml", values, block_lists=True)
+    write_document(folder / "body.yaml", {"comment": comment, "is_simulated": True})
 
 
 def write_cameras(mav0: Path, rig: StereoRig, stamp_ns: Int64) -> None:
     """Write `sensor.yaml` and `data.csv` of both cameras; the images come one by one."""
     span_s = max(float(stamp_ns[-1] - stamp_ns[0]) / NS_PER_S, 1e-9)
-    write_rig(mav0, rig, round((len(stamp_ns) - 1) / span_s, 3), block_lists=True)
+    write_rig(mav0, rig, round((len(stamp_ns) - 1) / span_s, 3))
     for name in ("cam0", "cam1"):
         (mav0 / name / "data").mkdir()
         euroc.write_table(mav0 / name / "data.csv", euroc.IMAGE_HEADER, (f"{t},{t}.png" for t in stamp_ns))
@@ -53,37 +52,19 @@ def write_imu(folder: Path, imu: ImuRecord, settings: SensorSettings) -> None:
     )  # fmt: skip
     values = np.column_stack([imu.gyro_radps, imu.accel_mps2])
     euroc.write_table(folder / "data.csv", euroc.IMU_HEADER, _rows(imu.stamp_ns, values, 9))
-    write_imu_description(folder / "sensor.yaml", noise, noise.rate_hz, block_lists=True)
+    write_imu_description(folder / "sensor.yaml", noise, noise.rate_hz)
 
 
-def write_crane(
-    folder: Path, stamp_ns: Int64, place_m: Float64, lever_m: Float64, nominal: Float64,
-    settings: SensorSettings,
-) -> None:  # fmt: skip
+def write_crane(folder: Path, crane: CraneSamples) -> None:
     """Write `crane0`."""
-    std_m = float(np.hypot(settings.encoder_std_m, settings.encoder_step_m / 12**0.5))
-    content = {
-        "sensor_type": "crane",
-        "comment": "absolute encoders of bridge, trolley and hoist: the crane point in the yard frame",
-        "p_crane_body": lever_m.tolist(), "R_yard_body": nominal.ravel().tolist(),
-        "rate_hz": settings.encoder_rate_hz,
-        "position_std_m": round(std_m, 6),
-    }  # fmt: skip
-    euroc.write_table(folder / "data.csv", euroc.CRANE_HEADER, _rows(stamp_ns, place_m, 6))
-    write_document(folder / "sensor.yaml", content, block_lists=True)
+    euroc.write_table(folder / "data.csv", euroc.CRANE_HEADER, _rows(crane.stamp_ns, crane.position_m, 6))
+    euroc.write_crane_description(folder / "sensor.yaml", crane)
 
 
-def write_laser(folder: Path, x_m: Float64, y_m: Float64, z_m: Float64, std_m: float) -> None:
-    """Write `laser0`: x_m (N,), y_m (K,), z_m (K, N) as measured."""
-    content = {
-        "sensor_type": "laser", "comment": "single points along X, yard frame; reference profiles",
-        "spacing_m": round(float(x_m[1] - x_m[0]), 6), "range_std_m": std_m,
-    }  # fmt: skip
-    rows = (
-        f"{k},{x:.3f},{y:.3f},{z:.4f}" for k, y in enumerate(y_m) for x, z in zip(x_m, z_m[k], strict=True)
-    )
-    euroc.write_table(folder / "data.csv", euroc.LASER_HEADER, rows)
-    write_document(folder / "sensor.yaml", content, block_lists=True)
+def write_laser(folder: Path, laser: tuple[LaserProfile, ...]) -> None:
+    """Write `laser0`."""
+    euroc.write_table(folder / "data.csv", euroc.LASER_HEADER, _rows(*euroc.laser_table(laser), 4))
+    euroc.write_laser_description(folder / "sensor.yaml", laser)
 
 
 def write_ground_truth(folder: Path, stamp_ns: Int64, place_m: Float64, quaternion_wxyz: Float64) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from math import inf
 from typing import Annotated
 
 import tyro
 
 from barsight.core.errors import ConfigError
-from barsight.core.settings.values import expect_values
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, SHARE, UNDER_1, expect_ranges, expect_values
 from barsight.simulation.effects.settings import FaultSettings, LightSettings
 
 BARS_OF_RINGS = (1, 7, 19, 37, 61)
@@ -84,18 +85,12 @@ class CameraSettings:
     """Noise that doesn't depend on the signal, in gray levels."""
 
     def __post_init__(self) -> None:
-        _expect(min(self.width_px, self.height_px) >= 64, "camera width and height must be at least 64 px")
-        _expect(max(self.width_px, self.height_px) <= 8192, "camera width and height end at 8192 px")
-        _expect(self.focal_px > 0.3 * self.width_px, "camera focal_px must be over 0.3 of the width")
-        _expect(0.01 <= self.baseline_m <= 3, "camera baseline_m must lie between 0.01 and 3 m")
-        _expect(1 <= self.samples_per_side <= 4, "camera samples_per_side must lie between 1 and 4")
-        _expect(0 <= self.vignetting < 1, "camera vignetting must lie between 0 and 1")
-        _expect(0 <= self.misalignment_deg <= 2, "camera misalignment_deg must lie between 0 and 2")
-        _expect(abs(self.tilt_deg) <= 30, "camera tilt_deg must lie within 30 degrees")
-        _expect(
-            min(self.shot_noise_dn, self.read_noise_dn, self.psf_sigma_px) >= 0,
-            "camera noises and blur can't be negative",
-        )
+        expect_ranges(
+            self, "camera.", width_px=(64, 8192), height_px=(64, 8192), baseline_m=(0.01, 3),
+            samples_per_side=(1, 4), vignetting=(0, UNDER_1), misalignment_deg=(0, 2), tilt_deg=(-30, 30),
+            shot_noise_dn=NOT_NEGATIVE, read_noise_dn=NOT_NEGATIVE, psf_sigma_px=NOT_NEGATIVE,
+        )  # fmt: skip
+        _expect(self.focal_px > 0.3 * self.width_px, "camera.focal_px must be over 0.3 of the width")
 
 
 @dataclass(frozen=True)
@@ -111,7 +106,7 @@ class YardSettings:
     skew_deg: float = 0.3
     """Standard deviation of the bundles' yaw; they stay within 1 degree, or within twice this."""
     uneven_ends_m: float = 0.03
-    """How far the ends of a bundle's bars stand apart."""
+    """Largest shift of a bar along its bundle, either way."""
     missing_ratio: float = 0.08
     """Share of places on the lowest layer that are empty (gullies)."""
     crossed_ratio: float = 0.0
@@ -128,20 +123,14 @@ class YardSettings:
     """Contrast of the surfaces' texture, steel's and the floor's, over the ordinary."""
 
     def __post_init__(self) -> None:
-        _expect(1 <= self.max_layers <= 5, "yard max_layers must lie between 1 and 5")
-        _expect(1 <= self.bar_length_m <= 20, "yard bar_length_m must lie between 1 and 20 m")
-        _expect(0 <= self.skew_deg <= 2, "yard skew_deg must lie between 0 and 2")
-        _expect(0 <= self.missing_ratio <= 0.6, "yard missing_ratio must lie between 0 and 0.6")
-        _expect(0 <= self.crossed_ratio <= 1, "yard crossed_ratio must lie between 0 and 1")
-        _expect(0.02 <= self.dunnage_m <= 0.3, "yard dunnage_m must lie between 0.02 and 0.3 m")
-        _expect(0 <= self.ribbed_ratio <= 1, "yard ribbed_ratio must lie between 0 and 1")
-        _expect(0 <= self.gap_m <= 1, "yard gap_m must lie between 0 and 1 m")
-        _expect(0 <= self.uneven_ends_m <= 0.5, "yard uneven_ends_m must lie between 0 and 0.5 m")
-        _expect(self.gloss >= 0, "yard gloss can't be negative")
-        _expect(0 <= self.texture_ratio <= 2, "yard texture_ratio must lie between 0 and 2")
+        expect_ranges(
+            self, "yard.", max_layers=(1, 5), bar_length_m=(1, 20), skew_deg=(0, 2), missing_ratio=(0, 0.6),
+            crossed_ratio=SHARE, dunnage_m=(0.02, 0.3), ribbed_ratio=SHARE, gap_m=(0, 1),
+            uneven_ends_m=(0, 0.5), gloss=NOT_NEGATIVE, texture_ratio=(0, 2),
+        )  # fmt: skip
         _expect(
             self.strap_spacing_m == 0 or self.strap_spacing_m >= 0.3,
-            "yard strap_spacing_m must be 0 or at least 0.3 m",
+            "yard.strap_spacing_m must be 0 or at least 0.3",
         )
 
 
@@ -156,7 +145,7 @@ class TravelSettings:
     standstill_s: float = 2.0
     """Time at rest before the start and after the end."""
     overrun_m: float = 0.6
-    """How far the travel begins before the stack and ends behind it."""
+    """Travel beyond either end of the stack."""
     sway_deg: float = 0.15
     """Amplitude of the body's swing."""
     sway_hz: float = 0.4
@@ -168,36 +157,25 @@ class TravelSettings:
     stops: int = 0
     """Times that the crane stops under way, at places drawn from the seed."""
     stop_s: float = 2.0
-    """Time of a stop, from standing still to starting anew."""
+    """Duration of a stop."""
     trolley_m: float = 0.0
-    """How far the trolley travels during the pass."""
+    """Travel of the trolley during the pass."""
     oscillation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Amplitudes of bridge, trolley and hoist on their springs, which their encoders don't see."""
+    """Amplitudes at which bridge, trolley and hoist oscillate, unseen by their encoders."""
     oscillation_hz: tuple[float, float, float] = (0.7, 1.1, 1.9)
-    """Frequencies of these."""
+    """Frequencies of these oscillations."""
     rail_m: float = 0.0
-    """Amplitude by which the rails rise and fall and lead aside, with a wave every few metres."""
+    """Amplitude of the rails' errors in height and straightness, with a wave every few metres."""
     skew_deg: float = 0.0
     """Amplitude by which the bridge skews as it travels."""
 
     def __post_init__(self) -> None:
-        _expect(0.01 <= self.speed_mps <= 5, "motion speed_mps must lie between 0.01 and 5")
-        _expect(0.01 <= self.acceleration_mps2 <= 10, "motion acceleration_mps2 must lie between 0.01 and 10")
-        _expect(1 <= self.standstill_s <= 120, "motion standstill_s must lie between 1 and 120")
-        _expect(0 <= self.overrun_m <= 5, "motion overrun_m must lie between 0 and 5 m")
-        _expect(0 <= self.sway_deg <= 5, "motion sway_deg must lie between 0 and 5")
-        _expect(0 <= self.vibration_m <= 0.01, "motion vibration_m must lie between 0 and 0.01")
-        hertz = (self.sway_hz, self.vibration_hz, *self.oscillation_hz)
-        _expect(min(hertz) > 0, "motion frequencies must be positive")
-        _expect(0 <= self.stops <= 20, "motion stops must lie between 0 and 20")
-        _expect(0 <= self.stop_s <= 600, "motion stop_s must lie between 0 and 600")
-        _expect(abs(self.trolley_m) <= 20, "motion trolley_m must lie within 20 m")
-        _expect(
-            0 <= min(self.oscillation_m) <= max(self.oscillation_m) <= 0.1,
-            "motion oscillation_m must lie between 0 and 0.1 m",
-        )
-        _expect(0 <= self.rail_m <= 0.05, "motion rail_m must lie between 0 and 0.05 m")
-        _expect(0 <= self.skew_deg <= 2, "motion skew_deg must lie between 0 and 2")
+        expect_ranges(
+            self, "motion.", speed_mps=(0.01, 5), acceleration_mps2=(0.01, 10), standstill_s=(1, 120),
+            overrun_m=(0, 5), sway_deg=(0, 5), vibration_m=(0, 0.01), sway_hz=POSITIVE,
+            vibration_hz=POSITIVE, oscillation_hz=POSITIVE, stops=(0, 20), stop_s=(0, 600),
+            trolley_m=(-20, 20), oscillation_m=(0, 0.1), rail_m=(0, 0.05), skew_deg=(0, 2),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -227,38 +205,31 @@ class SensorSettings:
     encoder_step_m: float = 0.001
     """Quantisation of a reading."""
     encoder_latency_s: float = 0.0
-    """A reading stamped t says where the crane was at t minus this."""
+    """Latency: a reading stamped t gives the position at t minus this."""
     encoder_jitter_s: float = 0.0
-    """How much later still a reading may be, evenly between 0 and this."""
+    """Jitter on top of the latency, uniform between 0 and this."""
     encoder_scale: float = 1.0
-    """A metre of the bridge as its encoder reads it."""
+    """Scale of the bridge's encoder: metres read per metre travelled."""
     encoder_backlash_m: float = 0.0
-    """Play between bridge and encoder: it reads the middle of it, and follows at its end."""
+    """Backlash between bridge and encoder, centred at the start."""
     laser_std_m: float = 0.001
     """Noise of a laser point."""
     laser_y_m: tuple[float, ...] = (0.45, -1.15)
-    """Where the laser's profiles lie across the travel; none leaves the laser out."""
+    """y of the laser's profiles; none leaves the laser out."""
 
     def __post_init__(self) -> None:
-        _expect(abs(self.timeshift_cam_imu_s) <= 0.5, "sensors timeshift_cam_imu_s must lie within 0.5 s")
-        _expect(20 <= self.imu_rate_hz <= 2000, "sensors imu_rate_hz must lie between 20 and 2000")
-        _expect(1 <= self.encoder_rate_hz <= 1000, "sensors encoder_rate_hz must lie between 1 and 1000")
-        _expect(0 <= self.encoder_step_m <= 0.1, "sensors encoder_step_m must lie between 0 and 0.1 m")
-        latest = self.encoder_latency_s + self.encoder_jitter_s
-        _expect(
-            min(self.encoder_latency_s, self.encoder_jitter_s) >= 0 and latest <= 0.9,
-            "sensors encoder_latency_s and encoder_jitter_s must lie between 0 and 0.9 s together",
-        )
-        _expect(0.9 <= self.encoder_scale <= 1.1, "sensors encoder_scale must lie between 0.9 and 1.1")
-        _expect(
-            0 <= self.encoder_backlash_m <= 0.1, "sensors encoder_backlash_m must lie between 0 and 0.1 m"
-        )
-        noises = (
-            self.gyro_noise_density, self.gyro_random_walk, self.gyro_bias_radps, self.accel_noise_density,
-            self.accel_random_walk, self.accel_bias_mps2, self.encoder_std_m, self.laser_std_m,
+        expect_ranges(
+            self, "sensors.", timeshift_cam_imu_s=(-0.5, 0.5), imu_rate_hz=(20, 2000),
+            encoder_rate_hz=(1, 1000), encoder_step_m=(0, 0.1), encoder_scale=(0.9, 1.1),
+            encoder_backlash_m=(0, 0.1), laser_y_m=(-3.7, 3.7), gyro_noise_density=NOT_NEGATIVE,
+            gyro_random_walk=NOT_NEGATIVE, gyro_bias_radps=NOT_NEGATIVE, accel_noise_density=NOT_NEGATIVE,
+            accel_random_walk=NOT_NEGATIVE, accel_bias_mps2=NOT_NEGATIVE, encoder_std_m=NOT_NEGATIVE,
+            laser_std_m=NOT_NEGATIVE, encoder_latency_s=(0, 0.9), encoder_jitter_s=(0, 0.9),
         )  # fmt: skip
-        _expect(min(noises) >= 0, "sensors noises can't be negative")
-        _expect(all(abs(y) <= 3.7 for y in self.laser_y_m), "sensors laser_y_m must lie within 3.7 m")
+        _expect(
+            self.encoder_latency_s + self.encoder_jitter_s <= 0.9,
+            "sensors.encoder_latency_s and encoder_jitter_s must lie in 0...0.9 together",
+        )
 
 
 @dataclass(frozen=True)
@@ -268,18 +239,19 @@ class MagnetSettings:
     size_m: tuple[float, float] = (0.0, 0.0)
     """Along the travel and across; 0 0 leaves it out."""
     below_body_m: float = 3.0
-    """How far it hangs under the body."""
+    """Distance below the body."""
     offset_m: tuple[float, float] = (0.6, 0.3)
-    """Where its middle hangs from the body, along the travel and across."""
+    """Its middle relative to the body, along the travel and across."""
     first_ratio: float = 0.3
-    """Share of the frames from which it hangs there."""
+    """Share of the frames after which it appears."""
     last_ratio: float = 0.6
-    """Share of the frames until which it hangs there."""
+    """Share of the frames after which it disappears."""
 
     def __post_init__(self) -> None:
-        _expect(min(self.size_m) >= 0, "magnet size_m can't be negative")
-        _expect(self.below_body_m > 0.2, "magnet below_body_m must be over 0.2 m")
-        _expect(0 <= self.first_ratio <= self.last_ratio <= 1, "magnet shares must rise within 0 and 1")
+        expect_ranges(
+            self, "magnet.", size_m=NOT_NEGATIVE, below_body_m=(0.2, inf), first_ratio=SHARE, last_ratio=SHARE
+        )
+        _expect(self.first_ratio <= self.last_ratio, "magnet.first_ratio can't be over magnet.last_ratio")
 
 
 @dataclass(frozen=True)
@@ -291,7 +263,7 @@ class SimulationSettings:
     frames: int = 20
     """Stereo pairs, spread evenly over the travel."""
     seed: int = 0
-    """Seed of everything that is drawn by chance."""
+    """Random seed."""
     bars: str = "90mm:7"
     """Kinds of bundles, diameter and bars: 90mm:7,40mm:37; each section of the stack takes one."""
     depth_views: int = 2
@@ -306,15 +278,14 @@ class SimulationSettings:
 
     def __post_init__(self) -> None:
         expect_values(self)
-        _expect(1 <= self.length_m <= 500, "length_m must lie between 1 and 500 m")
-        _expect(2 <= self.frames <= 100_000, "frames must lie between 2 and 100000")
-        _expect(self.seed >= 0, "seed can't be negative")
-        _expect(0 <= self.depth_views <= self.frames, "depth_views must lie between 0 and frames")
+        expect_ranges(
+            self, "", length_m=(1, 500), frames=(2, 100_000), seed=NOT_NEGATIVE, depth_views=(0, self.frames)
+        )
         layers = self.yard.max_layers + (self.yard.crossed_ratio > 0)
         tallest = max(2 * k.diameter_m * (k.rings + 0.5) for k in self.kinds) + self.yard.dunnage_m
         _expect(
             self.camera.above_floor_m > layers * tallest + 1,
-            "camera above_floor_m must be at least 1 m over the highest possible stack",
+            "camera.above_floor_m must be at least 1 m over the highest possible stack",
         )
 
     @property

@@ -16,6 +16,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
+from barsight.core.types import CraneSamples, LaserProfile
 from barsight.simulation import euroc_files
 from barsight.simulation.effects.faults import SpoiledLens, exposure_gain
 from barsight.simulation.hanging_plate import paint_plate, plate_at
@@ -28,7 +29,7 @@ from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.stock import stack_yard
 from barsight.simulation.textures import surface_tile
 from barsight.simulation.trajectory import SimulatedTrajectory
-from barsight.simulation.truth import SurfaceTruth, bundle_rows, true_depth, write_rig
+from barsight.simulation.truth import SurfaceTruth, bundle_rows, true_depth, write_rig_truth
 
 CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
 GROUND_TRUTH_HZ = 200
@@ -122,7 +123,7 @@ def simulate(
         surface.write(truth_folder)
         for name, content in world.laid.truth.items():
             (truth_folder / name).write_text(json.dumps(content, indent=1), encoding="utf-8")
-        write_rig(
+        write_rig_truth(
             world.mounted.rig, imu.gyro_bias_radps, imu.accel_bias_mps2, np.array(CRANE_TO_BODY_M), settings,
             truth_folder,
         )  # fmt: skip
@@ -150,13 +151,16 @@ def _write_slow_sensors(mav0: Path, world: World, surface: SurfaceTruth) -> ImuR
     euroc_files.write_imu(mav0 / "imu0", imu, sensors)
     stamp_ns, place = record_encoders(trajectory, sensors, lever, _stream(settings, 5))
     nominal = world.mounted.nominal_yard_from_body
-    euroc_files.write_crane(mav0 / "crane0", stamp_ns, place, lever, nominal, sensors)
+    std_m = round(float(np.hypot(sensors.encoder_std_m, sensors.encoder_step_m / 12**0.5)), 6)
+    euroc_files.write_crane(mav0 / "crane0", CraneSamples(stamp_ns, place, lever, nominal, std_m))
     if sensors.laser_y_m:
         noise = _stream(settings, 6).normal(0, 1, surface.profile_z_m.shape) * sensors.laser_std_m
-        euroc_files.write_laser(
-            mav0 / "laser0", surface.profile_x_m, surface.profile_y_m, surface.profile_z_m + noise,
-            sensors.laser_std_m,
-        )  # fmt: skip
+        x_m, z_m = surface.profile_x_m, surface.profile_z_m + noise
+        profiles = tuple(
+            LaserProfile(k, x_m, np.full(x_m.size, y), z_m[k], sensors.laser_std_m)
+            for k, y in enumerate(surface.profile_y_m)
+        )
+        euroc_files.write_laser(mav0 / "laser0", profiles)
     truth_ns = stamps(trajectory.duration_s, GROUND_TRUTH_HZ)
     motion = trajectory.at(seconds(truth_ns))
     euroc_files.write_ground_truth(

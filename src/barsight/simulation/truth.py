@@ -135,7 +135,7 @@ def bundle_rows(bundles: tuple[StackedBundle, ...]) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def write_rig(
+def write_rig_truth(
     rig: StereoRig, gyro_bias: Float64, accel_bias: Float64, lever_m: Float64, settings: SimulationSettings,
     folder: Path,
 ) -> None:  # fmt: skip

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, UNDER_1, expect_ranges
 from barsight.stereo.baselines.census import Census, CensusSettings
 from barsight.stereo.baselines.csca import Csca, CscaSettings
 from barsight.stereo.baselines.nonlocal_aggregation import Nonlocal, NonlocalSettings
@@ -53,14 +54,11 @@ class StereoSettings:
         low, high = self.min_disparity_px, self.max_disparity_px
         if low is not None and high is not None and high <= low:
             raise ConfigError(f"the disparity range {low}:{high} is empty")
-        if self.calibration_sigma_px < 0 or self.max_depth_m <= 0:
-            raise ConfigError("stereo.calibration_sigma_px can't be negative, max_depth_m must be positive")
-        if self.confirmed_pairs < 0:
-            raise ConfigError(f"stereo.confirmed_pairs can't be negative, {self.confirmed_pairs} is")
-        if self.max_sigma_px <= 0:
-            raise ConfigError(f"stereo.max_sigma_px must be positive, not {self.max_sigma_px}")
-        if not 0 <= self.gap_darkness < 1:
-            raise ConfigError(f"stereo.gap_darkness must lie in 0...1, not {self.gap_darkness}")
+        expect_ranges(
+            self, "stereo.", calibration_sigma_px=NOT_NEGATIVE, max_depth_m=POSITIVE, max_sigma_px=POSITIVE,
+            confirmed_pairs=NOT_NEGATIVE,
+            gap_darkness=(0, UNDER_1),
+        )  # fmt: skip
 
     def for_map(self) -> StereoSettings:
         """Drop guesses, which no map takes, and be as sure of a pixel's side as if there were no edge: a map

@@ -10,6 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.noise import image_noise
 
@@ -40,12 +41,12 @@ class SgbmSettings:
     """The part of the error that image noise doesn't explain: pixel locking and smoothing."""
 
     def __post_init__(self) -> None:
-        if self.block_px < 1 or self.block_px % 2 == 0:
-            raise ConfigError(f"stereo.sgbm.block_px must be odd and positive, not {self.block_px}")
-        if not 0 <= self.uniqueness_pct <= 100:
-            raise ConfigError(f"stereo.sgbm.uniqueness_pct must lie in 0...100, not {self.uniqueness_pct}")
-        if self.speckle_px < 0 or self.subpixel_sigma_px < 0:
-            raise ConfigError("stereo.sgbm.speckle_px and subpixel_sigma_px can't be negative")
+        if self.block_px % 2 == 0:
+            raise ConfigError(f"sgbm.block_px must be odd, not {self.block_px}")
+        expect_ranges(
+            self, "sgbm.", block_px=POSITIVE, uniqueness_pct=(0, 100), speckle_px=NOT_NEGATIVE,
+            subpixel_sigma_px=NOT_NEGATIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[
         server = viser.ViserServer(host=HOST, port=port, label="barsight", verbose=False)
     try:
         if port not in (0, server.get_port()):
-            raise OutputError(f"port {port} was taken at this moment; name another with --port")
+            raise OutputError(f"port {port} was taken at this moment; name another port")
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.scene.set_up_direction("+z")
         _aim(server, cloud, path)
@@ -98,14 +98,14 @@ def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
 def _expect_free(port: int) -> None:
     """Refuse a taken port: viser silently takes the next one; here that is an error."""
     if not 0 <= port <= 65535:
-        raise OutputError(f"port {port} does not exist; name one from 1024 to 65535 with --port")
+        raise OutputError(f"port {port} does not exist; name a port from 1024 to 65535")
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((HOST, port))
         except OSError as error:
             reason = "is taken" if error.errno == errno.EADDRINUSE else "may not be used"
-            raise OutputError(f"port {port} {reason}; name another with --port") from error
+            raise OutputError(f"port {port} {reason}; name another port") from error
 
 
 def _aim(server: viser.ViserServer, cloud: Cloud, path: CameraPath | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import OVER_0, POSITIVE, SHARE, expect_ranges
 
 
 @dataclass(frozen=True)
@@ -57,32 +57,15 @@ class LiftSettings:
     """A bundle nearer than this to a stanchion is held by it."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.bundles <= 10:
-            raise ConfigError(f"lift.bundles must lie in 1...10, not {self.bundles}")
-        shares = (
-            self.max_unknown_ratio, self.max_unexplained_ratio, self.min_confidence,
-            self.max_overhang_ratio, self.min_count_probability, self.max_refused_ratio,
+        expect_ranges(
+            self, "lift.", bundles=(1, 10), max_unknown_ratio=SHARE, max_unexplained_ratio=SHARE,
+            min_confidence=SHARE, max_overhang_ratio=SHARE, min_count_probability=SHARE,
+            max_refused_ratio=SHARE, strap_m=(0, 0.05), max_hidden_bar_m=(OVER_0, 0.1),
+            contact_gap_m=POSITIVE, max_age_s=POSITIVE, beside_stanchion_m=POSITIVE,
+            disturbed_reach_m=(0, 100), set_down_clear_m=POSITIVE, travel_clear_m=POSITIVE,
+            swing_m=POSITIVE, dunnage_m=(0, 0.5), max_turn_deg=(0, 180), max_stack_m=(OVER_0, 50),
+            max_lean_deg=(OVER_0, 45),
         )  # fmt: skip
-        if not all(0 <= share <= 1 for share in shares):
-            raise ConfigError("lift: shares, min_confidence and min_count_probability lie in 0...1")
-        if not 0 <= self.strap_m <= 0.05:
-            raise ConfigError(f"lift.strap_m must lie in 0...0.05, not {self.strap_m}")
-        if not 0 < self.max_hidden_bar_m <= 0.1:
-            raise ConfigError(f"lift.max_hidden_bar_m must lie in 0...0.1, not {self.max_hidden_bar_m}")
-        if self.contact_gap_m <= 0 or self.max_age_s <= 0 or self.beside_stanchion_m <= 0:
-            raise ConfigError("lift.contact_gap_m, max_age_s and beside_stanchion_m must be over 0")
-        if not 0 <= self.disturbed_reach_m <= 100:
-            raise ConfigError(f"lift.disturbed_reach_m must lie in 0...100, not {self.disturbed_reach_m}")
-        if min(self.set_down_clear_m, self.travel_clear_m, self.swing_m) <= 0:
-            raise ConfigError("lift.set_down_clear_m, travel_clear_m and swing_m must be over 0")
-        if not 0 <= self.dunnage_m <= 0.5:
-            raise ConfigError(f"lift.dunnage_m must lie in 0...0.5, not {self.dunnage_m}")
-        if not 0 <= self.max_turn_deg <= 180:
-            raise ConfigError(f"lift.max_turn_deg must lie in 0...180, not {self.max_turn_deg}")
-        if self.max_stack_m is not None and not 0 < self.max_stack_m <= 50:
-            raise ConfigError(f"lift.max_stack_m must lie between 0 and 50, not {self.max_stack_m}")
-        if not 0 < self.max_lean_deg <= 45:
-            raise ConfigError(f"lift.max_lean_deg must lie in 0...45, not {self.max_lean_deg}")
 
 
 UPPER = 1.645

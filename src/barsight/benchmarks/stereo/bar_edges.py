@@ -31,7 +31,7 @@ class Outlines:
     normals: Float64
 
 
-def bar_diameter(disparity: Disparity, pair: RectifiedPair, start: BarFit) -> float | Failed:
+def edge_diameter(disparity: Disparity, pair: RectifiedPair, start: BarFit) -> float | Failed:
     """Measure the diameter (m): the mean over both images' outlines at the distance that the disparities
     give.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import fmin
@@ -28,7 +29,16 @@ _CAUCHY_SIGMAS = 2.4
 _LARGEST_PRODUCT = 1e100
 
 
-_Problem = tuple[Float64, float, Float64, Float64, float, float, Float64, Float64]
+class BarPixels(NamedTuple):
+    """Pixels near a bar. rays: (N, 2) x, y with z = 1. behind: (N,) the floor's disparity, px. scale: focal
+    length times baseline, px m; doffs: px. found: (N,) px.
+    """
+
+    rays: Float64
+    behind: Float64
+    scale: float
+    doffs: float
+    found: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,17 +78,12 @@ def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> B
     behind = floor[0] * columns + floor[1] * rows + floor[2]
     found = disparity.disparity_px[rows, columns].astype(np.float64)
     sigma = disparity.sigma_px[rows, columns].astype(np.float64)
-    frame = _frame(guess)
-    scale_px = camera.focal_px * camera.baseline_m
-    place = np.zeros(5)
+    pixels = BarPixels(rays, behind, camera.focal_px * camera.baseline_m, camera.doffs_px, found)
+    frame, place = _frame(guess), np.zeros(5)
     for _ in range(_ROUNDS):
-        predicted = _predict(place, frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px)
-        residual = np.abs(found - predicted)
-        kappa = max(mad_sigma(residual / sigma), 1e-3)
-        weight = 1 / (_CAUCHY_SIGMAS * kappa * sigma)
-        place = _descend(
-            place, (frame, guess.radius_m, rays, behind, scale_px, camera.doffs_px, found, weight)
-        )
+        off = _residuals(*_placed(place, frame, guess.radius_m), pixels)
+        kappa = max(mad_sigma(off / sigma), 1e-3)
+        place = _descend(place, (frame, guess.radius_m, pixels, 1 / (_CAUCHY_SIGMAS * kappa * sigma)))
     centre, axis, radius = _placed(place, frame, guess.radius_m)
     if not 0.3 < radius / guess.radius_m < 3:
         return Failed("diverged", f"the fit ends at a radius of {1000 * radius:.1f} mm")
@@ -138,7 +143,7 @@ def _placed(place: Float64, frame: Float64, radius_m: float) -> tuple[Float64, F
     return centre, axis / np.linalg.norm(axis), radius_m * math.exp(place[4])
 
 
-def _descend(start: Float64, problem: _Problem) -> Float64:
+def _descend(start: Float64, problem: tuple[Float64, float, BarPixels, Float64]) -> Float64:
     """Minimise by Nelder and Mead's simplex: the loss has small steps where pixels change from
     floor to bar.
     """
@@ -157,52 +162,17 @@ def _descend(start: Float64, problem: _Problem) -> Float64:
     return best
 
 
-def _loss(
-    place: Float64,
-    frame: Float64,
-    radius_m: float,
-    rays: Float64,
-    behind: Float64,
-    scale_px: float,
-    doffs_px: float,
-    found: Float64,
-    weight: Float64,
-) -> float:
-    centre, axis, radius = _placed(place, frame, radius_m)
-    return _cauchy(centre, axis, radius, rays, behind, scale_px, doffs_px, found, weight)
-
-
-def _predict(
-    place: Float64,
-    frame: Float64,
-    radius_m: float,
-    rays: Float64,
-    behind: Float64,
-    scale_px: float,
-    doffs_px: float,
-) -> Float64:
-    centre, axis, radius = _placed(place, frame, radius_m)
-    predicted = np.empty(len(rays))
-    _disparities(centre, axis, radius, rays, behind, scale_px, doffs_px, predicted)
-    return predicted
+def _loss(place: Float64, frame: Float64, radius_m: float, pixels: BarPixels, weight: Float64) -> float:
+    return _cauchy(*_placed(place, frame, radius_m), pixels, weight)
 
 
 @kernel()
-def _disparity_of_ray(
-    centre: Float64,
-    axis: Float64,
-    radius: float,
-    x: float,
-    y: float,
-    behind: float,
-    scale: float,
-    doffs: float,
-) -> float:
-    """Intersect ray (x, y, 1) with the cylinder and the floor behind; the nearer's disparity.
+def _residual(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, index: int) -> float:
+    """Intersect a pixel's ray with the cylinder and the floor behind: found minus the nearer's disparity.
 
-    centre: (3,) m; axis: (3,) unit vector; radius: m. behind: px. scale: focal length times baseline, px m;
-    doffs: px.
+    centre: (3,) m; axis: (3,) unit vector; radius: m.
     """
+    x, y = pixels.rays[index, 0], pixels.rays[index, 1]
     slide = axis[0] * x + axis[1] * y + axis[2]
     lift = axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]
     ex, ey, ez = x - slide * axis[0], y - slide * axis[1], 1 - slide * axis[2]
@@ -210,59 +180,36 @@ def _disparity_of_ray(
     a = ex * ex + ey * ey + ez * ez
     b = ex * px + ey * py + ez * pz
     root = b * b - a * (px * px + py * py + pz * pz - radius * radius)
-    if root <= 0:
-        return behind
-    return float(max(behind, scale * a / (b - math.sqrt(root)) - doffs))
+    predicted = pixels.behind[index]
+    if root > 0:
+        predicted = max(predicted, pixels.scale * a / (b - math.sqrt(root)) - pixels.doffs)
+    return float(pixels.found[index] - predicted)
 
 
 @kernel()
-def _cauchy(
-    centre: Float64,
-    axis: Float64,
-    radius: float,
-    rays: Float64,
-    behind: Float64,
-    scale: float,
-    doffs: float,
-    found: Float64,
-    weight: Float64,
-) -> float:
+def _cauchy(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, weight: Float64) -> float:
     """Compute the mean Cauchy loss of the pixels' disparities.
 
-    centre: (3,) m; axis: (3,) unit vector; radius: m. rays: (N, 2) x, y with z = 1. behind: (N,) the floor's
-    disparity, px. scale: focal length times baseline, px m; doffs: px. found: (N,) px; weight: (N,) 1 / px.
+    centre: (3,) m; axis: (3,) unit vector; radius: m. weight: (N,) 1 / px.
     """
     total, product = 0.0, 1.0
-    for index in range(rays.shape[0]):
-        predicted = _disparity_of_ray(
-            centre, axis, radius, rays[index, 0], rays[index, 1], behind[index], scale, doffs
-        )
-        away = (found[index] - predicted) * weight[index]
+    for index in range(len(weight)):
+        away = _residual(centre, axis, radius, pixels, index) * weight[index]
         product *= 1 + away * away
         # One logarithm for many factors: logarithms are what takes the time.
         if product > _LARGEST_PRODUCT:
             total += math.log(product)
             product = 1.0
-    return float((total + math.log(product)) / rays.shape[0])
+    return float((total + math.log(product)) / len(weight))
 
 
 @kernel()
-def _disparities(
-    centre: Float64,
-    axis: Float64,
-    radius: float,
-    rays: Float64,
-    behind: Float64,
-    scale: float,
-    doffs: float,
-    predicted: Float64,
-) -> None:
-    """Predict the disparity of each ray, the cylinder's or the floor's behind it.
+def _residuals(centre: Float64, axis: Float64, radius: float, pixels: BarPixels) -> Float64:
+    """Compute each pixel's disparity (N,) less the cylinder's or the floor's behind it.
 
-    centre: (3,) m; axis: (3,) unit vector; radius: m. rays: (N, 2) x, y with z = 1. behind: (N,) px. scale:
-    focal length times baseline, px m; doffs: px. Fills predicted (N,) px.
+    centre: (3,) m; axis: (3,) unit vector; radius: m.
     """
-    for index in range(rays.shape[0]):
-        predicted[index] = _disparity_of_ray(
-            centre, axis, radius, rays[index, 0], rays[index, 1], behind[index], scale, doffs
-        )
+    off = np.empty(len(pixels.found))
+    for index in range(len(off)):
+        off[index] = _residual(centre, axis, radius, pixels, index)
+    return off

@@ -20,7 +20,7 @@ import numpy as np
 from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance, provenance
-from barsight.benchmarks.stereo.bar_edges import bar_diameter
+from barsight.benchmarks.stereo.bar_edges import edge_diameter
 from barsight.benchmarks.stereo.bar_fit import BarGuess, fit_bar
 from barsight.benchmarks.stereo.bar_renderer import RenderedBar, render_pair
 from barsight.benchmarks.stereo.bar_scenes import BAR_DIAMETER_M, bar_over_floor
@@ -121,7 +121,7 @@ def measure_bar(disparity: Disparity, pair: RectifiedPair, guess: BarGuess) -> t
     fitted = fit_bar(disparity, pair.camera, guess)
     if isinstance(fitted, Failed):
         return math.nan, math.nan
-    size = bar_diameter(disparity, pair, fitted)
+    size = edge_diameter(disparity, pair, fitted)
     return (math.nan if isinstance(size, Failed) else size), 2 * fitted.radius_m
 
 

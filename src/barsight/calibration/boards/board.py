@@ -1,4 +1,4 @@
-"""Parse `--board` texts and place the board's points."""
+"""Parse `board` texts and place the board's points."""
 
 from __future__ import annotations
 

@@ -49,11 +49,11 @@ MAX_PNP_PX = 4.0
 MAX_RIG_RAD, MAX_RIG_RATIO = 0.05, 0.15
 MIN_WALK = 1e-3
 REMEDIES = {
-    "too-few": "keep the board in sight; check --board",
+    "too-few": "keep the board in sight; check its description (board)",
     "still": "turn the rig about all three axes in front of the board",
     "no-overlap": "give the IMU's log of the same recording",
     "no-match": "give the IMU of the same recording, on one rigid body with the cameras",
-    "degrees": "the gyroscope is in degrees/s; give --gyro-unit deg/s or convert it to rad/s",
+    "degrees": "the gyroscope is in degrees/s; give gyro_unit deg/s or convert it to rad/s",
     "ratio": "check the gyroscope's unit and the cameras' stamps",
 }
 
@@ -79,7 +79,9 @@ def prepare(
     seen = [_seen(views, camera) for camera in (0, 1)]
     if min(len(own[1]) for own in seen) == 0:
         bare = 0 if not seen[0][1] else 1
-        raise CalibrationError(source, f"cam{bare} never sees the board", "check --board and the pictures")
+        raise CalibrationError(
+            source, f"cam{bare} never sees the board", "check its description (board) and the pictures"
+        )
     first, last = max(s[0][0] for s in seen), min(s[0][-1] for s in seen)
     margin = int(MARGIN_S * NS_PER_S)
     start_ns = max(int(first) - margin, int(imu.stamp_ns[0]))
@@ -155,7 +157,7 @@ def _checked_imu(imu: ImuSamples, source: Path) -> tuple[ImuSamples, tuple[str, 
         raise CalibrationError(source, "the IMU's log holds NaN", "leave those samples out")
     gravity = float(np.median(np.linalg.norm(imu.accel_mps2, axis=1)))
     if not 8.0 < gravity < 12.0:
-        unit = "they are probably in g: give --accel-unit g" if 0.8 < gravity < 1.25 else "check the unit"
+        unit = "they are probably in g: give accel_unit g" if 0.8 < gravity < 1.25 else "check the unit"
         raise CalibrationError(source, f"the accelerations' median is {gravity:.2f} m/s^2, not 9.8", unit)
     gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1
     edges = np.concatenate([[0], gaps, [imu.stamp_ns.size]])
@@ -182,7 +184,7 @@ def _expect_lenses(ways: Sequence[CameraPoses], source: Path) -> None:
         if not error <= MAX_PNP_PX:
             raise CalibrationError(
                 source, f"cam{camera}'s lens doesn't fit the corners (they lie {error:.1f} px off)",
-                "give the --rig and --board these pictures were taken with, cam0 the left camera",
+                "give the rig and board that these pictures were taken with, cam0 the left camera",
             )  # fmt: skip
 
 

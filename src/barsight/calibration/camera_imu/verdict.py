@@ -96,9 +96,9 @@ def assess_camera_imu(calibration: CameraImuCalibration, halves: Halves | Failed
         judge("pictures", found.corner_px / calibration.corner_px, "times their corners' noise", 3, 6,
               "corners of one picture err together where board or lens aren't as stated"),
         judge("gyro noise", found.gyro_radps / (stated.gyro_density * root), "times the stated", 1.5, 4,
-              "larger means a wrong --imu file, or vibration"),
+              "larger means a wrong imu file, or vibration"),
         judge("accelerometer noise", found.accel_mps2 / (stated.accel_density * root), "times the stated",
-              2, 6, "larger means a wrong --imu file, or vibration"),
+              2, 6, "larger means a wrong imu file, or vibration"),
         judge("gyro whiteness", float(np.abs(gyro.after - gyro.after_expected).max()),
               "largest autocorrelation beyond white noise's", 0.25, 0.6, "a pattern that the model lacks"),
         judge("accelerometer whiteness", float(np.abs(accel.after - accel.after_expected).max()),
@@ -145,5 +145,5 @@ def _advice(calibration: CameraImuCalibration) -> tuple[str, ...]:
                 "of the stated size, or calibrate the cameras again"
             )
         elif group.matters:
-            advice.append("the IMU's scales don't look ideal: compare with --imu-scales")
+            advice.append("the IMU's scales don't look ideal: compare with imu_scales")
     return tuple(advice)

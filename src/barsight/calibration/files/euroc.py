@@ -97,7 +97,7 @@ def read_imu(path: Path) -> MountedImu:
     return MountedImu(pose or Pose.identity("body", "imu"), noise)
 
 
-def write_rig(mav0: Path, rig: StereoRig, rate_hz: float, *, block_lists: bool = False) -> None:
+def write_rig(mav0: Path, rig: StereoRig, rate_hz: float) -> None:
     """Write `cam0/sensor.yaml` and `cam1/sensor.yaml`, which `read_rig` reads back bit for bit."""
     for name, camera, mount in (
         ("cam0", rig.cam0, rig.body_from_cam0),
@@ -118,11 +118,10 @@ def write_rig(mav0: Path, rig: StereoRig, rate_hz: float, *, block_lists: bool =
                 "distortion_coefficients": list(camera.coefficients),
                 "timeshift_cam_imu": rig.timeshift_cam_imu_ns / NS_PER_S,
             },
-            block_lists=block_lists,
         )
 
 
-def write_imu(path: Path, noise: ImuNoise | None, rate_hz: float, *, block_lists: bool = False) -> None:
+def write_imu_description(path: Path, noise: ImuNoise | None, rate_hz: float) -> None:
     """Write an IMU's `sensor.yaml` for samples that are in `body` already."""
     values: dict[str, object] = {
         "sensor_type": "imu",
@@ -137,7 +136,7 @@ def write_imu(path: Path, noise: ImuNoise | None, rate_hz: float, *, block_lists
             "accelerometer_noise_density": noise.accel_density,
             "accelerometer_random_walk": noise.accel_walk,
         }
-    write_document(path, values, block_lists=block_lists)
+    write_document(path, values)
 
 
 def _matrix(pose: Pose) -> dict[str, object]:

@@ -117,14 +117,11 @@ def read_document(path: Path) -> Document:
     return Document(path, {str(key): value for key, value in values.items()})
 
 
-def write_document(path: Path, values: dict[str, Any], *, block_lists: bool = False) -> None:
-    """Write a YAML mapping; floats as Python's `repr`, so that they read back bit for bit.
-
-    block_lists: a line per number instead of `[a, b, ...]`.
-    """
+def write_document(path: Path, values: dict[str, Any]) -> None:
+    """Write a YAML mapping; floats as Python's `repr`, so that they read back bit for bit."""
     yaml = YAML(typ="safe", pure=True)
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-    yaml.default_flow_style = False if block_lists else None
+    yaml.default_flow_style = None
     with path.open("w", encoding="utf-8") as stream:
         yaml.dump(values, stream)
 

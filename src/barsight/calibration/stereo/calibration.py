@@ -147,7 +147,7 @@ def calibrate_stereo(
         removed += out
         if not out and limit is None:
             break
-        start = _kept_state(solved.state, kept, remaining)
+        start = _select_boards(solved.state, kept, remaining)
         kept = remaining
         _expect_views(kept, source, removed)
     removed += corner_notes(before, kept)
@@ -166,7 +166,7 @@ def parameter_names(lens: Lens) -> tuple[str, ...]:
     return (*own, *rig)
 
 
-def rig_of(lens: Lens, state: AdjustmentState, sizes: Sequence[tuple[int, int]]) -> StereoRig:
+def calibrated_rig(lens: Lens, state: AdjustmentState, sizes: Sequence[tuple[int, int]]) -> StereoRig:
     """Build the rig of a solved state, its body at cam0. Raises ValueError where it can't be."""
     cam1_from_cam0 = Pose("cam1", "cam0", state.rotation, state.translation_m)
     body_from_cam0 = Pose.identity("body", "cam0")
@@ -185,7 +185,7 @@ def _start(
     return start
 
 
-def _kept_state(
+def _select_boards(
     state: AdjustmentState, views: Sequence[BoardView], kept: Sequence[BoardView]
 ) -> AdjustmentState:
     """Select the board poses of the kept views."""
@@ -255,7 +255,7 @@ def _finish(
     try:
         corners = sum(seen.ids.size for seen in observed)
         covariance, sigma, correlation = common_covariance(solved, corners, len(kept))
-        rig = rig_of(lens, solved.state, sizes)
+        rig = calibrated_rig(lens, solved.state, sizes)
     except np.linalg.LinAlgError:
         raise CalibrationError(
             source,

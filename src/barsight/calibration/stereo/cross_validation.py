@@ -11,7 +11,7 @@ from barsight.calibration.boards.board_views import BoardView
 from barsight.calibration.boards.board_warp import shape_basis
 from barsight.calibration.geometry.projection import project_lens
 from barsight.calibration.stereo.bundle_adjustment import AdjustmentResult, adjust, observe
-from barsight.calibration.stereo.calibration import StereoCalibration, rig_of
+from barsight.calibration.stereo.calibration import StereoCalibration, calibrated_rig
 from barsight.calibration.stereo.projection_uncertainty import (
     depth_derivatives,
     picture_grid,
@@ -130,7 +130,7 @@ def _compare(
         variance = np.einsum("nc,cd,nd->n", effect, spread[own, own], effect)
         predicted.append(float(np.sqrt(2 * variance.mean())))
     sizes = sizes_of(calibration.rig)
-    rigs = [rig_of(calibration.lens, s.state, sizes) for s in solved]
+    rigs = [calibrated_rig(calibration.lens, s.state, sizes) for s in solved]
     number, left, right = sample_pairs(calibration.rig, ranges_m)
     by = depth_derivatives(calibration, left, right)
     depth = triangulate_depth(rigs[0], left, right) - triangulate_depth(rigs[1], left, right)

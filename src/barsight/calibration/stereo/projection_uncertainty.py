@@ -15,7 +15,7 @@ from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.projection import Lens, project_lens
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.bundle_adjustment import retract_adjustment
-from barsight.calibration.stereo.calibration import StereoCalibration, rig_of
+from barsight.calibration.stereo.calibration import StereoCalibration, calibrated_rig
 from barsight.core.arrays import Bool, Float64
 
 COLUMNS, ROWS = 16, 12
@@ -130,7 +130,7 @@ def depth_derivatives(calibration: StereoCalibration, left: Float64, right: Floa
         for sign in (1.0, -1.0):
             change = np.zeros(steps.size)
             change[number] = sign * step
-            rig = rig_of(calibration.lens, retract_adjustment(calibration.state, change), sizes)
+            rig = calibrated_rig(calibration.lens, retract_adjustment(calibration.state, change), sizes)
             ends.append(triangulate_depth(rig, left, right))
         columns.append((ends[0] - ends[1]) / (2 * step))
     return np.column_stack(columns)

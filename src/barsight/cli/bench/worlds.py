@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from barsight.benchmarks.provenance import provenance, write_json
-from barsight.benchmarks.yard.kept_worlds import run_worlds
+from barsight.benchmarks.yard.world_runs import run_worlds
 from barsight.benchmarks.yard.world_scores import (
     WorldBench,
     WorldScore,

@@ -17,6 +17,9 @@ from barsight.core.settings.renamed import refuse_old_keys
 
 Settings = TypeVar("Settings")
 MAX_VALUE = 2**31 - 1
+OVER_0, UNDER_1 = math.nextafter(0, 1), math.nextafter(1, 0)
+POSITIVE, NOT_NEGATIVE, SHARE = (OVER_0, math.inf), (0.0, math.inf), (0.0, 1.0)
+"""Ranges that `expect_ranges` takes, like (lowest, highest)."""
 
 
 def build_settings(content: Any, kind: type[Settings], name: str = "settings") -> Settings:
@@ -50,6 +53,24 @@ def expect_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
     if value not in choices:
         *most, last = map(str, choices)
         raise ConfigError(f"{name} is {value!r}; choose {', '.join(most)}{' or ' if most else ''}{last}")
+
+
+def expect_ranges(settings: Any, section: str, **ranges: tuple[float, float]) -> None:
+    """Raise ConfigError naming the first setting that lies outside its range (lowest, highest).
+
+    Of a tuple each value counts; None passes.
+    """
+    for name, (low, high) in ranges.items():
+        value = getattr(settings, name)
+        values = value if isinstance(value, tuple) else (value,)
+        if not all(one is None or low <= one <= high for one in values):
+            raise ConfigError(f"{section}{name} must {_told(low, high)}, not {value}")
+
+
+def _told(low: float, high: float) -> str:
+    if math.isinf(high):
+        return "be positive" if low == OVER_0 else f"be at least {low:g}"
+    return f"lie in {low:g}...{high:g}" if low != OVER_0 else f"lie over 0 and up to {high:g}"
 
 
 @cache

@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int8, Int32, UInt8
 from barsight.mapping.fusion import height_sigma
-from barsight.mapping.tiles import GREY, TILE_CELLS, VIEWS, TileKey, Z
+from barsight.mapping.tiles import GRAY, TILE_CELLS, VIEWS, TileKey, Z
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class CloudPart:
         x, y = column + key[0] * TILE_CELLS, row + key[1] * TILE_CELLS
         return cls(
             np.column_stack([x * cell_m, y * cell_m, kept[:, Z]]).astype(np.float32),
-            kept[:, GREY].round().clip(0, 255).astype(np.uint8),
+            kept[:, GRAY].round().clip(0, 255).astype(np.uint8),
             height_sigma(kept),
             kept[:, VIEWS],
             (row * TILE_CELLS + column).astype(np.int32),

@@ -141,7 +141,8 @@ class SurfaceElection:
             around = _first_around(self._first, key, known)
             winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
-            np.save(_winner_file(self._elected, key), winner)
+            if last:
+                np.save(_winner_file(self._elected, key), winner)
             self._views[key] = asked.views
 
         def asked_of(key: TileKey) -> ViewSupport:

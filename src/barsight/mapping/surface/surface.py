@@ -14,7 +14,7 @@ from barsight.core.types import HeightSource
 from barsight.mapping.fusion import height_sigma
 from barsight.mapping.surface.cloud import CloudPart, read_part
 from barsight.mapping.surface.hole_filling import bridge_gaps
-from barsight.mapping.tiles import FIELDS, GREY, TILE_CELLS, VIEWS, TileKey, Z
+from barsight.mapping.tiles import FIELDS, GRAY, TILE_CELLS, VIEWS, TileKey, Z
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ def elected_layers(tile: Float32, winner: Int8) -> Layers:
     """Take from a tile's heights those that `elect_surface` chose."""
     won = _winners(tile, winner)
     source = np.where(winner >= 0, HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8)
-    return Layers(won[Z], height_sigma(np.moveaxis(won, 0, -1)), won[VIEWS], source, won[GREY])
+    return Layers(won[Z], height_sigma(np.moveaxis(won, 0, -1)), won[VIEWS], source, won[GRAY])
 
 
 @kernel()

@@ -96,7 +96,7 @@ def _learnt(problem: Problem, state: GraphState, system: System, pieces: Pieces,
     seen = problem.sightings
     assert seen is not None
     variance = np.zeros(len(state.points))
-    still, guess = np.zeros((len(problem.kept), 6)), linearisation_point(problem, state)
+    still, guess = np.zeros((len(problem.retained), 6)), linearisation_point(problem, state)
     none, points = np.zeros(2 * pieces.count + 2), state.points.copy()
     back_substitute(rig_of(seen), observations_of(problem, used), guess, still, none, points, variance)
     counts = np.bincount(seen.track[used], minlength=len(variance))

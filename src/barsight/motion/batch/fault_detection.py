@@ -51,7 +51,9 @@ def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> Checke
     known: what pictures and IMU say of the way. After a freeze an encoder may have lost count by any size,
     unless these show that it has not.
     """
-    parts = [(int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen(crane)]
+    parts = [
+        (int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen_stretches(crane)
+    ]
     samples, after = without_frozen(crane, parts)
     after = lost_counts(samples, after, known, least_way_m(crane))
     found = find_jumps(replace(samples, jumps=after), known)
@@ -147,7 +149,7 @@ def frames_off(
     """
     most = MAX_FRAMES_OFF if len(sightings) > 2 * MAX_FRAMES_OFF + MANY_STEPS else 1
     offs = tuple(range(-most, most + 1))
-    cost = {}
+    cost, worst = {}, {}
     for off, steps in zip(offs, compare_steps(sightings, imu, crane, rectifier, shift_ns, offs), strict=True):
         turned = _gyro_residual(steps)
         travelled = np.isfinite(steps.travel)
@@ -157,10 +159,11 @@ def frames_off(
         if travelled.sum() >= MIN_STEPS:
             wrong = (steps.travel - steps.way)[travelled]
             terms.append(float((wrong**2).mean()) / WAY_SIGMA_M**2)
-        cost[off] = float(np.mean(terms)) if terms else 0.0
+        cost[off], worst[off] = (float(np.mean(terms)), max(terms)) if terms else (0.0, 0.0)
     best = min(cost, key=lambda off: cost[off])
     clear = cost[best] < CLEARLY_BETTER * cost[0] and cost[0] > 1 / CLEARLY_BETTER
-    return -best if clear else 0
+    # Late stamps alone leave no sensor in doubt once they are shifted back.
+    return -best if clear and worst[best] < 1 / CLEARLY_BETTER else 0
 
 
 def _gyro_residual(steps: StepComparison) -> Float64:
@@ -176,7 +179,7 @@ def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
     return replace(crane, stamp_ns=crane.stamp_ns[kept], position_m=crane.position_m[kept])
 
 
-def frozen(crane: CraneSamples) -> list[tuple[int, int]]:
+def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
     """Find stretches (first, last) of equal readings that a moving crane runs into or comes out of elsewhere.
 
     A crane that turns gives equal readings too, of coarse encoders most of all, but stays near them.

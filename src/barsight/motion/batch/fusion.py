@@ -12,6 +12,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
+from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import (
     CraneSamples,
@@ -66,10 +67,7 @@ class FusionSettings:
         unknown = [name for name in self.sensors if name not in SENSORS]
         if unknown or not ({"stereo", "crane"} & set(self.sensors)):
             raise ConfigError(f"use is {self.use!r}; name stereo or crane, and imu if wanted, with commas")
-        if self.offset_prior_px < 0:
-            raise ConfigError("offset_prior_px can't be negative")
-        if not 0 < self.scale_sigma <= 0.1:
-            raise ConfigError(f"scale_sigma must lie over 0 and up to 0.1, not {self.scale_sigma}")
+        expect_ranges(self, "fusion.", offset_prior_px=NOT_NEGATIVE, scale_sigma=(OVER_0, 0.1))
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -122,7 +120,7 @@ class BatchPoses:
         if self._stated is not None:
             self._crane = check_crane(reestimate_noise(self._stated), KnownMotion(None, self._imu)).samples
         if self._crane is None and not self.reads_pictures:
-            raise MeasurementError(f"{recording.path}: no crane encoders; measure with --use stereo")
+            raise MeasurementError(f"{recording.path}: no crane encoders; measure with use: stereo")
         self._tracker = Tracker(self._predictor(), settings.front_end)
         self._points = PointTracker(rectifier, settings.front_end.rough)
         self._sightings: list[Sighting] = []
@@ -223,7 +221,7 @@ class BatchPoses:
                 path,
                 f"the cameras' stamps are {abs(late)} frame(s) {'late' if late > 0 else 'early'} "
                 "against gyro and encoders",
-                "repair the stamps, or use the pictures alone (--use stereo)",
+                "repair the stamps, or use the pictures alone (use: stereo)",
             )
         refuse_contradictions(path, sightings, self._imu, self._stated, self._rectifier, shift)
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, Int64
-from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.errors import Failed, MeasurementError
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import Pose
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame, Trajectory
 from barsight.motion.crane.robust_parabola import fit_parabola
@@ -37,10 +38,10 @@ class CraneSettings:
     """The attitude's error where the gyro measures the sway (1 sigma, each axis)."""
 
     def __post_init__(self) -> None:
-        if self.window_s <= 0 or self.sway_window_s <= 0:
-            raise ConfigError("window_s and sway_window_s must be positive")
-        if self.attitude_std_deg < 0 or self.sway_std_deg < 0:
-            raise ConfigError("attitude_std_deg and sway_std_deg can't be negative")
+        expect_ranges(
+            self, "motion.crane.", window_s=POSITIVE, sway_window_s=POSITIVE, attitude_std_deg=NOT_NEGATIVE,
+            sway_std_deg=NOT_NEGATIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,7 @@ class EncoderOdometry(TrajectoryEstimator):
     def begin(self, recording: Recording, rectifier: Rectifier) -> EncoderPoses:
         """Begin. Raises MeasurementError where the recording has no encoders."""
         if recording.crane() is None:
-            raise MeasurementError(
-                f"{recording.path}: no crane encoders; measure without them (--use stereo)"
-            )
+            raise MeasurementError(f"{recording.path}: no crane encoders; measure without them (use: stereo)")
         return EncoderPoses(self.settings, recording)
 
 

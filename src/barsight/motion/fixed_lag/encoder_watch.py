@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import E
 from barsight.core.arrays import Float64
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, EncoderJump
-from barsight.motion.batch.fault_detection import frozen, without_frozen
+from barsight.motion.batch.fault_detection import frozen_stretches, without_frozen
 from barsight.motion.crane.encoder_jumps import find_jumps, take_off_jumps
 from barsight.motion.crane.known_motion import KnownMotion
 from barsight.motion.fixed_lag.sliding_window import Window
@@ -34,7 +34,7 @@ class EncoderWatch:
         if not len(crane.stamp_ns):
             return
         stamps, place = crane.stamp_ns, crane.position_m
-        parts = [(int(stamps[first]), int(stamps[last])) for first, last in frozen(crane)]
+        parts = [(int(stamps[first]), int(stamps[last])) for first, last in frozen_stretches(crane)]
         if self.frozen:  # one that began before what is left of the readings goes on
             begin, end = self.frozen[-1]
             k = int(np.searchsorted(stamps, end))

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.errors import Failed, MeasurementError
+from barsight.core.settings.values import expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE
@@ -31,8 +32,7 @@ class FixedLagSettings:
     """Frames held at a time."""
 
     def __post_init__(self) -> None:
-        if not 3 <= self.frames <= 100:
-            raise ConfigError(f"live.frames must lie in 3...100, not {self.frames}")
+        expect_ranges(self, "live.", frames=(3, 100))
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class FixedLagPoses(ImmediatePoses):
         self.reads_pictures = "stereo" in self._use
         readings = self._readings()
         if readings.crane is None and not self.reads_pictures:
-            raise MeasurementError(f"{recording.path}: no crane encoders; estimate with --use stereo")
+            raise MeasurementError(f"{recording.path}: no crane encoders; estimate with use: stereo")
         self._level = None if readings.crane is not None else align_with_gravity(recording)
         self._estimator = FixedLagEstimator(
             settings, estimator.crane, estimator.live.frames, rectifier,

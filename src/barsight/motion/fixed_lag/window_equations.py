@@ -101,7 +101,7 @@ def assemble_equations(
     """Assemble equations of the used sightings and of what else binds nodes first...end - 1 to each other and
     to node `end`.
     """
-    kept, size = problem.kept, problem.width
+    kept, size = problem.retained, problem.width
     last = min(end, len(problem.start) - 1)
     within = kept[(kept >= first) & (kept <= last)]
     chain, gaps = eliminate_nodes(_chain(problem, state, first, end, last), within - first)
@@ -136,7 +136,7 @@ def _add_pictures(
     problem: Problem, state: GraphState, used: Bool, matrix: Float64, gradient: Float64
 ) -> None:
     """Add the sightings' equations to the lower half of the matrix."""
-    seen, nodes, size = problem.sightings, len(problem.kept), problem.width
+    seen, nodes, size = problem.sightings, len(problem.retained), problem.width
     assert seen is not None
     reduced, border = ReducedSystem.empty(nodes, nodes), np.zeros((2, 2))
     eliminate_points(
@@ -162,7 +162,7 @@ def prior_equations(problem: Problem, state: GraphState, slide: float) -> DenseE
     may slide.
     """
     border = border_of(problem, state, slide)
-    whole = len(problem.kept) * problem.width + len(border)
+    whole = len(problem.retained) * problem.width + len(border)
     matrix, gradient, prior = np.zeros((whole, whole)), np.zeros(whole), problem.prior
     if prior is not None:
         count = len(prior.matrix) - len(border)
@@ -191,7 +191,7 @@ def solve_step(
         by_drift, covariance = np.array([drift.yaw_rad, drift.scale]) - state.drift, drift.covariance
     left = -forward[:-2] - by_drift @ factor[-2:, :-2]
     step = np.concatenate([dense.solve_lower(factor[:-2, :-2], left, transposed=True), by_drift])
-    tail = len(matrix) - len(problem.kept) * size + size
+    tail = len(matrix) - len(problem.retained) * size + size
     own = factor[-tail:, -tail:]
     information = own @ own.T
     inverse = np.linalg.inv(information[:-2, :-2])[:size].astype(np.float64)
@@ -205,11 +205,11 @@ def solve_step(
 def _stepped(
     problem: Problem, state: GraphState, used: Bool, step: Float64, gaps: tuple[EliminatedNodes, ...]
 ) -> GraphState:
-    size, count = problem.width, len(problem.kept)
+    size, count = problem.width, len(problem.retained)
     encoders = step[count * size :][: problem.encoder_unknowns]
     by_node = step[: count * size].reshape(count, size)
-    by_node = back_substitute_nodes(by_node, encoders, problem.kept, gaps, len(problem.start))
-    pictures = by_node[problem.kept, :6]
+    by_node = back_substitute_nodes(by_node, encoders, problem.retained, gaps, len(problem.start))
+    pictures = by_node[problem.retained, :6]
     if problem.has_latency and problem.sightings is not None:
         pictures = pictures + step[-3] * slide_twist(problem.sightings.body_from_rect0)
     border = np.concatenate([encoders, step[-2:]])

@@ -128,11 +128,11 @@ def _placed_by_points(problem: Problem, state: GraphState, used: Bool) -> GraphS
         for _ in range(STEPS):
             normal, gradient = np.zeros((6, 6)), np.zeros(6)
             frame_equations(
-                rig, sights, linearisation_point(problem, state), len(problem.kept) - 1, normal, gradient
+                rig, sights, linearisation_point(problem, state), len(problem.retained) - 1, normal, gradient
             )
             values.update(X(node), values.atPose3(X(node)).retract(-dense.solve_positive(normal, gradient)))
             state = replace(state, values=values)
-    points, still = state.points.copy(), np.zeros((len(problem.kept), 6))
+    points, still = state.points.copy(), np.zeros((len(problem.retained), 6))
     shown = np.zeros(len(points), np.bool_)
     shown[seen.track[seen.node == node]] = True
     sights = sights._replace(used=used & shown[seen.track])

@@ -8,14 +8,16 @@ estimate does neither.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 
 import cv2
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float32, Float64, Int64
-from barsight.core.errors import ConfigError, Failed
+from barsight.core.errors import Failed
 from barsight.core.pose import Pose
+from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.core.types import PosedFrame, RectifiedCamera, Trajectory
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import match_mutual
@@ -40,8 +42,7 @@ class StitchingSettings:
     """A frame with fewer matches is refused."""
 
     def __post_init__(self) -> None:
-        if min(self.homography_px, self.trend_px) <= 0 or self.min_matches < 4:
-            raise ConfigError("the stitching's tolerances must be positive and min_matches at least 4")
+        expect_ranges(self, "stitching.", homography_px=POSITIVE, trend_px=POSITIVE, min_matches=(4, inf))
 
 
 @dataclass(frozen=True)

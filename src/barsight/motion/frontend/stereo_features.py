@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int64
-from barsight.core.errors import ConfigError, Failed
+from barsight.core.errors import Failed
+from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.core.types import RectifiedPair
 from barsight.features.guided_matching import match_across, triangulate_stereo
 from barsight.features.orb import Features, detect_orb
@@ -36,10 +38,10 @@ class OdometrySettings:
     """Points further off than this are outliers."""
 
     def __post_init__(self) -> None:
-        if not 100 <= self.features <= 100_000 or self.min_inliers < 6:
-            raise ConfigError("features must lie in 100...100000, min_inliers be at least 6")
-        if min(self.min_range_m, self.max_range_baselines, self.pixel_sigma_px, self.ransac_px) <= 0:
-            raise ConfigError("the odometry's distances and tolerances must be positive")
+        expect_ranges(
+            self, "odometry.", features=(100, 100_000), min_inliers=(6, inf), min_range_m=POSITIVE,
+            max_range_baselines=POSITIVE, pixel_sigma_px=POSITIVE, ransac_px=POSITIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

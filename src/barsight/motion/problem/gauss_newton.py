@@ -77,7 +77,7 @@ def observations_of(problem: Problem, used: Bool) -> Observations:
 def linearisation_point(problem: Problem, state: GraphState) -> LinearisationPoint:
     """Convert the state to the kernels' form."""
     assert problem.sightings is not None
-    left = state.poses[problem.kept] @ problem.sightings.body_from_rect0.matrix
+    left = state.poses[problem.retained] @ problem.sightings.body_from_rect0.matrix
     turn = left[:, :3, :3].transpose(0, 2, 1)
     camera = np.concatenate([turn, -turn @ left[:, :3, 3:]], axis=2)
     return LinearisationPoint(camera, state.points, np.concatenate([state.pieces, state.drift]))
@@ -143,7 +143,7 @@ def linearise_graph(problem: Problem, graph: Any, state: GraphState, used: Bool)
     corner, corner_gradient = np.zeros((border, border)), np.zeros(border)
     whole = linearise_chain(graph, state.values, layout.size, len(problem.start))
     add_encoders(whole, problem, state.poses, encoder_unknowns_of(state.values))
-    chain, gaps = eliminate_nodes(whole, problem.kept)
+    chain, gaps = eliminate_nodes(whole, problem.retained)
     add_chain(chain, layout.node, rows)
     gradient[layout.nodes] = chain.gradient.ravel()
     own = slice(problem.encoder_unknowns)
@@ -158,7 +158,7 @@ def linearise_graph(problem: Problem, graph: Any, state: GraphState, used: Bool)
     if problem.pieces is not None:
         _hold_pieces(problem.pieces, state.pieces, layout, rows, gradient, side, corner)
     return System(
-        rows, gradient, side, corner, corner_gradient, layout, problem.kept, gaps, len(problem.start),
+        rows, gradient, side, corner, corner_gradient, layout, problem.retained, gaps, len(problem.start),
         problem.encoder_unknowns,
     )  # fmt: skip
 
@@ -200,7 +200,7 @@ def retract(
     points, shared = state.points, np.concatenate([pieces, border[-2:]])
     if problem.sightings is not None:
         points = points.copy()
-        poses = np.ascontiguousarray(by_node[problem.kept, :6] if seen_step is None else seen_step)
+        poses = np.ascontiguousarray(by_node[problem.retained, :6] if seen_step is None else seen_step)
         rig, sights = rig_of(problem.sightings), observations_of(problem, used)
         back_substitute(
             rig, sights, linearisation_point(problem, state), poses, shared, points, np.empty(len(points))

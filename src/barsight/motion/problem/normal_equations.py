@@ -20,8 +20,8 @@ from barsight.motion.problem.rig_drift import LOOSE
 class System:
     """Normal equations at a state. rows: n unknowns, which stand as `layout` has them; gradient (n,). side:
     (b, n) with the border, corner (b, b) and corner_gradient (b,) of the border: the encoders' unknowns if
-    there are any, what pieces' slides have in common if there are any, then the rig's drift. kept: (K,) the
-    nodes that the band is of; gaps: those between. nodes: how many in all.
+    there are any, what pieces' slides have in common if there are any, then the rig's drift. retained: (K,)
+    the nodes that the band is of; gaps: those between. nodes: how many in all.
     """
 
     rows: Skyline
@@ -30,7 +30,7 @@ class System:
     corner: Float64
     corner_gradient: Float64
     layout: Ordering
-    kept: Int64
+    retained: Int64
     gaps: tuple[EliminatedNodes, ...]
     nodes: int
     encoder_unknowns: int
@@ -82,5 +82,5 @@ class System:
         skyline.solve_back_dense(factor, step)
         by_node = step[self.layout.nodes].reshape(-1, self.layout.size)
         shared = border[: self.encoder_unknowns]
-        by_node = back_substitute_nodes(by_node, shared, self.kept, self.gaps, self.nodes)
+        by_node = back_substitute_nodes(by_node, shared, self.retained, self.gaps, self.nodes)
         return by_node.ravel(), step[self.layout.pieces, 0], border

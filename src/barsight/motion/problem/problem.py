@@ -220,7 +220,7 @@ class Problem:
     """Whether velocities and biases are unknowns."""
 
     @cached_property
-    def kept(self) -> Int64:
+    def retained(self) -> Int64:
         """Return the nodes (K,) of the system."""
         return np.arange(len(self.start)) if self.asked is None else self.asked
 
@@ -233,7 +233,7 @@ class Problem:
     def places(self) -> Int64:
         """Return the index (M,) of each node in the system; those taken out beforehand: nowhere."""
         places = np.full(len(self.start), -1)
-        places[self.kept] = np.arange(len(self.kept))
+        places[self.retained] = np.arange(len(self.retained))
         return places
 
     @cached_property
@@ -244,7 +244,7 @@ class Problem:
             node, first = self.places[self.sightings.node], self.sightings.first
             begin, end = node[first[:-1]], node[first[1:] - 1]
         piece = None if self.pieces is None else self.pieces.piece
-        return order_unknowns(self.width, len(self.kept), begin, end, piece)
+        return order_unknowns(self.width, len(self.retained), begin, end, piece)
 
     @property
     def encoder_unknowns(self) -> int:

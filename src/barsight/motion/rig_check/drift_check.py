@@ -9,7 +9,8 @@ from enum import StrEnum
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.errors import Failed, MeasurementError
+from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.core.types import RectifiedCamera, RigDrift
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
@@ -43,10 +44,10 @@ class CheckSettings:
     """Pairs whose rows are looked at."""
 
     def __post_init__(self) -> None:
-        if self.range_m is not None and not 0.1 <= self.range_m <= 1000:
-            raise ConfigError(f"range_m {self.range_m:g} can't be; give the working distance in metres")
-        if min(self.max_depth_error_mm, self.max_row_error_px) <= 0 or self.frames < 1:
-            raise ConfigError("max_depth_error_mm, max_row_error_px and frames must be positive")
+        expect_ranges(
+            self, "", range_m=(0.1, 1000), max_depth_error_mm=POSITIVE, max_row_error_px=POSITIVE,
+            frames=POSITIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def _travel_lines(
     bad = abs(yaw) > 3 * sigma and abs(cost) > settings.max_depth_error_mm
     reason = "the crane's known travel against the disparities"
     if bad:
-        reason += "; measure --self-calibrate yaw takes it off"
+        reason += "; measuring with self_calibrate: yaw takes it off"
     lines = [
         CheckLine("yaw", yaw, sigma, "deg", cost, DriftState.RECALIBRATE if bad else DriftState.GOOD, reason),
         _scale_line(drift, range_m),

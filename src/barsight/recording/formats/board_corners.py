@@ -42,7 +42,7 @@ class CornerRecording(PairedAtOpening):
 
     def __init__(self, path: Path, settings: RecordingSettings) -> None:
         if settings.rig is None:
-            raise InputError(path, "holds corners without a calibration", "name the rig (--reading.rig)")
+            raise InputError(path, "holds corners without a calibration", "name its rig file (rig)")
         self.path = path
         self.rig: StereoRig = read_rig_file(settings.rig)
         self._imu_yaml = settings.imu_yaml

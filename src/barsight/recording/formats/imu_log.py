@@ -63,7 +63,7 @@ def read_imu_log(
             raise InputError(
                 file,
                 f"the accelerometer shows {norms[1]:.3g}, neither 1 g nor 9.8 m/s^2",
-                "give --accel-unit",
+                "give accel_unit",
             )
         accel_unit = AccelUnit.G if norms[1] < 2 else AccelUnit.MPS2
     if gyro_unit is GyroUnit.AUTO:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.files.euroc import write_imu, write_rig
+from barsight.calibration.files.euroc import write_imu_description, write_rig
 from barsight.calibration.files.yaml_document import write_document
 from barsight.core.arrays import Float64, Int64
 from barsight.core.types import CraneSamples, LaserProfile
@@ -35,7 +35,7 @@ def write_euroc(recording: StoredPictures, folder: Path, progress: Callable[[int
     if (imu := recording.imu()) is not None:
         values = np.hstack([imu.gyro_radps, imu.accel_mps2])
         write_table(mav0 / "imu0" / "data.csv", IMU_HEADER, table_rows(imu.stamp_ns, values))
-        write_imu(mav0 / "imu0" / "sensor.yaml", recording.imu_noise(), median_rate(imu.stamp_ns))
+        write_imu_description(mav0 / "imu0" / "sensor.yaml", recording.imu_noise(), median_rate(imu.stamp_ns))
     if (crane := recording.crane()) is not None:
         rows = table_rows(crane.stamp_ns, crane.position_m)
         write_table(mav0 / "crane0" / "data.csv", CRANE_HEADER, rows)

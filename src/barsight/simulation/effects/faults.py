@@ -11,7 +11,7 @@ import numpy as np
 from barsight.core.arrays import Float32, Float64, Int64, UInt8
 from barsight.simulation.effects.settings import FaultSettings
 
-HAZE_GREY = 0.45
+HAZE_GRAY = 0.45
 """Radiance of thick haze; 1 is white paper under the lamps."""
 LEAST_BLUR_PX = 0.05
 DROP_SIGMA_PX = 3.0
@@ -55,7 +55,7 @@ class SpoiledLens:
         """
         out = _motion_blur(radiance, velocity_px * settings.exposure_s)
         if settings.haze_ratio > 0:
-            out = (1 - settings.haze_ratio) * out + np.float32(settings.haze_ratio * HAZE_GREY)
+            out = (1 - settings.haze_ratio) * out + np.float32(settings.haze_ratio * HAZE_GRAY)
         if self.drop.any():
             blurred = cv2.GaussianBlur(out, (0, 0), DROP_SIGMA_PX)
             out = out + self.drop * (blurred - out)

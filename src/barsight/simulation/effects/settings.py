@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from barsight.core.errors import ConfigError
+from barsight.core.settings.values import OVER_0, SHARE, UNDER_1, expect_ranges
 
 
 @dataclass(frozen=True)
@@ -29,14 +30,13 @@ class LightSettings:
     """Patch that the sun would light on the open floor: x from, x to, y from, y to."""
 
     def __post_init__(self) -> None:
-        _expect(0 < self.lamp_ratio <= 10, "light lamp_ratio must lie over 0, up to 10")
-        _expect(0 <= self.ambient <= 5, "light ambient must lie between 0 and 5")
-        _expect(0 <= self.bounce_ratio <= 1, "light bounce_ratio must lie between 0 and 1")
-        _expect(0 < self.lamp_length_m <= 10, "light lamp_length_m must lie over 0, up to 10 m")
-        _expect(0 <= self.sun_ratio <= 20, "light sun_ratio must lie between 0 and 20")
-        _expect(10 <= self.sun_elevation_deg <= 90, "light sun_elevation_deg must lie between 10 and 90")
+        expect_ranges(
+            self, "light.", lamp_ratio=(OVER_0, 10), ambient=(0, 5), bounce_ratio=SHARE,
+            lamp_length_m=(OVER_0, 10), sun_ratio=(0, 20), sun_elevation_deg=(10, 90),
+        )  # fmt: skip
         low_x, high_x, low_y, high_y = self.sun_patch_m
-        _expect(low_x < high_x and low_y < high_y, "light sun_patch_m must name from before to")
+        if low_x >= high_x or low_y >= high_y:
+            raise ConfigError("light.sun_patch_m must name from before to")
 
 
 @dataclass(frozen=True)
@@ -63,19 +63,8 @@ class FaultSettings:
     """Stray light in the middle of a wide blot on each lens; 1 is white."""
 
     def __post_init__(self) -> None:
-        _expect(0 <= self.exposure_s <= 0.2, "faults exposure_s must lie between 0 and 0.2 s")
-        _expect(0 <= self.haze_ratio < 1, "faults haze_ratio must lie between 0 and 1")
-        _expect(0 <= self.exposure_step_ratio <= 1, "faults exposure_step_ratio must lie between 0 and 1")
-        _expect(0 <= self.flicker_ratio <= 0.5, "faults flicker_ratio must lie between 0 and 0.5")
-        _expect(0 <= self.glare_ratio <= 2, "faults glare_ratio must lie between 0 and 2")
-        _expect(1 <= self.dirt_px <= 500, "faults dirt_px must lie between 1 and 500")
-        _expect(
-            min(self.dirt_spots, self.drops, self.dead_pixels) >= 0
-            and max(self.dirt_spots, self.drops, self.dead_pixels) <= 10_000,
-            "faults dirt_spots, drops and dead_pixels must lie between 0 and 10000",
-        )
-
-
-def _expect(holds: bool, sentence: str) -> None:
-    if not holds:
-        raise ConfigError(sentence)
+        expect_ranges(
+            self, "faults.", exposure_s=(0, 0.2), haze_ratio=(0, UNDER_1), exposure_step_ratio=SHARE,
+            flicker_ratio=(0, 0.5), glare_ratio=(0, 2), dirt_px=(1, 500), dirt_spots=(0, 10_000),
+            drops=(0, 10_000), dead_pixels=(0, 10_000),
+        )  # fmt: skip

@@ -83,7 +83,7 @@ def pile_up(manner: Manner, upright: Upright, span: float, length: float, rng: n
         packs = [_bundle(sorts, rng) for _ in range(int(rng.integers(5, 8 + round(5 * span))))]
         base, boxes = _bear(pile, 0.0, (0.0, span), length, rng) if rng.random() < 0.5 else (0.0, [])
         settled = settle(_over(packs, (0.02, span - 0.02), base + 0.02, rng), boxes=[*sides, *boxes])
-        laid = [_laid(pack, 0, length, rng) for pack in _kept(settled, span)]
+        laid = [_laid(pack, 0, length, rng) for pack in _within(settled, span)]
         pile.lying += _slackened(laid, (0.0, span), rng)
     else:
         _layers(pile, span, length, sides, lambda: _bundle(sorts, rng), rng)
@@ -178,12 +178,12 @@ def _heap(pile: Pile, span: float, length: float, sides: list[Rectangle], rng: n
     settled = settle(_over(bars, (0.02, span - 0.02), 0.02, rng), boxes=sides)
     laid = [
         Lying(pack, 0, float(rng.uniform(0.5, 1.0)) * length, float(rng.normal(0, 0.15)), uneven=0.0)
-        for pack in _kept(settled, span)
+        for pack in _within(settled, span)
     ]
     pile.lying += _slackened(laid, (0.0, span), rng)
 
 
-def _kept(packs: Sequence[BarPack], span: float) -> list[BarPack]:
+def _within(packs: Sequence[BarPack], span: float) -> list[BarPack]:
     """Take away what fell or rolled far out of the pile."""
     return [p for p in packs if p.extent[0] > -ROLLED_M and p.extent[1] < span + ROLLED_M]
 

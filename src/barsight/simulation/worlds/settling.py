@@ -97,19 +97,6 @@ def settle(
     return [_moved(pack, body) for pack, body in zip(falling, bodies, strict=True)]
 
 
-def overlap(packs: Sequence[BarPack]) -> float:
-    """Compute the deepest overlap between discs of different packs, m; negative where all lie apart."""
-    discs = np.vstack([np.column_stack([p.cross, np.full(len(p.cross), p.radius)]) for p in packs])
-    number = np.repeat(np.arange(len(packs)), [len(p.cross) for p in packs])
-    deepest = -math.inf
-    for k, (x, z, radius) in enumerate(discs):
-        other = number > number[k]
-        if other.any():
-            away = np.hypot(discs[other, 0] - x, discs[other, 1] - z)
-            deepest = max(deepest, float((radius + discs[other, 2] - away).max()))
-    return deepest
-
-
 def _add(space: pymunk.Space, shape: pymunk.Shape) -> None:
     shape.friction = FRICTION
     space.add(shape)

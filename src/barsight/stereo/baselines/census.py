@@ -8,11 +8,13 @@ Memory: two blocks of 16 candidates, whatever their number.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 
 from barsight.core.arrays import Float32
 from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, SHARE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.census_transform import census_codes, census_cost
 from barsight.stereo.baselines.cross_aggregation import CrossRegions, cross_filter, cross_regions
@@ -65,14 +67,13 @@ class CensusSettings:
     )
 
     def __post_init__(self) -> None:
-        if self.tolerance_sigmas < 0 or self.rounds < 1 or self.vote_rounds < 0:
-            raise ConfigError(
-                "census needs tolerance_sigmas and vote_rounds of 0 or more and one round at least"
-            )
-        if not 0 < self.short_arm_px <= self.long_arm_px or self.long_arm_px > 1000:
-            raise ConfigError("census needs 0 < short_arm_px <= long_arm_px <= 1000")
-        if self.loose_gray < 0 or self.tight_gray < 0 or not 0 <= self.min_vote_ratio <= 1:
-            raise ConfigError("census's gray limits can't be negative, min_vote_ratio must lie in 0...1")
+        expect_ranges(
+            self, "census.", tolerance_sigmas=NOT_NEGATIVE, rounds=(1, inf), vote_rounds=NOT_NEGATIVE,
+            short_arm_px=(1, 1000), long_arm_px=(1, 1000), loose_gray=NOT_NEGATIVE, tight_gray=NOT_NEGATIVE,
+            min_vote_ratio=SHARE,
+        )  # fmt: skip
+        if self.short_arm_px > self.long_arm_px:
+            raise ConfigError("census.short_arm_px can't be over census.long_arm_px")
 
 
 @dataclass(frozen=True)

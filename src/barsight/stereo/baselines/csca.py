@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Literal
 
 import cv2
@@ -21,7 +22,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.gradient_cost import (
     CostImages,
@@ -77,12 +78,11 @@ class CscaSettings:
     )
 
     def __post_init__(self) -> None:
-        if self.regulariser < 0 or self.scales < 1:
-            raise ConfigError("csca needs a regulariser of 0 or more and at least one scale")
-        if self.radius_px < 1 or self.epsilon <= 0 or self.tree_sigma_gray <= 0:
-            raise ConfigError("csca's radius_px, epsilon and tree_sigma_gray must be positive")
-        if self.median_radius_px < 1 or self.median_sigma_px <= 0 or self.median_sigma_gray <= 0:
-            raise ConfigError("csca's median_radius_px and its sigmas must be positive")
+        expect_ranges(
+            self, "csca.", regulariser=NOT_NEGATIVE, scales=(1, inf), radius_px=(1, inf), epsilon=POSITIVE,
+            tree_sigma_gray=POSITIVE, median_radius_px=(1, inf), median_sigma_px=POSITIVE,
+            median_sigma_gray=POSITIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

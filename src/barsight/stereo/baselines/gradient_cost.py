@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, kernel
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import POSITIVE, SHARE, expect_ranges
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,7 @@ class GradientCostSettings:
     """Differences of the gradient, next pixel minus previous, count up to this."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.gray_weight <= 1:
-            raise ConfigError(f"gray_weight must lie in 0...1, not {self.gray_weight}")
-        if self.gray_limit <= 0 or self.gradient_limit <= 0:
-            raise ConfigError("gray_limit and gradient_limit must be positive")
+        expect_ranges(self, "cost.", gray_weight=SHARE, gray_limit=POSITIVE, gradient_limit=POSITIVE)
 
     @property
     def worst(self) -> float:

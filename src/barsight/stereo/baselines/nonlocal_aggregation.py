@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int32, kernel
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import OVER_0, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.gradient_cost import GradientCostSettings, cost_images, gradient_cost
 from barsight.stereo.baselines.left_right_check import left_right_agreement
@@ -48,8 +48,7 @@ class NonlocalSettings:
     )
 
     def __post_init__(self) -> None:
-        if not 0 < self.sigma <= 10:
-            raise ConfigError(f"nonlocal's sigma must lie above 0 and at most be 10, not {self.sigma}")
+        expect_ranges(self, "nonlocal_tree.", sigma=(OVER_0, 10))
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,13 @@ from the images after the start, so that the loop smooths D and can't undo its b
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 from typing import Literal
 
 import numpy as np
 
 from barsight.core.arrays import Float32
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.bilateral_filter import bilateral_update
 from barsight.stereo.baselines.census import Census, CensusSettings
@@ -52,10 +53,10 @@ class PaperSettings:
     """The loop doesn't know what lies behind an edge: it fills what is hidden with what is near."""
 
     def __post_init__(self) -> None:
-        if self.eta <= 0 or self.sigma_px <= 0 or self.sigma_gray <= 0 or self.settled_px <= 0:
-            raise ConfigError("the paper's eta, sigmas and settled_px must be positive")
-        if self.radius_px < 1 or self.max_rounds < 1:
-            raise ConfigError("the paper's loop needs a radius_px and max_rounds of 1 or more")
+        expect_ranges(
+            self, "paper.", eta=POSITIVE, sigma_px=POSITIVE, sigma_gray=POSITIVE, settled_px=POSITIVE,
+            radius_px=(1, inf), max_rounds=(1, inf),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int32, UInt8
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.winner_takes_all import Winners, subpixel_winners
 from barsight.stereo.noise import has_texture, noise_sigma
@@ -31,8 +31,7 @@ class OutputSettings:
     """The error of a filled pixel (1 sigma)."""
 
     def __post_init__(self) -> None:
-        if self.subpixel_sigma_px < 0 or self.filled_sigma_px < 0:
-            raise ConfigError("sigmas can't be negative")
+        expect_ranges(self, "output.", subpixel_sigma_px=NOT_NEGATIVE, filled_sigma_px=NOT_NEGATIVE)
 
 
 def assemble_disparity(

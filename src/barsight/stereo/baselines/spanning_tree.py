@@ -62,12 +62,12 @@ def spanning_tree(guide: UInt8) -> SpanningTree:
     size = guide.size
     node, parent = np.empty(size, dtype=np.int32), np.empty(size, dtype=np.int32)
     weight = np.empty(size, dtype=np.uint8)
-    _walk(guide, _kept_edges(guide), node, parent, weight)
+    _walk(guide, _tree_edges(guide), node, parent, weight)
     return SpanningTree(node, parent, weight)
 
 
 @kernel()
-def _kept_edges(guide: UInt8) -> UInt8:
+def _tree_edges(guide: UInt8) -> UInt8:
     """Select edges (H, W) uint8: 1 where the tree keeps the edge to the right neighbour, plus 2 for the one
     below.
     """
@@ -128,7 +128,7 @@ def _walk(guide: UInt8, kept: UInt8, node: Int32, parent: Int32, weight: UInt8) 
     """Order the nodes in preorder from the middle pixel, so that a node's parent is mostly still in the
     cache.
 
-    guide, kept: (H, W), of `_kept_edges`. Fills node, parent (flat pixel indices) and weight (gray difference
+    guide, kept: (H, W), of `_tree_edges`. Fills node, parent (flat pixel indices) and weight (gray difference
     of both), all (H * W,).
     """
     height, width = guide.shape

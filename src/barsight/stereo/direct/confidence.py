@@ -20,7 +20,7 @@ _WINDOW_PX = 21
 _EVERY_PX = 10
 _STRIPES = 4
 _STRIPE_ROWS = 81
-_OUTLIER_GREY = np.float32(8)
+_OUTLIER_GRAY = np.float32(8)
 _MIN_SLOPE_POWER = 4.0
 _MIN_INDEPENDENCE = 0.05
 _LARGEST_VARIANCE_PX2 = 0.1
@@ -116,7 +116,7 @@ def _vertical_shifts(
     y = (_derivative(left_gray, (0, 1)) + right_y) * np.float32(0.5)
     share = _mean(usable) + np.float32(1e-6)
     residual = (left_gray - _mean(usable * left_gray) / share) - (warped - _mean(usable * warped) / share)
-    trust = usable / (1 + np.square(residual / _OUTLIER_GREY))
+    trust = usable / (1 + np.square(residual / _OUTLIER_GRAY))
     products = np.stack([x * x, x * y, y * y, x * residual, y * residual, trust * np.square(y * residual)])
     xx, xy, yy, xr, yr, power = window_means(products, trust, _WINDOW_PX, _EVERY_PX)
     chosen = (slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX))

@@ -17,7 +17,7 @@ from barsight.stereo.direct.kernels.vectors import FLOAT, FLOAT_LANES, Vectors, 
 _RADIUS_PX = 5
 _SIDE_PX = 2 * _RADIUS_PX + 1
 _UNKNOWN = 1e30
-_GREY = 10.0
+_GRAY = 10.0
 _DISTANCE_PX = 4.0
 _BESIDE_PX = 3
 _LOWEST = -1e4
@@ -58,10 +58,10 @@ def _beside_jumps(disparity: Float32, jump_px: float) -> Bool:
 
 
 def _falling(v: Vectors, gap: Any) -> Any:
-    """Approximate exp(-gap / _GREY) to 1 % where it exceeds 1 %: the sixteenth power of a cubic, since
+    """Approximate exp(-gap / _GRAY) to 1 % where it exceeds 1 %: the sixteenth power of a cubic, since
     vectors have no exponential.
     """
-    small = v.product(gap, v.all(-1 / (16 * _GREY), v.floats))
+    small = v.product(gap, v.all(-1 / (16 * _GRAY), v.floats))
     power = v.all(1 / 6, v.floats)
     for factor in (1 / 2, 1.0, 1.0):
         power = v.sum(v.product(power, small), v.all(factor, v.floats))
@@ -101,7 +101,7 @@ def _load_window(v: Vectors, at: Any, stride: Any) -> tuple[list[Any], list[Any]
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _median(_: Any, theres: Any, grays: Any, at: Any, stride: Any, near: Any) -> Any:
-    """Compute the weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GREY),
+    """Compute the weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GRAY),
     of its gray's gap to that of the window's middle, times `near`. All arrays are flat.
 
     The interval of values is quartered until it is short enough: faster than to sort a hundred of them. In

@@ -23,7 +23,7 @@ _EVERY_PX = 3
 _SLOPE_HOLD = 20.0 / _EVERY_PX**2
 _SAME_SURFACE_PX = 1.0
 _SLOPE_LENGTH_PX = 50.0
-_GREY = 12.0
+_GRAY = 12.0
 _HIDDEN_QUANTILE = 0.3
 _SEEN_RATIO = 0.03
 _SPREAD_RATIO = 2.0
@@ -224,7 +224,7 @@ def _fill(
                     fade = _SLOPE_LENGTH_PX * (1.0 - math.exp(-distance / _SLOPE_LENGTH_PX)) / distance
                     value = there + fade * (slope_x[yy, xx] * (x - xx) + slope_y[yy, xx] * (y - yy))
                     value = min(max(value, lowest), highest)
-                    weight = math.exp(-abs(gray[yy, xx] - gray[y, x]) / _GREY) / (distance + 2.0)
+                    weight = math.exp(-abs(gray[yy, xx] - gray[y, x]) / _GRAY) / (distance + 2.0)
                     column = round(x - value)
                     if column >= 0:
                         beyond_border = False

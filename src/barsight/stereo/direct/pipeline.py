@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
-from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement, vertical_error_px
 from barsight.stereo.direct.confirmation import confirmed_start
@@ -32,7 +32,7 @@ _NAN = np.float32(np.nan)
 _FAST_STEPS = 2
 _JUMP_PX = 1.0
 _FURTHEST_FROM_START_PX = 2.0
-_MIN_CONTRAST_GREY = 0.5
+_MIN_CONTRAST_GRAY = 0.5
 _MIN_HALVED_PX = 128
 _FAR_STEP_PX, _MAX_FAR_RATIO = 0.3, 0.15
 """A prediction from which more than this share of the pixels step further is off as a whole."""
@@ -71,19 +71,13 @@ class BarsightSettings:
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
 
     def __post_init__(self) -> None:
-        if min(self.consistency_px, self.max_sigma_px) <= 0:
-            raise ConfigError("stereo.barsight.consistency_px and max_sigma_px must be positive")
-        shares = (
-            self.vertical_error_ratio,
-            self.edge_error_ratio,
-            self.start_error_ratio,
-            self.other_side_error_ratio,
-        )
-        lengths = (self.max_edge_px, self.wrong_side_px)
-        if min(self.model_sigma_px, self.island_px, *shares, *lengths) < 0:
-            raise ConfigError(
-                "stereo.barsight.model_sigma_px, island_px and the shares of sigma can't be negative"
-            )
+        expect_ranges(
+            self, "barsight.", consistency_px=POSITIVE, max_sigma_px=POSITIVE,
+            vertical_error_ratio=NOT_NEGATIVE, edge_error_ratio=NOT_NEGATIVE,
+            start_error_ratio=NOT_NEGATIVE, other_side_error_ratio=NOT_NEGATIVE,
+            max_edge_px=NOT_NEGATIVE, wrong_side_px=NOT_NEGATIVE, model_sigma_px=NOT_NEGATIVE,
+            island_px=NOT_NEGATIVE,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +101,7 @@ class BarsightStereo:
         """
         settings = self.settings
         candidates = _inside(candidates, pair.camera.width)
-        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GREY:
+        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY:
             nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
             return Disparity(nothing, nothing.copy())
         refinement = settings.refinement

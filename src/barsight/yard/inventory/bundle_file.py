@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,6 @@ from barsight.yard.weight import bundle_mass, bundle_section
 
 SCHEMA_VERSION = 2
 REMEDY = "measure the recording again"
-
-
-def schema() -> dict[str, Any]:
-    """Load the JSON Schema of bundles.json."""
-    text = resources.files("barsight.yard").joinpath("schemas/bundles.schema.json").read_text("utf-8")
-    content: dict[str, Any] = json.loads(text)
-    return content
 
 
 def write_bundles(

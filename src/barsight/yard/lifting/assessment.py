@@ -27,7 +27,14 @@ from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, tra
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
 from barsight.yard.magnet.description import Magnet, Tolerance
-from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement, count_gripped
+from barsight.yard.magnet.footprint import (
+    BEYOND_OPEN_END_M,
+    BundleTable,
+    Grip,
+    Placement,
+    Rectangles,
+    count_gripped,
+)
 from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, weakest_pole
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.thin_lines import ThinLine, find_thin_line
@@ -188,16 +195,14 @@ def _safety(
 def nearby_bundles(table: BundleTable, place: Placement, magnet: Magnet) -> BundleTable:
     """Select the bundles that the magnet may reach or that stand beside those."""
     reach = magnet.half_span_m + 1.0
-    away = np.array([place.x_m, place.y_m]) - table.centre
-    beside = np.abs(away[:, 0] * table.along[:, 1] - away[:, 1] * table.along[:, 0])
-    beyond = np.abs((away * table.along).sum(axis=1)) - table.half[:, 1]
-    beyond -= table.open_ends.any(axis=1) * BEYOND_OPEN_END_M
-    near = (beside < reach + table.half[:, 0]) & (beyond < reach)
-    return BundleTable(
-        tuple(b for b, take in zip(table.bundles, near, strict=True) if take),
-        table.centre[near], table.along[near], table.half[near], table.top[near], table.slope[near],
-        table.sigma[near], table.sigma_top[near], table.open_ends[near],
-    )  # fmt: skip
+    all_of = table.rectangles
+    away = np.array([place.x_m, place.y_m]) - all_of.centre
+    beside = np.abs(away[:, 0] * all_of.along[:, 1] - away[:, 1] * all_of.along[:, 0])
+    beyond = np.abs((away * all_of.along).sum(axis=1)) - all_of.half[:, 1]
+    beyond -= all_of.open_ends.any(axis=1) * BEYOND_OPEN_END_M
+    near = (beside < reach + all_of.half[:, 0]) & (beyond < reach)
+    bundles = tuple(b for b, take in zip(table.bundles, near, strict=True) if take)
+    return BundleTable(bundles, Rectangles(*(array[near] for array in all_of)))
 
 
 def _load_mass(load: tuple[Bundle, ...]) -> Mass:

@@ -237,11 +237,12 @@ def _unexplained(
     """
     across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
     outlines = np.empty((len(near.bundles), 8))
-    outlines[:, :2], outlines[:, 2:4] = near.centre, near.along
-    open_m = near.open_ends.any(axis=1) * BEYOND_OPEN_END_M
+    rectangles = near.rectangles
+    outlines[:, :2], outlines[:, 2:4] = rectangles.centre, rectangles.along
+    open_m = rectangles.open_ends.any(axis=1) * BEYOND_OPEN_END_M
     for first, sigmas in ((4, 3.0), (6, 2.0)):
-        wider = MARGIN_M + sigmas * np.hypot(near.sigma[:, :2], near.sigma[:, 3:])
-        outlines[:, first : first + 2] = near.half + wider
+        wider = MARGIN_M + sigmas * np.hypot(rectangles.sigma[:, :2], rectangles.sigma[:, 3:])
+        outlines[:, first : first + 2] = rectangles.half + wider
         outlines[:, first + 1] += open_m
     return _stray_shares(
         heights.z_m, heights.source, np.array([heights.x0_m, heights.y0_m, heights.cell_m]),

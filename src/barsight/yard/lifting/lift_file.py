@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +18,6 @@ from barsight.yard.vetoes import Veto
 
 SCHEMA_VERSION = 2
 REMEDY = "run barsight lifts on the folder"
-
-
-def schema() -> dict[str, Any]:
-    """Load the JSON Schema of lifts.json."""
-    text = resources.files("barsight.yard").joinpath("schemas/lifts.schema.json").read_text("utf-8")
-    content: dict[str, Any] = json.loads(text)
-    return content
 
 
 def write_lifts(

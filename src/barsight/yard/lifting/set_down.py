@@ -26,7 +26,6 @@ APART_M = 0.15
 SHADOW_M = 0.3
 """What lies this near to a load was partly hidden by it and may move when it goes."""
 SMALL_TURNS_DEG = (0.0, 2.5, -2.5, 5.0, -5.0)
-RULE = "The least turn first, then the lowest, then the nearest to where the load lies."
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,8 @@ class SetDown:
 
 
 def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSettings) -> SetDown | None:
-    """Find the first place in `RULE`'s order; None where there is none, or where the load would roll."""
+    """Find the place with the least turn, then the lowest, then the nearest; None where there is none, or
+    where the load would roll."""
     if load.rolls:
         return None
     ground = ground.about(load.x_m, load.y_m, REACH_M)

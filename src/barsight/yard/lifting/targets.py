@@ -85,7 +85,7 @@ def map_vetoes(
     if reference != "yard":
         vetoes.append(Veto("no-yard-frame", f"the map is in the {reference} frame: no crane gave its place"))
     if not has_magnet:
-        vetoes.append(Veto("no-magnet", "no magnet was described: give its file with --magnet"))
+        vetoes.append(Veto("no-magnet", "no magnet was described: give its file as magnet"))
     return (*vetoes, *vetoes_of(age_checks(captured_to_ns, now_ns, settings)))
 
 

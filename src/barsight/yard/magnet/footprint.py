@@ -49,16 +49,14 @@ class Placement:
         return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad)])
 
 
-@dataclass(frozen=True, eq=False)
-class BundleTable:
-    """Bundles as arrays, for all at once. Lengths in m.
+class Rectangles(NamedTuple):
+    """Bundles from above with their tops, for all at once. Lengths in m.
 
     centre: (B, 2). along: (B, 2) unit. half: (B, 2) half width, half length. top: (B,) at mid-length, slope:
     (B,) rise per metre along. sigma: (B, 5) of lateral, along, yaw, half width, half length; NaN is taken as
     `unknown_sigma`. sigma_top: (B,). open_ends: (B, 2) low-y and high-y end.
     """
 
-    bundles: tuple[Bundle, ...]
     centre: Float64
     along: Float64
     half: Float64
@@ -67,6 +65,14 @@ class BundleTable:
     sigma: Float64
     sigma_top: Float64
     open_ends: Bool
+
+
+@dataclass(frozen=True, eq=False)
+class BundleTable:
+    """Bundles, and as arrays (B, ...)."""
+
+    bundles: tuple[Bundle, ...]
+    rectangles: Rectangles
 
     @classmethod
     def of(cls, bundles: tuple[Bundle, ...]) -> BundleTable:
@@ -86,8 +92,7 @@ class BundleTable:
         ).reshape(-1, 5)
         unknown = np.broadcast_to((0.05, 0.05, 0.005, 0.05, 0.05), sigma.shape)
         sigma_top = np.array([b.sigma.top_z_m for b in bundles])
-        return cls(
-            bundles,
+        rectangles = Rectangles(
             np.array([b.centre_m[:2] for b in bundles]).reshape(-1, 2),
             np.stack([-np.sin(yaw), np.cos(yaw)], axis=1).reshape(-1, 2),
             np.array([(b.width_m / 2, b.length_m / 2) for b in bundles]).reshape(-1, 2),
@@ -97,6 +102,7 @@ class BundleTable:
             np.where(np.isfinite(sigma_top), np.minimum(sigma_top, MAX_TOP_SIGMA_M), 0.05),
             np.array([b.ends_open for b in bundles], dtype=np.bool_).reshape(-1, 2),
         )
+        return cls(bundles, rectangles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,27 +128,11 @@ def count_gripped(
     if not table.bundles:
         return Grip((), 1.0, np.empty(0))
     slack = np.array([tolerance.x_m, tolerance.y_m, np.radians(tolerance.yaw_deg)])
-    rectangles = Rectangles(
-        table.centre, table.along, table.half, table.top, table.slope, table.sigma, table.sigma_top,
-        table.open_ends,
-    )  # fmt: skip
     flips, taken = _grip(
-        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, face_z_m - magnet.reach_m, slack, rectangles
-    )
+        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, face_z_m - magnet.reach_m, slack,
+        table.rectangles,
+    )  # fmt: skip
     return Grip(tuple(np.flatnonzero(taken).tolist()), float(np.prod(1 - flips)), flips)
-
-
-class Rectangles(NamedTuple):
-    """Bundles from above with their tops: the arrays of a `BundleTable`, centre (B, 2) and so on."""
-
-    centre: Float64
-    along: Float64
-    half: Float64
-    top: Float64
-    slope: Float64
-    sigma: Float64
-    sigma_top: Float64
-    open_ends: Bool
 
 
 @kernel()
@@ -206,7 +196,7 @@ def overlap(
 
     dx, dy: pole's centre minus bundle's. cos, sin: of the magnet's yaw. pole: (4,) along, across, length,
     width, m. along: (2,) the bundle's unit vector; half_width, half_length, sigma (5,): its own, see
-    `BundleTable`. slack: (3,) on x, y (m) and yaw (rad). Of the four axes across the rectangles' sides the
+    `Rectangles`. slack: (3,) on x, y (m) and yaw (rad). Of the four axes across the rectangles' sides the
     one with the least overlap counts (separating axes).
     """
     best = (np.inf, 1.0, 0.0)

@@ -46,9 +46,9 @@ class SemiGlobalSettings:
 
     def __post_init__(self) -> None:
         if not 0 < self.p1 <= self.min_p2 <= self.p2:
-            raise ConfigError("the penalties must be 0 < p1 <= min_p2 <= p2")
+            raise ConfigError("semiglobal: the penalties must be 0 < p1 <= min_p2 <= p2")
         if self.p1 + self.p2 > _LARGEST_BYTE - BESIDE_COST:
-            raise ConfigError(f"p1 + p2 can't exceed {_LARGEST_BYTE - BESIDE_COST}")
+            raise ConfigError(f"semiglobal: p1 + p2 can't exceed {_LARGEST_BYTE - BESIDE_COST}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ class Penalties(NamedTuple):
     jumps: UInt8
 
 
-_EDGE_GREY = 8
+_EDGE_GRAY = 8
 _PATHS = 4
 
 
@@ -88,7 +88,7 @@ def p2_table(large: int, least: int) -> UInt8:
     """Tabulate the penalty P2 (256,) by the gray levels that the image changes there."""
     jumps = np.empty(256, dtype=np.uint8)
     for contrast in range(256):
-        jumps[contrast] = max(large * _EDGE_GREY // (_EDGE_GREY + contrast), least)
+        jumps[contrast] = max(large * _EDGE_GRAY // (_EDGE_GRAY + contrast), least)
     return jumps
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from barsight.core.errors import ConfigError
+from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, POSITIVE, expect_ranges
 
 
 @dataclass(frozen=True)
@@ -58,27 +59,13 @@ class BundleSettings:
     """Heights nearer to the floor than this are floor."""
 
     def __post_init__(self) -> None:
-        if any(not 5 <= d <= 500 for d in self.catalogue_mm):
-            raise ConfigError("catalogue_mm: a diameter must lie between 5 and 500 mm")
-        lengths = (
-            self.min_length_m,
-            self.min_bar_diameter_m,
-            self.min_single_diameter_m,
-            self.min_width_m,
-            self.slice_step_m,
-            self.slice_m,
-            self.agreement_m,
-            self.correlated_along_m,
-            self.correlated_across_m,
-            self.max_cell_m,
-        )
-        if (
-            min(lengths) <= 0
-            or min(self.smoothing_m, self.placing_m, self.shared_lateral_m, self.shared_yaw_deg) < 0
-            or self.shared_height_m < 0
-        ):
-            raise ConfigError("bundles: lengths must be positive, smoothing, placing and shares not negative")
+        expect_ranges(
+            self, "bundles.", catalogue_mm=(5, 500), min_length_m=POSITIVE, min_bar_diameter_m=POSITIVE,
+            min_single_diameter_m=POSITIVE, min_width_m=POSITIVE, slice_step_m=POSITIVE, slice_m=POSITIVE,
+            agreement_m=POSITIVE, correlated_along_m=POSITIVE, correlated_across_m=POSITIVE,
+            max_cell_m=POSITIVE, smoothing_m=NOT_NEGATIVE, placing_m=NOT_NEGATIVE,
+            shared_lateral_m=NOT_NEGATIVE, shared_yaw_deg=NOT_NEGATIVE, shared_height_m=NOT_NEGATIVE,
+            max_skew_deg=(OVER_0, 15),
+        )  # fmt: skip
         if self.max_width_m <= self.min_width_m:
-            raise ConfigError("bundles: max_width_m must be over min_width_m")
-        if not 0 < self.max_skew_deg <= 15:
-            raise ConfigError(f"bundles: max_skew_deg must lie in 0...15, not {self.max_skew_deg}")
+            raise ConfigError("bundles.max_width_m must be over bundles.min_width_m")
