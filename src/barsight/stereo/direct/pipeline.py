@@ -116,7 +116,7 @@ class BarsightStereo:
         where the pair's own pictures confirm it. In all steps, where that one goes far in many places.
         """
         candidates = _inside(candidates, pair.camera.width)
-        flat = min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GREY
+        flat = min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY
         if flat or min(pair.left.shape) < _MIN_HALVED_PX:
             return self(pair, candidates)
         own, refinement = self._start_at_half_size(pair, candidates), self.settings.refinement
