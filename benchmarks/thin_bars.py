@@ -22,7 +22,7 @@ from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.result_folder import read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
-from barsight.yard.lifting.thin_bars import MAX_STRENGTH, line_strengths
+from barsight.yard.thin_lines import MAX_STRENGTH, line_strengths
 from barsight.yard.types import Bundle
 
 DIAMETERS_M = (0.008, 0.012, 0.016, 0.020, 0.025, 0.030, 0.036)

@@ -8,6 +8,7 @@ from barsight.mapping.surface.directional_filter import (
     blur_sigma,
     deblur_across,
     smooth_along_bars,
+    step_sigma,
     valley_mask,
 )
 
@@ -114,6 +115,20 @@ def test_sharpening_undoes_part_of_a_windows_blur(turn_deg: float, diameter_m: f
     assert abs(np.mean(after[inner])) < 0.0005
     sigma = blur_sigma(sharp - averaged, valley_mask(sharp, direction))
     assert np.mean((np.abs(after) <= 1.96 * sigma)[inner]) > 0.8
+
+
+@pytest.mark.parametrize("step_m", [0.1, 0.4])
+def test_sigma_beside_a_step_holds_what_matching_stretches(step_m: float) -> None:
+    """A step that the map shows a pixel too far out, as a ramp; nothing is said further off."""
+    pixel_cells, truth = 1.5, np.where(np.arange(60) < 30, step_m, 0.0) + np.zeros((60, 1))
+    stretched = np.roll(truth, 1, axis=1)
+    stretched[:, 0] = step_m
+    shown = gaussian_filter(stretched, (0, 0.7)).astype(np.float32)
+    sigma = np.hypot(0.003, step_sigma(shown, pixel_cells))
+    assert (np.abs(shown - truth) <= 1.96 * sigma).mean() > 0.98
+    off = np.abs(np.arange(60) - 30) > 8
+    assert not step_sigma(shown, pixel_cells)[:, off].any()
+    assert not step_sigma(np.full((9, 9), np.nan, np.float32), pixel_cells).any()
 
 
 def valleys_slowly(z: np.ndarray, direction: np.ndarray) -> np.ndarray:

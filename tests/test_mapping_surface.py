@@ -170,7 +170,7 @@ def test_the_cloud_agrees_with_the_surface_on_bars(tmp_path: Path) -> None:
     beneath has the same part for blur."""
     rng = np.random.default_rng(2)
     x, y = block(60, 60, 230, 10)
-    bars = 0.5 + np.sqrt(0.03**2 - (0.01 * x % 0.06 - 0.03) ** 2)
+    bars = 0.5 + np.sqrt(0.02**2 - (0.01 * x % 0.04 - 0.02) ** 2)
     noisy = (z + rng.normal(0, 0.0005, x.shape) for z in (0.0, bars) for _ in range(2))
     views = [view(x, y, z, 0.0005) for z in noisy]
     surface = fused(views, tmp_path, MapSettings(min_views=2, along_m=0.1))

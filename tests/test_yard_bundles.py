@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from barsight.core.errors import ConfigError
 from barsight.core.types import HeightSource
+from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.flanks import Flanks
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.seen_section import SeenSection, estimate_section, is_no_hexagon
 from barsight.yard.types import Bundle, HeightMap
@@ -186,12 +190,52 @@ def test_a_beam_over_bundles_is_no_bundle() -> None:
     rows, columns = heights.z_m.shape
     x = heights.x0_m + heights.cell_m * np.arange(columns)
     y = heights.y0_m + heights.cell_m * np.arange(rows)
-    beam = (np.abs(y - 0.5) < 0.05)[:, None] & ((x > -0.2) & (x < 1.2))[None]
-    noise = np.random.default_rng(3).normal(0, 0.003, beam.shape)
-    heights.z_m[beam] = (lower[0].top_z_m + 0.1 + noise[beam]).astype(np.float32)
+    noise = np.random.default_rng(3).normal(0, 0.003, heights.z_m.shape)
+    for at, on_top, said in ((0.5, None, "lies across it"), (-0.8, True, "crosses over it at 2 places")):
+        beam = (np.abs(y - at) < 0.05)[:, None] & ((x > -0.2) & (x < 1.2))[None]
+        heights.z_m[beam] = (lower[0].top_z_m + 0.1 + noise[beam]).astype(np.float32)
+        bundles = find_bundles(heights, SETTINGS)
+        assert len(bundles) == 4 and all(b.on_top is on_top for b in bundles)
+        assert all(any(said in reason for reason in b.reasons) for b in bundles)
+
+
+def test_what_has_no_flanks_is_no_bundle() -> None:
+    """A plate of 0.4 by 1.2 m at the bundle's height, as a cart's top is."""
+    heights = draw([Laid(0.0, 0.0, 0.2, 0.0)])
+    rows, columns = heights.z_m.shape
+    x = heights.x0_m + heights.cell_m * np.arange(columns)
+    y = heights.y0_m + heights.cell_m * np.arange(rows)
+    plate = (np.abs(y) < 0.6)[:, None] & (np.abs(x - 0.7) < 0.2)[None]
+    noise = np.random.default_rng(4).normal(0, 0.003, plate.shape)
+    heights.z_m[plate] = (0.5 + noise[plate]).astype(np.float32)
+    heights.source[plate] = HeightSource.VISION
     bundles = find_bundles(heights, SETTINGS)
-    assert len(bundles) == 4 and all(b.on_top for b in bundles)
-    assert all(any("something narrow crosses" in reason for reason in b.reasons) for b in bundles)
+    assert [abs(b.centre_m[0]) < 0.02 for b in bundles] == [True]
+
+
+def test_a_neighbour_that_may_lie_over_a_flank_leaves_open_what_lies_on_it() -> None:
+    """A map shows 0.1 m of a free flank of 0.25 m; what rolled over it hides most of that."""
+    for fall, rise, is_seen in ((0.1, 0.1, True), (0.03, 0.1, False), (0.04, 0.4, True), (0.01, -0.1, False)):
+        assert (not Flanks(0.25, (0.1, fall), (-np.inf, rise), False).doubt) is is_seen, (fall, rise)
+
+
+def test_two_readings_of_one_bundle_are_joined() -> None:
+    (one,) = find_bundles(draw([Laid(0.0, 0.0, 0.2, 0.0)]), SETTINGS)
+    step = np.array([0.004, 1.0, 0.0])
+    pieces = [
+        replace(
+            one, centre_m=one.ends_m.mean(axis=0) + side * step, ends_m=one.ends_m + side * step,
+            ends_open=(side > 0, side < 0),
+        )
+        for side in (-(one.length_m / 2 + 0.1), one.length_m / 2 + 0.1)
+    ]  # fmt: skip
+    (whole,) = join_pieces(pieces)
+    assert whole.length_m == pytest.approx(2 * one.length_m + 0.2, abs=1e-3) and whole.ends_open == (
+        False,
+        False,
+    )
+    assert whole.sigma.lateral_m > one.sigma.lateral_m
+    assert len(join_pieces([replace(piece, ends_open=(False, False)) for piece in pieces])) == 2
 
 
 def test_ripples_of_the_floor_are_no_heading() -> None:

@@ -11,7 +11,8 @@ from scipy import ndimage
 
 from barsight.core.errors import ConfigError
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.thin_bars import MAX_STRENGTH, find_thin_line, thin_bar_checks
+from barsight.yard.lifting.thin_bars import thin_bar_checks
+from barsight.yard.thin_lines import MAX_STRENGTH, find_thin_line
 from barsight.yard.types import HeightMap
 from lift_yards import SETTINGS, codes, judged, laid, map_of, record
 

@@ -16,6 +16,8 @@ _STEP_M = 0.03
 _WIDEST_CELLS = np.float32(1.5)
 _BLUR_CELLS, _BLUR_RATIO, _VALLEY_RATIO = 11, 2.0, 4.5
 _VALLEY_CELLS = 6
+_RAMP_PX, _RAMP_RATIO, _RIM_PX, _RIM_RATIO = 3.0, 0.5, 1.0, 0.5
+_FAR_M = np.float32(1e4)
 
 
 def smooth_along_bars(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[Float32, Int8]:
@@ -130,6 +132,25 @@ def blur_sigma(moved: Float32, valley: Bool) -> Float32:
     )
     share = np.where(valley, np.float32(_VALLEY_RATIO), np.float32(_BLUR_RATIO))
     return np.asarray(share * np.sqrt(np.maximum(squares, 0) / np.maximum(count, 1e-6)), np.float32)
+
+
+def step_sigma(z: Float32, pixel_cells: float) -> Float32:
+    """Estimate the standard deviation (H, W) of heights beside steps of over 30 mm, 0 elsewhere.
+
+    Matching stretches a higher surface over a lower one by one to three pixels, and the map's cells then lie
+    on a ramp between both: half of what a height has over the lowest one within a pixel, and half of the
+    smaller way to the lowest and to the highest one within three. z: (H, W), NaN where there is none.
+    pixel_cells: a pixel's width on the ground.
+    """
+    low, high = np.where(np.isnan(z), _FAR_M, z), np.where(np.isnan(z), -_FAR_M, z)
+
+    def ways(reach_px: float) -> tuple[Float32, Float32]:
+        around = np.ones((2 * max(round(reach_px * pixel_cells), 1) + 1,) * 2, np.uint8)
+        down, up = z - cv2.erode(low, around), cv2.dilate(high, around) - z
+        return np.where(down + up > _STEP_M, down, 0), np.where(down + up > _STEP_M, up, 0)
+
+    ramp, rim = np.minimum(*ways(_RAMP_PX)), ways(_RIM_PX)[0]
+    return np.asarray(np.hypot(_RAMP_RATIO * ramp, _RIM_RATIO * rim), np.float32)
 
 
 def _across() -> Float64:

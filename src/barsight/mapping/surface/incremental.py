@@ -22,6 +22,7 @@ from barsight.mapping.surface.directional_filter import (
     blur_sigma,
     deblur_across,
     smooth_along_bars,
+    step_sigma,
     valley_mask,
 )
 from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
@@ -196,7 +197,9 @@ class SurfaceElection:
             pixel_m = sights.pixel_m(z, self._height_m)
             sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
             blur = blur_sigma(sharp - z, valley_mask(sharp, direction))
-            around = replace(around, z_m=sharp, sigma_m=np.hypot(around.sigma_m, blur))
+            pixel_cells = float(np.nanmedian(pixel_m)) / cell_m if np.isfinite(pixel_m).any() else 1.0
+            steps = step_sigma(sharp, pixel_cells)
+            around = replace(around, z_m=sharp, sigma_m=np.hypot(np.hypot(around.sigma_m, blur), steps))
         if reach > 0:
             fill_gaps(around, reach)
         inner = slice(_HALO, _HALO + TILE_CELLS)

@@ -8,6 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.bundles.bar_pitch import DIAMETER_SIGMA_RATIO
+from barsight.yard.bundles.crossing_bundles import rise_over
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
 from barsight.yard.bundles.fitting.ends import End, find_end
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, LOOSENESS, make_outline
@@ -26,6 +27,8 @@ from barsight.yard.bundles.fitting.outline_fit import (
 )
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.flanks import Flanks, seen_flanks
+from barsight.yard.bundles.irregular import widen_sigma
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours
 from barsight.yard.bundles.pack_edges import DOUBTFUL, hold_off
 from barsight.yard.bundles.seen_section import (
@@ -37,13 +40,14 @@ from barsight.yard.bundles.seen_section import (
 )
 from barsight.yard.bundles.straps import Pack, contradicts
 from barsight.yard.sections import MapStretch
+from barsight.yard.thin_lines import KNOWN_ACROSS
 from barsight.yard.types import Bundle, BundleSigma
 
 _NARROW_M = 0.3
 _SAME_RATIO, _SAME_M = 0.12, 0.005
 """Of the width, and besides: how far an outline's edges lie off those of the pack that it describes."""
-_PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M = 0.009, 0.016, 0.006
-"""Standard deviations of a pack's middle, width and top."""
+_PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.009, 0.016, 0.006, 3.0
+"""Standard deviations of a pack's middle, width and top, and its width's in those of a height."""
 _CREST_M = 0.006
 """Crest height that a map's mean section cuts off."""
 _STRAPPED = 0.95
@@ -51,6 +55,9 @@ _STRAPPED = 0.95
 _PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
 """Bounds of a piece: way of its axis within the flanks, most by which its top is higher and its ends lie
 beyond the pack's, sine of its skew."""
+_LIES_M, _ONE_PLACE_M = 0.02, 0.3
+"""What lies across a bundle rises so far over it; runs of rows nearer to each other than the second are one
+thing. Dunnage comes in twos and more."""
 _ASIDE_M = 0.02
 """Straps whose middle lies so far beside an outline's make its place that unsure."""
 _SURE_KNOWN = 0.7
@@ -61,7 +68,8 @@ class Reading:
     """A chosen outline with its weight (cells explained) and the strongest other reading of its place.
 
     other_packing: rings of another packing that explains the bundles of this kind as well, if any does. pack:
-    the bars that straps hold together there, None where no straps are seen.
+    the bars that straps hold together there, None where no straps are seen. flanks: of the pack where it is
+    seen whole, else of the outline; None where too little of them is seen.
     """
 
     found: FittedOutline
@@ -70,6 +78,7 @@ class Reading:
     rival_weight: float
     other_packing: int | None
     pack: Pack | None = None
+    flanks: Flanks | None = None
 
     @property
     def outlines_pack(self) -> bool:
@@ -79,6 +88,14 @@ class Reading:
             return True
         off = max(abs(pack.low_m + width / 2), abs(pack.high_m - width / 2))
         return off < _SAME_RATIO * width + _SAME_M
+
+    def with_flanks(self) -> Reading:
+        """Return the same with its flanks."""
+        half = self.found.fit.width_m / 2
+        edges = -half, half
+        if self.pack is not None and self.pack.sides_seen:
+            edges = self.pack.low_m, self.pack.high_m
+        return replace(self, flanks=seen_flanks(self.found, *edges))
 
 
 def describe_bundles(
@@ -121,8 +138,10 @@ def make_bundle(
     top = float(np.nanmax(outline.exact_m))
     top_z = float(centre[2]) + top
     bars, doubt = _count(reading, seen, top_z, floor_m)
-    reasons = doubt + _doubts(reading, rows, ends, sheet)
+    reasons = doubt + _doubts(reading, rows, ends, settings)
     section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
+    if reading.flanks is not None and reading.flanks.doubt:
+        reasons += (reading.flanks.doubt,)
     bundle = Bundle(
         id=0,
         centre_m=centre,
@@ -147,18 +166,33 @@ def make_bundle(
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
         section_m2=section,
     )
-    return bundle if reading.pack is None else _held_by_straps(bundle, reading, reading.pack, floor_m)
+    doubtful = reading.other_packing is not None
+    irregular = widen_sigma(bundle.sigma, reading.found, seen, bundle.length_m, is_one_of_two=doubtful)
+    if reading.pack is not None:
+        return _held_by_straps(bundle, irregular, reading, reading.pack, floor_m)
+    return bundle if bars is not None else replace(bundle, sigma=irregular)
 
 
-def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float | None) -> Bundle:
+def _held_by_straps(
+    bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
+) -> Bundle:
     """Hold a bundle to what straps show: place, width and section where the fitted outline misses the pack,
     the section alone where both agree, a doubt where the pack is not seen whole and goes on beyond it.
+
+    irregular: its sigma where it is not surely the hexagon that was fitted.
     """
     if not pack.sides_seen:
-        doubt = contradicts(pack, bundle.width_m)
+        beyond_m, doubt = contradicts(pack, bundle.width_m)
         if doubt:
             sure = min(bundle.confidence, DOUBTFUL)
             bundle = replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
+            irregular = replace(
+                irregular,
+                width_m=float(np.hypot(irregular.width_m, beyond_m)),
+                lateral_m=float(np.hypot(irregular.lateral_m, beyond_m / 2)),
+            )
+        if bundle.bars is None:
+            bundle = replace(bundle, sigma=irregular)
         if abs(pack.middle_m) > _ASIDE_M:
             lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
             bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
@@ -167,7 +201,7 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
         if bundle.bars is not None:
             return bundle
         if abs(pack.middle_m) < _PACK_MIDDLE_M:
-            return _confirmed(bundle, pack, floor_m)
+            return _confirmed(replace(bundle, sigma=irregular), pack, floor_m)
     fit = reading.found.fit
     top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
     section, section_sigma = section_of_pack(pack.width_m, _over(top_z, floor_m))
@@ -192,7 +226,8 @@ def _held_by_straps(bundle: Bundle, reading: Reading, pack: Pack, floor_m: float
         sigma=replace(
             bundle.sigma,
             lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
-            width_m=_PACK_WIDTH_M,
+            yaw_rad=irregular.yaw_rad,
+            width_m=float(np.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * fit.sigma_m)),
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
             bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
             section_m2=section_sigma,
@@ -305,18 +340,22 @@ def _count(
     )
 
 
-def _doubts(reading: Reading, rows: UInt8, ends: list[End], sheet: AlignedMap) -> tuple[str, ...]:
+def _doubts(reading: Reading, rows: UInt8, ends: list[End], settings: BundleSettings) -> tuple[str, ...]:
     """List what speaks against the bundle as described."""
     out = []
     known = (rows != 0).mean()
     if known < _SURE_KNOWN:
         out.append(f"only {100 * known:.0f} % of its length was measured")
     crossed = _runs(rows == ABOVE)
-    cell = sheet.cell_m
-    narrow = [b - a for a, b in crossed if 2 * cell < (b - a) * cell <= _NARROW_M]
+    cell = reading.found.sheet.cell_m
+    narrow = _places(
+        [run for run in crossed if cell < (run[1] - run[0]) * cell <= _NARROW_M], reading, settings
+    )
     wide = [b - a for a, b in crossed if (b - a) * cell > _NARROW_M]
-    if narrow:
-        out.append(f"something narrow crosses over it at {len(narrow)} place(s), such as dunnage")
+    if narrow == 1:
+        out.append("something narrow lies across it at one place")
+    elif narrow:
+        out.append(f"something narrow {KNOWN_ACROSS} at {narrow} places, such as dunnage")
     out += [f"something {n * cell:.2f} m long covers a part of it" for n in wide]
     sunken = (rows == BELOW).sum() * cell
     if sunken > 0.1:
@@ -330,6 +369,21 @@ def _doubts(reading: Reading, rows: UInt8, ends: list[End], sheet: AlignedMap) -
                 f"a bundle {1e3 * reading.rival.fit.width_m:.0f} mm wide explains the surface nearly as well"
             )
     return tuple(out)
+
+
+def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSettings) -> int:
+    """Count the places at which runs of rows lie over an outline; none where all are so low that noise is."""
+    sheet, fit = reading.found.sheet, reading.found.fit
+    across = np.linspace(-0.35, 0.35, 15) * fit.width_m
+    places, highest, last = 0, 0.0, -np.inf
+    for first, end in runs:
+        rows = np.arange(first, end) + fit.first
+        along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+        u = fit.values[U] + fit.values[SLOPE_U] * along[:, None] + across
+        highest = max(highest, float(np.nanmedian(rise_over(sheet, fit, rows, u, settings))))
+        places += (first - last) * sheet.cell_m > _ONE_PLACE_M
+        last = end
+    return places if highest > _LIES_M else 0
 
 
 def _confidence(reading: Reading, rows: UInt8) -> float:

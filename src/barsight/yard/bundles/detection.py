@@ -11,6 +11,7 @@ from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, reinforce_kinds
 from barsight.yard.bundles.bundle_record import Reading, describe_bundles, make_bundle, without_pieces
+from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.crossing_bundles import OVER_M, crossing_pieces, is_beam, rise_over
 from barsight.yard.bundles.fitting.growth import grow_outline
 from barsight.yard.bundles.fitting.outline import bundle_width
@@ -38,6 +39,7 @@ from barsight.yard.bundles.layers import same_place
 from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
 from barsight.yard.bundles.straps import strapped_pack
 from barsight.yard.sections import split_map
+from barsight.yard.thin_lines import with_thin_lines
 from barsight.yard.types import Bundle, HeightMap, YardMap
 
 _EDGE_CELLS = 3.0
@@ -97,7 +99,8 @@ def _search(
     readings = _settled(found, without_slivers(places, _SLIVER_RATIO), height_map, settings)
     chosen_ones = [reading.found for reading in readings]
     bundles = [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
-    return without_pieces(bundles, readings)
+    joined = join_pieces(without_pieces(bundles, readings))
+    return list(ordered_map(lambda bundle: with_thin_lines(bundle, height_map), joined))
 
 
 def _found(
@@ -148,7 +151,8 @@ def _settled(
     packs = ordered_map(
         lambda reading: strapped_pack(height_map, reading.found.sheet, reading.found.fit), readings
     )
-    return [replace(reading, pack=pack) for reading, pack in zip(readings, packs, strict=True)]
+    seen = [replace(reading, pack=pack).with_flanks() for reading, pack in zip(readings, packs, strict=True)]
+    return [reading for reading in seen if reading.flanks is None or not reading.flanks.are_flat]
 
 
 def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> FittedOutline:

@@ -14,6 +14,8 @@ _HIGHER_RATIO = 0.4
 _PARALLEL = 0.08
 _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
+_DOUBTS = "covers a part", "something higher", "lies across it", "may lie over"
+"""In reasons that leave open whether something lies on a bundle."""
 
 
 def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
@@ -53,7 +55,7 @@ def check_uncovered(bundle: Bundle, bundles: list[Bundle]) -> tuple[bool | None,
     covers = [other.id for other in bundles if other.id != bundle.id and _lies_on(other, bundle)]
     if covers:
         return False, (f"bundle {', '.join(map(str, covers))} lies on it",)
-    if any("covers a part" in reason or "something higher" in reason for reason in bundle.reasons):
+    if any(doubt in reason for reason in bundle.reasons for doubt in _DOUBTS):
         return None, ()
     return True, ()
 

@@ -336,17 +336,17 @@ def find_pack(
     return Pack(ends[0], ends[1], own, (others[0], others[1]), top, bool(seen))
 
 
-def contradicts(pack: Pack, width_m: float) -> str:
-    """Say how a pack that isn't seen whole speaks against an outline about the same axis; empty where it
-    doesn't.
+def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
+    """Say how a pack that isn't seen whole speaks against an outline about the same axis, and how far one is
+    off the other, m; 0 and empty where it doesn't.
     """
     beyond = max(-width_m / 2 - pack.span.low_m, pack.span.high_m - width_m / 2)
     if beyond > _BEYOND_M:
-        return f"straps hold bars up to {1e3 * beyond:.0f} mm beyond its outline"
+        return beyond, f"straps hold bars up to {1e3 * beyond:.0f} mm beyond its outline"
     within = max(pack.others_m[0] + width_m / 2, width_m / 2 - pack.others_m[1])
     if within > _BEYOND_M:
-        return f"other straps reach {1e3 * within:.0f} mm into its outline"
-    return ""
+        return within, f"other straps reach {1e3 * within:.0f} mm into its outline"
+    return 0.0, ""
 
 
 def _dip(level: Float64) -> float:

@@ -22,7 +22,7 @@ from barsight.yard.lifting.checks import (
 from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
 from barsight.yard.lifting.labels import label_checks
 from barsight.yard.lifting.set_down import SetDown
-from barsight.yard.lifting.thin_bars import ThinLine, find_thin_line, thin_bar_checks
+from barsight.yard.lifting.thin_bars import thin_bar_checks
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
@@ -37,6 +37,7 @@ from barsight.yard.magnet.footprint import (
 )
 from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, weakest_pole
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
+from barsight.yard.thin_lines import ThinLine, find_thin_line
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_min, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass, load_centre

@@ -21,6 +21,8 @@ _GROWTH_CELLS = 1.5
 """A map grows over ends by about one and a half cells."""
 _SEEN_SIGMA_M = 0.012
 """What is left where all bars end alike: a cell of growth, straps and shadows."""
+_SEEN_SIGMAS = 4.0
+"""Of a height's sigma, which rises with the size of the pixels: what they leave of an end's place."""
 _UNEVEN_M = (-0.15, 0.2)
 _ENDS_M = 0.03
 
@@ -63,7 +65,11 @@ def find_end(sheet: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -
                 spread = ragged * cell
                 end = v + step * (spread / 4 - _GROWTH_CELLS * cell)
                 uneven = _unevenness(sheet, fit, row, step, settings)
-                return End(end, float(np.linalg.norm([_SEEN_SIGMA_M, spread / 6, uneven])), False)
+                return End(
+                    end,
+                    float(np.linalg.norm([_SEEN_SIGMA_M, _SEEN_SIGMAS * fit.sigma_m, spread / 6, uneven])),
+                    False,
+                )
     return End(v, float("nan"), True, "the map doesn't show what lies beyond")
 
 

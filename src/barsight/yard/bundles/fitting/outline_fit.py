@@ -103,6 +103,7 @@ def refine_outline(
     stride = 1 + (rows[1] - rows[0]) // _ROWS_ENOUGH
     alike = settings.correlated_along_m * settings.correlated_across_m / sheet.cell_m**2 / stride
     width_ratio = bundle_width(start.rings, 1.0)
+    narrowest = settings.min_width_m if start.rings else settings.min_single_diameter_m
     held, values, normal, moments, alike = fit_outline(
         Heights(
             sheet.z_m, sheet.sigma_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, rows[0], rows[1], stride, v_m
@@ -111,7 +112,7 @@ def refine_outline(
         Rules(
             hexagon(start.rings), width_ratio, free, steps, float(gate_m or 2 * settings.agreement_m),
             settings.placing_m, settings.smoothing_m, alike, common or (0.0, np.inf),
-            (0.8 * settings.min_single_diameter_m, 1.2 * settings.max_width_m),
+            (0.8 * narrowest, 1.2 * settings.max_width_m),
         ),
     )  # fmt: skip
     if not held:

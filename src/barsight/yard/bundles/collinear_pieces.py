@@ -1,0 +1,82 @@
+"""Join pieces of one bundle that were read as two, one behind the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.yard.types import Bundle
+
+_SKEW, _ASIDE_RATIO, _LEVEL_M = 0.05, 0.3, 0.04
+"""Most that two pieces of one bundle differ by: sine of the skew, way between their axes over the narrower
+one's width, height of their tops."""
+_GAP_M = 0.6
+"""Longest gap between them, and most that they overlap."""
+_ALIKE_LOG = 0.7
+"""Logarithm of the factor between the widths of two readings of one bundle."""
+
+
+def join_pieces(bundles: list[Bundle]) -> list[Bundle]:
+    """Join pieces that run on in each other where the ends that face each other are open.
+
+    The longer one says what they are; how far the other reads otherwise widens its sigma.
+    """
+    left = sorted(bundles, key=lambda bundle: -bundle.length_m)
+    out: list[Bundle] = []
+    for piece in left:
+        for k, whole in enumerate(out):
+            joined = _joined(whole, piece)
+            if joined is not None:
+                out[k] = joined
+                break
+        else:
+            out.append(piece)
+    return out
+
+
+def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
+    """Join a piece to a bundle that is longer; None where they are not surely one."""
+    along = np.array([-np.sin(whole.yaw_rad), np.cos(whole.yaw_rad)])
+    if abs(np.sin(piece.yaw_rad - whole.yaw_rad)) > _SKEW:
+        return None
+    order = [0, 1] if np.cos(piece.yaw_rad - whole.yaw_rad) > 0 else [1, 0]
+    away = (piece.ends_m[order] - whole.centre_m) @ np.column_stack(
+        [np.append(along, 0), (along[1], -along[0], 0)]
+    )
+    side = int(away[:, 0].mean() > 0)
+    own = float((whole.ends_m[side] - whole.centre_m)[:2] @ along)
+    gap = (away[1 - side, 0] - own) * (1 if side else -1)
+    aside, width = float(np.abs(away[:, 1]).max()), piece.width_m / whole.width_m
+    if not (
+        whole.ends_open[side]
+        and piece.ends_open[order[1 - side]]
+        and abs(gap) < _GAP_M
+        and aside < _ASIDE_RATIO * min(whole.width_m, piece.width_m)
+        and abs(whole.top_z_m - piece.top_z_m) < _LEVEL_M
+        and abs(np.log(width)) < _ALIKE_LOG
+    ):
+        return None
+    end = whole.ends_m[side] + (away[side, 0] - own) * whole.direction / np.cos(whole.pitch_rad)
+    ends = np.array([whole.ends_m[0], end] if side else [end, whole.ends_m[1]])
+    far = order[side]
+    is_open, sigmas = list(whole.ends_open), list(whole.ends_sigma_m)
+    is_open[side], sigmas[side] = piece.ends_open[far], piece.ends_sigma_m[far]
+    sigma = replace(
+        whole.sigma,
+        lateral_m=float(np.hypot(whole.sigma.lateral_m, aside)),
+        width_m=float(np.hypot(whole.sigma.width_m, piece.width_m - whole.width_m)),
+        top_z_m=float(np.hypot(whole.sigma.top_z_m, piece.top_z_m - whole.top_z_m)),
+        along_m=float(np.linalg.norm(sigmas) / 2),
+        length_m=float(np.linalg.norm(sigmas)),
+    )
+    name = ("low-y", "high-y")[side]
+    kept = tuple(r for r in whole.reasons if f"the {name} end is open" not in r)
+    doubts = tuple(r for r in piece.reasons if "is open" not in r or ("low-y", "high-y")[far] in r)
+    doubts = tuple(r.replace(("low-y", "high-y")[far], name) for r in doubts if r not in kept)
+    return replace(
+        whole, centre_m=ends.mean(axis=0), ends_m=ends, ends_open=(is_open[0], is_open[1]),
+        ends_sigma_m=(sigmas[0], sigmas[1]), length_m=float(np.linalg.norm(ends[1] - ends[0])), sigma=sigma,
+        bars=whole.bars if whole.bars == piece.bars else None,
+        confidence=min(whole.confidence, piece.confidence), reasons=kept + doubts,
+    )  # fmt: skip

@@ -1,0 +1,76 @@
+"""See a bundle's flanks: how far it falls off on either side, and what may lie over them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.yard.bundles.fitting.outline_fit import FittedOutline
+from barsight.yard.bundles.seen_section import agreeing_rows, mean_section
+
+_CREST_RATIO = 0.35
+"""Of the width, to either side of its middle: where a bundle is highest."""
+_FLANK_RATIOS = 0.3, 0.5, 0.55
+"""Of the width, from its middle: where a bundle falls off, its edge, and how far a map may grow over that."""
+_BEYOND_M = 0.15
+"""How far from its edge a neighbour that may lie over it stands."""
+_FLAT_RATIO, _SHALLOW_RATIO, _HIGHER_M = 0.1, 0.18, 0.03
+"""Of the width: a flank that falls less is not seen; nor is one that falls less than the second beside what
+stands higher by so much. What stands higher by the whole width is a stack on feet of its own."""
+
+
+@dataclass(frozen=True)
+class Flanks:
+    """Flanks on the low and the high side. falls_m: from the crest to the lowest place of each, inf where it
+    falls to the floor or out of sight; rises_m: from the crest to the highest place beside it, -inf where
+    nothing is seen. are_flat: neither falls off before its edge, as a plate, a cart or a wall does not.
+    """
+
+    width_m: float
+    falls_m: tuple[float, float]
+    rises_m: tuple[float, float]
+    are_flat: bool
+
+    @property
+    def doubt(self) -> str:
+        """Say that something may lie over a flank; empty where both are seen."""
+        for name, fall, rise in zip(("low", "high"), self.falls_m, self.rises_m, strict=True):
+            if fall < _FLAT_RATIO * self.width_m:
+                return f"its {name} flank was not seen: something may lie over it"
+            if fall < _SHALLOW_RATIO * self.width_m and _HIGHER_M < rise < self.width_m:
+                return f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"
+        return ""
+
+
+def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | None:
+    """Measure the flanks of a bundle from low_m to high_m beside an outline's axis; None where too few rows
+    agree with it or its crest isn't seen.
+    """
+    rows = agreeing_rows(one.fit)
+    if rows.size < 3:
+        return None
+    width, middle = high_m - low_m, (low_m + high_m) / 2
+    half = round((width / 2 + abs(middle) + _BEYOND_M) / one.sheet.cell_m) + 1
+    beside, level = mean_section(one.sheet, one.fit, rows, half)
+    away = np.asarray(beside - middle, np.float64)
+    crest = level[(np.abs(away) < _CREST_RATIO * width) & np.isfinite(level)].max(initial=-np.inf)
+    if not np.isfinite(crest):
+        return None
+    low, high = (_flank(side * away, level, float(crest), width) for side in (-1, 1))
+    are_flat = max(low[0], high[0]) < _FLAT_RATIO * width
+    return Flanks(width, (low[1], high[1]), (low[2], high[2]), are_flat)
+
+
+def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tuple[float, float, float]:
+    """Compute how far one side falls before its edge; how far with what a map grows over that, inf where to
+    the floor or out of sight; and how far what lies beyond rises.
+    """
+    first, edge, last = (ratio * width for ratio in _FLANK_RATIOS)
+    inner = level[(outwards > first) & (outwards < edge)]
+    own = level[(outwards > first) & (outwards < last)]
+    beyond = level[(outwards >= edge) & (outwards < edge + _BEYOND_M)]
+    before = crest - inner[np.isfinite(inner)].min(initial=crest)
+    seen = own[~np.isnan(own)].min(initial=-np.inf if np.isnan(own).all() else np.inf)
+    return float(before), float(crest - seen), float(beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest)
