@@ -1,5 +1,7 @@
 """The crane's encoders: exact where the truth is a parabola, honest about noise, deaf to wild readings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,7 +9,9 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.types import CraneSamples, ImuSamples
+from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry, fit_position
+from barsight.motion.crane.known_motion import ImuWay, way_around
 from barsight.motion.crane.robust_parabola import ROUNDS, fit_parabola
 from barsight.motion.crane.sway import sway_at
 from motion_recordings import MemoryRecording, ideal_rig
@@ -56,20 +60,68 @@ def test_the_covariance_is_right(count: int) -> None:
     assert 0.8 < np.mean(nees) < (1.5 if count == 5 else 1.2)
 
 
-def test_a_known_acceleration_leaves_less_to_find() -> None:
+def oscillating(hz: float, late_s: float = 0.0) -> tuple[CraneSamples, ImuSamples, np.ndarray]:
+    """A crane that travels and oscillates by 0.6 m/s2, readings late; the place read at START_NS + 1 s."""
+    turn = 2 * np.pi * hz
+    wave = np.array([0.6, -0.3, 0.0]) / turn**2
+
+    def at(time: np.ndarray) -> np.ndarray:
+        return place(time) + np.sin(turn * time)[..., None] * wave
+
+    read, felt = np.arange(0.0, 2.0, 0.05), np.arange(0.0, 2.0, 0.005)
+    acceleration = 2 * np.array([-0.2, 0.1, 0.05]) - np.sin(turn * felt)[:, None] * wave * turn**2
+    force = (acceleration + np.array([0, 0, GRAVITY_MPS2])) @ NOMINAL
+    imu = ImuSamples(START_NS + np.round(1e9 * felt).astype(np.int64), np.zeros_like(force), force)
+    crane = CraneSamples(
+        START_NS + np.round(1e9 * read).astype(np.int64), at(read - late_s), MOUNT, NOMINAL, STD_M
+    )
+    return crane, imu, at(np.array(1.0 - late_s))
+
+
+@pytest.mark.parametrize("hz", [0.5, 1.5, 3.0])
+def test_an_oscillation_that_the_imu_tells_isnt_smeared(hz: float) -> None:
+    """Of millimetres by a parabola; where attitude and bias are open, a parabola more than the IMU tells."""
+    crane, imu, truth = oscillating(hz)
+    askew, none = NOMINAL @ Rotation.from_rotvec([2e-3, -1e-3, 0]).as_matrix(), ImuBias.none()
+    for rotation, degree in ((NOMINAL, 1), (askew, 2)):
+        way = way_around(imu, START_NS + 1_000_000_000, WINDOW_NS, rotation, none, degree)
+        fit = fit_position(crane, START_NS + 1_000_000_000, WINDOW_NS, way)
+        np.testing.assert_allclose(fit.position_m, truth, atol=2e-5)
+    assert way_around(imu, START_NS + 1_800_000_000, WINDOW_NS, NOMINAL, none, 1) is None
+
+
+def test_late_readings_of_an_oscillation_give_its_place_then() -> None:
+    crane, imu, truth = oscillating(2.0, late_s=0.04)
+    way = way_around(imu, START_NS + 1_000_000_000, WINDOW_NS + 40_000_000, NOMINAL, ImuBias.none(), 1)
+    fit = fit_position(crane, START_NS + 1_000_000_000, WINDOW_NS, way, 40_000_000)
+    np.testing.assert_allclose(fit.position_m, truth, atol=2e-5)
+
+
+def test_what_the_imu_tells_leaves_less_to_find() -> None:
     """A line's middle has 4/9 of a parabola's variance, and scatters so."""
     rng, count = np.random.default_rng(1), 14
     stamp, truth = START_NS + 350_000_000, place(np.array(0.35))
-    bend = 2 * np.array([-0.2, 0.1, 0.05])
+    time = np.arange(-0.01, 0.72, 0.005)
+    bend = np.tile(2 * np.array([-0.2, 0.1, 0.05]), (len(time), 1))
+    way = ImuWay.integrate(START_NS + np.round(1e9 * time).astype(np.int64), bend, 1)
     off, stated = [], []
     for _ in range(400):
-        fits = [fit_position(readings(count, STD_M, rng), stamp, WINDOW_NS, known) for known in (None, bend)]
+        fits = [fit_position(readings(count, STD_M, rng), stamp, WINDOW_NS, known) for known in (None, way)]
         off.append([fit.position_m - truth for fit in fits])
         stated.append([fit.covariance[0, 0] for fit in fits])
-        np.testing.assert_array_equal(fits[1].acceleration_mps2, bend)
+        np.testing.assert_allclose(fits[1].acceleration_mps2, bend[0])
     seen, stated = np.square(off).mean(axis=(0, 2)), np.mean(stated, axis=0)
     np.testing.assert_allclose(seen / stated, 1, atol=0.15)
     assert abs(seen[1] / seen[0] - 4 / 9) < 0.08
+
+
+def test_without_an_imu_sigma_holds_what_a_parabola_smears() -> None:
+    crane, _, _ = oscillating(3.0)
+    crane = replace(crane, position_std_m=2e-4)
+    fit = fit_position(crane, START_NS + 1_040_000_000, WINDOW_NS)
+    still = fit_position(replace(crane, position_m=crane.position_m * 0), START_NS + 1_040_000_000, WINDOW_NS)
+    assert fit.covariance[0, 0] ** 0.5 > 5 * still.covariance[0, 0] ** 0.5
+    assert 1e-3 > fit.covariance[0, 0] ** 0.5 > 4e-4
 
 
 @pytest.mark.parametrize("size_m", [0.05, 1.0, 100.0])

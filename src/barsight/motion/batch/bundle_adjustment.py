@@ -21,7 +21,7 @@ from barsight.motion.problem.encoder_factors import (
     encoder_inliers,
     encoder_residuals,
     encoder_state,
-    with_known_curvature,
+    with_known_way,
 )
 from barsight.motion.problem.gauss_newton import GraphState, optimise_graph, sighting_residuals
 from barsight.motion.problem.gtsam_factors import build_graph, initial_values
@@ -97,7 +97,7 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
         if problem.has_latency and seeks_drift:
             state, system, _ = optimise_with_drift(problem, state, system, used, START_GAIN)
         del system
-        seen, problem = problem.sightings, with_known_curvature(problem, state.values)
+        seen, problem = problem.sightings, with_known_way(problem, state.values)
         problem, state, system, used = _with_seen_noise(problem, seen, state, used)
     drift: RigDrift | None = None
     everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)

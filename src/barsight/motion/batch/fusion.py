@@ -254,7 +254,7 @@ class BatchPoses:
         attitudes: list[AttitudePrior] = []
         if inputs.crane is not None:
             chosen = _apart(nodes.stamp_ns, seconds_to_ns(PLACE_SPACING_S))
-            placed = encoder_positions(inputs.crane, nodes.stamp_ns, chosen)
+            placed = encoder_positions(inputs.crane, inputs.imu, nodes.stamp_ns, chosen)
             nominal = inputs.crane.yard_from_body_nominal
             sigmas = self._attitude_sigmas_deg(chosen, ties.still)
             attitudes = [AttitudePrior(k, nominal, np.full(3, np.deg2rad(s))) for k, s in sigmas.items()]
@@ -270,7 +270,7 @@ class BatchPoses:
             start, nodes.stamp_ns, inputs.crane is None, seen, ties.preintegrated, placed,
             tuple(attitudes), ties.still, ties.bias,
             offset_prior_px=self._settings.offset_prior_px, scale_prior=self._settings.scale_sigma,
-            crane=inputs.crane, has_latency=bool(placed), jumps=jumps,
+            crane=inputs.crane, imu=inputs.imu, has_latency=bool(placed), jumps=jumps,
             has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
         estimate = solve_batch(problem, nodes.frame)

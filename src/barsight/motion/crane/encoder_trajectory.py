@@ -15,6 +15,8 @@ from barsight.core.pose import Pose
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame, Trajectory
+from barsight.inertial.model import ImuBias
+from barsight.motion.crane.known_motion import ImuWay, way_around
 from barsight.motion.crane.robust_parabola import fit_parabola
 from barsight.motion.crane.sway import sway_at
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator
@@ -22,6 +24,8 @@ from barsight.recording.base import Recording
 
 CAUCHY_SIGMAS = 3.0
 MIN_FOR_NOISE = 100
+NINE_TENTHS = 0.623
+"""Mean square of the smaller nine in ten of normal residuals, over that of all."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +78,13 @@ class EncoderPoses(ImmediatePoses):
         crane, imu = self._recording.crane(), self._recording.imu()
         assert crane is not None
         at_ns = stamp + self._recording.rig.timeshift_cam_imu_ns
-        fit = fit_position(crane, at_ns, seconds_to_ns(settings.window_s))
+        attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
+        half, way = seconds_to_ns(settings.window_s), None
+        if imu is not None:
+            way = way_around(imu, at_ns, half, attitude, ImuBias.none(), 2)
+        fit = fit_position(crane, at_ns, half, way)
         if isinstance(fit, Failed):
             return fit
-        attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
         if imu is not None:
             sway = sway_at(imu, at_ns, settings.sway_window_s)
             if isinstance(sway, Failed):
@@ -112,14 +119,16 @@ class FittedPosition:
 
 
 def fit_position(
-    crane: CraneSamples, stamp_ns: int, window_ns: int, acceleration_mps2: Float64 | None = None
+    crane: CraneSamples, stamp_ns: int, window_ns: int, way: ImuWay | None = None, late_ns: int = 0
 ) -> FittedPosition | Failed:
     """Fit the crane point at `stamp_ns` to the readings around it.
 
     A parabola through the readings within the window (a line where they are fewer than six), by least
-    squares with Cauchy's weights, so that single wild readings don't pull however far off they are. Where
-    the acceleration (3,) is known, it takes a line, whose middle has 4/9 of the variance. Failed
-    `no-encoder` where the readings don't enclose the stamp; readings beyond a jump don't count.
+    squares with Cauchy's weights, so that single wild readings don't pull however far off they are. A crane
+    that oscillates follows no parabola: where the IMU knows its way, that is taken off the readings, which
+    are `late_ns` late, before the fit and added again, and only what it leaves open is fitted (a line, whose
+    middle has 4/9 of a parabola's variance, where it knows the acceleration too). Failed `no-encoder` where
+    the readings don't enclose the stamp; readings beyond a jump don't count.
     """
     begin_ns, end_ns = stamp_ns - window_ns, stamp_ns + window_ns
     for jump in crane.jumps:
@@ -136,16 +145,33 @@ def fit_position(
         )
     time = (stamps - stamp_ns) / window_ns
     window_s = window_ns / NS_PER_S
-    degree = 2 if stamps.size >= 6 and acceleration_mps2 is None else 1
-    bend = np.zeros(3) if acceleration_mps2 is None else acceleration_mps2
-    places = crane.position_m[first:last] - (time[:, None] * window_s) ** 2 / 2 * bend
+    degree = min(2 if stamps.size >= 6 else 1, 2 if way is None else way.open_degree)
+    places, here = crane.position_m[first:last], np.array([stamp_ns - late_ns])
+    if way is not None:
+        places = places - way.place_at(stamps - late_ns)
     fitted = np.empty((degree + 1, 4))
     length = CAUCHY_SIGMAS * 3**0.5 * crane.position_std_m
     fit_parabola(time, places, length, fitted)
     coefficients, variance = fitted[:, :3], fitted[0, 3] * crane.position_std_m**2
-    if degree == 2:
-        bend = 2 * coefficients[2] / window_s**2
-    return FittedPosition(coefficients[0], coefficients[1] / window_s, bend, np.eye(3) * variance)
+    place, velocity = coefficients[0], coefficients[1] / window_s
+    bend = 2 * coefficients[2] / window_s**2 if degree == 2 else np.zeros(3)
+    if way is None:
+        # What the parabola can't follow is all alike over the window: it doesn't average out.
+        off = places - np.polynomial.polynomial.polyval(time, coefficients).T
+        variance += _misfit_m2(off, degree + 1, crane.position_std_m)
+    else:
+        place, velocity = place + way.place_at(here)[0], velocity + way.speed_at(here)[0]
+        bend = bend + way.acceleration_at(here)[0]
+    return FittedPosition(place, velocity, bend, np.eye(3) * variance)
+
+
+def _misfit_m2(off_m: Float64, fitted: int, sigma_m: float) -> float:
+    """Estimate the variance of residuals (N, 3) beyond a reading's own, where that is clearly more, by the
+    smaller nine in ten of them: the rest may be wild.
+    """
+    free, squares = 3 * (len(off_m) - fitted), np.sort(off_m**2, axis=None)
+    seen = float(squares[: int(0.9 * squares.size)].mean()) / NINE_TENTHS * squares.size / free
+    return float(max(0.0, seen - (1 + 2 * (2 / free) ** 0.5) * sigma_m**2))
 
 
 def reestimate_noise(crane: CraneSamples) -> CraneSamples:

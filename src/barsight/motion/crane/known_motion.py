@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from barsight.core.arrays import Float64, Int64
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
 from barsight.core.types import CraneSamples, ImuSamples
+from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 from barsight.motion.crane.sway import MAX_GAP_S, turned_angle
 
 TREND_S = 20.0
@@ -77,19 +78,30 @@ class KnownMotion:
         turned = crane.yard_from_body_nominal @ Rotation.from_rotvec(angle[begin:end]).as_matrix()
         force = np.einsum("nij,nj->ni", turned, imu.accel_mps2[begin:end])
         force -= force.mean(axis=0)  # gravity and the biases, which whoever reads this leaves open
-        time = time[begin:end]
-        speed = cumulative_trapezoid(force, time, axis=0, initial=0)
-        speed -= speed.mean(axis=0)
-        return ImuWay(stamps[begin:end], speed, cumulative_trapezoid(speed, time, axis=0, initial=0))
+        return ImuWay.integrate(stamps[begin:end], force, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class ImuWay:
-    """The way by the IMU alone, but for a parabola. stamp_ns: (N,); speed_mps, place_m: (N, 3) in `yard`."""
+    """The way by the IMU alone, but for a polynomial of `open_degree`: a parabola where gravity and bias are
+    open, a line where they are known. stamp_ns: (N,); acceleration_mps2, speed_mps, place_m: (N, 3) in the
+    reference.
+    """
 
     stamp_ns: Int64
+    acceleration_mps2: Float64
     speed_mps: Float64
     place_m: Float64
+    open_degree: int
+
+    @classmethod
+    def integrate(cls, stamp_ns: Int64, acceleration_mps2: Float64, open_degree: int) -> ImuWay:
+        """Integrate accelerations (N, 3) twice, from a mean speed of zero."""
+        time = (stamp_ns - stamp_ns[0]) / NS_PER_S
+        speed = cumulative_trapezoid(acceleration_mps2, time, axis=0, initial=0)
+        speed -= speed.mean(axis=0)
+        place = cumulative_trapezoid(speed, time, axis=0, initial=0)
+        return cls(stamp_ns, acceleration_mps2, speed, place, open_degree)
 
     def place_at(self, stamp_ns: Int64) -> Float64:
         """Interpolate the place (M, 3)."""
@@ -98,3 +110,29 @@ class ImuWay:
     def speed_at(self, stamp_ns: Int64) -> Float64:
         """Interpolate the speed (M, 3)."""
         return interpolate_at(stamp_ns, self.stamp_ns, self.speed_mps)
+
+    def acceleration_at(self, stamp_ns: Int64) -> Float64:
+        """Interpolate the acceleration (M, 3)."""
+        return interpolate_at(stamp_ns, self.stamp_ns, self.acceleration_mps2)
+
+
+def way_around(
+    imu: ImuSamples, stamp_ns: int, half_ns: int, rotation: Float64, bias: ImuBias, open_degree: int
+) -> ImuWay | None:
+    """Integrate the IMU from `half_ns` before a stamp to as long after it; None where it doesn't cover that.
+
+    rotation: (3, 3) reference_from_body at the stamp; open_degree: 1 where it and the bias are known, else 2.
+    """
+    first, end = np.searchsorted(imu.stamp_ns, (stamp_ns - half_ns, stamp_ns + half_ns))
+    part = slice(max(0, int(first) - 1), int(end) + 1)
+    stamps = imu.stamp_ns[part]
+    if len(stamps) < 8 or stamps[0] > stamp_ns - half_ns or stamps[-1] < stamp_ns + half_ns:
+        return None
+    if np.diff(stamps).max() > seconds_to_ns(MAX_GAP_S):
+        return None
+    near = ImuSamples(stamps, imu.gyro_radps[part] - bias.gyro_radps, imu.accel_mps2[part] - bias.accel_mps2)
+    angle = turned_angle(near)
+    angle -= interpolate_at(np.array([stamp_ns]), stamps, angle)
+    turned = rotation @ Rotation.from_rotvec(angle).as_matrix()
+    force = np.einsum("nij,nj->ni", turned, near.accel_mps2)
+    return ImuWay.integrate(stamps, force - [0.0, 0.0, GRAVITY_MPS2], open_degree)

@@ -21,6 +21,7 @@ from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fault_detection import freeze_sentences
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
+from barsight.motion.crane.known_motion import way_around
 from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
@@ -29,7 +30,7 @@ from barsight.motion.frontend.motion_prediction import CranePredictor, predict_b
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.tracking import Sighting
 from barsight.motion.gravity import GravityAlignment
-from barsight.motion.problem.encoder_factors import jump_sentences
+from barsight.motion.problem.encoder_factors import encoder_position, jump_sentences
 from barsight.motion.problem.gauss_newton import GraphState
 from barsight.motion.problem.gtsam_factors import initial_values
 from barsight.motion.problem.nodes import (
@@ -41,7 +42,7 @@ from barsight.motion.problem.nodes import (
     preintegrate_between,
     subdivide,
 )
-from barsight.motion.problem.problem import AttitudePrior, EncoderPosition, Problem
+from barsight.motion.problem.problem import AttitudePrior, Problem
 
 RECENT_FRAMES = 40
 """So many of the last frames' motions are held against the encoders."""
@@ -279,11 +280,11 @@ class FixedLagEstimator:
             near = placed_ns is not None and node_ns - placed_ns < 0.97 * seconds_to_ns(PLACE_SPACING_S)
             if not at_once and (near or node_ns > complete):
                 continue
-            fit = fit_position(crane, node_ns, seconds_to_ns(self._crane.window_s if at_once else FIT_S))
-            if isinstance(fit, Failed):
-                continue
-            place = fit.position_m + crane.crane_to_body_m
-            sigma = float(np.sqrt(fit.covariance[0, 0]))
-            placed.append(EncoderPosition(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
-            placed_ns = node_ns
+            half, way = seconds_to_ns(self._crane.window_s if at_once else FIT_S), None
+            if now.imu is not None and not at_once:
+                way = way_around(now.imu, node_ns, half, window.pose(k).rotation, window.bias, 2)
+            found = encoder_position(crane, k, node_ns, half, way)
+            if not isinstance(found, Failed):
+                placed.append(found)
+                placed_ns = node_ns
         return replace(window, problem=replace(problem, placed=tuple(placed)), placed_ns=placed_ns)

@@ -12,13 +12,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from gtsam.symbol_shorthand import V
+from gtsam.symbol_shorthand import B, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, EncoderJump
+from barsight.core.types import CraneSamples, EncoderJump, ImuSamples
+from barsight.inertial.model import ImuBias
 from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.motion.crane.known_motion import ImuWay, way_around
 from barsight.motion.linear.chain_elimination import Chain
 from barsight.motion.problem.problem import EncoderPosition, Problem, encoder_unknowns_of, poses_of
 from barsight.motion.problem.rig_drift import HUBER_SIGMAS
@@ -46,36 +48,46 @@ class EncoderState:
     jump_sigma_m: Float64
 
 
+def encoder_position(
+    crane: CraneSamples, node: int, stamp_ns: int, window_ns: int, way: ImuWay | None, late_ns: int = 0
+) -> EncoderPosition | Failed:
+    """Interpolate the body's place at a node by the readings around it; see `fit_position`."""
+    fit = fit_position(crane, stamp_ns, window_ns, way, late_ns)
+    if isinstance(fit, Failed):
+        return fit
+    place, sigma = fit.position_m + crane.crane_to_body_m, float(np.sqrt(fit.covariance[0, 0]))
+    return EncoderPosition(node, place, fit.velocity_mps, fit.acceleration_mps2, sigma)
+
+
 def encoder_positions(
-    crane: CraneSamples, stamp_ns: Int64, nodes: Sequence[int], acceleration_mps2: Float64 | None = None
+    crane: CraneSamples, imu: ImuSamples | None, stamp_ns: Int64, nodes: Sequence[int]
 ) -> tuple[EncoderPosition, ...]:
-    """Interpolate the body's place at the nodes (of stamps (M,)) by the readings around each; acceleration
-    (M, 3) where it is known, NaN elsewhere.
-    """
-    found = []
+    """Interpolate the body's place at the nodes (of stamps (M,)), the attitude about as nominal."""
+    found, half = [], seconds_to_ns(WINDOW_S)
     for k in nodes:
-        known = None if acceleration_mps2 is None else acceleration_mps2[k]
-        if known is not None and not np.isfinite(known).all():
-            known = None
-        fit = fit_position(crane, int(stamp_ns[k]), seconds_to_ns(WINDOW_S), known)
-        if not isinstance(fit, Failed):
-            place, sigma = fit.position_m + crane.crane_to_body_m, float(np.sqrt(fit.covariance[0, 0]))
-            found.append(EncoderPosition(k, place, fit.velocity_mps, fit.acceleration_mps2, sigma))
-    return tuple(found)
+        stamp, nominal, none = int(stamp_ns[k]), crane.yard_from_body_nominal, ImuBias.none()
+        way = None if imu is None else way_around(imu, stamp, half, nominal, none, 2)
+        found.append(encoder_position(crane, k, stamp, half, way))
+    return tuple(place for place in found if not isinstance(place, Failed))
 
 
-def with_known_curvature(problem: Problem, values: Any) -> Problem:
-    """Refine places by the estimate's acceleration: they are 1.5 times as good."""
-    if problem.crane is None or not problem.has_imu:
+def with_known_way(problem: Problem, values: Any) -> Problem:
+    """Refine places by the way that the IMU tells with the estimate's attitudes, biases and latency: they are
+    1.5 times as good.
+    """
+    crane, imu = problem.crane, problem.imu
+    if crane is None or imu is None or not problem.has_imu:
         return problem
-    velocity = np.array([values.atVector(V(k)) for k in range(len(problem.start))])
-    time = problem.stamp_ns / NS_PER_S
-    bend = np.full(velocity.shape, np.nan)
-    tied = np.array([part is not None for part in problem.preintegrated])
-    both = np.flatnonzero(tied[:-1] & tied[1:]) + 1
-    bend[both] = (velocity[both + 1] - velocity[both - 1]) / (time[both + 1] - time[both - 1])[:, None]
-    nodes = [place.node for place in problem.placed]
-    return replace(problem, placed=encoder_positions(problem.crane, problem.stamp_ns, nodes, bend))
+    late_ns, found = seconds_to_ns(float(encoder_unknowns_of(values)[0])), []
+    half = seconds_to_ns(WINDOW_S) + abs(late_ns)
+    for place in problem.placed:
+        k, stamp = place.node, int(problem.stamp_ns[place.node])
+        bias = values.atConstantBias(B(k))
+        known = ImuBias(np.array(bias.gyroscope()), np.array(bias.accelerometer()))
+        way = way_around(imu, stamp, half, values.atPose3(X(k)).rotation().matrix(), known, 1)
+        again = encoder_position(crane, k, stamp, seconds_to_ns(WINDOW_S), way, late_ns)
+        found.append(place if way is None or isinstance(again, Failed) else again)
+    return replace(problem, placed=tuple(found))
 
 
 def add_encoders(chain: Chain, problem: Problem, poses: Float64, unknowns: Float64) -> None:

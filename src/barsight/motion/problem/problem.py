@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, EncoderJump, RectifiedCamera
+from barsight.core.types import CraneSamples, EncoderJump, ImuSamples, RectifiedCamera
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.frontend.tracking import Sighting
@@ -207,6 +207,8 @@ class Problem:
     """Takes the place of what fixes the first node, the biases and the encoders' unknowns."""
     crane: CraneSamples | None = None
     """The readings that `placed` are of."""
+    imu: ImuSamples | None = None
+    """The samples that tell how the crane moved between those readings."""
     pieces: Pieces | None = None
     """What slides together; None where nothing is held to slide."""
     asked: Int64 | None = None
