@@ -255,10 +255,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "is_simulated": measurement.is_simulated,
         "calibration_id": measurement.calibration_hash[:ID_DIGITS],
         "yard_frame_id": measurement.yard_frame_id,
-        "recording": {
-            "path": str(measurement.recording_path.resolve()),
-            "format": measurement.recording_format,
-        },
+        "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
         "reference": trajectory.reference,
         "hashes": {
             "calibration": measurement.calibration_hash,
