@@ -130,10 +130,10 @@ class Yard:
         now_ns = time.time_ns()
         said = []
         for lift in offered:
-            since = forbidden_since(content, lift.record, self.bundles, self._events, now_ns)
-            said.append((lift, [(veto.code, veto.reason) for veto in since]))
-        refused += tuple(_vetoed(lift, *found) for lift, found in said if found)
-        return Lifts(tuple(lift for lift, found in said if not found), refused, vetoes)
+            found = forbidden_since(content, lift.record, self.bundles, self._events, now_ns)
+            said.append((lift, [(veto.code, veto.reason) for veto in found]))
+        refused += tuple(_vetoed(lift, *codes) for lift, codes in said if codes)
+        return Lifts(tuple(lift for lift, codes in said if not codes), refused, vetoes)
 
     @property
     def _events(self) -> tuple[YardEvent, ...]:

@@ -72,7 +72,8 @@ def explain(folder: Path, which: str) -> Explanation:
     lifts = read_lifts(folder / "lifts.json")
     record = _find(lifts, which, folder)
     ids = ", ".join(str(number) for number in record["bundles"]) or "no bundle"
-    rank, bundles, since = record["rank"], read_bundles(folder / "bundles.json"), ()
+    rank, bundles = record["rank"], read_bundles(folder / "bundles.json")
+    since: tuple[Veto, ...] = ()
     state = "is refused"
     if rank is not None:
         state = f"is offered at rank {rank}"
