@@ -138,8 +138,7 @@ def _path(v: Float64, rise: Float64, steep: Float64, weight: Float64, noise: flo
     normal = terms.T @ (weight.reshape(-1, 1) * terms)
     for k, sigma in ((0, 1.0), (1, ASKEW), (2, BENT_PER_M)):
         normal[k, k] += (noise / sigma) ** 2
-    path: Float64 = np.linalg.solve(normal, terms.T @ (weight * rise))
-    return path
+    return np.linalg.solve(normal, terms.T @ (weight * rise)).astype(np.float64)
 
 
 @kernel()
