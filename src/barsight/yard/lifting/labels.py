@@ -15,13 +15,15 @@ from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
 
 STEP_M = 0.01
-LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 6
-"""Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides."""
-BRIGHTER_RATIO, FULL_LEVEL = 2.2, 200.0
-"""Grey level of a label over the median of the load, and the level from which on a picture shows no more."""
-MEAN_LOG, ODD_CELLS = 0.18, 2
-"""Logarithm of a label's level over that of the brighter end of the bare bar, on average; nowhere is it
-darker but in so many of its steps, where it lies askew."""
+LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
+"""Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides: a
+label ends at once, a gleam fades."""
+BRIGHTER_RATIO, FULL_LEVEL, LEAST_LEVEL = 2.2, 215.0, 150.0
+"""Grey level of a label over the median of the load, the level from which on a picture shows no more, and the
+least of a label's steps."""
+MEAN_LOG, ODD_CELLS = 0.15, 1
+"""Logarithm of a label's level over that of the brighter end of the bare bar, on average; each step but so
+many is brighter than that."""
 _DARK = 10.0
 """Level that is added to both: where hardly any light is, ratios tell nothing."""
 
@@ -81,7 +83,8 @@ def mark_labels(grey: Float32) -> Bool:
     level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
     seen = grey[grey > 0]
     needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
-    return np.asarray((mean > MEAN_LOG) & (least > brightest) & (level > needed))
+    sure = (least > brightest) & (least > LEAST_LEVEL + _DARK)
+    return np.asarray((mean > MEAN_LOG) & sure & (level > needed))
 
 
 def _grey(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> Float32:
