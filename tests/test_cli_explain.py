@@ -12,6 +12,7 @@ import pytest
 from barsight.cli.main import run
 from barsight.core.stamps import NS_PER_S
 from barsight.report.explanation import BGR, PIXELS_PER_M, explain
+from barsight.yard.events import YardEvent, write_events
 from yard_folders import lifts, write_folder
 
 
@@ -45,7 +46,19 @@ def test_a_lift_that_was_valid_once_is_said_to_be_too_old(
     assert explain(folder, "1").title.endswith("is offered at rank 1")
     later_ns = time.time_ns() + 3600 * NS_PER_S
     monkeypatch.setattr(time, "time_ns", lambda: later_ns)
-    assert explain(folder, "1").title.endswith("too old now")
+    assert explain(folder, "1").title.endswith("forbidden now: map-too-old")
+
+
+def test_a_lift_that_an_event_disturbed_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = write_folder(tmp_path / "out")
+    assert lifts(made) == 0
+    x_m, y_m = (explain(made, "1").record["target"][name] for name in ("x_m", "y_m"))
+    write_events([YardEvent(time.time_ns(), "magnet", x_m, y_m, 0.0, 1.0, 0.3)], made / "events.csv")
+    target = tmp_path / "why.html"
+    assert run(["explain", str(made), "1", "-o", str(target)]) == 0
+    said = capsys.readouterr().out
+    assert "is forbidden now: disturbed" in said and "a magnet at" in said
+    assert "is forbidden now" in target.read_text(encoding="utf-8")
 
 
 def test_the_block_is_marked_where_it_stands(folder: Path) -> None:

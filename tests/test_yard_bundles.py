@@ -16,7 +16,7 @@ from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.flanks import Flanks
 from barsight.yard.bundles.headings import find_headings
-from barsight.yard.bundles.seen_section import SeenSection, estimate_section, is_no_hexagon
+from barsight.yard.bundles.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.weight import bundle_mass
 from yard_maps import Laid, draw
@@ -249,3 +249,17 @@ def test_ripples_of_the_floor_are_no_heading() -> None:
     seen = np.full(z.shape, HeightSource.VISION, np.uint8)
     height_map = HeightMap(0.0, 0.0, 0.01, z.astype(np.float32), flat, flat + 3, seen)
     assert find_headings(height_map, 3.0) == (0.0,)
+
+
+@pytest.mark.parametrize(
+    ("behind", "begins", "seen"),
+    [(-0.09, False, False), (-0.3, False, True), (-np.inf, False, True), (-0.09, True, True)],
+)
+def test_what_shows_behind_a_steep_flank_may_be_a_bundles_own_lower_bars(
+    behind: float, begins: bool, seen: bool
+) -> None:
+    """A crest 0.1 m wide, four places out of sight, then a shelf: as deep as lower bars, or deeper."""
+    level = np.concatenate([np.zeros(6), np.full(4, np.nan), np.full(8, behind)])
+    another = np.arange(18) >= (9 if begins else 18)
+    last, is_seen, is_free = _edge(level, another, 0, 1, 0.1, np.inf, -0.2, 12)
+    assert (last, is_seen, is_free) == (5, seen, behind == -np.inf)

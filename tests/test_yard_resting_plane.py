@@ -134,6 +134,21 @@ def test_a_straight_load_stays_and_what_departs_is_drawn_to_it() -> None:
     np.testing.assert_allclose(_straight(known, column, 0.001), wanted, atol=2e-5)
 
 
+def test_a_load_that_runs_askew_and_bends_under_the_beam_is_straight_all_the_same() -> None:
+    """A round back of 0.1 m radius whose axis runs 12 mm aside and bends by 8 mm, with 2 mm of noise."""
+    rng = np.random.default_rng(6)
+    u, v = (a.ravel() for a in np.meshgrid(0.01 * np.arange(-4.5, 5), np.linspace(-2.4, 2.4, 12)))
+    aside = 0.005 * v + 0.0014 * v**2 - 0.004
+    back = np.sqrt(0.1**2 - (u - aside) ** 2) + 0.003 * v
+    known = np.zeros((u.size, COLUMNS))
+    known[:, U], known[:, V], known[:, SIGMA] = u, v, 0.01
+    known[:, POLE] = np.repeat(np.arange(4), 30)
+    known[:, Z] = back + rng.normal(0, 0.002, u.size)
+    column = np.tile(np.arange(10), 12)
+    off = _straight(known, column, 0.002) - back
+    assert np.abs(off).max() < 0.005 and off.std() < 0.0018
+
+
 def test_faces_rest_off_the_middle_only_where_the_suspension_holds_them() -> None:
     u, v = (a.ravel() for a in np.meshgrid(np.linspace(-0.05, 0.05, 11), np.linspace(-1, 1, 5)))
     noise = 0.001

@@ -137,7 +137,7 @@ def find_lifts(
         )
     source = probed.source
     return Measurement(
-        recording_path=source.path,
+        recording_path=source.path.resolve(),
         recording_format=source.format,
         is_simulated=source.is_simulated,
         calibration_hash=json_digest(to_json(asdict(source.rig))),

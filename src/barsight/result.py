@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 from collections.abc import Iterator
@@ -11,8 +10,6 @@ from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import Any
-
-import cattrs
 
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_directory
@@ -27,15 +24,10 @@ from barsight.result_folder import (
     read_heights,
     read_path,
 )
-from barsight.yard.events import YardEvent, read_events
+from barsight.yard.events import YardEvent, kept_events
 from barsight.yard.inventory.bundle_file import read_bundles
-from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.lift_file import read_lifts
-from barsight.yard.lifting.validity import Validity, disturbed_checks
-from barsight.yard.magnet.description import Magnet
-from barsight.yard.magnet.footprint import Placement
+from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
 from barsight.yard.types import Bundle, HeightMap
-from barsight.yard.vetoes import vetoes_of
 
 
 @dataclass(frozen=True)
@@ -135,29 +127,17 @@ class Yard:
             return Lifts((), refused, (*(veto for veto in vetoes if veto[0] != since[0]), since))
         if content["looks_back"]:
             return Lifts((), refused, vetoes, offered)
-        said = [(lift, self._happened_to(lift)) for lift in offered]
-        refused += tuple(_vetoed(lift, *found) for lift, found in said if found)
-        return Lifts(tuple(lift for lift, found in said if not found), refused, vetoes)
-
-    def _happened_to(self, lift: LiftTarget) -> list[tuple[str, str]]:
-        """Tell by vetoes what has forbidden an offered lift since it was chosen: age, events in the yard."""
-        found = []
-        if (lift.valid_until_ns or 0) < time.time_ns():
-            found.append(("map-too-old", "the lift was valid once, it isn't any more"))
-        seen_ns = lift.record["valid_from_ns"]
-        checks = disturbed_checks(
-            self._events, Placement(lift.x_m, lift.y_m, math.radians(lift.yaw_deg)),
-            cattrs.structure(self._chosen["magnet"], Magnet),
-            tuple(bundle for bundle in self.bundles if bundle.id in lift.bundles),
-            None if seen_ns is None else Validity(seen_ns, lift.valid_until_ns or seen_ns),
-            cattrs.structure(self._chosen["settings"], LiftSettings),
-        )  # fmt: skip
-        return found + [(veto.code, veto.reason) for veto in vetoes_of(checks)]
+        now_ns = time.time_ns()
+        said = []
+        for lift in offered:
+            found = forbidden_since(content, lift.record, self.bundles, self._events, now_ns)
+            said.append((lift, [(veto.code, veto.reason) for veto in found]))
+        refused += tuple(_vetoed(lift, *codes) for lift, codes in said if codes)
+        return Lifts(tuple(lift for lift, codes in said if not codes), refused, vetoes)
 
     @property
     def _events(self) -> tuple[YardEvent, ...]:
-        path = self.folder / "events.csv"
-        return read_events(path) if path.is_file() else ()
+        return kept_events(self.folder)
 
     @property
     def warnings(self) -> tuple[tuple[str, str], ...]:

@@ -18,15 +18,16 @@ from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.files import atomic_path
 from barsight.report.page import environment, format_number, resource
-from barsight.result_folder import open_folder, read_heights
-from barsight.yard.events import corners
+from barsight.result_folder import changed_inputs, open_folder, read_heights
+from barsight.yard.events import corners, kept_events
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.clearance import FacePlane, find_obstacle
-from barsight.yard.lifting.lift_file import read_lifts
+from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import lookup_heights
 from barsight.yard.types import Bundle, HeightMap, YardMap
+from barsight.yard.vetoes import Veto
 
 PIXELS_PER_M = 180.0
 BEYOND_M = 0.5
@@ -43,7 +44,8 @@ UNSEEN_BGR, HATCH_BGR = (225, 225, 225), (150, 150, 150)
 @dataclass(frozen=True, eq=False)
 class Explanation:
     """A lift of lifts.json with what its checks found. title: in words. picture: (H, W, 3) BGR, None where
-    nothing was known under the magnet. map_vetoes: what forbids every lift of the map.
+    nothing was known under the magnet. map_vetoes: what forbids every lift of the map; since: what has
+    forbidden this one since it was offered.
     """
 
     title: str
@@ -51,6 +53,7 @@ class Explanation:
     map_vetoes: tuple[dict[str, str], ...]
     picture: UInt8 | None
     is_simulated: bool
+    since: tuple[Veto, ...] = ()
 
     @property
     def checks(self) -> list[dict[str, Any]]:
@@ -69,22 +72,25 @@ def explain(folder: Path, which: str) -> Explanation:
     lifts = read_lifts(folder / "lifts.json")
     record = _find(lifts, which, folder)
     ids = ", ".join(str(number) for number in record["bundles"]) or "no bundle"
-    rank = record["rank"]
+    rank, bundles = record["rank"], read_bundles(folder / "bundles.json")
+    since: tuple[Veto, ...] = ()
     state = "is refused"
     if rank is not None:
         state = f"is offered at rank {rank}"
         if lifts["looks_back"]:
             state = f"would have been offered at rank {rank} at the recording's end"
-        elif (record["valid_until_ns"] or 0) < time.time_ns():
-            state = f"was offered at rank {rank}, and is too old now"
+        else:
+            since = forbidden_since(lifts, record, bundles, kept_events(folder), time.time_ns())
+            if changed := changed_inputs(summary):
+                since = (*since, Veto("calibration-changed", f"{changed} was changed since: measure again"))
+        if since:
+            state = f"was offered at rank {rank}, and is forbidden now: {', '.join(v.code for v in since)}"
     picture = None
     if record["target"]["z_m"] is not None:
-        picture = draw_place(
-            read_heights(folder), record, cattrs.structure(lifts["magnet"], Magnet),
-            read_bundles(folder / "bundles.json"),
-        )  # fmt: skip
+        picture = draw_place(read_heights(folder), record, cattrs.structure(lifts["magnet"], Magnet), bundles)
     title = f"The lift of bundle {ids} {state}"
-    return Explanation(title, record, tuple(lifts["vetoes"]), picture, bool(summary.get("is_simulated")))
+    simulated = bool(summary.get("is_simulated"))
+    return Explanation(title, record, tuple(lifts["vetoes"]), picture, simulated, since)
 
 
 def _find(lifts: dict[str, Any], which: str, folder: Path) -> dict[str, Any]:

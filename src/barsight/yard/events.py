@@ -64,6 +64,12 @@ def read_events(path: Path) -> tuple[YardEvent, ...]:
     return tuple(_event(path, number, row, remedy) for number, row in enumerate(rows[1:], start=2) if row)
 
 
+def kept_events(folder: Path) -> tuple[YardEvent, ...]:
+    """Read events.csv of a folder; none where it isn't there."""
+    path = folder / "events.csv"
+    return read_events(path) if path.is_file() else ()
+
+
 def _event(path: Path, number: int, row: list[str], remedy: str) -> YardEvent:
     try:
         stamp, kind, *rest = row

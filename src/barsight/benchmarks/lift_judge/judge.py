@@ -208,7 +208,7 @@ def _offsets(target: Target) -> list[tuple[float, float, float]]:
     for i, j, k in signs:
         dx, dy = i * target.box[0], j * target.box[1]
         moved.append((c * dx + s * dy, -s * dx + c * dy, k * target.box[2]))
-    return moved
+    return list(dict.fromkeys(moved))
 
 
 def _total(yard: SolidYard, load: tuple[int, ...]) -> tuple[float, Float64]:

@@ -12,7 +12,7 @@ from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.core.types import HeightSource
 from barsight.result_folder import read_heights, read_summary
 from barsight.simulation.scene import Scene
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings import CameraSettings, SimulationSettings
 from barsight.simulation.simulate import LaidYard, simulate
 from barsight.simulation.worlds.conditions import ASIDE_M
 from barsight.simulation.worlds.surfaces import draw_finishes, scene_of
@@ -40,19 +40,21 @@ def drawn_scene(world: DrawnYard) -> Scene:
     return scene_of(world.yard, draw_finishes(world.yard.bundles, rng), rng)
 
 
-def recording_settings(world: DrawnYard) -> SimulationSettings:
-    """Choose a short recording over a world: small pictures, ten pairs for 3 m."""
+def recording_settings(world: DrawnYard, *, full_size: bool = False) -> SimulationSettings:
+    """Choose a short recording over a world: small pictures, or of full size; ten pairs for 3 m."""
     base, length = SimulationSettings.demo(), world.size_m[0]
-    aside = ASIDE_M * (-1 if world.seed // 10 % 2 else 1) if world.hides else base.camera.trolley_y_m
+    camera = CameraSettings() if full_size else base.camera
+    aside = ASIDE_M * (-1 if world.seed // 10 % 2 else 1) if world.hides else camera.trolley_y_m
     return replace(
         base, seed=world.seed, length_m=length, frames=round(3 + 2.3 * length), depth_views=0,
-        camera=replace(base.camera, trolley_y_m=aside),
+        camera=replace(camera, trolley_y_m=aside),
     )  # fmt: skip
 
 
-def render_world(world: DrawnYard, recording: Path) -> None:
+def render_world(world: DrawnYard, recording: Path, *, full_size: bool = False) -> None:
     """Render a world as a recording."""
-    simulate(recording, recording_settings(world), laid=LaidYard(drawn_scene(world), {}))
+    settings = recording_settings(world, full_size=full_size)
+    simulate(recording, settings, laid=LaidYard(drawn_scene(world), {}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,8 @@ SPREAD = (0.1, 0.012, math.radians(0.1))
 class JudgedLift:
     """One placement and what the judge says. offered: it is in the plan's list; vetoes: the product's codes.
 
-    stated_*: by the product; true_*: by the judge, NaN where there is no load.
+    dangerous: of what is vetoed and dangerous at the target already, the reasons there. stated_*: by the
+    product; true_*: by the judge, NaN where there is no load.
     """
 
     seed: int
@@ -127,7 +128,12 @@ def _judged(world: DrawnYard, lift: Lift, judge: Judge, magnet: JudgedMagnet, *,
         target = Target(
             place.x_m, place.y_m, place.yaw_rad, box, plane, lift.mass.upper_kg, contact.pull_low_n
         )
-    verdict = judge.judge(target)
+    verdict = None
+    if lift.vetoes:
+        # What is dangerous at the target itself needs no look at the corners.
+        verdict = judge.judge(replace(target, box=(0.0, 0.0, 0.0)))
+    if verdict is None or not verdict.dangerous:
+        verdict = judge.judge(target)
     return JudgedLift(
         world.seed, world.kind, offered, place.x_m, place.y_m, place.yaw_deg,
         tuple(sorted({veto.code for veto in lift.vetoes})), verdict.dangerous, verdict.unclear,

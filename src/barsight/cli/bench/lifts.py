@@ -38,6 +38,7 @@ def bench_lift_targets(
     seeds: str = "0:8",
     placements: int = 40,
     rendered: bool = False,
+    full_size: bool = False,
     keep: Path | None = None,
     magnet: Path | None = None,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
@@ -52,6 +53,8 @@ def bench_lift_targets(
         seeds: Seeds of the yards, first:last, the last not included; the kind of yard is the seed modulo 10.
         placements: Random placements on each yard, beside the lifts that are offered there.
         rendered: Render and measure each yard, a minute of computing; without it the exact map gets noise.
+        full_size: Render pictures of 1280x1024 instead of 640x512: half the size of a pixel on the surface,
+            four times the computing.
         keep: Folder for the rendered yards; what is finished there is not done again.
         magnet: TOML file of the magnet; an example is assumed without it.
         save: JSON file for all placements, with commit and machine.
@@ -69,7 +72,9 @@ def bench_lift_targets(
         for done, seed in enumerate(numbers):
             world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
             folder = (keep or Path(scratch)) / f"seed_{seed}"
-            mapped = _measured(world, folder, settings) if rendered else noisy_world(world, settings)
+            mapped = (
+                _measured(world, folder, settings, full_size) if rendered else noisy_world(world, settings)
+            )
             found += judge_yard(world, mapped, described, judged, settings, placements)
             advance("yards", done + 1, len(numbers))
             if save is not None:
@@ -80,12 +85,12 @@ def bench_lift_targets(
         Console().print(dangerous_table(bench))
 
 
-def _measured(world: DrawnYard, folder: Path, settings: LiftSettings) -> MappedWorld:
+def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, full_size: bool) -> MappedWorld:
     """Render and measure the yard where its folders are not there yet."""
     recording, out = folder / "recording", folder / "measured"
     folder.mkdir(parents=True, exist_ok=True)
     if not recording.is_dir():
-        render_world(world, recording)
+        render_world(world, recording, full_size=full_size)
     if not (out / "result.json").is_file():
         measure_into(recording, out, MeasureSettings(), report=False, judged_at="end")
     return measured_world(out, settings)

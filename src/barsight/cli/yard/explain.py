@@ -47,6 +47,8 @@ def _print(told: Explanation, console: Console) -> None:
     console.print(told.title, highlight=False)
     for veto in told.map_vetoes:
         console.print(f"[red]{veto['code']}:[/red] {escape(veto['reason'])}", highlight=False)
+    for since in told.since:
+        console.print(f"[red]{since.code}:[/red] {escape(since.reason)}", highlight=False)
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("result", "what is checked", "figure", "bound", "veto"):
         table.add_column(head, overflow="fold", no_wrap=head != "what is checked")

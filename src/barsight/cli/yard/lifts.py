@@ -27,7 +27,7 @@ from barsight.result_folder import (
     open_folder,
     read_heights,
 )
-from barsight.yard.events import YardEvent, lift_of, merged, read_events, write_events
+from barsight.yard.events import YardEvent, kept_events, lift_of, merged, read_events, write_events
 from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.bundle_file import read_bundles, read_match
 from barsight.yard.inventory.stock_list import contradicted_bundles
@@ -182,10 +182,8 @@ def _events(
 ) -> tuple[YardEvent, ...]:
     """Gather what OUT/events.csv, a file and the ids of lifted bundles tell."""
     by_id, captured_ns = {bundle.id: bundle for bundle in folder.bundles}, folder.captured_ns
-    kept = out / "events.csv"
-    known = read_events(kept) if kept.is_file() else ()
-    told = read_events(file) if file is not None else ()
-    for path, events in ((kept, known), (file, told)):
+    known, told = kept_events(out), read_events(file) if file is not None else ()
+    for path, events in ((out / "events.csv", known), (file, told)):
         for event in events:
             if captured_ns is not None and event.stamp_ns < captured_ns[0] / OTHER_UNIT:
                 problem = f"stamp {event.stamp_ns} isn't ns on the frames' clock, which said {captured_ns[0]}"

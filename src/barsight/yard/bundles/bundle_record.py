@@ -196,6 +196,10 @@ def _held_by_straps(
         if abs(pack.middle_m) > _ASIDE_M:
             lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
             bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
+        if bundle.bars is None and pack.diameter_m > 0:
+            spread = DIAMETER_SIGMA_RATIO * pack.diameter_m
+            sigma = replace(bundle.sigma, bar_diameter_m=spread)
+            bundle = replace(bundle, bar_diameter_m=pack.diameter_m, sigma=sigma)
         return bundle
     if reading.outlines_pack:
         if bundle.bars is not None:

@@ -81,7 +81,8 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     others_begin = _is_neighbour(one, beside, others)
     resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
     parted_m = _PARTED_RATIO * fit.width_m if resolved else np.inf
-    limits = deep_m, parted_m, round(_HIDDEN_M / sheet.cell_m)
+    lowest_m = float(level[middle]) - _HEIGHT_RATIOS[1] * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
+    limits = deep_m, parted_m, lowest_m, round(_HIDDEN_M / sheet.cell_m)
     ends = [_edge(level, others_begin, middle, step, *limits) for step in (-1, 1)]
     own = level[ends[0][0] : ends[1][0] + 1]
     if not np.isfinite(own).any():
@@ -203,19 +204,25 @@ def is_overhung(inwards: Float64, outwards: Float64) -> bool:
 
 
 def _edge(
-    level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float, parted_m: float, hidden: int
-) -> tuple[int, bool, bool]:
+    level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float, parted_m: float,
+    lowest_m: float, hidden: int,
+) -> tuple[int, bool, bool]:  # fmt: skip
     """Walk from the middle to the last place that belongs to the bundle; whether it falls to the floor there,
     or sinks by parted_m before another begins; whether it falls to the floor.
+
+    What shows behind places out of sight may be its own lower bars, down to lowest_m, unless another begins.
     """
     last, lowest, lowest_at = middle, level[middle], middle
     for k in range(middle, len(level) if step > 0 else -1, step):
         if np.isnan(level[k]):
             behind = (level[k + 1 :] if step > 0 else level[:k][::-1])[:hidden]
-            behind = behind[~np.isnan(behind)]
-            floor = bool(behind.size and behind[0] == -np.inf)
+            taken = (others_begin[k + 1 :] if step > 0 else others_begin[:k][::-1])[:hidden]
+            taken, behind = taken[~np.isnan(behind)], behind[~np.isnan(behind)]
+            if not behind.size:
+                return last, False, False
             inwards = level[last::-1] if step > 0 else level[last:]
-            return last, bool(behind.size) and not is_overhung(inwards, behind), floor
+            ends = bool(behind[0] <= lowest_m or taken[0])
+            return last, ends and not is_overhung(inwards, behind), bool(behind[0] == -np.inf)
         if not level[k] > -np.inf:
             return last, True, True
         if others_begin[k]:

@@ -292,9 +292,10 @@ def strapped_pack(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> Pack | 
         return None
     beside, level = mean_section(sheet, fit, rows, round(REACH_M / sheet.cell_m))
     pack = find_pack(strap_spans(height_map, sheet, fit, level), fit.width_m, beside, level)
-    if pack is None or not pack.sides_seen:
+    if pack is None:
         return pack
-    return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, pack.low_m, pack.high_m))
+    ends = (pack.low_m, pack.high_m) if pack.sides_seen else (pack.span.low_m, pack.span.high_m)
+    return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, *ends))
 
 
 def find_pack(

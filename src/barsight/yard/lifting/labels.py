@@ -15,12 +15,15 @@ from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
 
 STEP_M = 0.01
-LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 6
-"""Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides."""
-BRIGHTER_RATIO, FULL_LEVEL = 2.2, 230.0
-"""Gray level of a label over the median of the load, and the level from which on a picture shows no more."""
-MEAN_LOG, MIN_LOG = 0.3, 0.1
-"""Logarithm of a label's level over that of the brighter end of the bare bar: on average, and everywhere."""
+LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
+"""Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides: a
+label ends at once, a gleam fades."""
+BRIGHTER_RATIO, FULL_LEVEL, LEAST_LEVEL = 2.2, 215.0, 150.0
+"""Gray level of a label over the median of the load, the level from which on a picture shows no more, and the
+least of a label's steps."""
+MEAN_LOG, ODD_CELLS = 0.15, 1
+"""Logarithm of a label's level over that of the brighter end of the bare bar, on average; each step but so
+many is brighter than that."""
 _DARK = 10.0
 """Level that is added to both: where hardly any light is, ratios tell nothing."""
 
@@ -72,15 +75,16 @@ def mark_labels(gray: Float32) -> Bool:
     gray: levels, 0 where nothing was seen.
     """
     inner = ndimage.uniform_filter1d(gray, LENGTH_CELLS, axis=0)
-    least = ndimage.minimum_filter1d(gray, LENGTH_CELLS, axis=0)
     bare = ndimage.uniform_filter1d(gray, WIDTH_CELLS, axis=0)
     brighter = np.maximum(np.roll(bare, APART_CELLS, axis=0), np.roll(bare, -APART_CELLS, axis=0)) + _DARK
     mean = ndimage.uniform_filter1d(np.log((inner + _DARK) / brighter), WIDTH_CELLS, axis=1)
-    worst = ndimage.minimum_filter1d(np.log((least + _DARK) / brighter), WIDTH_CELLS, axis=1)
+    least = ndimage.rank_filter(gray, ODD_CELLS, size=(LENGTH_CELLS, WIDTH_CELLS)) + _DARK
+    brightest = ndimage.maximum_filter1d(brighter, WIDTH_CELLS, axis=1)
     level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
     seen = gray[gray > 0]
     needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
-    return np.asarray((mean > MEAN_LOG) & (worst > MIN_LOG) & (level > needed))
+    sure = (least > brightest) & (least > LEAST_LEVEL + _DARK)
+    return np.asarray((mean > MEAN_LOG) & sure & (level > needed))
 
 
 def _gray(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> Float32:

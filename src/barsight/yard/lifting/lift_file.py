@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import cattrs
+
 from barsight.core.json_values import DIGITS, json_value
 from barsight.core.sealed_json import read_sealed, write_sealed
+from barsight.yard.events import YardEvent
 from barsight.yard.identity import MapIdentity
+from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
+from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS, Validity, disturbed_checks
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import Footing
-from barsight.yard.vetoes import Veto
+from barsight.yard.types import Bundle
+from barsight.yard.vetoes import Veto, vetoes_of
 
 SCHEMA_VERSION = 2
 REMEDY = "run barsight lifts on the folder"
@@ -33,6 +42,33 @@ def write_lifts(
 def read_lifts(path: Path) -> dict[str, Any]:
     """Read lifts.json. Raises InputError where it is missing, torn, changed or of another version."""
     return read_sealed(path, SCHEMA_VERSION, REMEDY)
+
+
+def forbidden_since(
+    content: dict[str, Any], record: dict[str, Any], bundles: Iterable[Bundle],
+    events: tuple[YardEvent, ...], now_ns: int,
+) -> tuple[Veto, ...]:  # fmt: skip
+    """Tell what has forbidden a lift since it was offered: its age, and events in the yard.
+
+    content: of lifts.json; record: one of its lifts. bundles, events: of the same folder. now_ns: on the
+    frames' clock.
+    """
+    found, target = [], record["target"]
+    until_ns, seen_ns = record["valid_until_ns"], record["valid_from_ns"]
+    if (until_ns or 0) < now_ns:
+        found.append(Veto("map-too-old", "the lift was valid once, it isn't any more"))
+    elif seen_ns is not None and seen_ns - now_ns > MAX_CLOCK_ERROR_NS:
+        found.append(
+            Veto("map-from-the-future", "the frames are ahead of this computer's clock: set the clocks")
+        )
+    checks = disturbed_checks(
+        events, Placement(target["x_m"], target["y_m"], math.radians(target["yaw_deg"])),
+        cattrs.structure(content["magnet"], Magnet),
+        tuple(bundle for bundle in bundles if bundle.id in record["bundles"]),
+        None if seen_ns is None else Validity(seen_ns, until_ns or seen_ns),
+        cattrs.structure(content["settings"], LiftSettings),
+    )  # fmt: skip
+    return (*found, *vetoes_of(checks))
 
 
 def lifts_content(

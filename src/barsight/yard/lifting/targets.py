@@ -29,6 +29,7 @@ from barsight.yard.stability.pile_sides import PileSide, pile_sides
 from barsight.yard.stability.stability import Footing, footings, high_side, mean_yaw, turn_between
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto, check_true, vetoes_of
+from barsight.yard.weight import load_centre
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
 BETWEEN_M = (0.0075, -0.0075, 0.0225, -0.0225)
@@ -212,12 +213,12 @@ def _worst_first(lift: Lift) -> tuple[int, float]:
 
 
 def _offset_across(group: tuple[Bundle, ...], place: Placement) -> float:
-    centre = np.mean([b.centre_m[:2] for b in group], axis=0)
+    centre = load_centre(group)
     return float((np.array([place.x_m, place.y_m]) - centre) @ place.across)
 
 
 def _place(group: tuple[Bundle, ...], along: float, across: float) -> Placement:
-    centre = np.mean([b.centre_m[:2] for b in group], axis=0)
+    centre = load_centre(group)
     yaw = mean_yaw(group)
     place = Placement(float(centre[0]), float(centre[1]), yaw)
     moved = centre + along * place.along + across * place.across

@@ -21,6 +21,7 @@ from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_max, check_true
+from barsight.yard.weight import load_centre
 
 ALONGSIDE_M = 1.0
 """Encoders are held against the map where the crane passed no further than this from the lift."""
@@ -235,8 +236,8 @@ def target_covariance(
     found = np.zeros((4, 4))
     found[:2, :2] = axes @ np.diag([lateral**2, along**2]) @ axes.T
     found[2, 2] = top**2 + plane_sigma_m**2 + map_sigma_m**2
-    # The place turns with the load's yaw about the load's middle.
-    away = np.array([place.x_m, place.y_m]) - np.mean([b.centre_m[:2] for b in load], axis=0)
+    # The place turns with the load's yaw about the load's centre of mass.
+    away = np.array([place.x_m, place.y_m]) - load_centre(load)
     turn = np.array([-away[1], away[0], 0.0, 1.0])
     found += yaw**2 * np.outer(turn, turn)
     if travel is not None:

@@ -27,6 +27,9 @@ further it is."""
 NEAR_LINE_M = 0.02
 """A height further than this from its line along the bars has less say in the load's slope, from twice this
 on none."""
+ASKEW, BENT_PER_M = 0.005, 0.002
+"""How far a load's axis may turn from the beam (rad), and bend sideways (m over its middle, a metre along
+squared), one sigma each: its section lies elsewhere under each pole."""
 COLUMNS = 8
 U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)
 _STEEPEST = 0.35
@@ -53,8 +56,9 @@ def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list
 def straighten_heights(points: Float64) -> float:
     """Correct the heights (N, COLUMNS), in place, towards a straight load; returns the noise that remains.
 
-    A load's section is the same under all poles but for a slope along. What departs from that, pole by pole
-    and point by point, is weighed by how straight bundles are against how sure the map is.
+    A load's section is the same under all poles but for a slope along, and for how its axis turns and bends
+    under the beam. What departs from that, pole by pole and point by point, is weighed by how straight
+    bundles are against how sure the map is.
     """
     seen = np.flatnonzero(~np.isnan(points[:, Z]))
     known = points[seen]
@@ -84,16 +88,18 @@ def _straight(known: Float64, column: Int64, noise: float) -> Float64:
     """Estimate the heights (N,) as they most likely are; column: (N,) number of the place across."""
     v, z = known[:, V], known[:, Z]
     pole = known[:, POLE].astype(np.int64)
-    slope = 0.0
+    path, steep = np.zeros(3), np.zeros(z.size)
     line = np.zeros(z.size)
-    for _ in range(3):
+    for _ in range(4):
+        along = path[0] * v - steep * (path[1] * v + path[2] * v**2)
         for c in range(column.max() + 1):
             own = column == c
-            line[own] = np.median(z[own] - slope * v[own])
-        rest_of = z - slope * v - line
+            line[own] = np.median(z[own] - along[own])
+        rest_of = z - along - line
         near = np.minimum(np.maximum(2 - np.abs(rest_of) / NEAR_LINE_M, 0.0), 1.0)
-        slope += (near * v * rest_of).sum() / max((near * v**2).sum(), 1e-9)
-    line += slope * v
+        steep = _steepness(known[:, U], line)
+        path = _path(v, z - line, steep, near, max(noise, 1e-3))
+    line += path[0] * v - steep * (path[1] * v + path[2] * v**2)
     likely = line.copy()
     for p in range(pole.max() + 1):
         own = pole == p
@@ -104,6 +110,36 @@ def _straight(known: Float64, column: Int64, noise: float) -> Float64:
         for k in np.flatnonzero(own):
             likely[k] += _likely(z[k] - line[k] - apart, noise)
     return likely
+
+
+@kernel()
+def _steepness(u: Float64, line: Float64) -> Float64:
+    """Compute the slope (N,) across of a section known at places u (N,) as line (N,), m, to both sides."""
+    steep = np.zeros(u.size)
+    for k in range(u.size):
+        low, high = k, k
+        for n in range(u.size):
+            if -1.5 * STEP_M < u[n] - u[k] < u[low] - u[k] - 1e-6:
+                low = n
+            if 1.5 * STEP_M > u[n] - u[k] > u[high] - u[k] + 1e-6:
+                high = n
+        if u[high] > u[low]:
+            steep[k] = (line[high] - line[low]) / (u[high] - u[low])
+    return steep
+
+
+@kernel()
+def _path(v: Float64, rise: Float64, steep: Float64, weight: Float64, noise: float) -> Float64:
+    """Estimate how a load runs under the beam (3,): slope, turn sideways and bend sideways per metre.
+
+    rise: (N,) heights over the section at places v (N,) along, m; steep: (N,) its slope across; weight: (N,).
+    noise: m. Linear least squares, turn and bend held to none by ASKEW and BENT_PER_M.
+    """
+    terms = np.stack((v, -steep * v, -steep * v**2), axis=1)
+    normal = terms.T @ (weight.reshape(-1, 1) * terms)
+    for k, sigma in ((0, 1.0), (1, ASKEW), (2, BENT_PER_M)):
+        normal[k, k] += (noise / sigma) ** 2
+    return np.linalg.solve(normal, terms.T @ (weight * rise)).astype(np.float64)
 
 
 @kernel()
