@@ -47,13 +47,13 @@ def test_a_label_under_a_face_forbids(y_m: float, under: bool) -> None:
 
 def test_an_askew_label_on_a_bright_bar_is_found_and_a_gleam_is_not() -> None:
     """Levels as on full-size pictures of a drawn yard: a label of 230 on a bar of 175, a cell askew."""
-    grey = np.full((40, 15), 120.0, np.float32)
-    grey[:, 6:11] = 175.0
-    gleam = grey.copy()
+    gray = np.full((40, 15), 120.0, np.float32)
+    gray[:, 6:11] = 175.0
+    gleam = gray.copy()
     for row in range(17, 23):
         first = 6 + (row >= 20)
-        grey[row, first : first + 4] = 230.0
-    assert mark_labels(grey).any()
+        gray[row, first : first + 4] = 230.0
+    assert mark_labels(gray).any()
     rows = np.arange(40)[:, None]
     gleam[:, 6:11] += 60 * np.exp(-(((rows - 20) / 8.0) ** 2))
     assert not mark_labels(gleam).any()
