@@ -67,8 +67,8 @@ def wide_motion(
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """How the last view of tracks repeats. share: of its points, beside which it does; pitches_m: (P, 3) by
-    what motions in the camera's axes it comes to lie on itself.
+    """Repetitions in the last view of tracks. share: of points beside which it repeats; pitches_m: (P, 3)
+    motions in the camera's axes after which it lies on itself.
     """
 
     share: float
