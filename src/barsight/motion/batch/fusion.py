@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Int64
+from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, expect_ranges
@@ -35,6 +35,14 @@ from barsight.motion.crane.known_motion import KnownMotion
 from barsight.motion.estimator import FrameInput, TrajectoryEstimator
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.board_corners import PointTracker, split_tracks
+from barsight.motion.frontend.chains import (
+    UNTIED,
+    chain_begins,
+    imu_bridges,
+    seconds_after,
+    tied_parts,
+    untied_sentence,
+)
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker, innovations
@@ -176,6 +184,8 @@ class BatchPoses:
             PosedFrame(int(stamp), estimate.poses[k], covariance)
             for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
         )
+        if inputs.crane is None:
+            seen += _joint_sentences(inputs.sightings, estimate.relative)
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
         return Trajectory(
@@ -210,7 +220,31 @@ class BatchPoses:
         if self.reads_pictures:
             few, most = _untied(sightings, refused)
             warnings, doubts = warnings + few, doubts + most
+            sightings, apart = self._joined(sightings, crane)
+            refused += apart
+            if apart:
+                doubts += (untied_sentence(len(apart)),)
         return _Inputs(crane, self._imu, sightings, refused, level, warnings, doubts)
+
+    def _joined(
+        self, sightings: tuple[Sighting, ...], crane: CraneSamples | None
+    ) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:
+        """Select the sightings that one estimate can hold: the parts that encoders place, without these the
+        longest; the others are refused.
+        """
+        shift = self._recording.rig.timeshift_cam_imu_ns
+        part = tied_parts(sightings, imu_bridges(self._imu, shift))
+        if not len(part) or (part == part[0]).all():
+            return sightings, ()
+        if crane is None:
+            names, counts = np.unique(part, return_counts=True)
+            good = names[[int(counts.argmax())]]
+        else:
+            fits = [fit_position(crane, s.stamp_ns + shift, seconds_to_ns(0.35)) for s in sightings]
+            good = np.unique(part[[not isinstance(fit, Failed) for fit in fits]])
+        kept = np.isin(part, good).tolist()
+        apart = [RefusedFrame(s.stamp_ns, UNTIED) for s, k in zip(sightings, kept, strict=True) if not k]
+        return tuple(s for s, k in zip(sightings, kept, strict=True) if k), tuple(apart)
 
     def _refuse_wrong_sensors(self, sightings: tuple[Sighting, ...]) -> None:
         """Raise InputError where the pictures show that a sensor or the cameras' stamps are wrong."""
@@ -332,7 +366,7 @@ def _untied(
     sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Warn that pictures don't follow from each other, though encoders may place their frames."""
-    count = len(refused) + sum(sighting.motion is None for sighting in sightings[1:])
+    count = len(refused) + sum(one.motion is None and one.again is None for one in sightings[1:])
     if count == 0:
         return (), ()
     total = len(sightings) + len(refused)
@@ -342,6 +376,19 @@ def _untied(
     return (), (
         f"{told}: too little texture, too long a step, or left and right pictures of different times",
     )
+
+
+def _joint_sentences(sightings: tuple[Sighting, ...], relative: Float64) -> tuple[str, ...]:
+    """Tell where pictures begin anew and what joins both parts, with its sigma; relative (K - 1, 6, 6)."""
+    told = []
+    for k, again in chain_begins(sightings):
+        turn, way = np.sqrt(np.diag(relative[k - 1]).reshape(2, 3).sum(axis=1))
+        at = seconds_after(sightings[k].stamp_ns, sightings[0].stamp_ns)
+        told.append(
+            f"the pictures begin anew at {at}; {'a place seen again' if again else 'the IMU'} joins both "
+            f"parts, 1 sigma {1e3 * way:.1f} mm and {np.degrees(turn):.3f} degrees"
+        )
+    return tuple(told)
 
 
 def _placed_frames(

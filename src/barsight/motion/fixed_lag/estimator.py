@@ -19,6 +19,7 @@ from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
+from barsight.motion.frontend.chains import UNTIED, untied_sentence
 from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
@@ -97,6 +98,8 @@ class FixedLagPoses(ImmediatePoses):
         doubts, warnings = self._estimator.encoder_faults()
         if self._level is not None:
             warnings += self._level.warnings
+        if untied := sum(frame.reason == UNTIED for frame in self.refused):
+            doubts += (untied_sentence(untied),)
         return Trajectory(
             "world" if readings.crane is None else "yard", tuple(self.placed), tuple(self.refused), sensors,
             warnings, doubts=doubts,

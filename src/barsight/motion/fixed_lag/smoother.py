@@ -26,6 +26,7 @@ from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
+from barsight.motion.frontend.chains import UNTIED, imu_bridges
 from barsight.motion.frontend.motion_prediction import CranePredictor, predict_by_imu
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.tracking import Sighting
@@ -104,6 +105,8 @@ class FixedLagEstimator:
         if sighting is None and not covered:
             assert isinstance(seen, RefusedFrame)
             return seen
+        if sighting is not None and not covered and not self._is_tied(sighting, stamp, now):
+            return RefusedFrame(seen.stamp_ns, UNTIED)
         window = (
             self._begun(stamp, sighting, now) if self.window is None else self._grown(stamp, sighting, now)
         )
@@ -124,6 +127,24 @@ class FixedLagEstimator:
         covariance = window.covariance
         self.window = marginalise(window, leaving) if leaving else window
         return PosedFrame(seen.stamp_ns, pose, covariance)
+
+    def _is_tied(self, sighting: Sighting, stamp: int, now: SensorBuffer) -> bool:
+        """Check whether pictures or IMU tie a sighting to the window."""
+        if self.window is None or self._old_node(sighting) is not None:
+            return True
+        return imu_bridges(now.imu, 0)(int(self.window.problem.stamp_ns[-1]), stamp)
+
+    def _old_node(self, sighting: Sighting) -> tuple[int, PredictedMotion] | None:
+        """Return the node that pictures tie a sighting to, and the motion since; None where they tie none."""
+        assert self.window is not None
+        ties = [] if sighting.again is None else [(sighting.again.stamp_ns, sighting.again.motion)]
+        if sighting.motion is not None and len(self.motions) > 1:
+            ties.insert(0, (self.motions[-2].stamp_ns, sighting.motion))
+        for stamp_ns, motion in ties:
+            at = np.flatnonzero(self.window.problem.stamp_ns == stamp_ns + self._shift_ns)
+            if at.size:
+                return int(at[0]), motion
+        return None
 
     def _check_encoders(self, stamp_ns: int) -> None:
         """Look for faults in the encoders' newest readings; places that were taken beyond a jump leave."""
@@ -217,11 +238,11 @@ class FixedLagEstimator:
                 speeds.append(state.velocity_mps)
             return poses, speeds
         end = old
-        at = np.flatnonzero(window.problem.stamp_ns == window.seen_ns)
-        if sighting is not None and sighting.motion is not None and at.size:
-            mount, motion = self._rectifier.body_from_rect0, sighting.motion
+        tie = None if sighting is None else self._old_node(sighting)
+        if tie is not None:
+            mount, (node, motion) = self._rectifier.body_from_rect0, tie
             moved = Pose("rect0", "rect0", motion.rotation, motion.translation).inverse()
-            end = window.pose(int(at[0])) @ mount @ moved @ mount.inverse()
+            end = window.pose(node) @ mount @ moved @ mount.inverse()
         elif now.crane is not None:
             fit = fit_position(now.crane, stamps[-1], seconds_to_ns(0.35))
             if not isinstance(fit, Failed):

@@ -24,6 +24,16 @@ from barsight.features.self_similarity import texture_period_px
 from barsight.features.tracks import Tracks, TrackSettings, detect_corners, match_tracks, update_tracks
 from barsight.motion.frontend.relative_pose import RelativePose, estimate_step, ransac, refine_pose
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, match_coarsely
+from barsight.motion.frontend.wide_steps import (
+    MIN_WIDE_RATIO,
+    REPEATING,
+    DescribedMotion,
+    Repeats,
+    check_next_bars,
+    check_overlap,
+    wide_motion,
+    wide_view,
+)
 from barsight.stereo.search_range import coarse_disparity
 
 MIN_RATIO = 0.45
@@ -32,6 +42,12 @@ most do (six in ten from a car, eight over a yard)."""
 MIN_KNOWN = 200
 SPAN = 1.6
 """New points are sought up to this much nearer and further than the known ones."""
+
+MAX_LOST = 3
+"""Ends of chains that are held."""
+
+Consensus = tuple[Bool, GuidedMatches, PredictedMotion]
+"""Which tracked points (N,) agree, all their matches, and the motion on which they do."""
 
 Predictor = Callable[[int, int], PredictedMotion | None]
 """From two frames' stamps to the motion of `rect0` between them as the other sensors know it, or None."""
@@ -43,8 +59,9 @@ class Sighting:
     sigma_px: (N,) of each as the patches show it.
 
     motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
-    one before. ambiguous: how many points were refused since the prediction was too coarse for the bars.
-    innovation: (6,) turn and way of `motion` minus the predicted ones in sigma, None without a prediction.
+    one before. again: another one that it is tied to, by points that both name. ambiguous: how many points
+    were refused since the prediction was too coarse for the bars. innovation: (6,) turn and way of `motion`
+    minus the predicted ones in sigma, None without a prediction.
     """
 
     stamp_ns: int
@@ -54,6 +71,15 @@ class Sighting:
     motion: PredictedMotion | None
     ambiguous: int
     innovation: Float64 | None = None
+    again: SeenAgain | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SeenAgain:
+    """A place seen again: the stamp of the sighting before a loss, and the motion of `rect0` since it."""
+
+    stamp_ns: int
+    motion: PredictedMotion
 
 
 @dataclass(frozen=True)
@@ -75,27 +101,77 @@ class _State:
     view: FeatureView | None
 
 
+@dataclass(frozen=True, eq=False)
+class _Lost:
+    """The end of a chain: number of the chain, its last state, and its last view."""
+
+    chain: int
+    state: _State
+    view: FeatureView | Failed
+
+
 class Tracker:
     """Tracks points from pair to pair; only the last few views are held.
 
-    `predictor` is asked when a frame's turn comes, so it may know what was made of the frames before.
+    A pair that nothing ties to the one before begins a chain anew. As long as no sensor predicts and it isn't
+    tied to those before, it is held against their ends. `predictor` is asked when a frame's turn comes, so it
+    may know what was made of the frames before.
     """
 
     def __init__(self, predictor: Predictor, settings: FrontEndSettings) -> None:
         self._predictor, self._settings = predictor, settings
         self._state: _State | None = None
+        self._lost: list[_Lost] = []
+        self._joined = [0]
+        """Of each chain, the first one that it is tied to."""
 
     def push(self, pair: RectifiedPair) -> Sighting | RefusedFrame:
         """Track the next pair, or refuse it where it shows too little."""
         state, settings, patches = self._state, self._settings, patch_pair(pair)
         prediction = self._predictor(state.stamp_ns, pair.stamp_ns) if state else None
         result = _see(state, patches, prediction, settings)
-        if isinstance(result, Failed) and state is not None and prediction is not None:
-            # The other sensors tie the frame to the ones before; pictures begin anew.
-            result = _see(replace(state, tracks=None), patches, prediction, settings)
+        if isinstance(result, Failed) and state is not None:
+            anew = _see(replace(state, tracks=None), patches, prediction, settings)
+            if not isinstance(anew, Failed):
+                result = anew
+                if prediction is None:
+                    self._lose(state)
         if isinstance(result, Failed):
             return RefusedFrame(pair.stamp_ns, result.reason)
         self._state, sighting = result
+        return sighting if prediction is not None else self._tied(sighting, patches)
+
+    def _lose(self, state: _State) -> None:
+        """Keep the end of the chain so far, and begin the next."""
+        assert state.tracks is not None and state.tracks.last is not None
+        view = wide_view(patch_pair(state.tracks.last), self._settings.rough)
+        self._lost = [*self._lost, _Lost(len(self._joined) - 1, state, view)][-MAX_LOST:]
+        self._joined.append(len(self._joined))
+
+    def _tied(self, sighting: Sighting, pair: PatchPair) -> Sighting:
+        """Tie a sighting to the ends of chains that its own isn't tied to, if it shows their points again."""
+        joined, settings = self._joined, self._settings
+        open_ends = [lost for lost in self._lost if joined[lost.chain] != joined[-1]]
+        if sighting.motion is None and open_ends:
+            open_ends = open_ends[:-1]  # to the last of them it has just failed
+        view = wide_view(pair, settings.rough) if open_ends else None
+        for lost in reversed(open_ends):
+            assert view is not None and lost.state.tracks is not None
+            tracks, found = lost.state.tracks, wide_motion(lost.view, view, settings.rough)
+            if isinstance(found, Failed):
+                continue
+            tied = wide_consensus(tracks, pair, found, settings)
+            if isinstance(tied, Failed):
+                continue
+            kept, matches, motion = tied
+            old, new = joined[lost.chain], joined[-1]
+            self._joined = [min(old, new) if one in (old, new) else one for one in joined]
+            return replace(
+                sighting, track=np.append(sighting.track, tracks.track[kept]),
+                stereo=np.vstack([sighting.stereo, matches.stereo[kept]]),
+                sigma_px=np.append(sighting.sigma_px, matches.sigma_px[kept]),
+                again=SeenAgain(lost.state.stamp_ns, motion),
+            )  # fmt: skip
         return sighting
 
 
@@ -109,19 +185,16 @@ def _see(
         tracks = Tracks(next_track=0 if state is None else state.next_track)
         motion, innovation = None, None
     else:
-        tracks, predicted = state.tracks, prediction
+        tracks = state.tracks
         found = None if prediction is None else motion_consensus(tracks, pair, prediction, settings)
         if found is None or isinstance(found, Failed):
-            rough_motion = _rough(state, tracks, pair, settings)
-            if isinstance(rough_motion, Failed):
-                return rough_motion
-            step, view = rough_motion
-            prediction = PredictedMotion(step.rotation, step.translation, 4 * step.covariance)
-            found = motion_consensus(tracks, pair, prediction, settings)
+            found, view = _by_pictures(state, tracks, pair, settings)
+            if isinstance(found, Failed) and prediction is None:
+                found = _by_wide_step(tracks, pair, settings)
             if isinstance(found, Failed):
                 return found
         kept, matches, motion = found
-        innovation = None if predicted is None else _innovation(predicted, motion)
+        innovation = None if prediction is None else _innovation(prediction, motion)
     camera = pair.pair.camera
     if view is None:
         span = _span(matches.stereo[kept], camera)
@@ -190,9 +263,46 @@ def describe_corners(
     return match_coarsely(pair, describe_upright(image, corners), settings.rough, span)
 
 
+def _by_pictures(
+    state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
+) -> tuple[Consensus | Failed, FeatureView | None]:
+    """Find the motion by the corners' descriptors, and what they agree on; also the new view."""
+    rough_motion = _rough(state, tracks, pair, settings)
+    if isinstance(rough_motion, Failed):
+        return rough_motion, None
+    step, view = rough_motion
+    found = DescribedMotion.of(step)
+    failed = check_overlap(tracks, pair, found, settings.tracks)
+    return failed or motion_consensus(tracks, pair, found.motion, settings), view
+
+
+def _by_wide_step(tracks: Tracks, pair: PatchPair, settings: FrontEndSettings) -> Consensus | Failed:
+    """Find the motion since the last view of tracks by features at several scales."""
+    assert tracks.last is not None
+    views = [wide_view(one, settings.rough) for one in (patch_pair(tracks.last), pair)]
+    motion = wide_motion(views[0], views[1], settings.rough)
+    return motion if isinstance(motion, Failed) else wide_consensus(tracks, pair, motion, settings)
+
+
+def wide_consensus(
+    tracks: Tracks, pair: PatchPair, wide: DescribedMotion, settings: FrontEndSettings
+) -> Consensus | Failed:
+    """Select points that agree on a motion which `wide_motion` found, unless the next bars agree too."""
+    if failed := check_overlap(tracks, pair, wide, settings.tracks):
+        return failed
+    repeats = Repeats.of(tracks)
+    min_ratio = MIN_RATIO if repeats.share >= REPEATING else MIN_WIDE_RATIO
+    found = motion_consensus(tracks, pair, wide.motion, settings, min_ratio)
+    if isinstance(found, Failed):
+        return found
+    kept, _, motion = found
+    return check_next_bars(tracks, pair, motion, repeats, int(kept.sum()), settings.tracks) or found
+
+
 def motion_consensus(
-    tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings
-) -> tuple[Bool, GuidedMatches, PredictedMotion] | Failed:
+    tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings,
+    min_ratio: float = MIN_RATIO,
+) -> Consensus | Failed:  # fmt: skip
     """Select points found again in their ellipses that agree on one motion in 3D, and that motion."""
     assert tracks.last is not None
     repeats = texture_period_px(tracks.last.left, tracks.stereo[:, :2])
@@ -217,7 +327,7 @@ def motion_consensus(
     kept = np.zeros(len(tracks.track), np.bool_)
     kept[index[step.kept]] = True
     share = kept.sum() / max(1, int((predicted.inside & ~matches.ambiguous).sum()))
-    if share < MIN_RATIO:
+    if share < min_ratio:
         return Failed(
             "ambiguous",
             f"only {100 * share:.0f} % of the points are found where they are expected: another bar may be",

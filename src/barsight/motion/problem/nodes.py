@@ -19,6 +19,7 @@ from barsight.core.types import CraneSamples, ImuSamples
 from barsight.inertial.model import ImuBias
 from barsight.inertial.standstill import estimate_at_rest, stands_still
 from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.motion.frontend.chains import chained_poses
 from barsight.motion.frontend.tracking import Sighting
 from barsight.motion.gravity import GravityAlignment
 
@@ -84,12 +85,7 @@ def initial_poses(
         turns = Rotation.from_matrix(np.repeat(crane.yard_from_body_nominal[None], len(stamps), axis=0))
         return _between("yard", nodes.stamp_ns, np.array(stamps), np.array(places), turns)
     assert level is not None
-    body_from_rect0 = rectifier.body_from_rect0
-    poses = [level.world_from_body]
-    for sighting in sightings[1:]:
-        assert sighting.motion is not None
-        moved = Pose("rect0", "rect0", sighting.motion.rotation, sighting.motion.translation).inverse()
-        poses.append(poses[-1] @ body_from_rect0 @ moved @ body_from_rect0.inverse())
+    poses = chained_poses(sightings, level.world_from_body, rectifier.body_from_rect0)
     known = np.array([sighting.stamp_ns + shift_ns for sighting in sightings])
     turns = Rotation.from_matrix([pose.rotation for pose in poses])
     return _between("world", nodes.stamp_ns, known, np.array([p.translation for p in poses]), turns)

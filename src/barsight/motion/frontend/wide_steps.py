@@ -1,0 +1,135 @@
+"""Tie two views that tracking can't, by features at several scales: long steps, and places seen again.
+
+Bars repeat, and no sensor says here how far the step goes; so a tie must explain most of the tracked points,
+and clearly more of them than the same motion by a bar's pitch more or less does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.features.guided_matching import PredictedMotion, predict_projections, triangulate_stereo
+from barsight.features.orb import detect_orb
+from barsight.features.patch_alignment import PatchPair
+from barsight.features.self_similarity import texture_period_px
+from barsight.features.tracks import Tracks, TrackSettings, match_tracks
+from barsight.motion.frontend.relative_pose import RelativePose, estimate_step
+from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, match_coarsely
+
+FEATURES = 3000
+MIN_WIDE_RATIO = 0.3
+"""Of points found where nothing repeats: after a step of 3 m by car it is a third to a half."""
+MIN_INSIDE, MIN_INSIDE_UNDISPUTED = 0.65, 0.35
+"""Of the tracked points, that the new pair must show: what is at the edge of a view may lie elsewhere too."""
+UNDISPUTED = 0.8
+"""From this share of matching features that agree no other motion competes (elsewhere alike: up to 0.7)."""
+REPEATING = 0.1
+"""From this share of points beside which the picture repeats, as many are wanted as of a short step's."""
+MAX_RIVAL_RATIO = 0.7
+"""One bar off, up to a half as many are found as at the true place."""
+BARS_OFF = (-2, -1, 1, 2)
+
+
+def wide_view(pair: PatchPair, settings: OdometrySettings) -> FeatureView | Failed:
+    """Detect and describe features at several scales."""
+    return match_coarsely(pair, detect_orb(pair.pair.left, max(settings.features, FEATURES)), settings)
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedMotion:
+    """A motion, its covariance fourfold, and the share of the matched features that agree on it."""
+
+    motion: PredictedMotion
+    agreeing: float
+
+    @classmethod
+    def of(cls, step: RelativePose) -> DescribedMotion:
+        """Take it from a step between two views."""
+        motion = PredictedMotion(step.rotation, step.translation, 4 * step.covariance)
+        return cls(motion, float(step.kept.mean()))
+
+
+def wide_motion(
+    old: FeatureView | Failed, new: FeatureView | Failed, settings: OdometrySettings
+) -> DescribedMotion | Failed:
+    """Estimate the motion between two views that `wide_view` described."""
+    if isinstance(old, Failed):
+        return old
+    if isinstance(new, Failed):
+        return new
+    step = estimate_step(old, new, settings)
+    return step if isinstance(step, Failed) else DescribedMotion.of(step)
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """Repetitions in the last view of tracks. share: of points beside which it repeats; pitches_m: (P, 3)
+    motions in the camera's axes after which it lies on itself.
+    """
+
+    share: float
+    pitches_m: Float64
+
+    @classmethod
+    def of(cls, tracks: Tracks) -> Repeats:
+        """Find the periods along rows and columns."""
+        assert tracks.last is not None
+        image, places = tracks.last.left, tracks.stereo[:, :2]
+        depth = triangulate_stereo(tracks.stereo, tracks.last.camera)[:, 2]
+        along = texture_period_px(image, places)
+        across = texture_period_px(np.ascontiguousarray(image.T), np.ascontiguousarray(places[:, ::-1]))
+        pitches = []
+        for axis, period in enumerate((along, across)):
+            metres = period * depth / tracks.last.camera.focal_px
+            found = _alike(metres[np.isfinite(metres)], 0.1 * REPEATING * len(places))
+            pitches += [pitch * np.eye(3)[axis] for pitch in found]
+        share = float((np.isfinite(along) | np.isfinite(across)).mean()) if len(places) else 0.0
+        return cls(share, np.array(pitches).reshape(-1, 3))
+
+
+def check_overlap(
+    tracks: Tracks, pair: PatchPair, wide: DescribedMotion, settings: TrackSettings
+) -> Failed | None:
+    """Fail `ambiguous` where the new pair shows too few of the tracked points to tell places alike apart."""
+    points = triangulate_stereo(tracks.stereo, pair.pair.camera)
+    inside = predict_projections(points, settings.sigma_px, wide.motion, pair.pair.camera).inside
+    least = MIN_INSIDE if wide.agreeing < UNDISPUTED else MIN_INSIDE_UNDISPUTED
+    if inside.mean() >= least:
+        return None
+    return Failed(
+        "ambiguous", f"only {inside.sum()} of {len(points)} points can be seen again: elsewhere may be alike"
+    )
+
+
+def check_next_bars(
+    tracks: Tracks, pair: PatchPair, motion: PredictedMotion, repeats: Repeats, found: int,
+    settings: TrackSettings,
+) -> Failed | None:  # fmt: skip
+    """Fail `ambiguous` where a motion some bars further explains nearly as many points as the one found."""
+    camera = pair.pair.camera
+    points = triangulate_stereo(tracks.stereo, camera)
+    inside = int(predict_projections(points, settings.sigma_px, motion, camera).inside.sum())
+    for pitch in repeats.pitches_m:
+        for bars in BARS_OFF:
+            moved = replace(motion, translation=motion.translation + bars * pitch)
+            places = predict_projections(points, settings.sigma_px, moved, camera)
+            matched = int(match_tracks(tracks, pair, places, settings).found.sum())
+            if matched * inside > MAX_RIVAL_RATIO * found * max(1, int(places.inside.sum())):
+                return Failed(
+                    "ambiguous",
+                    f"{bars} bars further {matched} points are found, here {found}: another bar may be",
+                )
+    return None
+
+
+def _alike(values: Float64, min_count: float) -> list[float]:
+    """Group values that differ by less than a tenth: the medians of groups large enough."""
+    ordered = np.sort(values)
+    parts = (
+        np.split(ordered, np.flatnonzero(np.diff(ordered) > 0.1 * ordered[:-1]) + 1) if len(values) else []
+    )
+    return [float(np.median(part)) for part in parts if len(part) >= min_count]
