@@ -439,10 +439,13 @@ def test_the_accidents_are_vetoed_with_bundles_as_they_are_found(
     heights = map_of(stock, sigma_m=0.005)
     bundles = find_bundles(heights, BundleSettings())
     assert code in codes(judged(stock, bundles, place, heights=heights))
-    # Straight over the top bundle of a sound yard the same steps find nothing to say.
+    # Straight over the top bundle of a sound yard the same steps find nothing to say; its bars can't be counted,
+    # so that with the whole tolerance its mass is too unsure for one pole.
+    sharp = replace(MAGNET, tolerance=Tolerance(0.01, 0.02, 0.1))
     sound = map_of([laid(0.3)], sigma_m=0.005)
     found = find_bundles(sound, BundleSettings())
-    assert codes(judged([laid(0.3)], found, Placement(0.3, 0.0, 0.0), heights=sound)) == set()
+    lift = judged([laid(0.3)], found, Placement(0.3, 0.0, 0.0), sharp, heights=sound)
+    assert codes(lift) == set()
 
 
 @pytest.mark.parametrize("damage", [{"sigma_m": None}, {"stamp_ns": [2, 1]}, {"place_m": [[0, 0]]}])

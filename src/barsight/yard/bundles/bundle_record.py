@@ -173,6 +173,29 @@ def make_bundle(
     return bundle if bars is not None else replace(bundle, sigma=irregular)
 
 
+def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
+    """Doubt a bundle whose pack goes on beyond it or lies aside, and whose flanks are not both seen."""
+    beyond_m, doubt = contradicts(pack, bundle.width_m)
+    if doubt:
+        sure = min(bundle.confidence, DOUBTFUL)
+        bundle = replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
+        irregular = replace(
+            irregular,
+            width_m=float(np.hypot(irregular.width_m, beyond_m)),
+            lateral_m=float(np.hypot(irregular.lateral_m, beyond_m / 2)),
+        )
+    if bundle.bars is None:
+        bundle = replace(bundle, sigma=irregular)
+    if abs(pack.middle_m) > _ASIDE_M:
+        lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
+        bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
+    if bundle.bars is None and pack.diameter_m > 0:
+        spread = DIAMETER_SIGMA_RATIO * pack.diameter_m
+        sigma = replace(bundle.sigma, bar_diameter_m=spread)
+        bundle = replace(bundle, bar_diameter_m=pack.diameter_m, sigma=sigma)
+    return bundle
+
+
 def _held_by_straps(
     bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
 ) -> Bundle:
@@ -182,25 +205,7 @@ def _held_by_straps(
     irregular: its sigma where it is not surely the hexagon that was fitted.
     """
     if not pack.sides_seen:
-        beyond_m, doubt = contradicts(pack, bundle.width_m)
-        if doubt:
-            sure = min(bundle.confidence, DOUBTFUL)
-            bundle = replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
-            irregular = replace(
-                irregular,
-                width_m=float(np.hypot(irregular.width_m, beyond_m)),
-                lateral_m=float(np.hypot(irregular.lateral_m, beyond_m / 2)),
-            )
-        if bundle.bars is None:
-            bundle = replace(bundle, sigma=irregular)
-        if abs(pack.middle_m) > _ASIDE_M:
-            lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
-            bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
-        if bundle.bars is None and pack.diameter_m > 0:
-            spread = DIAMETER_SIGMA_RATIO * pack.diameter_m
-            sigma = replace(bundle.sigma, bar_diameter_m=spread)
-            bundle = replace(bundle, bar_diameter_m=pack.diameter_m, sigma=sigma)
-        return bundle
+        return _partly_seen(bundle, irregular, pack)
     if reading.outlines_pack:
         if bundle.bars is not None:
             return bundle
