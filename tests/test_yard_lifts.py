@@ -439,8 +439,8 @@ def test_the_accidents_are_vetoed_with_bundles_as_they_are_found(
     heights = map_of(stock, sigma_m=0.005)
     bundles = find_bundles(heights, BundleSettings())
     assert code in codes(judged(stock, bundles, place, heights=heights))
-    # Straight over the top bundle of a sound yard the same steps find nothing to say; its bars can't be counted,
-    # so that with the whole tolerance its mass is too unsure for one pole.
+    # Straight over the top bundle of a sound yard the same steps find nothing to say. Its bars can't be
+    # counted, so that within the whole tolerance its mass is too unsure for one pole.
     sharp = replace(MAGNET, tolerance=Tolerance(0.01, 0.02, 0.1))
     sound = map_of([laid(0.3)], sigma_m=0.005)
     found = find_bundles(sound, BundleSettings())
