@@ -20,11 +20,10 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 
 _MAX_READING_AGE_NS = NS_PER_S // 2
 """A place between readings further apart than this is not known. A session has them all by then."""
-_KEPT_CHAINS = 4
 
 
 class PairChain:
-    """Matches the pairs of `pairs`, each once for all runs that keep checkpoints in that folder.
+    """Matches the pairs of `pairs`, each once for all runs that keep checkpoints in `checkpoints`.
 
     Results depend on the recording alone, not on which pairs are asked for or in what order: a pair whose
     predecessor wasn't asked for matches that one too. A chain begins every `length` pairs, and where encoders
@@ -46,8 +45,9 @@ class PairChain:
         chain = place // self.length
         with self._turns.setdefault(chain, Lock()):
             frame = self._at(pair, place)
-            for old in [number for number in self._last if number < chain - _KEPT_CHAINS]:
-                self._last.pop(old, None)
+            for done in [number for number in list(self._last) if number < chain - 1]:
+                self._last.pop(done, None)
+                self._turns.pop(done, None)
             return frame
 
     def match_all(self, pairs: Sequence[RectifiedPair | RefusedFrame]) -> list[MatchedFrame | Refusal]:
