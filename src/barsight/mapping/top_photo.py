@@ -102,7 +102,8 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
     lowest = np.float32(cells.z_m.min())
     heights = np.full(tuple(COARSE_CELLS * n for n in shape), lowest, np.float32)
     seen = np.zeros(heights.shape, np.uint8)
-    np.maximum.at(heights, (cells.y - row, cells.x - column), cells.z_m)
+    # A cell's highest comes first, and the last that is assigned stays.
+    heights[cells.y[::-1] - row, cells.x[::-1] - column] = cells.z_m[::-1]
     seen[cells.y - row, cells.x - column] = 1
     # A single wrong match raises nothing.
     smooth = cv2.medianBlur(heights, 3).reshape(shape[0], COARSE_CELLS, shape[1], COARSE_CELLS)
