@@ -80,7 +80,7 @@ def test_the_command(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "the gyro alone, one bias fitted to those poses, is " in said
     assert len((tmp_path / "out" / "trajectory.tum").read_text().splitlines()) == 41
     assert run(["odometry", str(path)]) == 3
-    assert "name the rig" in capsys.readouterr().err
+    assert "name its rig file" in capsys.readouterr().err
     assert run(["info", str(path), "--rig", flags(data)[1]]) == 0
     assert "corners were recorded" in capsys.readouterr().out
 
