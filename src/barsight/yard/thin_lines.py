@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Float32, Float64
+from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.linalg.robust import mad_sigma
 from barsight.yard.types import Bundle, HeightMap
 
@@ -95,24 +95,27 @@ def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32
     if len(along) <= 2 * rim or np.isfinite(level[:, first:last]).mean() < MIN_SEEN_RATIO:
         return None
     contrast, weight = _contrast(level, middle, round(bundle.width_m / 2 / STEP_M))
+    reaches = [round(beside / STEP_M) for beside in BESIDE_M]
+    left = [first - n for n in reaches if n <= first]
+    right = [last + n for n in reaches if last + n <= level.shape[1]]
+    ends, power = np.array([*left[::-1], *right]), weight**2
     strength = np.array([
-        _strengths(_sums(contrast, slope), _sums(weight**2, slope), first, last) for slope in _SLOPES
+        _strengths(_sums(contrast, slope, ends), _sums(power, slope, ends), len(left), last - first, ends)
+        for slope in _SLOPES
     ])  # fmt: skip
     return along[rim:-rim], strength[:, rim:-rim]
 
 
-def _strengths(total: Float32, known: Float32, first: int, last: int) -> Float32:
+def _strengths(total: Float32, known: Float32, count: int, width: int, ends: Int64) -> Float32:
     """Compute the strength of the line in each row (V,): the best of all reaches beside the load's middle.
 
-    total, known: sums (U + 1, V) of contrasts and squared weights before each column. first, last: of the
-    middle's columns, one past it.
+    total, known: sums (E, V) of contrasts and squared weights from the first of `ends` (E,) to each, of which
+    the first `count` lie left of the middle, the nearest last. width: the middle's columns.
     """
-    reaches = [round(beside / STEP_M) for beside in BESIDE_M]
-    left = [first - n for n in reaches if n <= first]
-    right = [last + n for n in reaches if last + n < len(total)]
-    own = total[last] - total[first]
+    left, right = slice(None, count), slice(count, None)
+    own = total[count] - total[count - 1]
     beside = total[right] - total[left][:, None] - own
-    share = np.subtract.outer(right, left).T / (last - first) - 1
+    share = np.subtract.outer(ends[right], ends[left]).T / width - 1
     counted = np.minimum(beside, BESIDE_RATIO * np.maximum(own, 0) * share[..., None])
     spread = np.sqrt(known[right] - known[left][:, None] + 2.0) * _ROW_SIGMAS
     return np.asarray(((own + counted) / spread).max(axis=(0, 1)), np.float32)
@@ -158,12 +161,14 @@ def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]
     return ((contrast - contrast.mean(axis=0)) * weight).astype(np.float32), weight.astype(np.float32)
 
 
-def _sums(part: Float32, slope: float) -> Float32:
-    """Compute sums (U + 1, V) of all columns before each, columns (V, U) shifted so that lines of this slope
-    through the middle become rows.
+def _sums(part: Float32, slope: float, ends: Int64) -> Float32:
+    """Compute sums (E, V) of the columns from the first of `ends` (E,) to each, columns (V, U) shifted so
+    that lines of this slope through the middle become rows.
     """
     columns = np.ascontiguousarray(part.T)
     shift = np.array([[1, slope, -slope * (len(columns) // 2)], [0, 1, 0]], np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     sheared = cv2.warpAffine(columns, shift, (columns.shape[1], columns.shape[0]), flags=flags)
-    return np.asarray(np.cumsum(np.pad(sheared, ((1, 0), (0, 0))), axis=0), np.float32)
+    sums = np.zeros((len(ends), columns.shape[1]), np.float32)
+    sums[1:] = np.add.reduceat(sheared[: ends[-1]], ends[:-1], axis=0).cumsum(axis=0)
+    return sums
