@@ -82,24 +82,31 @@ class Matcher:
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.watch("stereo", 1):
-            predicted = None if preceding is None else self._predicted(pair, preceding)
-            if predicted is not None and isinstance(self.method, BarsightStereo):
-                found = self.method.confirm(pair, candidates, predicted)
-            else:
-                found = self.method(pair, candidates)
+            found = self._match(pair, candidates, preceding)
             return mask_gaps(
                 mask_unsure(found, self.stereo.max_sigma_px), pair.left, self.stereo.gap_darkness
             )
 
-    def _predicted(self, pair: RectifiedPair, preceding: Preceding) -> Float32 | None:
-        """Predict the disparity (H, W) px, NaN where not; None where the views don't look alike."""
-        before, camera = preceding.frame, pair.camera
-        if isinstance(before.disparity, Failed) or not isinstance(self.method, BarsightStereo):
-            return None
-        motion = align_views(
-            before.pair.left, before.disparity, pair.left, camera, preceding.now_from_before
-        )  # fmt: skip
-        return None if isinstance(motion, Failed) else predict_disparity(before.disparity, camera, motion)
+    def _match(
+        self, pair: RectifiedPair, candidates: DisparityRange, preceding: Preceding | None
+    ) -> Disparity:  # fmt: skip
+        """Match from a prediction, or from nothing where the views don't look alike."""
+        method = self.method
+        if preceding is not None and isinstance(method, BarsightStereo):
+            predicted = _predicted(pair, preceding)
+            if predicted is not None:
+                return method.confirm(pair, candidates, predicted)
+        return method(pair, candidates)
+
+
+def _predicted(pair: RectifiedPair, preceding: Preceding) -> Float32 | None:
+    """Predict the disparity (H, W) px, NaN where not; None where the views don't look alike."""
+    before, camera = preceding.frame, pair.camera
+    if isinstance(before.disparity, Failed):
+        return None
+    guess = preceding.now_from_before
+    motion = align_views(before.pair.left, before.disparity, pair.left, camera, guess)
+    return None if isinstance(motion, Failed) else predict_disparity(before.disparity, camera, motion)
 
 
 @dataclass(frozen=True, eq=False)

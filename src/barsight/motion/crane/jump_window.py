@@ -42,7 +42,7 @@ WIDE_M = 10.0
 CAUCHY_SIGMAS = 3.0
 ROUNDS, MIN_CHANGE = 12, 0.01
 PLAY_M, PLAY_S = 0.0006, 0.4
-"""By how much an encoder follows its crane late or askew (1 sigma), and for how long alike."""
+"""Standard deviation of an encoder's lag or skew behind its crane, and its correlation time."""
 LATENCY_SIGMA_S = 0.1
 FREQUENCIES_HZ = np.linspace(0.3, 3.2, 12)
 AMPLITUDES_M = np.minimum(0.015, 1.0 / (2 * np.pi * FREQUENCIES_HZ) ** 2)

@@ -27,7 +27,7 @@ SHORTEST = 0.8
 """Least length of a bundle over the longest of its pile."""
 
 ROLLED_M = 0.8
-"""How far beside its pile a bundle may lie."""
+"""Largest distance of a bundle from its pile."""
 
 Manner = Literal["layered", "nested", "loose"]
 Upright = Literal["wedges", "stanchions", "walls"]

@@ -18,7 +18,7 @@ with extra("bench"):
 GRAVITY_MPS2 = 9.81
 STEP_S = 1 / 500
 SKIN_M = 0.0003
-"""What every pack is thicker while it falls: contacts sink in by less."""
+"""Margin around each pack while it falls; contacts sink in by less."""
 FRICTION = 0.45
 REST_MPS = 0.002
 MAX_SETTLING_S = 20.0
@@ -26,7 +26,7 @@ CHECKED_STEPS = 50
 FLOOR = (-200.0, -1.0, 200.0, 0.0)
 
 Rectangle = tuple[float, float, float, float]
-"""What doesn't move: x and z of the lower, of the upper corner."""
+"""Fixed boxes: x and z of the lower and of the upper corner."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ _CREST_RATIO = 0.35
 _FLANK_RATIOS = 0.3, 0.5, 0.55
 """Of the width, from its middle: where a bundle falls off, its edge, and how far a map may grow over that."""
 _BEYOND_M = 0.15
-"""How far from its edge a neighbour that may lie over it stands."""
+"""Largest distance from its edge of a neighbour that may lie over it."""
 _FLAT_RATIO, _SHALLOW_RATIO, _HIGHER_M = 0.1, 0.18, 0.03
 """Of the width: a flank that falls less is not seen; nor is one that falls less than the second beside what
 stands higher by so much. What stands higher by the whole width is a stack on feet of its own."""
