@@ -201,6 +201,21 @@ def test_interrupted_in_the_middle(recording: Path, sent: signal.Signals) -> Non
     assert set(recording.parent.iterdir()) == before
 
 
+def test_an_interrupt_inside_exec_keeps_its_exit_code(tmp_path: Path) -> None:
+    """Python 3.11 ends `-m` by SIGINT where an interrupt has passed through `exec` of a string."""
+    (tmp_path / "interrupted.py").write_text("""
+import importlib, sys, types
+from barsight.cli import main
+importlib.import_module = lambda _: types.SimpleNamespace(run=lambda _: exec("raise KeyboardInterrupt"))
+sys.argv = ["barsight", "info"]
+main.main()
+""")
+    command = [sys.executable, "-m", "interrupted"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert done.returncode == 130
+    assert done.stderr == "barsight: interrupted; nothing half-written is left\n"
+
+
 def test_an_interrupt_that_a_library_hides_is_one_still(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

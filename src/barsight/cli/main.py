@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import signal
@@ -53,7 +54,10 @@ def main() -> None:
         signal.signal(number, _interrupt)
     if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
         signal.signal(signal.SIGHUP, _interrupt)
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    if code == INTERRUPTED:
+        _leave_at_once(code)
+    sys.exit(code)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -106,6 +110,18 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 def _interrupt_again(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
+
+
+def _leave_at_once(code: int) -> None:
+    """Exit without the interpreter's own end, which an interrupted import can turn into a crash.
+
+    A C library whose loading was cut short frees its memory twice, and Python ends by SIGINT, not by
+    the code, where the interrupt came inside `exec` of a string (dataclasses and namedtuples do that).
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # closed by the reader
+            stream.flush()
+    os._exit(code)
 
 
 def _interrupted() -> int:
