@@ -121,7 +121,7 @@ def test_points_a_cell_fall_with_range_and_slant() -> None:
         way = eye - point
         away = np.linalg.norm(way)
         wanted = min((one_point_m / away) ** 2 * way[2] / away, 1.0)
-        assert point_density(point, eye, one_point_m) == pytest.approx(wanted)
+        assert point_density(tuple(way), one_point_m) == pytest.approx(wanted)
 
 
 def cut_slowly(point: np.ndarray, row: int, column: int, around: np.ndarray, least: int) -> bool:
@@ -181,7 +181,7 @@ def test_support_is_the_votes_over_those_that_can_be_expected(hills: np.ndarray)
         if tile[i, j, s, VIEWS] < 2 or len(able) < 2 or covered:
             assert share[i, j, s] == -1 and expected[i, j, s] == 0
             continue
-        votes = sum(point_density(point, views.eyes[k, 0], 4.0) for k in able)
+        votes = sum(point_density(tuple(views.eyes[k, 0] - point), 4.0) for k in able)
         assert expected[i, j, s] == pytest.approx(votes, rel=1e-6)
         assert share[i, j, s] == pytest.approx(min(tile[i, j, s, CENTRAL] / votes, 1), rel=1e-6)
     assert 0.2 < (share >= 0).mean() < 0.8 and cut > 10

@@ -49,7 +49,8 @@ def _lengthways(
     """
     height, width = z.shape[0] - 2 * reach, z.shape[1] - 2 * reach
     out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)
-    least, squares, best = np.empty(width), np.empty(width), np.empty(width, np.int64)
+    least, squares = np.empty(width, np.float32), np.empty(width, np.float32)
+    gate, best = np.float32(gate_m), np.empty(width, np.int32)
     for i in range(height):
         out[i] = z[i + reach, reach : reach + width]
         known = np.flatnonzero(weight[i + reach, reach : reach + width] > 0)
@@ -64,7 +65,7 @@ def _lengthways(
                 b = first + columns[d, k]
                 if rows[d, k] == 0 and columns[d, k] == 0:
                     continue
-                _add_squares(squares[:size], z[i + reach + rows[d, k], b : b + size], own, gate_m)
+                _add_squares(squares[:size], z[i + reach + rows[d, k], b : b + size], own, gate)
             for j in range(size):
                 best[j] = d if squares[j] < least[j] else best[j]
                 least[j] = min(squares[j], least[j])
@@ -84,12 +85,12 @@ def _lengthways(
 
 
 @kernel()
-def _add_squares(squares: Float64, beside: Float32, own: Float32, gate_m: float) -> None:
+def _add_squares(squares: Float32, beside: Float32, own: Float32, gate_m: np.float32) -> None:
     """Add the squared differences of two rows of heights (W,), each no more than the gate; as much where one
     is missing.
     """
     for j in range(squares.size):
-        gap = np.float64(abs(beside[j] - own[j]))
+        gap = abs(beside[j] - own[j])
         squares[j] += gap * gap if gap <= gate_m else gate_m * gate_m
 
 

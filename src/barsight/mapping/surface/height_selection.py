@@ -256,10 +256,13 @@ def _supported(
                         continue
                     if within[a, b, k] == SOMEWHERE and not is_pictured(x, y, z, planes, k):
                         continue
-                    if not _is_seen(point, i, j, eyes[k], clear[a, b, k], scene, cell_m):
+                    if min(z - clear[a, b, k, 0], z - clear[a, b, k, 1]) < 0 and not _is_seen(
+                        point, i, j, eyes, k, clear, scene, cell_m
+                    ):
                         continue
                     able += 1
-                    votes += 1.0 if dense[a, b, k] else point_density(point, eyes[k, 0], one_point_m)
+                    way = eyes[k, 0, 0] - x, eyes[k, 0, 1] - y, eyes[k, 0, 2] - z
+                    votes += 1.0 if dense[a, b, k] else point_density(way, one_point_m)
                 known[i, j, s, 1], known[i, j, s, 2] = able, votes
                 if able < min_views:
                     continue
@@ -274,18 +277,18 @@ def _supported(
 
 @kernel()
 def _is_seen(
-    point: Float64, row: int, column: int, eyes: Float64, clear: Float64,
+    point: Float64, row: int, column: int, eyes: Float64, view: int, clear: Float64,
     scene: tuple[Float32, Float32, float], cell_m: float,
 ) -> bool:  # fmt: skip
     """Check that both cameras of a view have a free line of sight to a point, in a cell of the middle tile.
 
-    point: (3,) m. eyes: (2, 3) m. clear: (2,) m, heights from which the line is known to be free.
-    scene: around, roof and ceiling of `is_unoccluded`.
+    point: (3,) m. eyes: (K, 2, 3) m. view: its number among the K. clear: (B, B, K, 2) m, heights from which
+    the lines of a block are known to be free. scene: around, roof and ceiling of `is_unoccluded`.
     """
     (around, roof, ceiling), z = scene, point[2]
     for e in range(2):
-        if z < clear[e]:
-            way = eyes[e, 0] - point[0], eyes[e, 1] - point[1], eyes[e, 2] - z
+        if z < clear[row // BLOCK, column // BLOCK, view, e]:
+            way = eyes[view, e, 0] - point[0], eyes[view, e, 1] - point[1], eyes[view, e, 2] - z
             if not is_unoccluded(z, row, column, way, around, roof, ceiling, cell_m):
                 return False
     return True

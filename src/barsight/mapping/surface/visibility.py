@@ -15,12 +15,12 @@ STRIDE = 4
 
 
 @kernel()
-def point_density(point: Float64, eye: Float64, one_point_m: float) -> float:
+def point_density(way: tuple[float, float, float], one_point_m: float) -> float:
     """Compute points that a view has in a level cell, at most 1.
 
-    point, eye: (3,) m. one_point_m: the range at which points lie as far apart as cells.
+    way: from the cell to the eye, m. one_point_m: the range at which points lie as far apart as cells.
     """
-    x, y, z = eye[0] - point[0], eye[1] - point[1], eye[2] - point[2]
+    x, y, z = way
     squared = x * x + y * y + z * z
     return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
 
