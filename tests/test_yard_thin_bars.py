@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from scipy import ndimage
 from barsight.core.errors import ConfigError
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.thin_bars import thin_bar_checks
-from barsight.yard.thin_lines import MAX_STRENGTH, find_thin_line
+from barsight.yard.thin_lines import BESIDE_RATIO, MAX_STRENGTH, _line_strengths, find_thin_line
 from barsight.yard.types import HeightMap
 from lift_yards import SETTINGS, codes, judged, laid, map_of, record
 
@@ -113,3 +114,29 @@ def test_pictures_too_coarse_to_show_a_bar_forbid() -> None:
     assert thin_bar_checks(heights, line, LOAD, 0.014, coarse)[1].result == "passed"
     with pytest.raises(ConfigError, match="max_hidden_bar_m"):
         LiftSettings(max_hidden_bar_m=0.0)
+
+
+def strength_slowly(contrast: np.ndarray, power: np.ndarray, slope: float, ends: np.ndarray, v: int) -> float:
+    """The best strength of a line through row v of the middle column; two columns of `ends` lie left of it."""
+
+    def along(image: np.ndarray, first: int, end: int) -> float:
+        columns = np.arange(first, end)
+        rows = v + slope * (columns - image.shape[1] // 2)
+        return float(ndimage.map_coordinates(image, [rows, columns], order=1, mode="grid-constant").sum())
+
+    own, width, found = along(contrast, ends[1], ends[2]), ends[2] - ends[1], []
+    for first, end in itertools.product(ends[:2], ends[2:]):
+        beside = along(contrast, first, end) - own
+        counted = min(beside, BESIDE_RATIO * max(own, 0) * ((end - first) / width - 1))
+        found.append((own + counted) / math.sqrt(3 * (along(power, first, end) + 2)))
+    return max(found)
+
+
+def test_a_lines_strength_is_its_sum_along_it() -> None:
+    rng = np.random.default_rng(3)
+    contrast, power = (rng.normal(size=(40, 31)).astype(np.float32) for _ in range(2))
+    power, slopes, ends = power**2, np.array([-1.17, 0.0, 0.33]), np.array([2, 8, 23, 30])
+    padded = (np.pad(np.ascontiguousarray(part.T), ((0, 0), (40, 40))) for part in (contrast, power))
+    found = _line_strengths(*padded, 40, slopes, ends, 2, 15)
+    wanted = [[strength_slowly(contrast, power, slope, ends, v) for v in range(40)] for slope in slopes]
+    np.testing.assert_allclose(found, wanted, atol=2e-5)

@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
-from barsight.core.arrays import Float32, Float64, Int64
-from barsight.core.linalg.robust import mad_sigma
+from barsight.core.arrays import Float32, Float64, Int64, kernel
+from barsight.core.linalg.robust import mad_sigma, running_median
 from barsight.yard.types import Bundle, HeightMap
 
 KNOWN_ACROSS = "crosses over it"
@@ -40,8 +39,8 @@ HIGHLIGHT_LOG, FADE_LOG = 0.3, 0.4
 BESIDE_END_M = 0.12
 """Rows nearer to an end tell nothing: what lies before it shows there."""
 MIN_SEEN_RATIO = 0.8
-_SLOPES = [*np.arange(-1.2, -0.5, 0.05), *np.arange(-0.5, 0.501, 0.02), *np.arange(0.55, 1.21, 0.05)]
-_ROW_SIGMAS = math.sqrt(3.0)
+_SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
+_ROW_SIGMAS = np.float32(math.sqrt(3.0))
 """Neighbouring columns of the photo share their pixels: a row's sum scatters more by this."""
 
 
@@ -98,27 +97,63 @@ def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32
     reaches = [round(beside / STEP_M) for beside in BESIDE_M]
     left = [first - n for n in reaches if n <= first]
     right = [last + n for n in reaches if last + n <= level.shape[1]]
-    ends, power = np.array([*left[::-1], *right]), weight**2
-    strength = np.array([
-        _strengths(_sums(contrast, slope, ends), _sums(power, slope, ends), len(left), last - first, ends)
-        for slope in _SLOPES
-    ])  # fmt: skip
+    ends = np.array([*left[::-1], *right])
+    reach = math.ceil(float(np.abs(_SLOPES).max()) * level.shape[1]) + 1
+    columns = (np.ascontiguousarray(part.T) for part in (contrast, weight**2))
+    padded = (np.pad(column, ((0, 0), (reach, reach))) for column in columns)
+    strength = _line_strengths(*padded, reach, _SLOPES, ends, len(left), last - first)
     return along[rim:-rim], strength[:, rim:-rim]
 
 
-def _strengths(total: Float32, known: Float32, count: int, width: int, ends: Int64) -> Float32:
-    """Compute the strength of the line in each row (V,): the best of all reaches beside the load's middle.
+@kernel()
+def _line_strengths(
+    contrast: Float32, power: Float32, reach: int, slopes: Float64, ends: Int64, count: int, width: int
+) -> Float32:  # fmt: skip
+    """Compute the strength (S, V) of the line of each slope through each row of the middle column: the best
+    of all reaches beside the load's middle.
 
-    total, known: sums (E, V) of contrasts and squared weights from the first of `ends` (E,) to each, of which
-    the first `count` lie left of the middle, the nearest last. width: the middle's columns.
+    contrast, power: (U, V + 2 reach) contrasts and squared weights by columns, zeros before and after: as far
+    as the steepest line reaches, and one more. ends: (E,) columns, of which the first `count` lie left of the
+    middle, the nearest last. width: the middle's columns.
     """
-    left, right = slice(None, count), slice(count, None)
-    own = total[count] - total[count - 1]
-    beside = total[right] - total[left][:, None] - own
-    share = np.subtract.outer(ends[right], ends[left]).T / width - 1
-    counted = np.minimum(beside, BESIDE_RATIO * np.maximum(own, 0) * share[..., None])
-    spread = np.sqrt(known[right] - known[left][:, None] + 2.0) * _ROW_SIGMAS
-    return np.asarray(((own + counted) / spread).max(axis=(0, 1)), np.float32)
+    rows = contrast.shape[1] - 2 * reach
+    strength = np.full((slopes.size, rows), -np.inf, np.float32)
+    total, known = np.empty((ends.size, rows), np.float32), np.empty((ends.size, rows), np.float32)
+    for s in range(slopes.size):
+        _add_along(contrast, slopes[s], ends, total)
+        _add_along(power, slopes[s], ends, known)
+        best = strength[s]
+        for i in range(count):
+            for j in range(count, ends.size):
+                share = np.float32(BESIDE_RATIO * ((ends[j] - ends[i]) / width - 1))
+                for v in range(rows):
+                    own = total[count, v] - total[count - 1, v]
+                    beside = total[j, v] - total[i, v] - own
+                    counted = own + min(beside, share * max(own, np.float32(0)))
+                    spread = _ROW_SIGMAS * np.sqrt(known[j, v] - known[i, v] + np.float32(2))
+                    best[v] = max(best[v], counted / spread)
+    return strength
+
+
+@kernel()
+def _add_along(part: Float32, slope: float, ends: Int64, sums: Float32) -> None:
+    """Sum columns from the first of `ends` (E,) to each along lines of one slope, (E, V); interpolated
+    linearly between rows. part: (U, V + 2 reach), see `_line_strengths`.
+    """
+    rows, middle = sums.shape[1], len(part) // 2
+    reach = (part.shape[1] - rows) // 2
+    sums[0] = 0
+    for e in range(1, ends.size):
+        into = sums[e]
+        into[:] = sums[e - 1]
+        for u in range(ends[e - 1], ends[e]):
+            shift = slope * (u - middle)
+            before = int(np.floor(shift))
+            share = np.float32(shift - before)
+            rest = np.float32(1) - share
+            column = part[u, reach + before : reach + before + rows + 1]
+            for v in range(rows):
+                into[v] += rest * column[v] + share * column[v + 1]
 
 
 def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
@@ -151,7 +186,7 @@ def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]
     ordered = np.sort(level, axis=0)
     typical = np.take_along_axis(ordered, np.maximum(seen.sum(axis=0) - 1, 0)[None] // 2, axis=0)
     filled = np.where(seen, level, np.nan_to_num(typical))
-    around = ndimage.median_filter(filled, (2 * round(AROUND_M / STEP_M / 2 - 0.5) + 1, 1), mode="nearest")
+    around = running_median(filled, 2 * round(AROUND_M / STEP_M / 2 - 0.5) + 1)
     off = np.where(seen, filled - around, 0)
     off -= np.median(off, axis=0)
     sigma = np.maximum(mad_sigma(off, axis=0), MIN_SIGMA_LOG)
@@ -159,16 +194,3 @@ def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]
     base = float(np.median(around[:, middle - half : middle + half + 1]))
     weight = np.clip((base + HIGHLIGHT_LOG - around) / FADE_LOG, 0, 1)
     return ((contrast - contrast.mean(axis=0)) * weight).astype(np.float32), weight.astype(np.float32)
-
-
-def _sums(part: Float32, slope: float, ends: Int64) -> Float32:
-    """Compute sums (E, V) of the columns from the first of `ends` (E,) to each, columns (V, U) shifted so
-    that lines of this slope through the middle become rows.
-    """
-    columns = np.ascontiguousarray(part.T)
-    shift = np.array([[1, slope, -slope * (len(columns) // 2)], [0, 1, 0]], np.float32)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    sheared = cv2.warpAffine(columns, shift, (columns.shape[1], columns.shape[0]), flags=flags)
-    sums = np.zeros((len(ends), columns.shape[1]), np.float32)
-    sums[1:] = np.add.reduceat(sheared[: ends[-1]], ends[:-1], axis=0).cumsum(axis=0)
-    return sums

@@ -1,4 +1,4 @@
-"""Estimate scatter whatever a few gross errors are."""
+"""Estimate scatter and level whatever a few gross errors are."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 SIGMA_PER_MAD = 1.4826
 """Sigma of normal errors over their median absolute deviation."""
@@ -19,3 +20,14 @@ def mad_sigma(deviation: NDArray[Any], axis: int | None = None) -> float | NDArr
     """Compute sigma = 1.4826 median |deviation|, of all values or along an axis."""
     median = np.median(np.abs(deviation), axis=axis)
     return SIGMA_PER_MAD * (float(median) if axis is None else median)
+
+
+def running_median(values: NDArray[Any], count: int) -> NDArray[Any]:
+    """Compute the median of `count` (odd) rows about each, (N, M); the first and last row are repeated.
+
+    All columns go as one line through SciPy's 1-D filter, which takes a fraction of the 2-D one's time.
+    """
+    rim = count // 2
+    line = np.pad(values.T, ((0, 0), (rim, rim)), mode="edge")
+    medians = ndimage.median_filter(line.ravel(), count).reshape(line.shape)
+    return np.asarray(medians[:, rim : rim + len(values)].T)

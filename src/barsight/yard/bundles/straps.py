@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64
-from barsight.core.linalg.robust import mad_sigma
+from barsight.core.linalg.robust import mad_sigma, running_median
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bar_pitch import bar_diameter, find_minima
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
@@ -177,7 +177,7 @@ def line_contrast(gray: Float32, cell_m: float) -> Float64:
     middle = np.take_along_axis(np.sort(level, axis=0), np.maximum(known - 1, 0)[None] // 2, axis=0)
     level = np.where(np.isfinite(level), level, np.nan_to_num(middle))
     around = 2 * round(_AROUND_M / cell_m / 2) + 1
-    off = np.abs(level - ndimage.median_filter(level, (around, 1), mode="nearest"))
+    off = np.abs(level - running_median(level, around))
     sigma = np.maximum(mad_sigma(off, axis=0), _MIN_SIGMA_LOG)
     beyond = np.minimum(off / sigma, _CLIPPED) - _NOISE
     lines: Float64 = ndimage.maximum_filter1d(ndimage.uniform_filter1d(beyond, 3, axis=0), 3, axis=0)
