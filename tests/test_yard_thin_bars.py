@@ -117,7 +117,7 @@ def test_pictures_too_coarse_to_show_a_bar_forbid() -> None:
 
 
 def strength_slowly(contrast: np.ndarray, power: np.ndarray, slope: float, ends: np.ndarray, v: int) -> float:
-    """The best strength of a line through row v of the middle column; two columns of `ends` lie left of it."""
+    """Compute the strength of a line through row v of the middle column; two of `ends` lie left of it."""
 
     def along(image: np.ndarray, first: int, end: int) -> float:
         columns = np.arange(first, end)
