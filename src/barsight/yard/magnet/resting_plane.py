@@ -86,30 +86,47 @@ def _columns(u: Float64) -> Int64:
 @kernel()
 def _straight(known: Float64, column: Int64, noise: float) -> Float64:
     """Estimate the heights (N,) as they most likely are; column: (N,) number of the place across."""
-    v, z = known[:, V], known[:, Z]
-    pole = known[:, POLE].astype(np.int64)
-    path, steep = np.zeros(3), np.zeros(z.size)
-    line = np.zeros(z.size)
+    u, v, z, pole = known[:, U], known[:, V], known[:, Z], known[:, POLE]
+    path, steep, line, along = np.zeros(3), np.zeros(z.size), np.zeros(z.size), np.zeros(z.size)
+    rest, near, sigma = np.empty(z.size), np.empty(z.size), known[:, SIGMA]
     for _ in range(4):
-        along = path[0] * v - steep * (path[1] * v + path[2] * v**2)
-        for c in range(column.max() + 1):
-            own = column == c
-            line[own] = np.median(z[own] - along[own])
-        rest_of = z - along - line
-        near = np.minimum(np.maximum(2 - np.abs(rest_of) / NEAR_LINE_M, 0.0), 1.0)
-        steep = _steepness(known[:, U], line)
-        path = _path(v, z - line, steep, near, max(noise, 1e-3))
-    line += path[0] * v - steep * (path[1] * v + path[2] * v**2)
-    likely = line.copy()
-    for p in range(pole.max() + 1):
-        own = pole == p
-        if not own.any():
+        for k in range(z.size):
+            rest[k] = z[k] - along[k]
+        _median_of_each(rest, column, line)
+        for k in range(z.size):
+            near[k] = min(max(2 - abs(rest[k] - line[k]) / NEAR_LINE_M, 0.0), 1.0)
+            rest[k] = z[k] - line[k]
+        steep = _steepness(u, line)
+        path = _path(v, rest, steep, near, max(noise, 1e-3))
+        for k in range(z.size):
+            along[k] = path[0] * v[k] - steep[k] * (path[1] * v[k] + path[2] * v[k] ** 2)
+    apart, unsure, number = np.empty(z.size), np.empty(z.size), pole.astype(np.int64)
+    for k in range(z.size):
+        line[k] += along[k]
+        rest[k] = z[k] - line[k]
+    _median_of_each(rest, number, apart)
+    _median_of_each(sigma, number, unsure)
+    for k in range(z.size):
+        line[k] += _likely(apart[k], unsure[k]) + _likely(rest[k] - apart[k], noise)
+    return line
+
+
+@kernel()
+def _median_of_each(values: Float64, number: Int64, out: Float64) -> None:
+    """Fill out (N,) with the median of the values (N,) that have the same number."""
+    own = np.empty(values.size)
+    for n in range(number.max() + 1):
+        count = 0
+        for k in range(values.size):
+            if number[k] == n:
+                own[count] = values[k]
+                count += 1
+        if count == 0:
             continue
-        apart = np.median(z[own] - line[own])
-        likely[own] += _likely(apart, np.median(known[own, SIGMA]))
-        for k in np.flatnonzero(own):
-            likely[k] += _likely(z[k] - line[k] - apart, noise)
-    return likely
+        median = np.median(own[:count])
+        for k in range(values.size):
+            if number[k] == n:
+                out[k] = median
 
 
 @kernel()
@@ -135,11 +152,27 @@ def _path(v: Float64, rise: Float64, steep: Float64, weight: Float64, noise: flo
     rise: (N,) heights over the section at places v (N,) along, m; steep: (N,) its slope across; weight: (N,).
     noise: m. Linear least squares, turn and bend held to none by ASKEW and BENT_PER_M.
     """
-    terms = np.stack((v, -steep * v, -steep * v**2), axis=1)
-    normal = terms.T @ (weight.reshape(-1, 1) * terms)
-    for k, sigma in ((0, 1.0), (1, ASKEW), (2, BENT_PER_M)):
-        normal[k, k] += (noise / sigma) ** 2
-    return np.linalg.solve(normal, terms.T @ (weight * rise)).astype(np.float64)
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for k in range(v.size):
+        term = v[k], -steep[k] * v[k], -steep[k] * v[k] ** 2
+        for a in range(3):
+            right[a] += weight[k] * term[a] * rise[k]
+            for b in range(3):
+                normal[a, b] += weight[k] * term[a] * term[b]
+    for a, sigma in ((0, 1.0), (1, ASKEW), (2, BENT_PER_M)):
+        normal[a, a] += (noise / sigma) ** 2
+    # Gauss's elimination: LAPACK's solver would be half of what this module takes to compile.
+    for a in range(2):
+        for b in range(a + 1, 3):
+            share = normal[b, a] / normal[a, a]
+            right[b] -= share * right[a]
+            for c in range(a, 3):
+                normal[b, c] -= share * normal[a, c]
+    for a in (2, 1, 0):
+        for c in range(a + 1, 3):
+            right[a] -= normal[a, c] * right[c]
+        right[a] /= normal[a, a]
+    return right
 
 
 @kernel()
