@@ -99,9 +99,10 @@ def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32
     right = [last + n for n in reaches if last + n <= level.shape[1]]
     ends = np.array([*left[::-1], *right])
     reach = math.ceil(float(np.abs(_SLOPES).max()) * level.shape[1]) + 1
-    columns = (np.ascontiguousarray(part.T) for part in (contrast, weight**2))
-    padded = (np.pad(column, ((0, 0), (reach, reach))) for column in columns)
-    strength = _line_strengths(*padded, reach, _SLOPES, ends, len(left), last - first)
+    columns, power = (
+        np.pad(np.ascontiguousarray(part.T), ((0, 0), (reach, reach))) for part in (contrast, weight**2)
+    )
+    strength = _line_strengths(columns, power, reach, _SLOPES, ends, len(left), last - first)
     return along[rim:-rim], strength[:, rim:-rim]
 
 
