@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -40,9 +40,11 @@ class RecordingSettings:
 
 @dataclass(frozen=True)
 class FrameIndex:
-    """stamps_ns: the paired frames' stamps (cam0's clock), increasing. unpaired: frames on one side only."""
+    """stamps_ns: the paired frames' stamps (cam0's clock), increasing; of packets they grow. unpaired: frames on
+    one side only.
+    """
 
-    stamps_ns: tuple[int, ...]
+    stamps_ns: Sequence[int]
     unpaired: tuple[RefusedFrame, ...]
 
 

@@ -48,7 +48,8 @@ class PacketRecording:
         self, rig: StereoRig, folder: Path, noise: ImuNoise | None = None, *, is_simulated: bool = False
     ) -> None:
         self.rig, self._folder, self._noise, self.is_simulated = rig, folder, noise, is_simulated
-        self._frames: dict[int, RefusedFrame | None] = {}
+        self._stamps_ns: list[int] = []
+        self._refused: dict[int, RefusedFrame] = {}
         self._imu: _Grown[ImuSamples] = _Grown()
         self._crane: _Grown[CraneSamples] = _Grown()
         self._laser: list[LaserProfile] = []
@@ -67,7 +68,9 @@ class PacketRecording:
             self.last_frame_ns = packet.stamp_ns
             if isinstance(packet, StereoFrame):
                 np.savez(self._file(packet.stamp_ns), left=packet.left, right=packet.right)
-            self._frames[packet.stamp_ns] = packet if isinstance(packet, RefusedFrame) else None
+            else:
+                self._refused[packet.stamp_ns] = packet
+            self._stamps_ns.append(packet.stamp_ns)
 
     def _add_samples(self, packet: Samples, held: _Grown[Samples]) -> None:
         if not len(packet.stamp_ns):
@@ -93,13 +96,13 @@ class PacketRecording:
     @property
     def index(self) -> FrameIndex:
         """Return the index; see `Recording.index`."""
-        return FrameIndex(tuple(self._frames), ())
+        return FrameIndex(self._stamps_ns, ())
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
         """Yield frames; see `Recording.frames`."""
-        for stamp, refused in list(self._frames.items()):
+        for stamp in self._stamps_ns[:]:
             if wanted is None or stamp in wanted:
-                yield self._read(stamp) if refused is None else refused
+                yield self._refused.get(stamp) or self._read(stamp)
 
     def imu(self) -> ImuSamples | None:
         """Read the IMU; see `Recording.imu`."""
