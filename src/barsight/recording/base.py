@@ -40,7 +40,7 @@ class RecordingSettings:
 
 @dataclass(frozen=True)
 class FrameIndex:
-    """stamps_ns: the paired frames' stamps (cam0's clock), increasing; of packets they grow. unpaired: frames on
+    """stamps_ns: the paired frames' stamps (cam0's clock), increasing; a session's grow. unpaired: frames on
     one side only.
     """
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -86,7 +86,7 @@ def _crane_doubts(crane: CraneSamples) -> Iterator[Notice]:
             yield Notice("units-doubtful", f"the crane travels at {speed:.3g} m/s: give metres, not mm")
 
 
-def _span_doubts(name: str, stamp_ns: Int64, frames_ns: tuple[int, ...]) -> Iterator[Notice]:
+def _span_doubts(name: str, stamp_ns: Int64, frames_ns: Sequence[int]) -> Iterator[Notice]:
     if not frames_ns:
         return
     first, last = frames_ns[0], frames_ns[-1]
