@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Container
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
-from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
+from barsight.core.motion_detail import NormalisedResiduals
 from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import (
@@ -23,6 +23,7 @@ from barsight.core.types import (
     Trajectory,
 )
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
+from barsight.motion.batch.detail import joint_sentences, jumps_alone, select_detail, untied_pictures
 from barsight.motion.batch.fault_detection import check_crane, frames_off
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import (
@@ -37,15 +38,13 @@ from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.board_corners import PointTracker, split_tracks
 from barsight.motion.frontend.chains import (
     UNTIED,
-    chain_begins,
     imu_bridges,
-    seconds_after,
     tied_parts,
     untied_sentence,
 )
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.seen_steps import known_motion
-from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker, innovations
+from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
 from barsight.recording.base import Recording
@@ -170,7 +169,7 @@ class BatchPoses:
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())
         if len(frames) < 2:
-            return replace(self._simple(inputs), doubts=inputs.doubts + _jumps_alone(inputs))
+            return replace(self._simple(inputs), doubts=inputs.doubts + jumps_alone(inputs.crane))
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
             estimate, seen, doubts, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
@@ -178,20 +177,20 @@ class BatchPoses:
             simple = self._simple(inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             told = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
-            doubts = inputs.doubts + _jumps_alone(inputs)
+            doubts = inputs.doubts + jumps_alone(inputs.crane)
             return replace(simple, warnings=told, doubts=(*doubts, f"{reason}: estimated one by one"))
         placed = tuple(
             PosedFrame(int(stamp), estimate.poses[k], covariance)
             for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
         )
         if inputs.crane is None:
-            seen += _joint_sentences(inputs.sightings, estimate.relative)
+            seen += joint_sentences(inputs.sightings, estimate.relative)
         names = {"stereo": bool(inputs.sightings), "imu": inputs.imu is not None, "crane": inputs.crane}
         sensors = tuple(name for name in ("crane", "imu", "stereo") if names[name])
         return Trajectory(
             "world" if inputs.crane is None else "yard", placed, tuple(refused), sensors,
             inputs.warnings + seen, estimate.drift,
-            _detail(estimate, inputs.sightings, nodes, encoders, shift), inputs.doubts + doubts,
+            select_detail(estimate, inputs.sightings, nodes, encoders, shift), inputs.doubts + doubts,
         )  # fmt: skip
 
     def _simple(self, inputs: _Inputs) -> Trajectory:
@@ -218,7 +217,7 @@ class BatchPoses:
         if self._spoiled:
             warnings += (f"{self._spoiled} IMU samples are at the end of their scale and were left out",)
         if self.reads_pictures:
-            few, most = _untied(sightings, refused)
+            few, most = untied_pictures(sightings, refused)
             warnings, doubts = warnings + few, doubts + most
             sightings, apart = self._joined(sightings, crane)
             refused += apart
@@ -324,71 +323,6 @@ class BatchPoses:
         moving, standing = self._crane_settings.attitude_std_deg * 1.6, [k for k in chosen if k in still]
         at_rest = self._crane_settings.sway_std_deg * len(standing) ** 0.5
         return {k: at_rest if k in standing else moving for k in chosen}
-
-
-def _jumps_alone(inputs: _Inputs) -> tuple[str, ...]:
-    """Tell of the encoders' jumps where no estimate of all sensors takes them off."""
-    from barsight.motion.problem.encoder_factors import jump_sentences
-
-    if inputs.crane is None:
-        return ()
-    sure, maybe = jump_sentences(inputs.crane.jumps, int(inputs.crane.stamp_ns[0]), None)
-    return sure + maybe
-
-
-def _detail(
-    estimate: Estimate,
-    sightings: tuple[Sighting, ...],
-    nodes: Nodes,
-    encoders: NormalisedResiduals | None,
-    shift: int,
-) -> MotionDetail:
-    """Select details by cam0's clock; of the frames alone where it is of the nodes."""
-    inertial = estimate.inertial
-    if inertial is not None:
-        values = {f.name: getattr(inertial, f.name)[nodes.frame] for f in fields(inertial)}
-        inertial = InertialStates(**{**values, "stamp_ns": values["stamp_ns"] - shift})
-    seen = {sighting.stamp_ns: sighting.ambiguous for sighting in sightings}
-    shown = np.flatnonzero(estimate.points)
-    ambiguous = [seen.get(int(stamp) - shift, 0) for stamp in nodes.stamp_ns[shown]]
-    points = np.column_stack([estimate.points[shown], np.array(ambiguous, np.int64)])
-    by_frames = [
-        None if part is None else replace(part, stamp_ns=part.stamp_ns - shift)
-        for part in (estimate.pictures, estimate.imu, encoders)
-    ]
-    return MotionDetail(
-        inertial, by_frames[0], by_frames[1], by_frames[2], points, RelativePoses(estimate.relative),
-        innovations(sightings),
-    )  # fmt: skip
-
-
-def _untied(
-    sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Warn that pictures don't follow from each other, though encoders may place their frames."""
-    count = len(refused) + sum(one.motion is None and one.again is None for one in sightings[1:])
-    if count == 0:
-        return (), ()
-    total = len(sightings) + len(refused)
-    told = f"the pictures of {count} of {total} frames can't be tied to those before"
-    if 2 * count <= total:
-        return (told,), ()
-    return (), (
-        f"{told}: too little texture, too long a step, or left and right pictures of different times",
-    )
-
-
-def _joint_sentences(sightings: tuple[Sighting, ...], relative: Float64) -> tuple[str, ...]:
-    """Tell where pictures begin anew and what joins both parts, with its sigma; relative (K - 1, 6, 6)."""
-    told = []
-    for k, again in chain_begins(sightings):
-        turn, way = np.sqrt(np.diag(relative[k - 1]).reshape(2, 3).sum(axis=1))
-        at = seconds_after(sightings[k].stamp_ns, sightings[0].stamp_ns)
-        told.append(
-            f"the pictures begin anew at {at}; {'a place seen again' if again else 'the IMU'} joins both "
-            f"parts, 1 sigma {1e3 * way:.1f} mm and {np.degrees(turn):.3f} degrees"
-        )
-    return tuple(told)
 
 
 def _placed_frames(
