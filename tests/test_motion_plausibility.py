@@ -14,7 +14,8 @@ from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import without_saturation
 from barsight.motion.batch import fusion
 from barsight.motion.batch.fault_detection import check_crane, frozen_stretches
-from barsight.motion.batch.fusion import BatchFusion, FusionSettings, _untied
+from barsight.motion.batch.detail import untied_pictures
+from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
@@ -275,8 +276,8 @@ def test_pictures_that_dont_follow_from_each_other_are_told() -> None:
     """Where encoders place every frame, nothing else would say that no picture was of use."""
     none = np.empty(0, np.int64)
     seen = tuple(Sighting(k, none, np.empty((0, 3)), np.empty(0), None, 0) for k in range(4))
-    assert _untied(seen[:1], ()) == ((), ())
-    warnings, (doubt,) = _untied(seen, (RefusedFrame(9, "no texture"),))
+    assert untied_pictures(seen[:1], ()) == ((), ())
+    warnings, (doubt,) = untied_pictures(seen, (RefusedFrame(9, "no texture"),))
     assert warnings == () and doubt.startswith("the pictures of 4 of 5 frames can't be tied")
     assert "different times" in doubt
 
