@@ -13,8 +13,8 @@ from barsight.core.types import CraneSamples, EncoderJump, ImuSamples, RefusedFr
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import without_saturation
 from barsight.motion.batch import fusion
-from barsight.motion.batch.fault_detection import check_crane, frozen_stretches
 from barsight.motion.batch.detail import untied_pictures
+from barsight.motion.batch.fault_detection import check_crane, frozen_stretches
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
