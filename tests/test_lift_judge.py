@@ -167,7 +167,7 @@ def test_what_lies_in_the_tolerance_alone_is_found() -> None:
 
 
 def test_faces_that_miss_the_load_and_rest_on_what_is_foreign_are_infinitely_high() -> None:
-    walls = [box("wall", np.array([x, 0.0, 0.1]), np.array([0.2, 3.4, 0.2])) for x in (-0.4, 0.4)]
+    walls = [box("wall", np.array([x, 0.0, 0.1]), np.array([0.06, 3.4, 0.2])) for x in (-0.4, 0.4)]
     missed = judged(*plate(), *walls, target=Target(0.0, 0.0, 0.0, (0.4, 0.0, 0.0)))
     assert missed.figures["foreign over the faces, mm"] == math.inf
     assert any(one.startswith("foreign over the faces") for one in missed.dangerous)
