@@ -166,6 +166,13 @@ def test_what_lies_in_the_tolerance_alone_is_found() -> None:
     assert judged(*plate(), wall, target=Target(0.0, 0.0, 0.0, (0.015, 0.0, 0.0))).dangerous
 
 
+def test_faces_that_miss_the_load_and_rest_on_what_is_foreign_are_infinitely_high() -> None:
+    walls = [box("wall", np.array([x, 0.0, 0.1]), np.array([0.06, 3.4, 0.2])) for x in (-0.4, 0.4)]
+    missed = judged(*plate(), *walls, target=Target(0.0, 0.0, 0.0, (0.4, 0.0, 0.0)))
+    assert missed.figures["foreign over the faces, mm"] == math.inf
+    assert any(one.startswith("foreign over the faces") for one in missed.dangerous)
+
+
 def test_a_bar_in_the_groove_of_two_lies_on_both_and_a_neighbour_on_neither() -> None:
     below = [bar(-0.03, 0.02, 0.02, bundle=0), bar(0.03, 0.02, 0.02, bundle=1)]
     above = bar(0.0, 0.02 + math.sqrt(0.04**2 - 0.03**2), 0.02, bundle=2)

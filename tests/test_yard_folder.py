@@ -111,9 +111,11 @@ def test_a_bundle_is_fetched_by_name_or_said_why_not(
     assert "Lifts that fetch bundle 1" in told and "Measure again after every lift" in told
     (step,) = read_lifts(folder / "lifts.json")["fetch"]["steps"]
     assert step["bundle"] == 1 and step["is_offered"] and step["travel_z_m"] == pytest.approx(3.5)
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     assert lifts(folder, "--fetch", "1") != 0
-    assert "not seen" in capsys.readouterr().err
-    assert read_lifts(folder / "lifts.json")["fetch"] is None
+    said = capsys.readouterr().err
+    assert "not seen" in said and "nothing was written" in said
+    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 
 def test_fetching_a_bundle_that_there_is_not_is_one_line_and_writes_nothing(

@@ -188,8 +188,10 @@ class MagnetOnSolids:
             if load not in self._own:
                 self._own[load] = around.own(load)
             own, _ = faces.look(self._own[load], around.owner, offset)
-            alone = self.rest(own) if np.isfinite(own).any() else Rest(-np.inf, 0.0, 0.0, rest.contacts)
-            rise = float((z - alone.at(faces.v, faces.u))[foreign].max())
+            # Without any of the load below them nothing but what is foreign carries the faces.
+            rise = math.inf
+            if np.isfinite(own).any():
+                rise = float((z - self.rest(own).at(faces.v, faces.u))[foreign].max())
         return Standing(
             rest, rise, self._above(self._stray, around.all, rest, offset, load),
             self._above(self._beam, around.coarse, rest, offset, ()) - self._magnet.beam[2],

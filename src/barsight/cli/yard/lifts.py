@@ -86,16 +86,16 @@ def run(arguments: Sequence[str]) -> None:
                 events=happened, contradicted=folder.contradicted,
             )  # fmt: skip
             order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
-        found = None if isinstance(order, Failed) else order
+        if isinstance(order, Failed):
+            problem = f"bundle {fetch} can't be fetched, and nothing was written: {order.reason}"
+            raise InputError(out, problem, FETCH_REMEDY)
         target, console = out / "lifts.json", Console(stderr=True)
         digest, sequence = bundles_digest(out), next_sequence(target, folder.identity)
-        write_lifts(plan, folder.reference, folder.identity, digest, target, sequence, found)
+        write_lifts(plan, folder.reference, folder.identity, digest, target, sequence, order)
         if happened:
             write_events(happened, out / "events.csv")
         write_report(out, out / "report.html", pictures.result())
         print_lifts(plan, console)
-        if isinstance(order, Failed):
-            raise InputError(out, f"bundle {fetch} can't be fetched: {order.reason}", FETCH_REMEDY)
         if order is not None:
             print_order(order, console)
 

@@ -36,6 +36,7 @@ from barsight.yard.magnet.footprint import (
     count_gripped,
 )
 from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, weakest_pole
+from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.thin_lines import ThinLine, find_thin_line
 from barsight.yard.types import Bundle, HeightMap
@@ -123,7 +124,7 @@ def assess_placement(
     contact = rest_magnet(yard.heights, place, magnet, settings.contact_gap_m)
     if contact is None:
         return _unseen_lift(place)
-    held = count_gripped(place, magnet, magnet.tolerance, near, contact.z_m)
+    held = _grip(place, yard.heights, magnet, magnet.tolerance, near, contact)
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, settings) if yard.travel else None
     mass = _load_mass(load)
@@ -166,6 +167,15 @@ def assess_placement(
             place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
         ),
     )  # fmt: skip
+
+
+def _grip(
+    place: Placement, heights: HeightMap, magnet: Magnet, tolerance: Tolerance, near: BundleTable,
+    contact: Contact,
+) -> Grip:  # fmt: skip
+    """Count what the poles take by how far they reach on the map."""
+    reached = reached_strips(heights, place, magnet, tolerance, contact.z_m)
+    return count_gripped(place, magnet, tolerance, near, contact.z_m, reached)
 
 
 def _unseen_lift(place: Placement) -> Lift:
@@ -245,7 +255,7 @@ def _tolerance(
     found, load = 0.0, tuple(near.bundles[k] for k in held.gripped)
     for scale in SCALES:
         box = _scaled(magnet.tolerance, scale)
-        sure = count_gripped(place, magnet, box, near, contact.z_m).probability
+        sure = _grip(place, yard.heights, magnet, box, near, contact).probability
         unsure = vetoes_of([probability_check(sure, len(held.gripped), settings)])
         if unsure:
             return found, unsure[0].reason
@@ -294,7 +304,7 @@ def _change(
         obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), load, careful=False)
         if obstacle is not None:
             return obstacle.reason
-        there = count_gripped(moved, magnet, exact.tolerance, near, contact.z_m)
+        there = _grip(moved, yard.heights, magnet, exact.tolerance, near, contact)
         if there.gripped != held.gripped:
             return f"it takes {len(there.gripped)} bundles"
     return ""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, kernel
+from barsight.core.arrays import Bool, Float64, Int64, kernel
 from barsight.yard.magnet.description import Magnet, Tolerance
 from barsight.yard.types import Bundle
 
@@ -21,6 +21,8 @@ BEYOND_OPEN_END_M = 20.0
 MIN_SIGMA_M = 0.001
 HEIGHT_SIGMA_M = 0.005
 """How well a bundle's top line stands for its height under a pole, beside its own sigma."""
+SURELY = 3.0
+"""Sigmas by which a place lies within a bundle's ends that surely has it."""
 MAX_TOP_SIGMA_M = 0.008
 """Faces rest on the same map: what all places share of a top's sigma says nothing of heights between them."""
 
@@ -119,17 +121,20 @@ class Grip:
 
 
 def count_gripped(
-    place: Placement, magnet: Magnet, tolerance: Tolerance, table: BundleTable, face_z_m: Float64
-) -> Grip:
+    place: Placement, magnet: Magnet, tolerance: Tolerance, table: BundleTable, face_z_m: Float64,
+    reached: Float64,
+) -> Grip:  # fmt: skip
     """Count the bundles under the poles whose top lies within the magnet's reach.
 
     face_z_m: (P,) height of each pole's face. tolerance: how far off the crane may set down; a hard bound.
+    reached: (P, 4) of `reach.reached_strips`: a bundle that lies beside all of it isn't taken, though its
+    outline comes under a face.
     """
     if not table.bundles:
         return Grip((), 1.0, np.empty(0))
     slack = np.array([tolerance.x_m, tolerance.y_m, np.radians(tolerance.yaw_deg)])
     flips, taken = _grip(
-        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, face_z_m - magnet.reach_m, slack,
+        place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, reached, face_z_m - magnet.reach_m, slack,
         table.rectangles,
     )  # fmt: skip
     return Grip(tuple(np.flatnonzero(taken).tolist()), float(np.prod(1 - flips)), flips)
@@ -137,38 +142,50 @@ def count_gripped(
 
 @kernel()
 def _grip(
-    x: float, y: float, yaw: float, poles: Float64, reach_z: Float64, slack: Float64, bundles: Rectangles
-) -> tuple[Float64, Bool]:
+    x: float, y: float, yaw: float, poles: Float64, reached: Float64, reach_z: Float64, slack: Float64,
+    bundles: Rectangles,
+) -> tuple[Float64, Bool]:  # fmt: skip
     """Compute the probability (B,) of a wrong count, and whether each bundle is taken.
 
-    x, y, yaw: the magnet's place, m and rad. poles: (P, 4) along, across, length, width, m. reach_z: (P,) the
-    lowest top that a pole takes, m. slack: (3,) bounds on the crane's x, y (m) and yaw (rad).
+    x, y, yaw: the magnet's place, m and rad. poles: (P, 4) along, across, length, width, m; reached: (P, 4)
+    the same of what they may reach. reach_z: (P,) the lowest top that a pole takes, m. slack: (3,) bounds on
+    the crane's x, y (m) and yaw (rad).
     """
     centre, along, half, top, slope, sigma, sigma_top, open_ends = bundles
     count = len(centre)
     flips, taken = np.zeros(count), np.zeros(count, np.bool_)
     cos, sin = np.cos(yaw), np.sin(yaw)
+    none = np.zeros(3)
+    held, holder = _held(x, y, cos, sin, reached, reach_z, bundles)
     for b in range(count):
         kept = 1.0
         # Poles on one side of the middle err together; those on the other by the opposite yaw.
         added = np.zeros(2)
         for p in range(len(poles)):
-            px = x - poles[p, 0] * sin + poles[p, 1] * cos
-            py = y + poles[p, 0] * cos + poles[p, 1] * sin
-            dx, dy = px - centre[b, 0], py - centre[b, 1]
+            part, give = reached[p], none
+            dx, dy = _away(x, y, cos, sin, part, centre[b])
             depth, spread, loose = overlap(
-                dx, dy, cos, sin, poles[p], along[b], half[b, 0], half[b, 1], sigma[b], slack
+                dx, dy, cos, sin, part, along[b], half[b, 0], half[b, 1], sigma[b], give
             )
+            if depth > 0:
+                part, give = poles[p], slack
+                dx, dy = _away(x, y, cos, sin, part, centre[b])
+                depth, spread, loose = overlap(
+                    dx, dy, cos, sin, part, along[b], half[b, 0], half[b, 1], sigma[b], give
+                )
             miss = _below(-max(abs(depth) - loose, 0.0) / spread)
             if depth <= 0 and (open_ends[b, 0] or open_ends[b, 1]):
                 # Where a bundle's open end may lie under the pole, nobody knows.
                 longer = (open_ends[b, 0] + open_ends[b, 1]) * BEYOND_OPEN_END_M / 2
                 shift = (1.0 * open_ends[b, 1] - 1.0 * open_ends[b, 0]) * BEYOND_OPEN_END_M / 2
                 most, unsure, astray = overlap(
-                    dx - shift * along[b, 0], dy - shift * along[b, 1], cos, sin, poles[p], along[b],
-                    half[b, 0], half[b, 1] + longer, sigma[b], slack,
+                    dx - shift * along[b, 0], dy - shift * along[b, 1], cos, sin, part, along[b],
+                    half[b, 0], half[b, 1] + longer, sigma[b], give,
                 )  # fmt: skip
                 miss = max(miss, 0.5 * _below((most + astray) / unsure))
+            if depth <= 0 and holder[p] >= 0 and abs(dx * along[b, 0] + dy * along[b, 1]) < half[b, 1]:
+                # What is one bundle's is not another's that lies beside it.
+                miss = min(miss, _below(-held[p, 0 if dx * cos + dy * sin > 0 else 1]))
             over = top[b] + (dx * along[b, 0] + dy * along[b, 1]) * slope[b] - reach_z[p]
             low = _below(-abs(over) / np.hypot(sigma_top[b], HEIGHT_SIGMA_M))
             under = (1 - miss if depth > 0 else miss) * (1 - low if over > 0 else low)
@@ -179,6 +196,46 @@ def _grip(
             added[side] = max(added[side], under)
         flips[b] = kept if taken[b] else min(added.sum(), 1.0)
     return flips, taken
+
+
+@kernel()
+def _held(
+    x: float, y: float, cos: float, sin: float, reached: Float64, reach_z: Float64, bundles: Rectangles
+) -> tuple[Float64, Int64]:
+    """Find for each pole the bundle (P,) that has the middle of all that it reaches, -1 where none surely
+    does, and by how many sigmas that lies within its sides (P, 2), towards low and high across the beam.
+
+    x, y: the magnet's place, m; cos, sin: of its yaw. reached, reach_z: as in `_grip`.
+    """
+    centre, along, half, top, slope, sigma, _, _ = bundles
+    held, holder = np.zeros((len(reached), 2)), np.full(len(reached), -1)
+    for p in range(len(reached)):
+        part = reached[p]
+        for b in range(len(centre)):
+            dx, dy = _away(x, y, cos, sin, part, centre[b])
+            away = dx * along[b, 0] + dy * along[b, 1]
+            ends = math.sqrt(sigma[b, 1] ** 2 + sigma[b, 4] ** 2)
+            if top[b] + away * slope[b] < reach_z[p] or half[b, 1] - abs(away) < SURELY * ends:
+                continue
+            # A bundle may be given the other way round than the beam lies.
+            same = 1.0 if along[b, 1] * cos - along[b, 0] * sin > 0 else -1.0
+            beside = same * (dx * along[b, 1] - dy * along[b, 0])
+            turn = abs(along[b, 0] * cos + along[b, 1] * sin)
+            level = abs(along[b, 1] * cos - along[b, 0] * sin)
+            reaches = level * part[3] / 2 + turn * part[2] / 2
+            far = abs(away) + part[2] / 2
+            variance = sigma[b, 0] ** 2 + (far * sigma[b, 2]) ** 2 + sigma[b, 3] ** 2 + MIN_SIGMA_M**2
+            low = (half[b, 0] + beside - reaches) / math.sqrt(variance)
+            high = (half[b, 0] - beside - reaches) / math.sqrt(variance)
+            if min(low, high) > max(min(held[p, 0], held[p, 1]), 0.0):
+                held[p, 0], held[p, 1], holder[p] = low, high, b
+    return held, holder
+
+
+@kernel()
+def _away(x: float, y: float, cos: float, sin: float, part: Float64, centre: Float64) -> tuple[float, float]:
+    """Compute the way (m) from a bundle's centre (2,) to a rectangle's (4,), along and across the beam."""
+    return x - part[0] * sin + part[1] * cos - centre[0], y + part[0] * cos + part[1] * sin - centre[1]
 
 
 @kernel()

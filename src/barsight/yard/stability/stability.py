@@ -1,8 +1,8 @@
 """Assess how the pile stands: its sides, what carries each bundle, what leans, how far stanchions reach.
 
 From above only tops are seen. What a bundle stands on is inferred from what shows beside it: where the layer
-below sticks out on one side by less than half a bundle and nothing shows on the other, the bundle stands that
-much over the other side's edge.
+below sticks out on one side by less than half a bundle, and by less on the other, where hardly anything
+shows, the bundle stands that much over the other side's edge.
 """
 
 from __future__ import annotations
@@ -92,12 +92,15 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
     if bundle.layer > 0:
         for sign, outer, inner in ((-1, low, high), (1, high, low)):
             stands_over = outer.ledge_m < MIN_LEDGE_M and _is_free(outer, bundle)
-            shifted = MIN_LEDGE_M <= inner.ledge_m < 0.5 * bundle.width_m + MIN_LEDGE_M
-            if stands_over and shifted and _is_free(inner, bundle):
+            # A map blurs both edges alike: what shows on both sides tells no shift.
+            shift = inner.ledge_m - outer.ledge_m
+            if not (stands_over and _is_free(inner, bundle)):
+                continue
+            if shift < MIN_LEDGE_M - STEP_M / 2:
+                overhang = 0.0 if math.isnan(overhang) else overhang
+            elif inner.ledge_m < 0.5 * bundle.width_m + MIN_LEDGE_M:
                 overhang, side = inner.ledge_m, sign
                 lean = math.degrees(math.atan2(inner.run_m, inner.drop_m))
-            elif stands_over and inner.ledge_m < MIN_LEDGE_M and _is_free(inner, bundle):
-                overhang = 0.0
     tops = [
         z - bundle.top_z_m
         for x, y, z in settings.stanchions
