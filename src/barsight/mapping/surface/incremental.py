@@ -17,15 +17,19 @@ from barsight.core.arrays import Bool, Float32, Int8
 from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface.bar_profiles import REACH_CELLS, draw_bars
 from barsight.mapping.surface.cloud import CloudPart, cloud_file
 from barsight.mapping.surface.directional_filter import (
+    VOTE_CELLS,
     blur_sigma,
     deblur_across,
     smooth_along_bars,
     step_sigma,
     valley_mask,
+    vote_directions,
 )
 from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
+from barsight.mapping.surface.picture_stripes import find_stripes
 from barsight.mapping.surface.surface import (
     Layers,
     Surface,
@@ -38,8 +42,9 @@ from barsight.mapping.surface.surface import (
 )
 from barsight.mapping.tiles import TILE_CELLS, TileKey, TileStore
 
-_HALO = 19
-"""Cells around a tile that it depends on: 12 along a bar, as far as six cells beside it, one for the bend."""
+_HALO = 13 + VOTE_CELLS // 2 + REACH_CELLS
+"""Cells around a tile that it depends on: along a bar, and what is read beside it. Even, so that stripes are
+sought at the same cells in a tile and in its neighbours' halos."""
 _KEPT_HEIGHT_M = 0.05
 """A snapshot sharpens tiles anew once the cameras' median height has changed by so much."""
 
@@ -199,6 +204,11 @@ class SurfaceElection:
             blur = blur_sigma(sharp - z, valley_mask(sharp, direction))
             pixel_cells = float(np.nanmedian(pixel_m)) / cell_m if np.isfinite(pixel_m).any() else 1.0
             steps = step_sigma(sharp, pixel_cells)
+            bar = vote_directions(direction)
+            stripes = find_stripes(z, around.intensity, bar, cell_m)
+            bars, unsure = draw_bars(z, bar, stripes, pixel_m / np.float32(cell_m), cell_m)
+            sharp = np.where(np.isfinite(bars), bars, sharp)
+            blur = np.where(np.isfinite(bars), unsure, np.maximum(blur, unsure))
             around = replace(around, z_m=sharp, sigma_m=np.hypot(np.hypot(around.sigma_m, blur), steps))
         if reach > 0:
             fill_gaps(around, reach)
