@@ -14,9 +14,9 @@ from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.bundles.flanks import Flanks
 from barsight.yard.bundles.headings import find_headings
-from barsight.yard.bundles.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
+from barsight.yard.bundles.section.flanks import Flanks
+from barsight.yard.bundles.section.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.weight import bundle_mass
 from yard_maps import Laid, draw

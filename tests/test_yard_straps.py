@@ -8,19 +8,14 @@ import numpy as np
 import pytest
 
 from barsight.core.types import HeightSource
-from barsight.yard.bundles.bar_pitch import dark_lines
 from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, ShadeProfile
 from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.pack_edges import hold_off
-from barsight.yard.bundles.seen_section import section_of_pack
-from barsight.yard.bundles.straps import (
-    Pack,
-    StrapSpan,
-    contradicts,
-    find_pack,
-    split_columns,
-    strapped_pack,
-)
+from barsight.yard.bundles.section.bar_pitch import dark_lines
+from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
+from barsight.yard.bundles.section.seen_section import section_of_pack
+from barsight.yard.bundles.section.strap_lines import split_columns
+from barsight.yard.bundles.section.straps import StrapSpan
 from barsight.yard.types import HeightMap
 from lift_yards import laid, record
 

@@ -10,7 +10,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, reinforce_kinds
-from barsight.yard.bundles.bundle_record import Reading, describe_bundles, make_bundle, without_pieces
+from barsight.yard.bundles.bundle_record import describe_bundles, make_bundle
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.crossing_bundles import OVER_M, crossing_pieces, is_beam, rise_over
 from barsight.yard.bundles.fitting.growth import grow_outline
@@ -36,8 +36,10 @@ from barsight.yard.bundles.floor import find_floor
 from barsight.yard.bundles.gully_shading import estimate_smoothing, refit_with_packing
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import same_place
+from barsight.yard.bundles.reading import Reading
+from barsight.yard.bundles.section.packs import strapped_pack
 from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
-from barsight.yard.bundles.straps import strapped_pack
+from barsight.yard.bundles.strapped_bundles import without_pieces
 from barsight.yard.sections import split_map
 from barsight.yard.thin_lines import with_thin_lines
 from barsight.yard.types import Bundle, HeightMap, YardMap

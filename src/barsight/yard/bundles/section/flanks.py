@@ -8,7 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import FittedOutline
-from barsight.yard.bundles.seen_section import agreeing_rows, mean_section
+from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 
 _CREST_RATIO = 0.35
 """Of the width, to either side of its middle: where a bundle is highest."""
