@@ -50,6 +50,8 @@ _CLAIM_M = 0.02
 _RIVAL_RATIO = 0.8
 _SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
 """How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
+_LOWER_M = 0.005
+"""How far under its true height a single bar's top may be measured."""
 _RESOLVED_CELLS = 4.0
 _SLIVER_RATIO = 0.03
 _CROSSING_STEP_M = 0.4
@@ -87,7 +89,8 @@ def _search(
     if not (height_map.source == HeightSource.VISION).any():
         return []
     found: list[FittedOutline] = []
-    headings = find_headings(height_map, settings.max_skew_deg)
+    stock_over_m = -np.inf if floor is None else floor + settings.min_rise_m
+    headings = find_headings(height_map, settings.max_skew_deg, stock_over_m)
     for heading in headings:
         found += _found(height_map, heading, floor, templates, settings)
     places = [_claims(one, settings) for one in found]
@@ -110,7 +113,11 @@ def _found(
 ) -> list[FittedOutline]:
     """Find every outline that runs about as `heading` does."""
     sheet = align_map(height_map, heading, -np.inf if floor is None else floor + settings.min_rise_m)
-    return [FittedOutline(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
+    return [
+        FittedOutline(sheet, fit)
+        for fit in _readings(sheet, templates, settings)
+        if _on(floor, fit, settings)
+    ]
 
 
 def _weights(found: list[FittedOutline]) -> Float64:
@@ -166,10 +173,16 @@ def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> 
     return replace(one, fit=widen_fit(fit, settings))
 
 
-def _on(floor_m: float | None, fit: Fit) -> bool:
-    """Check that the whole packing lies over the floor: its top rises from it by about its own height."""
-    sunken = min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
-    return floor_m is None or fit.values[Z] - fit.width_m / 2 > floor_m - sunken
+def _on(floor_m: float | None, fit: Fit, settings: BundleSettings) -> bool:
+    """Check that the whole packing lies over the floor: its top rises from it by about its own height, and a
+    single bar's by the least diameter of one, however wide the map shows it.
+    """
+    if floor_m is None:
+        return True
+    middle, half = float(fit.values[Z]) - floor_m, fit.width_m / 2
+    if fit.rings == 0 and middle + half < settings.min_single_diameter_m - _LOWER_M:
+        return False
+    return middle - half > -min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
 
 
 def _readings(sheet: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:
