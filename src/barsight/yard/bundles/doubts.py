@@ -15,10 +15,12 @@ from barsight.yard.bundles.section.seen_section import SeenSection, is_no_hexago
 from barsight.yard.thin_lines import KNOWN_ACROSS
 
 _NARROW_M = 0.3
+"""Longest place along a bundle over which a thing that lies across it counts as narrow."""
 _LIES_M, _ONE_PLACE_M = 0.02, 0.3
 """What lies across a bundle rises so far over it; runs of rows nearer to each other than the second are one
 thing. Dunnage comes in twos and more."""
 _SURE_KNOWN = 0.7
+"""Share of a bundle's length that must have been measured."""
 
 
 def count_bars(

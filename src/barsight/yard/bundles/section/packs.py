@@ -6,54 +6,36 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
-from barsight.yard.bundles.section.bar_pitch import bar_diameter, find_minima
-from barsight.yard.bundles.section.seen_section import agreeing_rows, is_overhung, mean_section
-from barsight.yard.bundles.section.strap_lines import CLIFF_M, FLOOR_M, GULLY_M
+from barsight.yard.bundles.section.bar_pitch import bar_diameter
+from barsight.yard.bundles.section.pack_sides import PackSide, find_side
+from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
+from barsight.yard.bundles.section.strap_lines import FLOOR_M
 from barsight.yard.bundles.section.straps import MIN_ROWS, REACH_M, StrapSpan, strap_spans
 from barsight.yard.types import HeightMap
 
 _OWN_RATIO = 0.5
-"""Of the narrower one's width: what straps and a fit must have in common."""
-_FLANK_RATIO, _FLANK_DEPTH_M, _FLANK_M = 0.6, 0.15, 0.15
-"""Depth of a flank under the top, of the straps' width and at least; how far from them it is looked for."""
-_HIDDEN_CELLS = 12
-"""A flank may be hidden over so many places before the surface is seen to have fallen away."""
-_STEP_M, _DEEP_CELLS = 0.05, 2
-"""What follows deep below by steps under this is the bundle's lowest bars; over so many places that are seen
-deep below nothing hangs."""
-_NEAR_M, _FAR_M = 0.08, 0.25
-"""Where another bundle's straps begin this near, the lowest place between parts both; up to the further
-distance a single gully does."""
-_HIDDEN_DEPTH_M, _TWIN_M = 0.03, 0.012
-"""How much deeper places out of sight count, and how far the surface must rise between two gullies."""
-_STEEP_RATIO = 0.3
-"""Of the width: a flank that is seen to fall so far before it is out of sight hides little of the bundle."""
+"""Least overlap of straps and a fit, of the narrower one's width, for the straps to be the fit's own."""
 _DIP_RATIO = 0.12
-"""Of a span's width: a deeper dip in it may part two bundles whose straps lie in line."""
+"""Depth of a dip in a span, of its width, from which it may part two bundles whose straps lie in line."""
 _SPREAD_M = 0.03
-"""Straps that disagree on an end by more (median) leave it open."""
-_IN_LINE_M, _BESIDE_M = 0.025, 0.09
-"""Along the bars: how far the two halves of one strap may lie apart; a strap that is nearer than the second,
-but not in line, makes it doubtful that any are of one bundle."""
+"""Median distance between the straps' ends from which the pack's is open."""
+_IN_LINE_M, _BESIDE_M = 0.018, 0.09
+"""Along the bars: largest distance between the two halves of one strap where they meet; a strap that is
+nearer than the second, but not in line, makes it doubtful that any are of one bundle."""
 _BEYOND_M = 0.03
-"""Straps that go on so far beyond an outline, or others that reach so far into it, speak against it."""
-_BEHIND_CELLS = 16
-"""Places behind a flank where a neighbour that stands over it would begin."""
-_RISES_M = 0.01
-"""Behind its flank a surface that rises by this is a neighbour's."""
+"""Distance of straps beyond an outline, or of others' into it, from which they speak against it."""
 
 
 @dataclass(frozen=True)
 class Pack:
     """Bars that straps hold, with their flanks: from low_m to high_m beside a fit's axis. span: of the straps
     themselves; others_m: where other bundles' begin on either side, infinite where none do. top_m: highest
-    place over the axis; sides_seen: both flanks sink before a neighbour begins: the width is whole.
-    diameter_m: of its bars by the dark lines along it, NaN where they aren't seen.
+    place over the axis; sides: the low and the high one. diameter_m: of its bars by the dark lines along it,
+    NaN where they aren't seen.
     """
 
     low_m: float
@@ -61,8 +43,18 @@ class Pack:
     span: StrapSpan
     others_m: tuple[float, float]
     top_m: float
-    sides_seen: bool
+    sides: tuple[PackSide, PackSide]
     diameter_m: float = math.nan
+
+    @property
+    def sides_seen(self) -> bool:
+        """Check whether both flanks sink before a neighbour begins: the width is whole."""
+        return self.sides == (PackSide.SEEN, PackSide.SEEN)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Check whether it is known on both sides how far the pack is in sight."""
+        return PackSide.OPEN not in self.sides
 
     @property
     def width_m(self) -> float:
@@ -84,7 +76,7 @@ def strapped_pack(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> Pack | 
     pack = find_pack(strap_spans(height_map, sheet, fit, level), fit.width_m, beside, level)
     if pack is None:
         return pack
-    ends = (pack.low_m, pack.high_m) if pack.sides_seen else (pack.span.low_m, pack.span.high_m)
+    ends = (pack.low_m, pack.high_m) if pack.is_bounded else (pack.span.low_m, pack.span.high_m)
     return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, *ends))
 
 
@@ -111,20 +103,21 @@ def find_pack(
     top = float(level_m[inside].max())
     cell = float(beside_m[1] - beside_m[0])
     level_inside = level_m[inside[0] : inside[-1] + 1]
-    seen = own.spread_m <= _SPREAD_M and _dip(level_inside) < _DIP_RATIO * own.width_m
-    ends, others = [], []
+    is_one = own.spread_m <= _SPREAD_M and _dip(level_inside) < _DIP_RATIO * own.width_m
+    ends, others, sides = [], [], []
     for step, at, number_beside in ((-1, inside[0], number - 1), (1, inside[-1], number + 1)):
         next_one = spans[number_beside] if 0 <= number_beside < len(spans) else None
         near, begin = np.inf, None
-        shared = None if next_one is None else _shared(own, next_one)
+        shared = None
         if next_one is not None:
+            shared = _shared(next_one, own) if step < 0 else _shared(own, next_one)
             near = next_one.high_m if step < 0 else next_one.low_m
             begin = max(round((abs(near - float(beside_m[at])) - cell / 2) / cell), 0)
         others.append(float(near) if shared is False else step * np.inf)
-        last, is_seen = _flank(level_m[at::step], level_m[at::-step], begin, shared, top, own.width_m, cell)
+        last, side = find_side(level_m[at::step], level_m[at::-step], begin, shared, top, own.width_m, cell)
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
-        seen &= is_seen
-    return Pack(ends[0], ends[1], own, (others[0], others[1]), top, bool(seen))
+        sides.append(side if is_one else PackSide.OPEN)
+    return Pack(ends[0], ends[1], own, (others[0], others[1]), top, (sides[0], sides[1]))
 
 
 def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
@@ -147,100 +140,13 @@ def _dip(level: Float64) -> float:
     return float((between - seen).max(initial=0.0))
 
 
-def _shared(one: StrapSpan, other: StrapSpan) -> bool | None:
-    """Check whether most straps of either lie in line with the other's, as those of one bundle do; None where
-    they do but for some that lie just beside one.
+def _shared(lower: StrapSpan, upper: StrapSpan) -> bool | None:
+    """Check whether most straps of either lie in line with the other's where they meet, as those of one
+    bundle do; False where none does. None where no more than half do, or some lie just beside one.
     """
-    apart = np.abs(np.subtract.outer(one.rows_m, other.rows_m))
-    nearest = apart.min(axis=1 if len(one.rows_m) <= len(other.rows_m) else 0)
+    apart = np.abs(np.subtract.outer([rows[1] for rows in lower.rows_m], [rows[0] for rows in upper.rows_m]))
+    nearest = apart.min(axis=1 if len(lower.rows_m) <= len(upper.rows_m) else 0)
     in_line = nearest < _IN_LINE_M
-    if 2 * in_line.sum() <= nearest.size:
+    if not in_line.any():
         return False
-    return None if (~in_line & (nearest < _BESIDE_M)).any() else True
-
-
-def _flank(
-    outwards: Float64, inwards: Float64, begin: int | None, shared: bool | None, top: float, width_m: float,
-    cell_m: float,
-) -> tuple[int, bool]:  # fmt: skip
-    """Find the last place of a bundle on one side, and whether its flank is seen there.
-
-    outwards, inwards: heights from the last place that its straps hold: NaN unseen, -inf floor. begin: places
-    to the next straps, None where there are none; shared: whether those lie in line with its own. top,
-    width_m: of what the straps hold.
-    """
-    deep = top - max(_FLANK_RATIO * width_m, _FLANK_DEPTH_M)
-    limit = round(_FLANK_M / cell_m)
-    last, falls = _fall(outwards, limit if begin is None else min(begin, limit), deep)
-    if falls:
-        behind = outwards[last + 1 : last + 1 + _BEHIND_CELLS]
-        known = behind[~np.isnan(behind)]
-        open_below = (known[:_DEEP_CELLS] <= deep).sum() >= _DEEP_CELLS
-        return last, bool(open_below or not is_overhung(inwards, behind))
-    if begin is None or shared or begin > round(_FAR_M / cell_m):
-        return last, False
-    alone = shared is None or begin > round(_NEAR_M / cell_m)
-    bottom = _gully(outwards[: begin + 1], top, alone)
-    if bottom is None:
-        return last, False
-    last = int(np.flatnonzero(np.isfinite(outwards[: bottom + 1]))[-1])
-    hidden = not np.isfinite(outwards[last + 1 : bottom + _HIDDEN_CELLS]).all()
-    if hidden and top - float(np.nanmin(outwards[: last + 1])) >= _STEEP_RATIO * width_m:
-        return last, True
-    before = np.concatenate([outwards[last:0:-1], inwards])
-    towers = bool((outwards[: begin + _BEHIND_CELLS // 4] > top + CLIFF_M).any())
-    return last, not towers and not is_overhung(before, outwards[last + 1 :][:_BEHIND_CELLS])
-
-
-def _fall(level: Float64, limit: int, deep: float) -> tuple[int, bool]:
-    """Walk outwards to the lowest place before the surface rises; whether it is seen to fall away there.
-
-    level: heights: NaN unseen, -inf floor. deep: height under which nothing belongs to the bundle but what
-    goes on there without a step.
-    """
-    lowest = 0
-    for k in range(1, min(len(level), limit + 1)):
-        if np.isnan(level[k]):
-            behind = level[k : k + _HIDDEN_CELLS]
-            behind = behind[~np.isnan(behind)]
-            return lowest, bool(behind.size and behind[0] <= deep)
-        if level[k] <= deep:
-            last = lowest
-            while k <= limit and k < len(level) and -_RISES_M < level[last] - level[k] < _STEP_M:
-                last, k = k, k + 1
-            return (lowest + last) // 2, True
-        if level[k] > level[lowest] + _RISES_M:
-            break
-        if level[k] < level[lowest]:
-            lowest = k
-    return lowest, False
-
-
-def _gully(level: Float64, top: float, alone: bool) -> int | None:
-    """Find the bottom of the gully between a bundle's straps and another's: the place, None where none parts
-    them.
-
-    level: heights from the last place of the ones to the first of the others. alone: the straps are so far
-    apart that it must be the only one, and deep.
-    """
-    filled = _fill_hidden(level)
-    bottom = int(np.argmin(filled))
-    if not alone:
-        return bottom
-    dips = find_minima(filled, _TWIN_M, falling=True)
-    if len(dips) != 1:
-        return None
-    deep = min(top - filled[bottom], filled[bottom:].max() - filled[bottom]) >= GULLY_M
-    return bottom if deep else None
-
-
-def _fill_hidden(level: Float64) -> Float64:
-    """Fill places out of sight, and floor, below the lower of their two neighbours; the first is seen."""
-    filled = level.copy()
-    runs, count = ndimage.label(~np.isfinite(level))
-    for number in range(1, count + 1):
-        own = np.flatnonzero(runs == number)
-        around = [level[k] for k in (own[0] - 1, own[-1] + 1) if 0 <= k < len(level)]
-        floor = np.isneginf(level[own]).any()
-        filled[own] = min(around) - (FLOOR_M if floor else _HIDDEN_DEPTH_M)
-    return filled
+    return None if 2 * in_line.sum() <= nearest.size or (~in_line & (nearest < _BESIDE_M)).any() else True

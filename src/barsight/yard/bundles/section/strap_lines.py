@@ -11,6 +11,7 @@ from barsight.core.linalg.robust import mad_sigma
 _AROUND_M = 0.2
 """Length along the bars over which the steel's own gray level is taken."""
 _MIN_SIGMA_LOG = 0.05
+"""Least scatter of a bar's gray levels along it, in the logarithm."""
 _CLIPPED, _NOISE = 6.0, 2.0
 """Contrasts over noise: from where more counts no more, and what a line must have more of."""
 _TOOTH = 0.6

@@ -23,6 +23,7 @@ from barsight.yard.types import HeightMap
 REACH_M = 0.55
 """Search reach to either side of a bundle's axis, its neighbours' straps included."""
 _NARROWEST_M = 0.07
+"""Width of the narrowest place that straps may hold."""
 _EDGE = 1.0
 """Median contrast of the straps, beyond _NOISE, where a bundle's are still seen."""
 _BREAK_M = 0.08
@@ -33,19 +34,21 @@ _DENSE_M = 0.45
 """Straps are no nearer to each other than this, on average over a bundle's length."""
 MIN_STRAPS, MIN_ROWS = 2, 20
 """Fewest straps that hold a bundle, and rows of the map that tell its mean section."""
+_LINE_M, _END_M = 0.05, 0.08
+"""Half the length along the bars over which a strap's place is averaged, and the width of either end."""
 _APART_M = 0.3
 """Lines nearer to each other along the bars are one strap."""
 
 
 @dataclass(frozen=True)
 class StrapSpan:
-    """Place that straps hold together: from low_m to high_m beside a bundle's axis. rows_m: where along it;
-    spread_m: how far the straps disagree on an end.
+    """Place that straps hold together: from low_m to high_m beside a bundle's axis. rows_m: where along it
+    each strap lies at its low and at its high end; spread_m: how far the straps disagree on an end.
     """
 
     low_m: float
     high_m: float
-    rows_m: tuple[float, ...]
+    rows_m: tuple[tuple[float, float], ...]
     spread_m: float
 
     @property
@@ -80,7 +83,8 @@ def strap_spans(
         spread = float(np.median(np.abs(ends - (low, high)), axis=0).max())
         if high - low >= narrowest:
             across = beside[0] + sheet.cell_m * (first - 0.5 + np.array([low, high]))
-            along = tuple(float(row) for row in sheet.cell_m * np.sort(rows))
+            own = contrast[:, first + round(low) : first + round(high)]
+            along = tuple(_row_at_ends(own, row, sheet.cell_m) for row in np.sort(rows).tolist())
             spans.append(StrapSpan(float(across[0]), float(across[1]), along, sheet.cell_m * spread))
     return tuple(spans)
 
@@ -126,6 +130,18 @@ def _strongest(strength: Float64, teeth: Int64, apart: int) -> Int64:
         if all(abs(teeth[k] - row) >= apart for row in kept):
             kept.append(int(teeth[k]))
     return np.array(kept, np.int64)
+
+
+def _row_at_ends(contrast: Float64, row: int, cell_m: float) -> tuple[float, float]:
+    """Compute where along the axis, m, a strap lies at its low and its high end: its contrast's centre."""
+    reach, end = round(_LINE_M / cell_m), max(round(_END_M / cell_m), 1)
+    first = max(row - reach, 0)
+    near = np.maximum(contrast[first : row + reach + 1], 0.0)
+    low, high = (
+        float(np.average(np.arange(len(near)), weights=part)) if part.any() else float(row - first)
+        for part in (near[:, :end].sum(axis=1), near[:, -end:].sum(axis=1))
+    )
+    return cell_m * (first + low), cell_m * (first + high)
 
 
 def _ends(contrast: Float64, bridged: int) -> Float64 | None:
