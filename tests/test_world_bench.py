@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from barsight.benchmarks.yard import world_runs, world_scores
-from barsight.benchmarks.yard.bundle_scores import TrueBundle, bars_mass, score_bundles
+from barsight.benchmarks.yard.bundle_scores import TrueBundle, bars_mass, read_true_bundles, score_bundles
 from barsight.benchmarks.yard.world_runs import WorldKeys, looked_at_list, run_world
 from barsight.benchmarks.yard.world_scores import WorldScore, world_rows
 from barsight.cli.main import run
@@ -53,13 +53,24 @@ def test_rows_are_medians_worst_cases_and_weighted_shares() -> None:
     assert ("all", "single bars found, %") not in rows
 
 
+def test_a_true_width_is_that_of_the_outline(tmp_path: Path) -> None:
+    row = {
+        "center": [1.0, 0.0, 0.2], "yaw_deg": 0.0, "length": 5.0, "bundle_radius": 0.17, "top_z": 0.4,
+        "bar_diameter": 0.05, "bars": 30, "on_top": True, "outline": [[0.86, 0.2], [1.0, 0.4], [1.15, 0.2]],
+    }  # fmt: skip
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "bundles.json").write_text(json.dumps([row]))
+    (true,) = read_true_bundles(tmp_path)
+    assert true.width_m == pytest.approx(0.29)
+
+
 def test_a_mass_is_held_against_the_true_bars() -> None:
     found = record(laid(0.3))
     assert found.bars is not None
     mass = bars_mass(found.bars, found.bar_diameter_m, found.length_m)
     true = TrueBundle(
         found.centre_m, found.yaw_rad, found.length_m, found.width_m, found.top_z_m, found.bar_diameter_m,
-        found.bars, 0, True, mass + 30.0,
+        found.bars, True, mass + 30.0,
     )  # fmt: skip
     scores = score_bundles((found,), (true,))
     assert scores.found == 1 and 1e3 * scores.errors["mass"][0] == pytest.approx(-30)

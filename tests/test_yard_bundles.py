@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from barsight.core.errors import ConfigError
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.collinear_pieces import join_pieces
-from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.detection import _on, find_bundles
+from barsight.yard.bundles.fitting.outline import bundle_width
 from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.bundles.flanks import Flanks
 from barsight.yard.bundles.headings import find_headings
-from barsight.yard.bundles.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
+from barsight.yard.bundles.section.flanks import Flanks
+from barsight.yard.bundles.section.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.weight import bundle_mass
 from yard_maps import Laid, draw
@@ -249,6 +250,21 @@ def test_ripples_of_the_floor_are_no_heading() -> None:
     seen = np.full(z.shape, HeightSource.VISION, np.uint8)
     height_map = HeightMap(0.0, 0.0, 0.01, z.astype(np.float32), flat, flat + 3, seen)
     assert find_headings(height_map, 3.0) == (0.0,)
+    part = height_map.part(slice(0, 150), slice(140, 900))
+    steeper = replace(part, z_m=np.where(part.z_m < 0.1, 8 * part.z_m, part.z_m))
+    assert find_headings(steeper, 3.0) != (0.0,)
+    assert find_headings(steeper, 3.0, stock_over_m=0.05) == (0.0,)
+
+
+@pytest.mark.parametrize(("rings", "top_m", "is_on"), [(0, 0.052, False), (0, 0.061, True), (1, 0.052, True)])
+def test_a_thin_bar_on_the_floor_is_no_bundle(rings: int, top_m: float, is_on: bool) -> None:
+    """A map shows its flanks too wide; its top over the floor says how thick it can be."""
+    width = 0.063
+    state, gain = np.ones(100, np.uint8), np.ones(100, np.float32)
+    diameter = width / bundle_width(rings, 1.0)
+    values = np.array([0.0, 0.0, 1.0 + top_m - width / 2, 0.0, 0.0, diameter])
+    fit = Fit(rings, 0.0, values, np.zeros((6, 6)), 0, 99, state, gain, 0.0, 0.0)
+    assert _on(1.0, fit, SETTINGS) == is_on
 
 
 @pytest.mark.parametrize(

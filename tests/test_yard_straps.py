@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 
 from barsight.core.types import HeightSource
-from barsight.yard.bundles.bar_pitch import dark_lines
+from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, ShadeProfile
 from barsight.yard.bundles.fitting.rotated_map import align_map
+from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.pack_edges import hold_off
-from barsight.yard.bundles.seen_section import section_of_pack
-from barsight.yard.bundles.straps import (
-    Pack,
-    StrapSpan,
-    contradicts,
-    find_pack,
-    split_columns,
-    strapped_pack,
-)
+from barsight.yard.bundles.section.bar_pitch import dark_lines
+from barsight.yard.bundles.section.pack_sides import PackSide, _widest
+from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
+from barsight.yard.bundles.section.seen_section import section_of_pack
+from barsight.yard.bundles.section.strap_lines import split_columns
+from barsight.yard.bundles.section.straps import StrapSpan
 from barsight.yard.types import HeightMap
 from lift_yards import laid, record
 
@@ -51,6 +49,11 @@ def drawn(
         np.full(shape, 4, np.float32), np.full(shape, HeightSource.VISION, np.uint8),
         np.clip(gray, 1, 255).astype(np.uint8),
     )  # fmt: skip
+
+
+def straight(*rows: float) -> tuple[tuple[float, float], ...]:
+    """Straps square to the axis."""
+    return tuple((row, row) for row in rows)
 
 
 def pack_at(heights: HeightMap, u_m: float, width_m: float = 0.2) -> Pack | None:
@@ -96,8 +99,8 @@ def test_a_flank_out_of_sight_is_not_seen() -> None:
 
 
 def test_straps_that_go_on_contradict_an_outline() -> None:
-    span = StrapSpan(-0.14, 0.06, (1.0, 2.0), 0.0)
-    pack = Pack(-0.15, 0.08, span, (-np.inf, 0.09), 0.1, False)
+    span = StrapSpan(-0.14, 0.06, straight(1.0, 2.0), 0.0)
+    pack = Pack(-0.15, 0.08, span, (-np.inf, 0.09), 0.1, (PackSide.SEEN, PackSide.OPEN))
     for width, off, said in ((0.2, 0.04, "beyond its outline"), (0.26, 0.04, "into its outline")):
         off_m, doubt = contradicts(pack, width)
         assert said in doubt and off_m == pytest.approx(off)
@@ -134,7 +137,7 @@ def test_a_place_belongs_to_the_straps_that_it_shares() -> None:
 
 
 BESIDE = CELL * np.arange(-40, 41)
-ROWS, OTHER_ROWS = (0.5, 2.0, 3.5), (1.0, 2.6, 4.1)
+ROWS, OTHER_ROWS = straight(0.5, 2.0, 3.5), straight(1.0, 2.6, 4.1)
 
 
 def level_of(*points: tuple[float, float]) -> np.ndarray:
@@ -142,7 +145,7 @@ def level_of(*points: tuple[float, float]) -> np.ndarray:
     return np.interp(BESIDE, *np.array(points).T)
 
 
-def pack_beside(level: np.ndarray, rows: tuple[float, ...], begins_m: float) -> Pack:
+def pack_beside(level: np.ndarray, rows: tuple[tuple[float, float], ...], begins_m: float) -> Pack:
     spans = StrapSpan(-0.12, 0.09, ROWS, 0.0), StrapSpan(begins_m, begins_m + 0.15, rows, 0.0)
     pack = find_pack(spans, 0.24, BESIDE, level)
     assert pack is not None
@@ -165,7 +168,7 @@ LEFT = (-0.4, -1.0), (-0.14, -1.0), (-0.13, -0.06), (0.0, 0.0)
     ids=["a gully", "straps in line", "two gullies", "no gully", "something higher begins"],
 )  # fmt: skip
 def test_a_single_gully_before_other_straps_is_the_flank(
-    right: tuple[tuple[float, float], ...], rows: tuple[float, ...], seen: bool
+    right: tuple[tuple[float, float], ...], rows: tuple[tuple[float, float], ...], seen: bool
 ) -> None:
     pack = pack_beside(level_of(*LEFT, *right), rows, 0.21)
     assert pack.sides_seen == seen
@@ -178,6 +181,60 @@ def test_a_low_bar_at_the_flank_is_still_the_bundle_s() -> None:
     low_bar = (0.04, -0.05), (0.09, -0.13), (0.1, -0.16), (0.15, -0.17), (0.16, -1.0), (0.4, -1.0)
     pack = pack_beside(level_of(*LEFT, *low_bar), ROWS, 0.35)
     assert pack.sides_seen and 0.1 < pack.high_m < 0.17
+
+
+@pytest.mark.parametrize(
+    ("right", "rows", "side"),
+    [
+        (((0.09, -0.04), (0.11, -0.05), (0.15, 0.0), (0.4, 0.0)), ROWS, PackSide.OPEN),
+        (((0.09, -0.04), (0.11, -0.07), (0.15, 0.0), (0.4, 0.0)), straight(0.53, 2.03, 3.53), PackSide.SEEN),
+        (((0.09, -0.04), (0.11, -0.05), (0.15, 0.0), (0.4, 0.0)), straight(0.5, 2.3, 3.9), PackSide.OPEN),
+        (((0.09, -0.04), (0.11, -0.05), (0.15, 0.06), (0.4, 0.06)), OTHER_ROWS, PackSide.COVERED),
+        (((0.09, -0.06), (0.11, -0.12), (0.15, 0.06), (0.4, 0.06)), OTHER_ROWS, PackSide.SEEN),
+        (((0.09, -0.04), (0.11, -0.05), (0.4, -0.12)), OTHER_ROWS, PackSide.OPEN),
+        (((0.09, -0.04), (0.1, -0.09), (0.13, -0.06), (0.14, 0.3), (0.4, 0.3)), OTHER_ROWS, PackSide.SEEN),
+    ],
+    ids=[
+        "straps in line", "straps beside each other", "one of three in line", "a higher neighbour",
+        "a higher neighbour beside a deep flank", "one round surface", "a wall beyond something lower",
+    ],
+)  # fmt: skip
+def test_the_side_where_other_straps_begin(
+    right: tuple[tuple[float, float], ...], rows: tuple[tuple[float, float], ...], side: PackSide
+) -> None:
+    pack = pack_beside(level_of(*LEFT, *right), rows, 0.12)
+    assert pack.sides == (PackSide.SEEN, side)
+    if side != PackSide.OPEN:
+        assert pack.high_m == pytest.approx(0.11, abs=1.1 * CELL)
+
+
+def test_a_smeared_flank_ends_where_a_pack_is_widest() -> None:
+    smeared = (0.08, -0.03), (0.1, -0.12), (0.2, -0.4), (0.21, -1.0), (0.4, -1.0)
+    pack = pack_beside(level_of(*LEFT, *smeared), ROWS, 0.35)
+    assert pack.sides_seen and pack.high_m == pytest.approx(0.1, abs=1.1 * CELL)
+
+
+@pytest.mark.parametrize(
+    ("falls", "last"),
+    [((0.3,), 0), ((0.0, 0.05, 0.3), 1), ((0.0, 0.05), 1), ((0.0, 0.12, 0.123, 0.126), 3)],
+)
+def test_the_last_place_of_a_flank_that_falls_away(falls: tuple[float, ...], last: int) -> None:
+    assert _widest(-np.array(falls), -0.1, CELL) == last
+
+
+def test_what_lies_over_a_pack_leaves_its_section_open() -> None:
+    """The low pack goes on under the high one, whose flank rises beside it: one is free, one unknown."""
+    rng = np.random.default_rng(4)
+    heights = drawn([(-0.25, 0.0, (-1.5, 0.1, 1.6)), (0.0, 0.26, (-1.1, 0.6, 2.0))], rng)
+    x = heights.x0_m + CELL * np.arange(heights.shape[1])
+    low = np.where(x < -0.25, 0.0, 0.2 - 0.09 * ((x + 0.08) / 0.17) ** 2)
+    z = np.where(x < 0, low + np.random.default_rng(5).normal(0, 0.001, heights.shape), heights.z_m)
+    found = find_bundles(replace(heights, z_m=z.astype(np.float32)), BundleSettings())
+    (lower,) = (b for b in found if abs(b.centre_m[0] + 0.125) < 0.05)
+    (upper,) = (b for b in found if abs(b.centre_m[0] - 0.13) < 0.05)
+    assert upper.on_top and upper.width_m == pytest.approx(0.26, abs=0.04)
+    assert lower.on_top is None and lower.bars is None and not np.isfinite(lower.section_m2)
+    assert lower.sigma.width_m > 0.4 * lower.width_m
 
 
 def test_the_way_between_dark_lines_is_a_bar_s_diameter() -> None:

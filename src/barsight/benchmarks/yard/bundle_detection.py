@@ -112,6 +112,6 @@ def drawn_map(settings: SimulationSettings) -> tuple[HeightMap, tuple[TrueBundle
 def _true(bundle: StackedBundle) -> TrueBundle:
     return TrueBundle(
         bundle.centre_m, bundle.yaw_rad, bundle.length_m, 2 * bundle.radius_m, bundle.top_z_m,
-        bundle.kind.diameter_m, bundle.kind.count, bundle.layer, bundle.on_top,
+        bundle.kind.diameter_m, bundle.kind.count, bundle.on_top,
         bars_mass(bundle.kind.count, bundle.kind.diameter_m, bundle.length_m),
     )  # fmt: skip

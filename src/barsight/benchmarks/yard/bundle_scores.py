@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -32,7 +33,6 @@ class TrueBundle:
     top_z_m: float
     bar_diameter_m: float
     bars: int
-    layer: int
     on_top: bool
     mass_kg: float
 
@@ -66,12 +66,18 @@ def read_true_bundles(recording: Path) -> tuple[TrueBundle, ...]:
     return tuple(
         TrueBundle(
             np.array(row["center"]), float(np.radians(row["yaw_deg"])), row["length"],
-            row.get("width", 2 * row["bundle_radius"]), row["top_z"], row["bar_diameter"], row["bars"],
-            row["lay"], row["on_top"],
+            _width(row), row["top_z"], row["bar_diameter"], row["bars"], row["on_top"],
             row.get("mass_kg", bars_mass(row["bars"], row["bar_diameter"], row["length"])),
         )
         for row in json.loads(path.read_text(encoding="utf-8"))
     )  # fmt: skip
+
+
+def _width(row: dict[str, Any]) -> float:
+    """Compute a true bundle's extent across, from its outline (x, z) where there is one, else all round."""
+    if "outline" in row:
+        return float(np.ptp(np.array(row["outline"])[:, 0]))
+    return float(row.get("width", 2 * row["bundle_radius"]))
 
 
 def bars_mass(bars: int, diameter_m: float, length_m: float) -> float:

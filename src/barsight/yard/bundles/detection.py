@@ -10,7 +10,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, reinforce_kinds
-from barsight.yard.bundles.bundle_record import Reading, describe_bundles, make_bundle, without_pieces
+from barsight.yard.bundles.bundle_record import describe_bundles, make_bundle
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.crossing_bundles import OVER_M, crossing_pieces, is_beam, rise_over
 from barsight.yard.bundles.fitting.growth import grow_outline
@@ -36,8 +36,10 @@ from barsight.yard.bundles.floor import find_floor
 from barsight.yard.bundles.gully_shading import estimate_smoothing, refit_with_packing
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import same_place
+from barsight.yard.bundles.reading import Reading
+from barsight.yard.bundles.section.packs import strapped_pack
 from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
-from barsight.yard.bundles.straps import strapped_pack
+from barsight.yard.bundles.strapped_bundles import without_pieces
 from barsight.yard.sections import split_map
 from barsight.yard.thin_lines import with_thin_lines
 from barsight.yard.types import Bundle, HeightMap, YardMap
@@ -48,6 +50,8 @@ _CLAIM_M = 0.02
 _RIVAL_RATIO = 0.8
 _SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
 """How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
+_LOWER_M = 0.005
+"""How far under its true height a single bar's top may be measured."""
 _RESOLVED_CELLS = 4.0
 _SLIVER_RATIO = 0.03
 _CROSSING_STEP_M = 0.4
@@ -85,7 +89,8 @@ def _search(
     if not (height_map.source == HeightSource.VISION).any():
         return []
     found: list[FittedOutline] = []
-    headings = find_headings(height_map, settings.max_skew_deg)
+    stock_over_m = -np.inf if floor is None else floor + settings.min_rise_m
+    headings = find_headings(height_map, settings.max_skew_deg, stock_over_m)
     for heading in headings:
         found += _found(height_map, heading, floor, templates, settings)
     places = [_claims(one, settings) for one in found]
@@ -108,7 +113,11 @@ def _found(
 ) -> list[FittedOutline]:
     """Find every outline that runs about as `heading` does."""
     sheet = align_map(height_map, heading, -np.inf if floor is None else floor + settings.min_rise_m)
-    return [FittedOutline(sheet, fit) for fit in _readings(sheet, templates, settings) if _on(floor, fit)]
+    return [
+        FittedOutline(sheet, fit)
+        for fit in _readings(sheet, templates, settings)
+        if _on(floor, fit, settings)
+    ]
 
 
 def _weights(found: list[FittedOutline]) -> Float64:
@@ -164,10 +173,16 @@ def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> 
     return replace(one, fit=widen_fit(fit, settings))
 
 
-def _on(floor_m: float | None, fit: Fit) -> bool:
-    """Check that the whole packing lies over the floor: its top rises from it by about its own height."""
-    sunken = min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
-    return floor_m is None or fit.values[Z] - fit.width_m / 2 > floor_m - sunken
+def _on(floor_m: float | None, fit: Fit, settings: BundleSettings) -> bool:
+    """Check that the whole packing lies over the floor: its top rises from it by about its own height, and a
+    single bar's by the least diameter of one, however wide the map shows it.
+    """
+    if floor_m is None:
+        return True
+    middle, half = float(fit.values[Z]) - floor_m, fit.width_m / 2
+    if fit.rings == 0 and middle + half < settings.min_single_diameter_m - _LOWER_M:
+        return False
+    return middle - half > -min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
 
 
 def _readings(sheet: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:

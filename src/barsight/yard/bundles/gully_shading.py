@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barsight.core.arrays import Float64, UInt8, kernel
+from barsight.core.arrays import Float64, kernel
 from barsight.yard.bundles.fitting.outline import (
     BARS_OF_RINGS,
     STEP_M,
@@ -20,27 +20,19 @@ from barsight.yard.bundles.fitting.outline import (
     turned_hexagon,
 )
 from barsight.yard.bundles.fitting.outline_fit import (
-    AGREES,
     DIAMETER,
     ROLL,
-    SLOPE_U,
     Fit,
     FittedOutline,
     ShadeProfile,
-    U,
     refine_outline,
 )
-from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.section.shades import shade_profile
 from barsight.yard.types import HeightMap
 
-_BIN_M = 0.002
-_MIN_CELLS = 8
-"""A place across the bundle needs so many cells along it for its median."""
-_MIN_PLACES = 10
 _PIXEL_M = 0.003
 """Blur by lens and pixel, standard deviation on the surface."""
-_INSIDE = 0.46
 _WIDER = np.arange(-0.04, 0.041, 0.02)
 _SHIFTS_M = np.arange(-0.004, 0.0041, 0.002)
 _ROLLS_RAD = np.radians(np.arange(-6.0, 6.1, 3.0))
@@ -52,55 +44,6 @@ _SURE = 4.5
 """Logarithm of how much likelier the best packing must be than the next."""
 _SMOOTHINGS_M = np.array([0.004, 0.007, 0.010, 0.013, 0.016])
 _MAX_SMOOTHED = 8
-
-
-def shade_profile(
-    height_map: HeightMap, sheet: AlignedMap, fit: Fit, between_m: tuple[float, float] | None = None
-) -> ShadeProfile | None:
-    """Sample the orthophoto's shades over the rows that agree with the fit, across its inside or between two
-    places beside its axis; None where too little was seen.
-    """
-    if height_map.gray is None:
-        return None
-    rows = np.flatnonzero(fit.state == AGREES)
-    rows = rows[(rows >= fit.first) & (rows <= fit.last)]
-    cell, half = height_map.cell_m, _INSIDE * fit.width_m
-    first, last = between_m or (-half, half)
-    ends = sheet.v0_m + cell * np.array([fit.first, fit.last])
-    middle = fit.values[U] + fit.values[SLOPE_U] * (ends - fit.v_m)
-    corners = sheet.to_map(
-        np.stack([np.concatenate([middle + first, middle + last]), np.concatenate([ends, ends])], axis=1)
-    )
-    place = (corners - (height_map.x0_m, height_map.y0_m)) / cell
-    low = np.floor(place.min(axis=0)).astype(int).clip(0, None)
-    high = np.ceil(place.max(axis=0)).astype(int) + 1
-    gray = height_map.gray[low[1] : high[1], low[0] : high[0]]
-    row, column = np.nonzero(gray)
-    x = height_map.x0_m + cell * (column + low[0])
-    y = height_map.y0_m + cell * (row + low[1])
-    c, s = np.cos(sheet.heading_rad), np.sin(sheet.heading_rad)
-    v = c * y - s * x
-    beside = (c * x + s * y - fit.values[U] - fit.values[SLOPE_U] * (v - fit.v_m)) / np.hypot(
-        1, fit.values[SLOPE_U]
-    )
-    number = np.rint((v - sheet.v0_m) / cell).astype(int).clip(0, fit.state.size - 1)
-    agrees = np.zeros(fit.state.size, bool)
-    agrees[rows] = True
-    wanted = agrees[number] & (beside > first) & (beside < last)
-    places, levels = _medians(beside[wanted], gray[row[wanted], column[wanted]])
-    return ShadeProfile(places, levels) if places.size >= _MIN_PLACES else None
-
-
-def _medians(beside: Float64, gray: UInt8) -> tuple[Float64, Float64]:
-    """Compute mean place and logarithm of the median gray level of each 2 mm that has enough cells."""
-    number = np.floor(beside / _BIN_M).astype(np.int64)
-    order = np.lexsort((gray, number))
-    first = np.flatnonzero(np.diff(number[order], prepend=np.iinfo(np.int64).min))
-    count = np.diff(first, append=order.size)
-    places = np.add.reduceat(beside[order], first) / count if order.size else np.empty(0)
-    enough = count >= _MIN_CELLS
-    middle = gray[order][(first + count // 2)[enough]].astype(np.float64)
-    return places[enough], np.log(middle + 5.0)
 
 
 @dataclass(frozen=True)

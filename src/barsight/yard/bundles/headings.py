@@ -18,22 +18,25 @@ _MIN_RELIEF = 0.15
 """Of the mean squared slope where most of the relief is: what a block needs to count."""
 
 
-def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
+def find_headings(
+    height_map: HeightMap, apart_deg: float, stock_over_m: float = -np.inf
+) -> tuple[float, ...]:
     """Find headings (rad, in (-pi/2, pi/2], 0 along +y), the commonest first, at least `apart_deg` apart.
 
     Bars slope across their axis only: the structure tensor of each block of 0.3 m says which way, and how
-    clearly [Bigun 1987]. A heading within `apart_deg` of an axis of the map is that axis.
+    clearly [Bigun 1987]. A heading within `apart_deg` of an axis of the map is that axis. Heights up to
+    stock_over_m are floor, whose ripples run as the pictures do.
     """
     block = max(round(_BLOCK_M / height_map.cell_m), 1)
     rows, columns = (n // block for n in height_map.z_m.shape)
     if rows < 1 or columns < 1 or min(height_map.z_m.shape) < 3:
         return (0.0,)
     strips = [
-        _slopes(height_map, block, rows, first, min(first + _STRIP_BLOCKS, columns))
+        _slopes(height_map, block, rows, first, min(first + _STRIP_BLOCKS, columns), stock_over_m)
         for first in range(0, columns, _STRIP_BLOCKS)
     ]
     even, odd, energy = np.concatenate(strips, axis=2)
-    # The ripples of a flat floor run as the pictures do, not as the bars: they have little relief.
+    # The ripples of a level platform run as the pictures do, not as the bars: they have little relief.
     usual = float((energy**2).sum() / max(energy.sum(), 1e-12))
     clear = np.hypot(even, odd) > _COHERENT * np.maximum(energy, 1e-12)
     clear &= energy > _MIN_RELIEF * usual
@@ -56,12 +59,15 @@ def find_headings(height_map: HeightMap, apart_deg: float) -> tuple[float, ...]:
     return tuple(float(np.radians(h)) for h in found) or (0.0,)
 
 
-def _slopes(height_map: HeightMap, block: int, rows: int, first: int, last: int) -> Float64:
+def _slopes(
+    height_map: HeightMap, block: int, rows: int, first: int, last: int, stock_over_m: float
+) -> Float64:
     """Compute the structure tensor (3, rows, last - first) of those blocks, as the difference of both axes'
     squared slopes, twice their product and their sum. By strips: a long yard's slopes are many times its map.
     """
     low, high = max(first * block - 1, 0), min(last * block + 1, height_map.z_m.shape[1])
     seen = height_map.source[:, low:high] == HeightSource.VISION
+    seen &= height_map.z_m[:, low:high] > stock_over_m
     z = np.where(seen, height_map.z_m[:, low:high], np.nan).astype(np.float64)
     gy, gx = np.gradient(z, height_map.cell_m)
     usable = np.isfinite(gx) & np.isfinite(gy) & (np.hypot(gx, gy) < _STEEPEST)

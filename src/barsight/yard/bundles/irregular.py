@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, FittedOutline
-from barsight.yard.bundles.seen_section import SeenSection
+from barsight.yard.bundles.section.seen_section import SeenSection
 from barsight.yard.types import BundleSigma
 
 _WIDTH_RATIOS, _WIDTH_SIGMAS = (0.03, 0.12), (1.5, 2.0)

@@ -8,7 +8,7 @@ from scipy import ndimage
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import Fit, ShadeProfile
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
-from barsight.yard.bundles.gully_shading import shade_profile
+from barsight.yard.bundles.section.shades import shade_profile
 from barsight.yard.types import HeightMap
 
 DIAMETER_SIGMA_RATIO = 0.13

@@ -8,7 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import FittedOutline
-from barsight.yard.bundles.seen_section import agreeing_rows, mean_section
+from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 
 _CREST_RATIO = 0.35
 """Of the width, to either side of its middle: where a bundle is highest."""
@@ -26,18 +26,22 @@ class Flanks:
     """Flanks on the low and the high side. falls_m: from the crest to the lowest place of each, inf where it
     falls to the floor or out of sight; rises_m: from the crest to the highest place beside it, -inf where
     nothing is seen. are_flat: neither falls off before its edge, as a plate, a cart or a wall does not.
+    ended: on which sides straps show where the bundle ends, however little it falls there.
     """
 
     width_m: float
     falls_m: tuple[float, float]
     rises_m: tuple[float, float]
     are_flat: bool
+    ended: tuple[bool, bool] = (False, False)
 
     @property
     def doubt(self) -> str:
         """Say that something may lie over a flank; empty where both are seen."""
-        for name, fall, rise in zip(("low", "high"), self.falls_m, self.rises_m, strict=True):
-            if fall < _FLAT_RATIO * self.width_m:
+        for name, fall, rise, ended in zip(
+            ("low", "high"), self.falls_m, self.rises_m, self.ended, strict=True
+        ):
+            if fall < _FLAT_RATIO * self.width_m and not (ended and rise <= _HIGHER_M):
                 return f"its {name} flank was not seen: something may lie over it"
             if fall < _SHALLOW_RATIO * self.width_m and _HIGHER_M < rise < self.width_m:
                 return f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"

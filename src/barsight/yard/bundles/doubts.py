@@ -1,0 +1,111 @@
+"""Say what speaks against a bundle as it was read, whether its bars can be counted, and how sure it is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Bool, UInt8
+from barsight.yard.bundles.crossing_bundles import rise_over
+from barsight.yard.bundles.fitting.ends import End
+from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, LOOSENESS
+from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, U
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.reading import Reading
+from barsight.yard.bundles.section.seen_section import SeenSection, is_no_hexagon
+from barsight.yard.thin_lines import KNOWN_ACROSS
+
+_NARROW_M = 0.3
+"""Longest place along a bundle over which a thing that lies across it counts as narrow."""
+_LIES_M, _ONE_PLACE_M = 0.02, 0.3
+"""What lies across a bundle rises so far over it; runs of rows nearer to each other than the second are one
+thing. Dunnage comes in twos and more."""
+_SURE_KNOWN = 0.7
+"""Share of a bundle's length that must have been measured."""
+
+
+def count_bars(
+    reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
+) -> tuple[int | None, tuple[str, ...]]:
+    """Count bars by the outline; None and a sentence where it is not surely a full hexagon, where another
+    packing explains its kind as well, or where one bar may as well be many thin ones.
+    """
+    fit, other = reading.found.fit, reading.other_packing
+    if other is None:
+        why_not = is_no_hexagon(seen, fit, top_m, floor_m)
+        if not why_not and fit.rings == 0 and reading.found.shades is None:
+            why_not = "many thin bars may look like one"
+        return (None, (f"its bars can't be counted: {why_not}",)) if why_not else (fit.bars, ())
+    diameter = fit.width_m / (2 * LOOSENESS * other + 1)
+    return None, (
+        f"{fit.bars} bars of {1e3 * fit.values[DIAMETER]:.0f} mm or {BARS_OF_RINGS[other]} of "
+        f"{1e3 * diameter:.0f} mm: the outline fits both",
+    )
+
+
+def list_doubts(reading: Reading, rows: UInt8, ends: list[End], settings: BundleSettings) -> tuple[str, ...]:
+    """List what speaks against the bundle as described."""
+    out = []
+    known = (rows != 0).mean()
+    if known < _SURE_KNOWN:
+        out.append(f"only {100 * known:.0f} % of its length was measured")
+    crossed = _runs(rows == ABOVE)
+    cell = reading.found.sheet.cell_m
+    narrow = _places(
+        [run for run in crossed if cell < (run[1] - run[0]) * cell <= _NARROW_M], reading, settings
+    )
+    wide = [b - a for a, b in crossed if (b - a) * cell > _NARROW_M]
+    if narrow == 1:
+        out.append("something narrow lies across it at one place")
+    elif narrow:
+        out.append(f"something narrow {KNOWN_ACROSS} at {narrow} places, such as dunnage")
+    out += [f"something {n * cell:.2f} m long covers a part of it" for n in wide]
+    sunken = (rows == BELOW).sum() * cell
+    if sunken > 0.1:
+        out.append(f"over {sunken:.2f} m the surface lies lower than the outline")
+    out += [f"the {name} end is open: {end.why}" for name, end in zip(("low-y", "high-y"), ends, strict=True)
+            if end.is_open]  # fmt: skip
+    if reading.rival is not None and reading.rival_weight > 0.9 * reading.weight:
+        gap = abs(reading.rival.fit.width_m - reading.found.fit.width_m)
+        if gap > 0.15 * reading.found.fit.width_m:
+            out.append(
+                f"a bundle {1e3 * reading.rival.fit.width_m:.0f} mm wide explains the surface nearly as well"
+            )
+    return tuple(out)
+
+
+def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSettings) -> int:
+    """Count the places at which runs of rows lie over an outline; none where all are so low that noise is."""
+    sheet, fit = reading.found.sheet, reading.found.fit
+    across = np.linspace(-0.35, 0.35, 15) * fit.width_m
+    places, highest, last = 0, 0.0, -np.inf
+    for first, end in runs:
+        rows = np.arange(first, end) + fit.first
+        along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+        u = fit.values[U] + fit.values[SLOPE_U] * along[:, None] + across
+        highest = max(highest, float(np.nanmedian(rise_over(sheet, fit, rows, u, settings))))
+        places += (first - last) * sheet.cell_m > _ONE_PLACE_M
+        last = end
+    return places if highest > _LIES_M else 0
+
+
+def rate_confidence(reading: Reading, rows: UInt8) -> float:
+    """Estimate the probability from how much of the length agrees and how far the next other reading is
+    behind.
+    """
+    fit, rival = reading.found.fit, reading.rival
+    lead = 1.0
+    if rival is not None and abs(rival.fit.width_m - fit.width_m) > 0.15 * fit.width_m:
+        lead = 1 - reading.rival_weight / max(reading.weight, 1e-9)
+    sure = 1 - 0.5 * np.exp(-max(lead, 0.0) / 0.05)
+    return float(np.clip(sure * rate_agreement(rows), 0.01, 0.99))
+
+
+def rate_agreement(rows: UInt8) -> float:
+    """Rate by how much of what was seen of its length agrees with an outline: 1 from four fifths on."""
+    return min(1.0, float((rows == AGREES).sum() / max((rows != 0).sum(), 1)) / 0.8)
+
+
+def _runs(flags: Bool) -> list[tuple[int, int]]:
+    """Find first and one-past-last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

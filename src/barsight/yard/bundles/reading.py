@@ -1,0 +1,51 @@
+"""Define a chosen outline with what speaks for and against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from barsight.yard.bundles.fitting.outline_fit import FittedOutline
+from barsight.yard.bundles.section.flanks import Flanks, seen_flanks
+from barsight.yard.bundles.section.pack_sides import PackSide
+from barsight.yard.bundles.section.packs import Pack
+
+_SAME_RATIO, _SAME_M = 0.12, 0.005
+"""Of the width, and besides: how far an outline's edges lie off those of the pack that it describes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A chosen outline with its weight (cells explained) and the strongest other reading of its place.
+
+    other_packing: rings of another packing that explains the bundles of this kind as well, if any does. pack:
+    the bars that straps hold together there, None where no straps are seen. flanks: of the pack where its
+    bounds are known, else of the outline; None where too little of them is seen.
+    """
+
+    found: FittedOutline
+    weight: float
+    rival: FittedOutline | None
+    rival_weight: float
+    other_packing: int | None
+    pack: Pack | None = None
+    flanks: Flanks | None = None
+
+    @property
+    def outlines_pack(self) -> bool:
+        """Check whether the fitted outline ends where the pack does, or no pack's bounds are known."""
+        pack, width = self.pack, self.found.fit.width_m
+        if pack is None or not pack.is_bounded:
+            return True
+        off = max(abs(pack.low_m + width / 2), abs(pack.high_m - width / 2))
+        return off < _SAME_RATIO * width + _SAME_M
+
+    def with_flanks(self) -> Reading:
+        """Return the same with its flanks."""
+        half, pack = self.found.fit.width_m / 2, self.pack
+        if pack is None or not pack.is_bounded:
+            return replace(self, flanks=seen_flanks(self.found, -half, half))
+        flanks = seen_flanks(self.found, pack.low_m, pack.high_m)
+        if flanks is not None:
+            ended = pack.sides[0] == PackSide.SEEN, pack.sides[1] == PackSide.SEEN
+            flanks = replace(flanks, ended=ended, are_flat=flanks.are_flat and not all(ended))
+        return replace(self, flanks=flanks)

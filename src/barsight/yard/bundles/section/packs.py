@@ -1,0 +1,152 @@
+"""Extend what straps hold to its flanks: a pack, whose width is whole where both flanks are seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.yard.bundles.fitting.outline_fit import Fit
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
+from barsight.yard.bundles.section.bar_pitch import bar_diameter
+from barsight.yard.bundles.section.pack_sides import PackSide, find_side
+from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
+from barsight.yard.bundles.section.strap_lines import FLOOR_M
+from barsight.yard.bundles.section.straps import MIN_ROWS, REACH_M, StrapSpan, strap_spans
+from barsight.yard.types import HeightMap
+
+_OWN_RATIO = 0.5
+"""Least overlap of straps and a fit, of the narrower one's width, for the straps to be the fit's own."""
+_DIP_RATIO = 0.12
+"""Depth of a dip in a span, of its width, from which it may part two bundles whose straps lie in line."""
+_SPREAD_M = 0.03
+"""Median distance between the straps' ends from which the pack's is open."""
+_IN_LINE_M, _BESIDE_M = 0.018, 0.09
+"""Along the bars: largest distance between the two halves of one strap where they meet; a strap that is
+nearer than the second, but not in line, makes it doubtful that any are of one bundle."""
+_BEYOND_M = 0.03
+"""Distance of straps beyond an outline, or of others' into it, from which they speak against it."""
+
+
+@dataclass(frozen=True)
+class Pack:
+    """Bars that straps hold, with their flanks: from low_m to high_m beside a fit's axis. span: of the straps
+    themselves; others_m: where other bundles' begin on either side, infinite where none do. top_m: highest
+    place over the axis; sides: the low and the high one. diameter_m: of its bars by the dark lines along it,
+    NaN where they aren't seen.
+    """
+
+    low_m: float
+    high_m: float
+    span: StrapSpan
+    others_m: tuple[float, float]
+    top_m: float
+    sides: tuple[PackSide, PackSide]
+    diameter_m: float = math.nan
+
+    @property
+    def sides_seen(self) -> bool:
+        """Check whether both flanks sink before a neighbour begins: the width is whole."""
+        return self.sides == (PackSide.SEEN, PackSide.SEEN)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Check whether it is known on both sides how far the pack is in sight."""
+        return PackSide.OPEN not in self.sides
+
+    @property
+    def width_m(self) -> float:
+        """Return the width from flank to flank."""
+        return self.high_m - self.low_m
+
+    @property
+    def middle_m(self) -> float:
+        """Return the place midway between the flanks."""
+        return (self.low_m + self.high_m) / 2
+
+
+def strapped_pack(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> Pack | None:
+    """Find what straps hold together over a fit's axis; None where none are seen."""
+    rows = agreeing_rows(fit)
+    if height_map.gray is None or rows.size < MIN_ROWS:
+        return None
+    beside, level = mean_section(sheet, fit, rows, round(REACH_M / sheet.cell_m))
+    pack = find_pack(strap_spans(height_map, sheet, fit, level), fit.width_m, beside, level)
+    if pack is None:
+        return pack
+    ends = (pack.low_m, pack.high_m) if pack.is_bounded else (pack.span.low_m, pack.span.high_m)
+    return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, *ends))
+
+
+def find_pack(
+    spans: tuple[StrapSpan, ...], width_m: float, beside_m: Float64, level_m: Float64
+) -> Pack | None:
+    """Extend the straps over a fit's axis to its flanks; None where no straps lie over it.
+
+    width_m: of the fit. level_m: (N,) mean heights over the axis at beside_m: NaN unknown, -inf floor.
+    A flank is seen where the surface falls to the floor, or far under the top, or where a neighbour
+    begins that is no higher and whose straps lie elsewhere. What may be a bar of the same bundle leaves it
+    open.
+    """
+    shares = [
+        (min(s.high_m, 0.5 * width_m) - max(s.low_m, -0.5 * width_m)) / min(s.width_m, width_m) for s in spans
+    ]
+    if not shares or max(shares) < _OWN_RATIO:
+        return None
+    number = int(np.argmax(shares))
+    own = spans[number]
+    inside = np.flatnonzero((beside_m >= own.low_m) & (beside_m <= own.high_m) & np.isfinite(level_m))
+    if inside.size == 0:
+        return None
+    top = float(level_m[inside].max())
+    cell = float(beside_m[1] - beside_m[0])
+    level_inside = level_m[inside[0] : inside[-1] + 1]
+    is_one = own.spread_m <= _SPREAD_M and _dip(level_inside) < _DIP_RATIO * own.width_m
+    ends, others, sides = [], [], []
+    for step, at, number_beside in ((-1, inside[0], number - 1), (1, inside[-1], number + 1)):
+        next_one = spans[number_beside] if 0 <= number_beside < len(spans) else None
+        near, begin = np.inf, None
+        shared = None
+        if next_one is not None:
+            shared = _shared(next_one, own) if step < 0 else _shared(own, next_one)
+            near = next_one.high_m if step < 0 else next_one.low_m
+            begin = max(round((abs(near - float(beside_m[at])) - cell / 2) / cell), 0)
+        others.append(float(near) if shared is False else step * np.inf)
+        last, side = find_side(level_m[at::step], level_m[at::-step], begin, shared, top, own.width_m, cell)
+        ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
+        sides.append(side if is_one else PackSide.OPEN)
+    return Pack(ends[0], ends[1], own, (others[0], others[1]), top, (sides[0], sides[1]))
+
+
+def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
+    """Say how a pack that isn't seen whole speaks against an outline about the same axis, and how far one is
+    off the other, m; 0 and empty where it doesn't.
+    """
+    beyond = max(-width_m / 2 - pack.span.low_m, pack.span.high_m - width_m / 2)
+    if beyond > _BEYOND_M:
+        return beyond, f"straps hold bars up to {1e3 * beyond:.0f} mm beyond its outline"
+    within = max(pack.others_m[0] + width_m / 2, width_m / 2 - pack.others_m[1])
+    if within > _BEYOND_M:
+        return within, f"other straps reach {1e3 * within:.0f} mm into its outline"
+    return 0.0, ""
+
+
+def _dip(level: Float64) -> float:
+    """Compute how deep the surface sinks between two higher places; what isn't seen lies on the floor."""
+    seen = np.nan_to_num(level, nan=-FLOOR_M, neginf=-FLOOR_M)
+    between = np.minimum(np.maximum.accumulate(seen), np.maximum.accumulate(seen[::-1])[::-1])
+    return float((between - seen).max(initial=0.0))
+
+
+def _shared(lower: StrapSpan, upper: StrapSpan) -> bool | None:
+    """Check whether most straps of either lie in line with the other's where they meet, as those of one
+    bundle do; False where none does. None where no more than half do, or some lie just beside one.
+    """
+    apart = np.abs(np.subtract.outer([rows[1] for rows in lower.rows_m], [rows[0] for rows in upper.rows_m]))
+    nearest = apart.min(axis=1 if len(lower.rows_m) <= len(upper.rows_m) else 0)
+    in_line = nearest < _IN_LINE_M
+    if not in_line.any():
+        return False
+    return None if 2 * in_line.sum() <= nearest.size or (~in_line & (nearest < _BESIDE_M)).any() else True

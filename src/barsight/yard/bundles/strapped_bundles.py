@@ -1,0 +1,191 @@
+"""Hold fitted outlines to what straps show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.yard.bundles.doubts import rate_agreement
+from barsight.yard.bundles.fitting.outline_fit import SLOPE_U
+from barsight.yard.bundles.pack_edges import DOUBTFUL, hold_off
+from barsight.yard.bundles.reading import Reading
+from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO
+from barsight.yard.bundles.section.pack_sides import PackSide
+from barsight.yard.bundles.section.packs import Pack, contradicts
+from barsight.yard.bundles.section.seen_section import section_of_pack
+from barsight.yard.types import Bundle, BundleSigma
+
+_PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0
+"""Standard deviations of a pack's middle, width and top, and its width's in those of a height."""
+_SAME_MIDDLE_M = 0.009
+"""Largest distance between the middles of a pack and of the outline that is fitted to it."""
+_CREST_M = 0.006
+"""Crest height that a map's mean section cuts off."""
+_HIDDEN_RATIO = 0.5
+"""Of the width in sight: one standard deviation of what a neighbour hides of a pack. In the pile that was
+looked at, as much as what was in sight was hidden at most."""
+_STRAPPED = 0.95
+"""Confidence in a bundle whose straps and flanks were seen."""
+_PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
+"""Bounds of a piece: way of its axis within the flanks, most by which its top is higher and its ends lie
+beyond the pack's, sine of its skew."""
+_ASIDE_M = 0.02
+"""Straps whose middle lies so far beside an outline's make its place that unsure."""
+
+
+def held_by_straps(
+    bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
+) -> Bundle:
+    """Hold a bundle to what straps show: place, width and section where the fitted outline misses the pack,
+    the section alone where both agree, a doubt where a neighbour may lie over the pack or it goes on beyond
+    what is in sight.
+
+    irregular: its sigma where it is not surely the hexagon that was fitted.
+    """
+    if not pack.is_bounded:
+        return _partly_seen(bundle, irregular, pack)
+    if reading.outlines_pack:
+        if bundle.bars is not None and pack.sides_seen:
+            return bundle
+        shown = reading.found.shades is not None
+        if shown or abs(pack.middle_m) < _SAME_MIDDLE_M:
+            own = replace(bundle, sigma=irregular)
+            return _covered(_confirmed(own, pack, floor_m, is_hexagon=shown), pack)
+    return _covered(_as_pack(bundle, irregular, reading, pack, floor_m), pack)
+
+
+def _as_pack(
+    bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
+) -> Bundle:
+    """Replace place, width, top and section of a fitted outline by those of the pack that straps hold."""
+    fit = reading.found.fit
+    top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
+    section, section_sigma = section_of_pack(pack.width_m, _over(top_z, floor_m))
+    aside = pack.middle_m * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
+    if abs(bundle.yaw_rad - reading.found.sheet.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
+        aside = -aside
+    down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
+    diameter = pack.diameter_m if pack.diameter_m > 0 else bundle.bar_diameter_m
+    packing = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
+    return replace(
+        bundle,
+        centre_m=bundle.centre_m + aside + down,
+        ends_m=bundle.ends_m + aside + down,
+        width_m=pack.width_m,
+        top_z_m=top_z,
+        bars=None,
+        bar_diameter_m=diameter,
+        bar_axes=(),
+        section_m2=section,
+        confidence=_STRAPPED * rate_agreement(fit.state[fit.first : fit.last + 1]),
+        reasons=(*(reason for reason in bundle.reasons if "explains the surface" not in reason), packing),
+        sigma=replace(
+            bundle.sigma,
+            lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
+            yaw_rad=irregular.yaw_rad,
+            width_m=float(np.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * fit.sigma_m)),
+            top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
+            bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
+            section_m2=section_sigma,
+        ),
+    )
+
+
+def _covered(bundle: Bundle, pack: Pack) -> Bundle:
+    """Doubt a bundle over whose flanks neighbours may lie: its width is what is seen, its section open."""
+    sides = [name for name, side in zip(("low", "high"), pack.sides, strict=True) if side == PackSide.COVERED]
+    if not sides:
+        return bundle
+    hidden_m = _HIDDEN_RATIO * bundle.width_m
+    doubts = (f"what stands higher beside it may lie over its {name} flank" for name in sides)
+    return replace(
+        bundle,
+        bars=None,
+        section_m2=np.nan,
+        confidence=min(bundle.confidence, DOUBTFUL),
+        reasons=(*bundle.reasons, *doubts),
+        sigma=replace(
+            bundle.sigma,
+            lateral_m=float(np.hypot(bundle.sigma.lateral_m, hidden_m / 2)),
+            width_m=float(np.hypot(bundle.sigma.width_m, hidden_m)),
+            section_m2=np.nan,
+        ),
+    )
+
+
+def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
+    """Doubt a bundle whose pack goes on beyond it or lies aside, and whose flanks are not both seen."""
+    beyond_m, doubt = contradicts(pack, bundle.width_m)
+    if doubt:
+        sure = min(bundle.confidence, DOUBTFUL)
+        bundle = replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
+        irregular = replace(
+            irregular,
+            width_m=float(np.hypot(irregular.width_m, beyond_m)),
+            lateral_m=float(np.hypot(irregular.lateral_m, beyond_m / 2)),
+        )
+    if bundle.bars is None:
+        bundle = replace(bundle, sigma=irregular)
+    if abs(pack.middle_m) > _ASIDE_M:
+        lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
+        bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
+    if bundle.bars is None and pack.diameter_m > 0:
+        spread = DIAMETER_SIGMA_RATIO * pack.diameter_m
+        sigma = replace(bundle.sigma, bar_diameter_m=spread)
+        bundle = replace(bundle, bar_diameter_m=pack.diameter_m, sigma=sigma)
+    return bundle
+
+
+def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, *, is_hexagon: bool) -> Bundle:
+    """Keep a fitted outline that ends where the pack does; they are as sure as they agree. Its width is the
+    mean of both by their sigma unless the pictures show the hexagon that was fitted.
+    """
+    section, section_sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
+    diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
+    if abs(pack.diameter_m - diameter) > DIAMETER_SIGMA_RATIO * diameter:
+        diameter, spread = pack.diameter_m, DIAMETER_SIGMA_RATIO * pack.diameter_m
+    sigma = replace(
+        bundle.sigma,
+        bar_diameter_m=spread,
+        lateral_m=float(np.hypot(bundle.sigma.lateral_m, pack.middle_m)),
+        width_m=float(np.hypot(bundle.sigma.width_m, bundle.width_m - pack.width_m)),
+        section_m2=section_sigma,
+    )
+    own, packs = bundle.sigma.width_m**-2, _PACK_WIDTH_M**-2
+    mean = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
+    width = bundle.width_m if is_hexagon else mean
+    return replace(bundle, width_m=width, section_m2=section, bar_diameter_m=diameter, sigma=sigma)
+
+
+def _over(top_z_m: float, floor_m: float | None) -> float:
+    return np.inf if floor_m is None else max(top_z_m - floor_m, 0.0)
+
+
+def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:
+    """Remove bundles that are pieces of one that straps hold: their axes run within its flanks. What else
+    reaches into one is cut.
+    """
+    whole = [k for k, one in enumerate(readings) if one.pack is not None and one.pack.is_bounded]
+    whole.sort(key=lambda k: -readings[k].weight)
+    gone: set[int] = set()
+    for k in whole:
+        if k not in gone:
+            gone |= {n for n, other in enumerate(bundles) if n != k and _is_piece(other, bundles[k])}
+    left = [k for k in range(len(bundles)) if k not in gone]
+    packs = [pack is not None and pack.is_bounded for pack in (readings[k].pack for k in left)]
+    return hold_off([bundles[k] for k in left], packs)
+
+
+def _is_piece(piece: Bundle, whole: Bundle) -> bool:
+    """Check that a bundle's middle lies within another's flanks, at about its height, and along it."""
+    away = piece.centre_m[:2] - whole.centre_m[:2]
+    along = np.array([-np.sin(whole.yaw_rad), np.cos(whole.yaw_rad)])
+    beside = abs(float(away[0] * along[1] - away[1] * along[0]))
+    lower = whole.top_z_m - piece.top_z_m
+    return bool(
+        beside < whole.width_m / 2 - _PIECE_M
+        and abs(float(away @ along)) + piece.length_m / 2 < whole.length_m / 2 + _PIECE_BEYOND_M
+        and abs(np.sin(piece.yaw_rad - whole.yaw_rad)) < _PIECE_SKEW
+        and -_PIECE_HIGHER_M < lower < whole.width_m
+    )
