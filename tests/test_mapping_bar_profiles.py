@@ -32,7 +32,7 @@ def row_of_bars(pitch_m: float, slope: float) -> tuple[np.ndarray, np.ndarray, n
 
 def drawn(
     shown: np.ndarray, gray: np.ndarray, pixel_cells: float = PIXEL_CELLS
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     z, direction = smooth_along_bars(shown, np.ones_like(shown), 0.015, 12)
     direction = vote_directions(direction)
     stripes = find_stripes(z, gray, direction, CELL_M)
@@ -46,7 +46,9 @@ def test_bars_are_drawn_round_and_their_sigma_holds(pitch_m: float, slope: float
     truth, shown, gray = row_of_bars(pitch_m, slope)
     rng = np.random.default_rng(5)
     noisy = (shown + rng.normal(0, 0.002, shown.shape)).astype(np.float32)
-    z, sigma = (a[INNER, INNER] for a in drawn(noisy, gray + rng.normal(0, 3, gray.shape).astype(np.float32)))
+    z, sigma, hidden = (
+        a[INNER, INNER] for a in drawn(noisy, gray + rng.normal(0, 3, gray.shape).astype(np.float32))
+    )
     known, truth = np.isfinite(z), truth[INNER, INNER]
     error, before = np.abs(z - truth)[known], np.abs(shown[INNER, INNER] - truth)[known]
     assert known.mean() > 0.9
@@ -54,20 +56,22 @@ def test_bars_are_drawn_round_and_their_sigma_holds(pitch_m: float, slope: float
     assert np.mean(error) < 0.5 * np.mean(before)
     assert (z - truth)[known].mean() == pytest.approx(0, abs=0.0008)
     assert np.mean(error <= 1.96 * np.hypot(sigma[known], 0.001)) > 0.9
+    # What isn't drawn says how far it is off.
+    assert np.mean(before <= 1.96 * np.hypot(hidden[known], 0.002)) > 0.88
 
 
 def test_a_plate_without_stripes_stays_as_it_is() -> None:
     rng = np.random.default_rng(2)
     plate = rng.normal(0, 0.002, (CELLS, CELLS)).astype(np.float32)
-    z, sigma = drawn(plate, np.float32(90) + rng.normal(0, 3, plate.shape).astype(np.float32))
+    z, _, hidden = drawn(plate, np.float32(90) + rng.normal(0, 3, plate.shape).astype(np.float32))
     assert np.isnan(z).all()
-    assert not sigma.any()
+    assert not hidden.any()
 
 
 def test_stripes_on_a_plate_are_no_bars_where_the_heights_would_show_them() -> None:
     """With small pixels the heights show bars of 40 mm: stripes without them are paint."""
     _, _, gray = row_of_bars(0.04, 0.0)
-    z, _ = drawn(np.zeros_like(gray), gray, pixel_cells=0.41)
+    z, *_ = drawn(np.zeros_like(gray), gray, pixel_cells=0.41)
     assert np.isnan(z[INNER, INNER]).all()
 
 
@@ -76,10 +80,10 @@ def test_bars_in_no_row_are_unsure() -> None:
     _, shown, gray = row_of_bars(0.04, 0.0)
     x = np.arange(CELLS) * CELL_M
     uneven = shown + (0.007 * np.sin(2 * np.pi * x / 0.08)).astype(np.float32)
-    z, sigma = drawn(uneven.astype(np.float32), gray)
+    z, _, unsure = drawn(uneven.astype(np.float32), gray)
     crests = np.zeros(CELLS, bool)
     crests[10:90:4] = True
-    hidden = sigma[INNER][:, crests & (x > 0.15) & (x < 0.85)]
+    hidden = unsure[INNER][:, crests & (x > 0.15) & (x < 0.85)]
     assert np.isnan(z[INNER][:, crests & (x > 0.15) & (x < 0.85)]).all()
     assert (hidden > 0.112 * 0.03 * 0.6).all()
 

@@ -37,9 +37,9 @@ class _Profiles(NamedTuple):
 
 def draw_bars(
     z: Float32, direction: Int8, stripes: Stripes, pixel_cells: Float32, cell_m: float
-) -> tuple[Float32, Float32]:
-    """Draw bars over the heights z (H, W): the heights, NaN where none is drawn, and the sigma of what is
-    drawn, or of what the heights can't show where stripes are seen and none is drawn, else 0.
+) -> tuple[Float32, Float32, Float32]:
+    """Draw bars over the heights z (H, W): the bars' heights and their sigma, NaN where none is drawn, and
+    the sigma of what the heights z can't show where stripes are seen, else 0.
 
     direction: (H, W), of `smooth_along_bars`. pixel_cells: (H, W) width of a pixel. A row of bars is a line
     through the heights a pitch to either side (or one and two pitches to one side); the bars touch and are
@@ -49,9 +49,9 @@ def draw_bars(
     that share; without it, the heights' mean over a pitch is the row's level.
     """
     drawn = np.full(z.shape, np.nan, np.float32)
-    sigma = np.zeros(z.shape, np.float32)
-    _draw(z, direction, stripes, pixel_cells, cell_m, _profiles(), drawn, sigma)
-    return drawn, sigma
+    sigma, hidden = drawn.copy(), np.zeros(z.shape, np.float32)
+    _draw(z, direction, stripes, pixel_cells, cell_m, _profiles(), drawn, sigma, hidden)
+    return drawn, sigma, hidden
 
 
 @lru_cache(maxsize=1)
@@ -82,10 +82,10 @@ def _profiles() -> _Profiles:
 @kernel()
 def _draw(
     z: Float32, direction: Int8, stripes: Stripes, pixel_cells: Float32, cell_m: float, profiles: _Profiles,
-    drawn: Float32, sigma: Float32,
+    drawn: Float32, sigma: Float32, hidden: Float32,
 ) -> None:  # fmt: skip
     """Draw bars, see `draw_bars`. z, pixel_cells: (H, W), NaN where there is none; direction: (H, W), -1
-    where there is none. Fills drawn and sigma (H, W).
+    where there is none. Fills drawn, sigma and hidden (H, W).
     """
     height, width = z.shape
     step_m = STEP_CELLS * cell_m
@@ -102,12 +102,12 @@ def _draw(
             turn = direction[row * NODE_CELLS, column * NODE_CELLS] * np.pi / DIRECTIONS
             ways = np.cos(turn), -np.sin(turn), step_m
             shown = np.exp(-2 * (np.pi * _BLUR_PX * pixel_cells[i, j] / pitch) ** 2)
-            sigma[i, j] = _ROUND * (1 - shown) * pitch * cell_m
+            hidden[i, j] = _ROUND * (1 - shown) * pitch * cell_m
             if pitch > _WIDEST_CELLS:
                 continue
             rise_m, off_m = _line(z, i, j, ways, pitch, _UNSEEN_RATIO * pitch * cell_m)
             if off_m > 0:
-                sigma[i, j] = np.hypot(sigma[i, j], (1 - shown) * off_m / 2)
+                hidden[i, j] = np.hypot(hidden[i, j], (1 - shown) * off_m / 2)
             if pitch > _WIDEST_PX * pixel_cells[i, j] or not off_m <= _LINE_RATIO * pitch * cell_m:
                 continue
             slope = round(rise_m / (pitch * cell_m) / _SLOPE_STEP) + _SLOPES // 2

@@ -206,9 +206,11 @@ class SurfaceElection:
             steps = step_sigma(sharp, pixel_cells)
             bar = vote_directions(direction)
             stripes = find_stripes(z, around.intensity, bar, cell_m)
-            bars, unsure = draw_bars(z, bar, stripes, pixel_m / np.float32(cell_m), cell_m)
-            sharp = np.where(np.isfinite(bars), bars, sharp)
-            blur = np.where(np.isfinite(bars), unsure, np.maximum(blur, unsure))
+            bars, unsure, hidden = draw_bars(z, bar, stripes, pixel_m / np.float32(cell_m), cell_m)
+            blur = np.maximum(blur, hidden)
+            if settings.thin_bars == "drawn":
+                drawn = np.isfinite(bars)
+                sharp, blur = np.where(drawn, bars, sharp), np.where(drawn, unsure, blur)
             around = replace(around, z_m=sharp, sigma_m=np.hypot(np.hypot(around.sigma_m, blur), steps))
         if reach > 0:
             fill_gaps(around, reach)
