@@ -211,17 +211,10 @@ def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) ->
 
 @kernel()
 def _supported(
-    tile: Float32,
-    corner: Float64,
-    scene: tuple[Float32, Float32, float],
-    planes: Float64,
-    eyes: Float64,
-    blocks: tuple[Int8, Bool, Float64, Bool],
-    cell_m: float,
-    min_views: float,
-    one_point_m: float,
+    tile: Float32, corner: Float64, scene: tuple[Float32, Float32, float], planes: Float64, eyes: Float64,
+    blocks: tuple[Int8, Bool, Float64, Bool], cell_m: float, min_views: float, one_point_m: float,
     asked: tuple[int, Float32],
-) -> tuple[Float32, Float32]:
+) -> tuple[Float32, Float32]:  # fmt: skip
     """Compute support, two arrays (rows, columns, SLOTS): the ratio of votes to those a height can expect, -1
     where fewer than min_views see or can see it or something may lie above; and how many it can expect.
 
@@ -256,9 +249,8 @@ def _supported(
                         continue
                     if within[a, b, k] == SOMEWHERE and not is_pictured(x, y, z, planes, k):
                         continue
-                    if min(z - clear[a, b, k, 0], z - clear[a, b, k, 1]) < 0 and not _is_seen(
-                        point, i, j, eyes, k, clear, scene, cell_m
-                    ):
+                    near = z < max(clear[a, b, k, 0], clear[a, b, k, 1])
+                    if near and not _is_seen(point, i, j, eyes, k, clear, scene, cell_m):
                         continue
                     able += 1
                     way = eyes[k, 0, 0] - x, eyes[k, 0, 1] - y, eyes[k, 0, 2] - z
