@@ -36,9 +36,9 @@ class MapSettings:
     """Matching's window lowers crests and lifts valleys across the bars as a blur of so many pixels (sigma)
     does: heights averaged along a bar are moved back by as much, and sigma grows with it; 0 leaves both."""
     thin_bars: Literal["sigma", "drawn"] = "sigma"
-    """What the orthophoto's stripes are used for, where bars are too thin for heights to show them: `sigma`
-    adds what is hidden to the heights' sigma, `drawn` draws round bars over them: nearer in the median on
-    stacks of thin bars, further off on piles of irregular ones, whose bundles are then found less well."""
+    """Use of the orthophoto's stripes, where bars are too thin for heights to show them: `sigma` adds what is
+    hidden to the heights' sigma, `drawn` draws round bars over them: nearer in the median on stacks of thin
+    bars, further off on piles of irregular ones, whose bundles are then found less well."""
     fill_m: float = 0.03
     """Unknown cells no further than this from seen ones on opposite sides are filled, and flagged so."""
     max_sigma_m: float = 0.5

@@ -36,10 +36,10 @@ class _Profiles(NamedTuple):
 
 
 def draw_bars(
-    z: Float32, direction: Int8, stripes: Stripes, pixel_cells: Float32, cell_m: float
+    z: Float32, direction: Int8, stripes: Stripes, pixel_cells: Float32, cell_m: float, draws: bool = True
 ) -> tuple[Float32, Float32, Float32]:
-    """Draw bars over the heights z (H, W): the bars' heights and their sigma, NaN where none is drawn, and
-    the sigma of what the heights z can't show where stripes are seen, else 0.
+    """Draw bars over the heights z (H, W), if it draws: the bars' heights and their sigma, NaN where none is
+    drawn, and the sigma of what the heights z can't show where stripes are seen, else 0.
 
     direction: (H, W), of `smooth_along_bars`. pixel_cells: (H, W) width of a pixel. A row of bars is a line
     through the heights a pitch to either side (or one and two pitches to one side); the bars touch and are
@@ -50,7 +50,7 @@ def draw_bars(
     """
     drawn = np.full(z.shape, np.nan, np.float32)
     sigma, hidden = drawn.copy(), np.zeros(z.shape, np.float32)
-    _draw(z, direction, stripes, pixel_cells, cell_m, _profiles(), drawn, sigma, hidden)
+    _draw(z, direction, stripes, pixel_cells, cell_m, draws, _profiles(), drawn, sigma, hidden)
     return drawn, sigma, hidden
 
 
@@ -81,8 +81,8 @@ def _profiles() -> _Profiles:
 
 @kernel()
 def _draw(
-    z: Float32, direction: Int8, stripes: Stripes, pixel_cells: Float32, cell_m: float, profiles: _Profiles,
-    drawn: Float32, sigma: Float32, hidden: Float32,
+    z: Float32, direction: Int8, stripes: Stripes, pixel_cells: Float32, cell_m: float, draws: bool,
+    profiles: _Profiles, drawn: Float32, sigma: Float32, hidden: Float32,
 ) -> None:  # fmt: skip
     """Draw bars, see `draw_bars`. z, pixel_cells: (H, W), NaN where there is none; direction: (H, W), -1
     where there is none. Fills drawn, sigma and hidden (H, W).
@@ -108,7 +108,11 @@ def _draw(
             rise_m, off_m = _line(z, i, j, ways, pitch, _UNSEEN_RATIO * pitch * cell_m)
             if off_m > 0:
                 hidden[i, j] = np.hypot(hidden[i, j], (1 - shown) * off_m / 2)
-            if pitch > _WIDEST_PX * pixel_cells[i, j] or not off_m <= _LINE_RATIO * pitch * cell_m:
+            if (
+                not draws
+                or pitch > _WIDEST_PX * pixel_cells[i, j]
+                or not off_m <= _LINE_RATIO * pitch * cell_m
+            ):
                 continue
             slope = round(rise_m / (pitch * cell_m) / _SLOPE_STEP) + _SLOPES // 2
             slope = min(max(slope, 0), _SLOPES - 1)

@@ -206,11 +206,11 @@ class SurfaceElection:
             steps = step_sigma(sharp, pixel_cells)
             bar = vote_directions(direction)
             stripes = find_stripes(z, around.intensity, bar, cell_m)
-            bars, unsure, hidden = draw_bars(z, bar, stripes, pixel_m / np.float32(cell_m), cell_m)
-            blur = np.maximum(blur, hidden)
-            if settings.thin_bars == "drawn":
-                drawn = np.isfinite(bars)
-                sharp, blur = np.where(drawn, bars, sharp), np.where(drawn, unsure, blur)
+            draws, pixel = settings.thin_bars == "drawn", pixel_m / np.float32(cell_m)
+            bars, unsure, hidden = draw_bars(z, bar, stripes, pixel, cell_m, draws)
+            drawn = np.isfinite(bars)
+            sharp = np.where(drawn, bars, sharp)
+            blur = np.where(drawn, unsure, np.maximum(blur, hidden))
             around = replace(around, z_m=sharp, sigma_m=np.hypot(np.hypot(around.sigma_m, blur), steps))
         if reach > 0:
             fill_gaps(around, reach)

@@ -51,7 +51,7 @@ _RIVAL_RATIO = 0.8
 _SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
 """How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
 _LOWER_M = 0.005
-"""How far under its true height a single bar's top may be measured."""
+"""Largest error, downwards, of a single bar's measured top."""
 _RESOLVED_CELLS = 4.0
 _SLIVER_RATIO = 0.03
 _CROSSING_STEP_M = 0.4

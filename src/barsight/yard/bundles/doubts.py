@@ -17,7 +17,7 @@ from barsight.yard.thin_lines import KNOWN_ACROSS
 _NARROW_M = 0.3
 """Longest place along a bundle over which a thing that lies across it counts as narrow."""
 _LIES_M, _ONE_PLACE_M = 0.02, 0.3
-"""What lies across a bundle rises so far over it; runs of rows nearer to each other than the second are one
+"""Least rise over a bundle of a thing that lies across it; largest gap between runs of rows that are one
 thing. Dunnage comes in twos and more."""
 _SURE_KNOWN = 0.7
 """Share of a bundle's length that must have been measured."""

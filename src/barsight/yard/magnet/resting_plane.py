@@ -28,7 +28,7 @@ NEAR_LINE_M = 0.02
 """A height further than this from its line along the bars has less say in the load's slope, from twice this
 on none."""
 ASKEW, BENT_PER_M = 0.005, 0.002
-"""How far a load's axis may turn from the beam (rad), and bend sideways (m over its middle, a metre along
+"""Turn of a load's axis from the beam (rad), and its bend sideways (m over its middle, a metre along
 squared), one sigma each: its section lies elsewhere under each pole."""
 COLUMNS = 8
 U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)

@@ -21,13 +21,13 @@ _LEDGE_SLOPE = 0.5
 _HIDDEN_CELLS = 12
 """Largest number of places out of sight in a flank before the surface is seen to have fallen away."""
 _STEP_M, _DEEP_CELLS = 0.05, 2
-"""What follows deep below by steps under this is the bundle's lowest bars; over so many places that are seen
-deep below nothing hangs."""
+"""Least step that parts the bundle's lowest bars from another thing deep below; least number of places seen
+deep below that rule out an overhang."""
 _NEAR_M, _FAR_M = 0.08, 0.25
-"""Where another bundle's straps begin this near, the lowest place between parts both; up to the further
-distance a single gully does."""
+"""Distances to another bundle's straps up to which the lowest place between parts both, and a single gully
+does."""
 _HIDDEN_DEPTH_M, _TWIN_M = 0.03, 0.012
-"""How much deeper places out of sight count, and how far the surface must rise between two gullies."""
+"""Depth added to places out of sight; least rise of the surface between two gullies."""
 _STEEP_RATIO = 0.3
 """Of the width: a flank that is seen to fall so far before it is out of sight hides little of the bundle."""
 _DENT_M, _RIM_CELLS = 0.006, 8
