@@ -16,6 +16,7 @@ from barsight.yard.bundles.fitting.outline import bundle_width
 from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.headings import find_headings
+from barsight.yard.bundles.layers import list_overlaps
 from barsight.yard.bundles.section.flanks import Flanks
 from barsight.yard.bundles.section.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
 from barsight.yard.types import Bundle, HeightMap
@@ -55,7 +56,7 @@ def test_two_touching_neighbours_and_one_apart_are_three_bundles() -> None:
     assert len(bundles) == 3
     for one in laid:
         expect(nearest(bundles, one), one)
-    assert [b.on_top for b in bundles] == [True] * 3
+    assert [b.is_free for b in bundles] == [True] * 3
     assert [b.layer for b in bundles] == [0] * 3
     assert bundles[0].neighbours == (1,) and bundles[1].neighbours == (0,) and bundles[2].neighbours == ()
     assert not any(any(b.ends_open) for b in bundles)
@@ -198,6 +199,31 @@ def test_a_beam_over_bundles_is_no_bundle() -> None:
         bundles = find_bundles(heights, SETTINGS)
         assert len(bundles) == 4 and all(b.on_top is on_top for b in bundles)
         assert all(any(said in reason for reason in b.reasons) for b in bundles)
+        assert not any(b.is_free for b in bundles)
+
+
+@pytest.mark.parametrize(
+    ("from_axis_m", "rise_m", "width_m", "is_free"),
+    [(0.06, 0.14, 0.1, False), (0.06, 0.14, 0.02, True), (0.06, 0.01, 0.1, True), (0.15, 0.14, 0.1, True)],
+)
+def test_a_beams_end_on_a_flank_holds_the_bundle_down(
+    from_axis_m: float, rise_m: float, width_m: float, *, is_free: bool
+) -> None:
+    """Not what is narrower than 40 mm, as straps are, or ends beside the bundle, 0.27 m wide."""
+    heights = draw([Laid(0.0, 0.0, 0.2, 0.0)])
+    rows, columns = heights.z_m.shape
+    x = heights.x0_m + heights.cell_m * np.arange(columns)
+    y = heights.y0_m + heights.cell_m * np.arange(rows)
+    heights.z_m[(np.abs(y - 0.6) < width_m / 2)[:, None] & (x > from_axis_m)[None]] += rise_m
+    (bundle,) = [b for b in find_bundles(heights, SETTINGS) if abs(b.centre_m[0]) < 0.05]
+    assert bundle.is_free is is_free
+
+
+def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:
+    (one,) = find_bundles(draw([Laid(0.0, 0.0, 0.2, 0.0)]), SETTINGS)
+    for away_m, is_free in ((one.width_m - 0.03, False), (one.width_m - 0.005, True)):
+        other = replace(one, id=1, centre_m=one.centre_m + np.array([away_m, 0.0, -0.05]))
+        assert (not list_overlaps(one, [one, other])) is is_free
 
 
 def test_what_has_no_flanks_is_no_bundle() -> None:
@@ -218,6 +244,9 @@ def test_a_neighbour_that_may_lie_over_a_flank_leaves_open_what_lies_on_it() -> 
     """A map shows 0.1 m of a free flank of 0.25 m; what rolled over it hides most of that."""
     for fall, rise, is_seen in ((0.1, 0.1, True), (0.03, 0.1, False), (0.04, 0.4, True), (0.01, -0.1, False)):
         assert (not Flanks(0.25, (0.1, fall), (-np.inf, rise), False).doubt) is is_seen, (fall, rise)
+    for fall, is_sure in ((0.07, False), (0.08, True)):
+        flanks = Flanks(0.25, (0.1, fall), (-np.inf, 0.1), False)
+        assert not flanks.doubt and (not flanks.cover_doubt) is is_sure
 
 
 def test_two_readings_of_one_bundle_are_joined() -> None:

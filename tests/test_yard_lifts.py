@@ -131,6 +131,12 @@ def test_a_covered_bundle(on_top: bool | None) -> None:
     assert codes(judged([laid(0.3)], (record(laid(0.3), on_top=on_top),))) == {"covered"}
 
 
+def test_a_bundle_that_dunnage_may_hold_down() -> None:
+    lift = judged([laid(0.3)], (record(laid(0.3), cover_doubts=("a beam lies over it",)),))
+    assert codes(lift) == {"covered"}
+    assert "a beam lies over it" in lift.vetoes[0].reason
+
+
 def test_accident_two_a_footprint_over_two_bundles() -> None:
     stock = [laid(0.3), laid(0.58)]
     lift = judged(stock, place=Placement(0.44, 0.0, 0.0))

@@ -98,7 +98,7 @@ def bundle_shapes(bundles: tuple[Bundle, ...]) -> tuple[Shape, ...]:
     """Draw outline and axis of each bundle, in m; open ends dashed."""
     shapes = []
     for bundle in bundles:
-        colour = FREE_RGB if bundle.on_top else COVERED_RGB
+        colour = FREE_RGB if bundle.is_free else COVERED_RGB
         corners = rectangle(bundle.centre_m[:2], bundle.yaw_rad, bundle.width_m, bundle.length_m)
         low, high = bundle.ends_m[:, :2].tolist()
         for a, b, dashed in (

@@ -24,7 +24,7 @@ def yard_lines(out_dir: Path) -> dict[str, Float32]:
     lines: dict[str, list[Float64]] = {"free": [], "covered": [], "axes": [], "poles": []}
     if (out_dir / "bundles.json").is_file():
         for bundle in read_bundles(out_dir / "bundles.json"):
-            lines["free" if bundle.on_top else "covered"].append(bundle_box(bundle))
+            lines["free" if bundle.is_free else "covered"].append(bundle_box(bundle))
             lines["axes"].append(bundle.ends_m[None])
     if (out_dir / "lifts.json").is_file():
         lifts = read_lifts(out_dir / "lifts.json")

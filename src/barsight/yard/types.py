@@ -148,7 +148,8 @@ class Bundle:
     NaN where open. top_z_m: the highest line at mid-length.
     visible_bars: bars seen from above. bars: bars in the bundle by its outline, None where that isn't
     certain; section_m2: steel's section by what was seen, NaN where that isn't known either.
-    layer: 0 lies on the floor or on dunnage. on_top: nothing lies on it; None where that can't be seen.
+    layer: 0 lies on the floor or on dunnage. on_top: no other bundle or bar lies on it; None where that can't
+    be seen. cover_doubts: sentences on what may hold it down all the same, as dunnage or a neighbour's flank.
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
     confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
     """
@@ -175,6 +176,12 @@ class Bundle:
     bar_axes: tuple[Bar, ...] = ()
     ends_sigma_m: tuple[float, float] = (float("nan"), float("nan"))
     section_m2: float = float("nan")
+    cover_doubts: tuple[str, ...] = ()
+
+    @property
+    def is_free(self) -> bool:
+        """Check that nothing at all lies on it, for sure."""
+        return self.on_top is True and not self.cover_doubts
 
     @property
     def direction(self) -> Float64:

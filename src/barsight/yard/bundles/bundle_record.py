@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.yard.bundles.doubts import count_bars, list_doubts, rate_confidence
+from barsight.yard.bundles.doubts import count_bars, list_cover_doubts, list_doubts, rate_confidence
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
 from barsight.yard.bundles.fitting.ends import End, find_end
 from barsight.yard.bundles.fitting.outline import LOOSENESS, make_outline
@@ -24,7 +24,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.irregular import widen_sigma
-from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours
+from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours, list_overlaps
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
@@ -47,6 +47,7 @@ def describe_bundles(
                 out[bundle.id] = replace(
                     bundle, layer=layer, on_top=on_top, neighbours=list_neighbours(bundle, near),
                     reasons=bundle.reasons + why,
+                    cover_doubts=bundle.cover_doubts + list_overlaps(bundle, near),
                 )  # fmt: skip
     return tuple(out)
 
@@ -99,6 +100,7 @@ def make_bundle(
         bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
         section_m2=section,
+        cover_doubts=list_cover_doubts(reading, reasons),
     )
     doubtful = reading.other_packing is not None
     irregular = widen_sigma(bundle.sigma, reading.found, seen, bundle.length_m, is_one_of_two=doubtful)

@@ -79,4 +79,5 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         ends_sigma_m=(sigmas[0], sigmas[1]), length_m=float(np.linalg.norm(ends[1] - ends[0])), sigma=sigma,
         bars=whole.bars if whole.bars == piece.bars else None,
         confidence=min(whole.confidence, piece.confidence), reasons=kept + doubts,
+        cover_doubts=tuple(dict.fromkeys(whole.cover_doubts + piece.cover_doubts)),
     )  # fmt: skip

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from barsight.core.arrays import Bool, UInt8
 from barsight.yard.bundles.crossing_bundles import rise_over
 from barsight.yard.bundles.fitting.ends import End
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, LOOSENESS
-from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, U
+from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import SeenSection, is_no_hexagon
@@ -19,6 +20,10 @@ _NARROW_M = 0.3
 _LIES_M, _ONE_PLACE_M = 0.02, 0.3
 """Least rise over a bundle of a thing that lies across it; largest gap between runs of rows that are one
 thing. Dunnage comes in twos and more."""
+_LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
+"""Least rise of a thing that lies over a part of a bundle's width, and its size along and across."""
+_BEFORE_END_M = 0.05
+"""Rows nearer to an end tell nothing of that: bars end unevenly."""
 _SURE_KNOWN = 0.7
 """Share of a bundle's length that must have been measured."""
 
@@ -86,6 +91,47 @@ def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSetti
         places += (first - last) * sheet.cell_m > _ONE_PLACE_M
         last = end
     return places if highest > _LIES_M else 0
+
+
+def list_cover_doubts(reading: Reading, reasons: tuple[str, ...]) -> tuple[str, ...]:
+    """List what may hold the bundle down though no other bundle is known to lie on it."""
+    out = [reason for reason in reasons if KNOWN_ACROSS in reason]
+    laid = measure_laid(reading)
+    if laid > 0:
+        out.append(f"something {1e3 * laid:.0f} mm high lies over a part of its width")
+    if reading.flanks is not None and reading.flanks.cover_doubt:
+        out.append(reading.flanks.cover_doubt)
+    return tuple(out)
+
+
+def measure_laid(reading: Reading) -> float:
+    """Measure how high the highest thing rises that lies over a part of a bundle's width, as a beam's end
+    does; 0 where nothing does.
+
+    Heights are taken over the bundle's own section, the median along it at each place across. A thing is a
+    patch that everywhere holds a square of _LAID_SIZE_M and rises by _LAID_M.
+    """
+    sheet, fit, pack = reading.found.sheet, reading.found.fit, reading.pack
+    low, high = -fit.width_m / 2, fit.width_m / 2
+    if pack is not None and pack.is_bounded:
+        low, high = pack.low_m, pack.high_m
+    rim = round(_BEFORE_END_M / sheet.cell_m)
+    rows = np.arange(fit.first + rim, fit.last + 1 - rim)
+    along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+    beside = np.arange(low, high + sheet.cell_m / 2, sheet.cell_m)
+    column = np.rint(
+        (fit.values[U] + fit.values[SLOPE_U] * along[:, None] + beside - sheet.u0_m) / sheet.cell_m
+    )
+    inside = (column >= 0) & (column < sheet.z_m.shape[1])
+    z = sheet.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
+    z = np.where(inside, z - fit.values[SLOPE_Z] * along[:, None], np.nan)
+    known = np.isfinite(z)
+    ordered = np.sort(z, axis=0)
+    typical = np.take_along_axis(ordered, np.maximum(known.sum(axis=0) - 1, 0)[None] // 2, axis=0)
+    rise = np.where(known, z - typical, -np.inf)
+    size = [max(round(side / sheet.cell_m), 1) for side in _LAID_SIZE_M]
+    laid = ndimage.binary_opening(rise > _LAID_M, np.ones(size, bool))
+    return float(rise[laid].max(initial=0.0))
 
 
 def rate_confidence(reading: Reading, rows: UInt8) -> float:

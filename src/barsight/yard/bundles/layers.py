@@ -16,6 +16,8 @@ _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
 _DOUBTS = "covers a part", "something higher", "lies across it", "may lie over"
 """In reasons that leave open whether something lies on a bundle."""
+_MEET_M, _MEET_LENGTH_M = 0.02, 0.3
+"""Two outlines that overlap by more, over this length, are not both right: one may lie over the other."""
 
 
 def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
@@ -65,6 +67,20 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
     if upper.centre_m[2] - lower.centre_m[2] < _HIGHER_RATIO * (upper.width_m + lower.width_m) / 2:
         return False
     return _common_length(lower, upper, -0.2 * lower.width_m) > _OVERLAP_M
+
+
+def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[str, ...]:
+    """List other bundles whose outlines overlap this one's, not all below it: one may lie over the other."""
+    ids = [str(other.id) for other in bundles if other.id != bundle.id and _overlaps(other, bundle)]
+    return (
+        (f"its outline and that of bundle {', '.join(ids)} overlap: one may lie over the other",)
+        if ids
+        else ()
+    )
+
+
+def _overlaps(other: Bundle, bundle: Bundle) -> bool:
+    return other.top_z_m > _bottom(bundle) and _common_length(bundle, other, -_MEET_M) > _MEET_LENGTH_M
 
 
 def list_neighbours(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:

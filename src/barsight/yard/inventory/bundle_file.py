@@ -82,6 +82,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "mass_kg": mass.kg,
         "layer": bundle.layer,
         "on_top": bundle.on_top,
+        "cover_doubts": list(bundle.cover_doubts),
         "neighbours": list(bundle.neighbours),
         "sigma": {
             "lateral_m": sigma.lateral_m,
@@ -134,6 +135,7 @@ def _bundle(record: dict[str, Any]) -> Bundle:
         bars=record["bars"] or None,
         layer=record["layer"],
         on_top=record["on_top"],
+        cover_doubts=tuple(record["cover_doubts"]),
         neighbours=tuple(record["neighbours"]),
         sigma=BundleSigma(yaw_rad=yaw_rad, **figures),
         known_share=record["known_share"],

@@ -182,11 +182,15 @@ def load_checks(
 
 
 def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
-    what = "something lies on" if bundle.on_top is False else "it isn't known what lies on"
+    covered = bundle.on_top is False
+    what = f"{'something lies' if covered else 'it is not known what lies'} on bundle {bundle.id}"
+    if bundle.on_top and bundle.cover_doubts:
+        what += f": {bundle.cover_doubts[0]}"
     ends = " and ".join(e for e, o in zip(("low-y", "high-y"), bundle.ends_open, strict=True) if o)
     return [
         check_true(
-            "covered", f"nothing lies on bundle {bundle.id}", bundle.on_top, f"{what} bundle {bundle.id}"
+            "covered", f"nothing lies on bundle {bundle.id}",
+            True if bundle.is_free else False if covered else None, what,
         ),
         check_min(
             "bundle-doubtful", f"how sure bundle {bundle.id} is", bundle.confidence, settings.min_confidence,

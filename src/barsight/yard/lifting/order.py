@@ -120,7 +120,7 @@ def _sequence(
             continue
         needed.add(one)
         open_ += blockers[one]
-        unexplained = by_id[one].on_top is not True and not blockers[one]
+        unexplained = not by_id[one].is_free and not blockers[one]
         if unexplained:
             return Failed("covered", f"what lies on bundle {one} is not known")
     queue = list[Bundle]()

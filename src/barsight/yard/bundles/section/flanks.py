@@ -16,9 +16,10 @@ _FLANK_RATIOS = 0.3, 0.5, 0.55
 """Of the width, from its middle: where a bundle falls off, its edge, and how far a map may grow over that."""
 _BEYOND_M = 0.15
 """Largest distance from its edge of a neighbour that may lie over it."""
-_FLAT_RATIO, _SHALLOW_RATIO, _HIGHER_M = 0.1, 0.18, 0.03
+_FLAT_RATIO, _SHALLOW_RATIO, _SURE_RATIO, _HIGHER_M = 0.1, 0.18, 0.3, 0.03
 """Of the width: a flank that falls less is not seen; nor is one that falls less than the second beside what
-stands higher by so much. What stands higher by the whole width is a stack on feet of its own."""
+stands higher by so much, and below the third that isn't sure. What stands higher by the whole width is a
+stack on feet of its own."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,20 @@ class Flanks:
     @property
     def doubt(self) -> str:
         """Say that something may lie over a flank; empty where both are seen."""
+        return self._doubt(_SHALLOW_RATIO)
+
+    @property
+    def cover_doubt(self) -> str:
+        """Say the same of a flank that isn't seen for sure."""
+        return self._doubt(_SURE_RATIO)
+
+    def _doubt(self, shallow_ratio: float) -> str:
         for name, fall, rise, ended in zip(
             ("low", "high"), self.falls_m, self.rises_m, self.ended, strict=True
         ):
             if fall < _FLAT_RATIO * self.width_m and not (ended and rise <= _HIGHER_M):
                 return f"its {name} flank was not seen: something may lie over it"
-            if fall < _SHALLOW_RATIO * self.width_m and _HIGHER_M < rise < self.width_m:
+            if fall < shallow_ratio * self.width_m and _HIGHER_M < rise < self.width_m:
                 return f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"
         return ""
 
