@@ -173,25 +173,32 @@ def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, .
 
 
 def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift:
-    """Choose the placement with the fewest vetoes, then the safest."""
+    """Choose the placement with the fewest vetoes, then the safest; the middle where the load forbids all."""
 
     def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
         places = (_place(group, along, across) for along, across in offsets)
-        found = [assess_placement(place, yard, magnet, settings, search=False) for place in places]
-        return sorted(found, key=_worst_first)
+        return [assess_placement(place, yard, magnet, settings, search=False) for place in places]
 
     limit = magnet.limits.offset_across_m
-    quick = tried((0.0, across) for across in ACROSS_M if abs(across) < limit)
+    quick = tried([(0.0, 0.0)])
+    if set(quick[0].bundles) == {bundle.id for bundle in group} and _forbidden_anywhere(quick):
+        return quick[0]
+    quick += tried((0.0, across) for across in ACROSS_M if 0 < abs(across) < limit)
+    quick.sort(key=_worst_first)
     sound = _sound(quick, yard, magnet, settings)
-    wherever = ANYWHERE.intersection(*({veto.code for veto in lift.vetoes} for lift in quick))
-    if wherever or (sound is not None and not sound.vetoes):
+    if _forbidden_anywhere(quick) or (sound is not None and not sound.vetoes):
         return sound or quick[0]
     middle = _offset_across(group, quick[0].place)
     between = [across for across in BETWEEN_M if sound is not None and abs(across) < limit]
     beside = [(along, across) for along in ALONG_M for across in dict.fromkeys((0.0, middle))]
-    more = tried([*((0.0, across) for across in between), *beside])
+    more = sorted(tried([*((0.0, across) for across in between), *beside]), key=_worst_first)
     found = [one for one in (sound, _sound(more, yard, magnet, settings)) if one is not None]
     return min(found or [*quick, *more], key=_worst_first)
+
+
+def _forbidden_anywhere(lifts: list[Lift]) -> bool:
+    """Check whether all are vetoed for the load itself, and for the same reason."""
+    return bool(ANYWHERE.intersection(*({veto.code for veto in lift.vetoes} for lift in lifts)))
 
 
 def _sound(quick: list[Lift], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift | None:
