@@ -120,6 +120,14 @@ def test_steel_of_no_known_bundle() -> None:
     assert "unexplained-surface" in found
 
 
+@pytest.mark.parametrize(("beside_m", "is_taken"), [(0.05, True), (0.09, True), (0.15, False)])
+def test_a_thin_bar_beside_a_thick_one_is_in_no_bundle(beside_m: float, *, is_taken: bool) -> None:
+    """A bar of 60 mm on the floor, another of 32 mm beside it: within the faces' reach of 40 mm."""
+    bar = laid(0.3, 0.03, diameter_m=0.06, bars=1)
+    thin = laid(0.3 + beside_m, 0.016, diameter_m=0.032, bars=1)
+    assert ("unexplained-surface" in codes(judged([bar, thin], (record(bar),)))) is is_taken
+
+
 def test_a_doubtful_bundle() -> None:
     lift = judged([laid(0.3)], (record(laid(0.3), confidence=0.3, reasons=("it may be two",)),))
     assert codes(lift) == {"bundle-doubtful"}

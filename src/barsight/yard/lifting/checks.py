@@ -18,7 +18,7 @@ from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 from barsight.yard.weight import Mass
 
-MARGIN_M = 0.02
+MARGIN_M = 0.015
 """How far beyond its stated outline a bundle may show."""
 STEP_M = 0.02
 EDGE_M = 0.01
@@ -55,7 +55,7 @@ def count_checks(
     elif near.bundles:
         why = f": bundle {near.bundles[int(np.argmax(held.flips))].id} may be in or out"
         checks.append(probability_check(held.probability, count, settings, why))
-    shares = _unexplained(place, heights, magnet, near, contact)
+    shares = _unexplained(place, heights, magnet, near, contact, held)
     checks.append(
         check_max(
             "unexplained-surface", "part within the poles' reach that belongs to no known bundle", shares[0],
@@ -234,24 +234,28 @@ def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
 
 
 def _unexplained(
-    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact
+    place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, held: Grip
 ) -> tuple[float, float]:
     """Compute the fraction of the places under the poles, within reach, that lie outside all bundles'
-    outlines, made wider by three sigmas and by two.
+    outlines, made wider by two sigmas and by one.
+
+    What lies in the wider margin of the load may be another's: as far beyond, the surface is looked at too.
     """
     across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
     outlines = np.empty((len(near.bundles), 8))
     rectangles = near.rectangles
     outlines[:, :2], outlines[:, 2:4] = rectangles.centre, rectangles.along
     open_m = rectangles.open_ends.any(axis=1) * BEYOND_OPEN_END_M
-    for first, sigmas in ((4, 3.0), (6, 2.0)):
+    spread = np.hypot(rectangles.sigma[:, 0], rectangles.sigma[:, 3])
+    margin = MARGIN_M + 2.0 * float(spread[list(held.gripped)].max(initial=0.0))
+    for first, sigmas in ((4, 2.0), (6, 1.0)):
         wider = MARGIN_M + sigmas * np.hypot(rectangles.sigma[:, :2], rectangles.sigma[:, 3:])
         outlines[:, first : first + 2] = rectangles.half + wider
         outlines[:, first + 1] += open_m
     return _stray_shares(
         heights.z_m, heights.source, np.array([heights.x0_m, heights.y0_m, heights.cell_m]),
         np.array([(place.x_m, place.y_m), place.along, place.across]),
-        _face_grid(magnet, math.ceil(1e3 * float(across))), contact.z_m - magnet.reach_m, outlines,
+        _face_grid(magnet, math.ceil(1e3 * (float(across) + margin))), contact.z_m - magnet.reach_m, outlines,
     )  # fmt: skip
 
 
