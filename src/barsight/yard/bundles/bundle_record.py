@@ -103,7 +103,10 @@ def make_bundle(
         cover_doubts=list_cover_doubts(reading, reasons),
     )
     doubtful = reading.other_packing is not None
-    irregular = widen_sigma(bundle.sigma, reading.found, seen, bundle.length_m, is_one_of_two=doubtful)
+    width_m = None if seen is None else seen.width_m
+    if reading.pack is not None and reading.pack.is_bounded:
+        width_m = reading.pack.width_m
+    irregular = widen_sigma(bundle.sigma, reading.found, width_m, bundle.length_m, is_one_of_two=doubtful)
     if reading.pack is not None:
         return held_by_straps(bundle, irregular, reading, reading.pack, floor_m)
     return bundle if bars is not None else replace(bundle, sigma=irregular)

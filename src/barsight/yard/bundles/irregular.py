@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, FittedOutline
-from barsight.yard.bundles.section.seen_section import SeenSection
 from barsight.yard.types import BundleSigma
 
 _WIDTH_RATIOS, _WIDTH_SIGMAS = (0.03, 0.12), (1.5, 2.0)
@@ -21,15 +20,21 @@ fits as well."""
 
 
 def widen_sigma(
-    sigma: BundleSigma, one: FittedOutline, seen: SeenSection | None, length_m: float, *, is_one_of_two: bool
+    sigma: BundleSigma,
+    one: FittedOutline,
+    seen_width_m: float | None,
+    length_m: float,
+    *,
+    is_one_of_two: bool,
 ) -> BundleSigma:
-    """Add what a hexagon fitted to another outline leaves open. is_one_of_two: another packing fits as well.
+    """Add what a hexagon fitted to another outline leaves open. seen_width_m: of what is seen, by its straps
+    where they bound it. is_one_of_two: another packing fits as well.
 
     Where one edge is off, the middle is off by half as much.
     """
     fit, shown = one.fit, one.shades is not None
     ratio, sigmas = (parts[0 if shown else 1] for parts in (_WIDTH_RATIOS, _WIDTH_SIGMAS))
-    section = 0.0 if seen is None else _SECTION_RATIO * abs(seen.width_m - fit.width_m)
+    section = 0.0 if seen_width_m is None else _SECTION_RATIO * abs(seen_width_m - fit.width_m)
     wide = float(np.linalg.norm([ratio * fit.width_m, sigmas * fit.sigma_m, section]))
     turned = 0.0 if shown else _YAW_SIGMAS * fit.sigma_m / max(length_m, fit.width_m)
     diameter = _DIAMETER_RATIO * float(fit.values[DIAMETER]) if is_one_of_two else 0.0
