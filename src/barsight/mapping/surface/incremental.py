@@ -197,7 +197,7 @@ class SurfaceElection:
                 paste(read_tile(self._elected, neighbour), neighbour, around, column, row)
         blur = np.zeros((side, side), np.float32)
         if along > 0:
-            weight = np.nan_to_num(around.sigma_m**-2)
+            weight = np.nan_to_num(1 / (around.sigma_m * around.sigma_m))
             z, direction = smooth_along_bars(around.z_m, weight, settings.min_gate_m, along)
             pixel_m = sights.pixel_m(z, self._height_m)
             sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
@@ -211,7 +211,7 @@ class SurfaceElection:
             drawn = np.isfinite(bars)
             sharp = np.where(drawn, bars, sharp)
             blur = np.where(drawn, unsure, np.maximum(blur, hidden))
-            around = replace(around, z_m=sharp, sigma_m=np.hypot(np.hypot(around.sigma_m, blur), steps))
+            around = replace(around, z_m=sharp, sigma_m=np.sqrt(around.sigma_m**2 + blur**2 + steps**2))
         if reach > 0:
             fill_gaps(around, reach)
         inner = slice(_HALO, _HALO + TILE_CELLS)
