@@ -197,7 +197,7 @@ class SurfaceElection:
                 paste(read_tile(self._elected, neighbour), neighbour, around, column, row)
         blur = np.zeros((side, side), np.float32)
         if along > 0:
-            weight = np.nan_to_num(1 / (around.sigma_m * around.sigma_m))
+            weight: Float32 = np.nan_to_num(1 / (around.sigma_m * around.sigma_m))
             z, direction = smooth_along_bars(around.z_m, weight, settings.min_gate_m, along)
             pixel_m = sights.pixel_m(z, self._height_m)
             sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
