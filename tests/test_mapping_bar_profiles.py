@@ -128,3 +128,35 @@ def test_directions_are_voted() -> None:
         near = direction[max(i - 4, 0) : i + 5, max(j - 4, 0) : j + 5]
         assert voted[i, j] == np.argmax(np.bincount(near[near >= 0], minlength=16))
     assert (voted[5:-5, 5:25] == 3).all()
+
+
+def test_a_node_has_the_same_stripes_whatever_its_neighbours_read() -> None:
+    """Neighbours share the means along a bar, each in its own direction; one node alone reads them anew."""
+    rng = np.random.default_rng(9)
+    _, z, gray = row_of_bars(0.042, 0.0)
+    gray[rng.random(gray.shape) < 0.1] = np.nan
+    z[rng.random(z.shape) < 0.02] += np.float32(0.1)
+    direction = rng.choice([0, 8, 9], z.shape).astype(np.int8)
+    both = find_stripes(z, gray, direction, CELL_M)
+    assert 0.1 < (both.pitch > 0).mean() < 0.9
+    for row, column in rng.integers(4, 46, (30, 2)):
+        alone = np.full_like(direction, -1)
+        alone[2 * row, 2 * column] = direction[2 * row, 2 * column]
+        stripes = find_stripes(z, gray, alone, CELL_M)
+        assert stripes.pitch[row, column] == both.pitch[row, column]
+        assert stripes.crest[row, column] == both.crest[row, column]
+
+
+def test_means_along_a_bar_end_at_steps_and_count_what_is_known() -> None:
+    z, gray = np.zeros((20, 20), np.float32), np.arange(400, dtype=np.float32).reshape(20, 20) + 1
+    z[10, 14:] = 1
+    gray[10, 6] = np.nan
+    window = picture_stripes._window()
+    mean, share = picture_stripes._mean_along(z, gray, 10, 9, 0, 0.1, window)
+    places = [3, 4, 5, 7, 8, 9, 10, 11, 12, 13]
+    assert mean == pytest.approx(np.mean([201 + place for place in places]))
+    assert share == pytest.approx(10 / 13)
+    z[10, 9] = np.nan
+    mean, share = picture_stripes._mean_along(z, gray, 10, 9, 0, 0.1, window)
+    assert mean == 0
+    assert share == 0

@@ -88,8 +88,9 @@ def supported_span(heights: Float32, min_views: float) -> tuple[float, float]:
 
 @kernel()
 def _margins(middle: Float64, half: Float64, planes: Float64) -> tuple[Float64, Float64]:
-    """Bound the `frustum_margin` (K,) of a box's points, from below and from above. middle, half: (3,) m, its
-    middle and half its sides.
+    """Bound the margin (K,) of a box's points inside both pictures of each view, from below and from above.
+
+    middle, half: (3,) m, its middle and half its sides. planes: (6, 4, K), see `ViewFrusta.planes`.
     """
     least, most = np.full(planes.shape[2], np.inf), np.full(planes.shape[2], np.inf)
     for p in range(planes.shape[0]):

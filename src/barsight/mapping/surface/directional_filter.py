@@ -41,12 +41,12 @@ def vote_directions(direction: Int8) -> Int8:
     """Replace each direction (H, W) of `smooth_along_bars` by the most frequent one, the first of those that
     are alike, in 9 x 9 cells; -1 stays. On bars that the heights hardly show, noise turns single ones.
     """
-    most, voted = np.zeros(direction.shape, np.float32), direction.copy()
+    most = np.zeros(direction.shape, np.uint16)
     for number in range(_DIRECTIONS):
-        own = (direction == number).astype(np.float32)
+        own = (direction == number).view(np.uint8)
         votes = cv2.boxFilter(own, -1, (VOTE_CELLS,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        better = votes > most
-        voted[better], most[better] = number, votes[better]
+        np.maximum(most, votes * np.uint16(_DIRECTIONS) + np.uint16(_DIRECTIONS - 1 - number), out=most)
+    voted = (_DIRECTIONS - 1 - most % _DIRECTIONS).astype(np.int8)
     voted[direction < 0] = -1
     return voted
 
@@ -66,6 +66,7 @@ def _lengthways(
     out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)
     least, squares = np.empty(width, np.float32), np.empty(width, np.float32)
     gate, best = np.float32(gate_m), np.empty(width, np.int32)
+    flat, weights, ways = z.ravel(), weight.ravel(), rows * z.shape[1] + columns
     for i in range(height):
         out[i] = z[i + reach, reach : reach + width]
         known = np.flatnonzero(weight[i + reach, reach : reach + width] > 0)
@@ -86,15 +87,15 @@ def _lengthways(
                 least[j] = min(squares[j], least[j])
         for column in known:
             chosen[i, column] = best[column - known[0]]
-            to_row, to_column = rows[chosen[i, column]], columns[chosen[i, column]]
-            own_m = z[i + reach, column + reach]
+            middle = (i + reach) * z.shape[1] + reach + column
+            own_m = flat[middle]
             off, total = 0.0, 0.0
-            for k in range(rows.shape[1]):
-                a, b = i + reach + to_row[k], column + reach + to_column[k]
-                gap = z[a, b] - own_m
+            for k in range(ways.shape[1]):
+                at = middle + ways[chosen[i, column], k]
+                gap = flat[at] - own_m
                 if abs(gap) <= gate_m:
-                    off += weight[a, b] * gap
-                    total += weight[a, b]
+                    off += weights[at] * gap
+                    total += weights[at]
             out[i, column] = own_m + off / total
     return out, chosen
 
@@ -158,15 +159,19 @@ def step_sigma(z: Float32, pixel_cells: float) -> Float32:
     smaller way to the lowest and to the highest one within three. z: (H, W), NaN where there is none.
     pixel_cells: a pixel's width on the ground.
     """
-    low, high = np.where(np.isnan(z), _FAR_M, z), np.where(np.isnan(z), -_FAR_M, z)
+    unknown = np.isnan(z)
+    low, high = np.where(unknown, _FAR_M, z), np.where(unknown, -_FAR_M, z)
 
-    def ways(reach_px: float) -> tuple[Float32, Float32]:
+    def ways(reach_px: float) -> tuple[Float32, Float32, Bool]:
         around = np.ones((2 * max(round(reach_px * pixel_cells), 1) + 1,) * 2, np.uint8)
         down, up = z - cv2.erode(low, around), cv2.dilate(high, around) - z
-        return np.where(down + up > _STEP_M, down, 0), np.where(down + up > _STEP_M, up, 0)
+        return down, up, down + up > _STEP_M
 
-    ramp, rim = np.minimum(*ways(_RAMP_PX)), ways(_RIM_PX)[0]
-    return np.asarray(np.hypot(_RAMP_RATIO * ramp, _RIM_RATIO * rim), np.float32)
+    down, up, is_step = ways(_RAMP_PX)
+    ramp = np.where(is_step, np.minimum(down, up), 0)
+    down, _, is_step = ways(_RIM_PX)
+    rim = np.where(is_step, down, 0)
+    return np.asarray(np.sqrt((_RAMP_RATIO * ramp) ** 2 + (_RIM_RATIO * rim) ** 2), np.float32)
 
 
 def _across() -> Float64:

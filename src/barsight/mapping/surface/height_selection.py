@@ -227,7 +227,7 @@ def _supported(
     rows, columns = tile.shape[:2]
     share = np.full((rows, columns, SLOTS), -1, np.float32)
     expected = np.zeros((rows, columns, SLOTS), np.float32)
-    point, margin = np.empty(3), np.empty(eyes.shape[0])
+    point = np.empty(3)
     (around, _, ceiling), (within, dense, clear, is_open) = scene, blocks
     first_new, known = asked
     for i in range(rows):
@@ -244,7 +244,7 @@ def _supported(
                     able, votes, first = known[i, j, s, 1], known[i, j, s, 2], first_new
                 else:
                     known[i, j, s, 0] = z
-                for k in range(first, margin.size):
+                for k in range(first, eyes.shape[0]):
                     if within[a, b, k] == NOWHERE:
                         continue
                     if within[a, b, k] == SOMEWHERE and not is_pictured(x, y, z, planes, k):
@@ -259,7 +259,7 @@ def _supported(
                 if able < min_views:
                     continue
                 if not is_open[a, b] and may_be_occluded(
-                    point, i, j, around, ceiling, planes, margin, cell_m, min_views
+                    point, i, j, around, ceiling, planes, cell_m, min_views
                 ):
                     continue
                 share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
@@ -267,7 +267,7 @@ def _supported(
     return share, expected
 
 
-@kernel()
+@kernel(inline=True)
 def _is_seen(
     point: Float64, row: int, column: int, eyes: Float64, view: int, clear: Float64,
     scene: tuple[Float32, Float32, float], cell_m: float,
@@ -304,39 +304,46 @@ def _elected(
     """
     rows, columns = tile.shape[:2]
     winner = np.full((rows, columns), -1, np.int8)
+    heights = np.empty_like(share)
+    for i in range(rows):
+        for j in range(columns):
+            for s in range(SLOTS):
+                heights[i, j, s] = tile[i, j, s, Z] if share[i, j, s] >= 0 else np.float32(np.nan)
     for i in range(rows):
         for j in range(columns):
             best = -1
             for s in range(SLOTS):
-                z = float(tile[i, j, s, Z])
-                if share[i, j, s] < 0 or (best >= 0 and z <= tile[i, j, best, Z]):
+                z = float(heights[i, j, s])
+                if np.isnan(z) or (best >= 0 and z <= heights[i, j, best]):
                     continue
                 # Where views expect less than min_views points a cell, an empty neighbour says nothing.
                 needed = along_ratio if expected[i, j, s] < min_views else own_ratio
-                if share[i, j, s] >= needed or _share_along(tile, share, i, j, z, cell_m) >= along_ratio:
+                if share[i, j, s] >= needed or _share_along(heights, share, i, j, z, cell_m) >= along_ratio:
                     best = s
             winner[i, j] = best
     return winner
 
 
 @kernel()
-def _share_along(tile: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
+def _share_along(heights: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
     """Average the support of a height and its like within `_ALONG` cells (every third is read), along that of
     four directions in which most of the tile's cells have one: the bar's own, or the edge's.
 
-    tile: (rows, columns, SLOTS, FIELDS). share: (rows, columns, SLOTS) of `_supported`. z: the height, m.
+    heights, share: (rows, columns, SLOTS) of `_supported`, heights NaN where share is -1. z: the height, m.
     """
     most, result = -1, 0.0
     for direction in range(4):
         di, dj = (0, 1, 1, 1)[direction], (1, 0, 1, -1)[direction]
         alike, inside, total = 0, 0, 0.0
         for n in range(-_ALONG, _ALONG + 1, 3):
+            if alike + (_ALONG - n) // 3 + 1 <= most:
+                break
             i, j = row + n * di, column + n * dj
-            if i < 0 or j < 0 or i >= tile.shape[0] or j >= tile.shape[1]:
+            if i < 0 or j < 0 or i >= heights.shape[0] or j >= heights.shape[1]:
                 continue
             inside += 1
             for s in range(SLOTS):
-                if share[i, j, s] >= 0 and abs(tile[i, j, s, Z] - z) <= _ALIKE_CELLS * cell_m:
+                if abs(heights[i, j, s] - z) <= _ALIKE_CELLS * cell_m:
                     alike += 1
                     total += share[i, j, s]
                     break

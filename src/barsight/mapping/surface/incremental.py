@@ -29,7 +29,7 @@ from barsight.mapping.surface.directional_filter import (
     vote_directions,
 )
 from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
-from barsight.mapping.surface.picture_stripes import find_stripes
+from barsight.mapping.surface.picture_stripes import NODE_CELLS, find_stripes
 from barsight.mapping.surface.surface import (
     Layers,
     Surface,
@@ -197,26 +197,35 @@ class SurfaceElection:
                 paste(read_tile(self._elected, neighbour), neighbour, around, column, row)
         blur = np.zeros((side, side), np.float32)
         if along > 0:
-            weight = np.nan_to_num(around.sigma_m**-2)
+            weight: Float32 = np.nan_to_num(1 / (around.sigma_m * around.sigma_m))
             z, direction = smooth_along_bars(around.z_m, weight, settings.min_gate_m, along)
             pixel_m = sights.pixel_m(z, self._height_m)
             sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
-            blur = blur_sigma(sharp - z, valley_mask(sharp, direction))
+            blur = blur_sigma(sharp - z, valley_mask(sharp, _within(direction, reach)))
             pixel_cells = float(np.nanmedian(pixel_m)) / cell_m if np.isfinite(pixel_m).any() else 1.0
             steps = step_sigma(sharp, pixel_cells)
-            bar = vote_directions(direction)
+            bar = _within(vote_directions(direction), reach + NODE_CELLS)
             stripes = find_stripes(z, around.intensity, bar, cell_m)
             draws, pixel = settings.thin_bars == "drawn", pixel_m / np.float32(cell_m)
             bars, unsure, hidden = draw_bars(z, bar, stripes, pixel, cell_m, draws)
             drawn = np.isfinite(bars)
             sharp = np.where(drawn, bars, sharp)
             blur = np.where(drawn, unsure, np.maximum(blur, hidden))
-            around = replace(around, z_m=sharp, sigma_m=np.hypot(np.hypot(around.sigma_m, blur), steps))
+            around = replace(around, z_m=sharp, sigma_m=np.sqrt(around.sigma_m**2 + blur**2 + steps**2))
         if reach > 0:
             fill_gaps(around, reach)
         inner = slice(_HALO, _HALO + TILE_CELLS)
         layers = Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
         return layers, blur[inner, inner]
+
+
+def _within(direction: Int8, margin: int) -> Int8:
+    """Keep directions of the tile and of so many cells about it, -1 further out: nothing is read there."""
+    out = max(_HALO - margin, 0)
+    inner = slice(out, direction.shape[0] - out)
+    kept = np.full_like(direction, -1)
+    kept[inner, inner] = direction[inner, inner]
+    return kept
 
 
 def _around(key: TileKey) -> list[TileKey]:

@@ -88,6 +88,7 @@ def _fit_stripes(
     """
     count = window.taper.shape[1]
     level, weight = np.empty(count, np.float32), np.empty(count, np.float32)
+    along = np.full(z.shape, -1, np.int8), np.empty(z.shape, np.float32), np.empty(z.shape, np.float32)
     sums = np.empty((7, pitches.size), np.float32)
     for row in range(pitch.shape[0]):
         for column in range(pitch.shape[1]):
@@ -95,7 +96,7 @@ def _fit_stripes(
             d = direction[i, j]
             if d < 0:
                 continue
-            total = _read_across(z, gray, i, j, d, step_m, window, level, weight)
+            total = _read_across(z, gray, i, j, d, step_m, window, along, level, weight)
             if total < _FEWEST_CELLS:
                 continue
             mean, power = np.float32(0), np.float32(0)
@@ -162,16 +163,17 @@ def _best_wave(
 
 @kernel()
 def _read_across(
-    z: Float32, gray: Float32, i: int, j: int, d: int, step_m: float, window: _Window, level: Float32,
-    weight: Float32,
+    z: Float32, gray: Float32, i: int, j: int, d: int, step_m: float, window: _Window,
+    along: tuple[Int8, Float32, Float32], level: Float32, weight: Float32,
 ) -> np.float32:  # fmt: skip
     """Average gray levels along the bar at each cell across it, outward from cell (i, j) up to a step.
 
-    z, gray: (H, W). d: the direction. Fills level and weight (N,), 0 beyond a step, and returns the weights'
-    sum.
+    z, gray: (H, W). d: the direction. along: (H, W) each, the direction in which a cell was averaged last, -1
+    before the first, with its mean and share of known cells: nodes side by side share cells. Fills level and
+    weight (N,), 0 beyond a step, and returns the weights' sum.
     """
     height, width = z.shape
-    middle, long = weight.size // 2, window.along_rows.shape[1]
+    middle, (turned, means, shares) = weight.size // 2, along
     weight[:], level[:] = 0, 0
     total = np.float32(0)
     for side in (-1, 1):
@@ -182,15 +184,28 @@ def _read_across(
             if not (0 <= a < height and 0 <= b < width) or not abs(z[a, b] - last) <= step_m:
                 break
             last = z[a, b]
-            heard, shares = np.float32(0), 0
-            for q in range(long):
-                e, f = a + window.along_rows[d, q], b + window.along_columns[d, q]
-                inside = 0 <= e < height and 0 <= f < width
-                if inside and abs(z[e, f] - last) <= step_m and gray[e, f] > 0:
-                    heard += gray[e, f]
-                    shares += 1
-            if shares > 0:
-                level[k] = heard / np.float32(shares)
-                weight[k] = window.taper[d, k] * np.float32(shares / long)
-                total += weight[k]
+            if turned[a, b] != d:
+                turned[a, b] = d
+                means[a, b], shares[a, b] = _mean_along(z, gray, a, b, d, step_m, window)
+            level[k] = means[a, b]
+            weight[k] = window.taper[d, k] * shares[a, b]
+            total += weight[k]
     return total
+
+
+@kernel()
+def _mean_along(
+    z: Float32, gray: Float32, row: int, column: int, d: int, step_m: float, window: _Window
+) -> tuple[np.float32, np.float32]:
+    """Average gray levels (H, W) along direction d about a cell where heights z (H, W) are within step_m of
+    its own; and the share of its places that are known. 0 and 0 without any.
+    """
+    height, width = z.shape
+    heard, known, long = np.float32(0), 0, window.along_rows.shape[1]
+    for q in range(long):
+        a, b = row + window.along_rows[d, q], column + window.along_columns[d, q]
+        inside = 0 <= a < height and 0 <= b < width
+        if inside and abs(z[a, b] - z[row, column]) <= step_m and gray[a, b] > 0:
+            heard += gray[a, b]
+            known += 1
+    return heard / np.float32(max(known, 1)), np.float32(known / long)

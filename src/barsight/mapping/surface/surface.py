@@ -125,7 +125,7 @@ def tile_file(folder: Path, key: TileKey) -> Path:
 
 def write_tile(folder: Path, key: TileKey, layers: Layers) -> None:
     """Write a tile's layers as a new file: links to an older one keep what they show."""
-    stacked = np.stack([getattr(layers, field.name).astype(np.float32) for field in fields(Layers)])
+    stacked = np.stack([getattr(layers, field.name) for field in fields(Layers)], dtype=np.float32)
     path = tile_file(folder, key)
     path.unlink(missing_ok=True)
     np.save(path, stacked)

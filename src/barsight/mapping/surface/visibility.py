@@ -39,19 +39,6 @@ def is_pictured(x_m: float, y_m: float, z_m: float, planes: Float64, view: int) 
 
 
 @kernel()
-def frustum_margin(x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64) -> None:
-    """Compute the margin (K,) of a point inside both pictures of each view, not below 0 where it does.
-
-    planes: (6, 4, K), see `Sights.planes`.
-    """
-    margin[:] = np.inf
-    for p in range(planes.shape[0]):
-        for k in range(margin.size):
-            over = planes[p, 0, k] * x_m + planes[p, 1, k] * y_m + planes[p, 2, k] * z_m + planes[p, 3, k]
-            margin[k] = min(margin[k], over)
-
-
-@kernel()
 def may_be_occluded(
     point: Float64,
     row: int,
@@ -59,16 +46,14 @@ def may_be_occluded(
     around: Float32,
     ceiling: float,
     planes: Float64,
-    margin: Float64,
     cell_m: float,
     min_views: float,
 ) -> bool:
     """Check for possible occlusion: within `_CUT_CELLS` along x or y, a much higher surface ends where fewer
-    than min_views views could see it go on towards the point: their pictures end there. margin: (K,) is
-    written to.
+    than min_views views could see it go on towards the point: their pictures end there.
     """
     x_m, y_m = point[0], point[1]
-    if has_enough_views(x_m, y_m, ceiling, planes, margin, min_views):
+    if has_enough_views(x_m, y_m, ceiling, planes, min_views):
         return False
     for direction in range(4):
         di, dj = (0, 0, 1, -1)[direction], (1, -1, 0, 0)[direction]
@@ -77,22 +62,24 @@ def may_be_occluded(
             if height > point[2] + _OVERHANG_CELLS * cell_m:
                 outward = max(n - _CUT_MARGIN_CELLS, 0) * cell_m
                 x_there, y_there = x_m + dj * outward, y_m + di * outward
-                if not has_enough_views(x_there, y_there, height, planes, margin, min_views):
+                if not has_enough_views(x_there, y_there, height, planes, min_views):
                     return True
                 break
     return False
 
 
 @kernel()
-def has_enough_views(
-    x_m: float, y_m: float, z_m: float, planes: Float64, margin: Float64, least: float
-) -> bool:
+def has_enough_views(x_m: float, y_m: float, z_m: float, planes: Float64, least: float) -> bool:
     """Check that at least so many views have the point in both pictures.
 
-    planes: (6, 4, K), see `ViewFrusta.planes`. margin: (K,) is written to.
+    planes: (6, 4, K), see `ViewFrusta.planes`.
     """
-    frustum_margin(x_m, y_m, z_m, planes, margin)
-    return bool((margin >= 0).sum() >= least)
+    having = 0
+    for view in range(planes.shape[2]):
+        if having >= least:
+            break
+        having += is_pictured(x_m, y_m, z_m, planes, view)
+    return bool(having >= least)
 
 
 @kernel(inline=True)
