@@ -9,7 +9,7 @@ from barsight.core.extras import extra
 from barsight.store.audit import Entry
 from barsight.store.history import executed_lifts
 from barsight.store.states import step_lift
-from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, VETOES
+from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SURVEY_VETOES
 
 with extra("store"):
     from sqlalchemy import select
@@ -23,12 +23,12 @@ def add_lifts(
     Lifts are offered only where no later survey is known (is_newest); vetoes are kept of any.
     """
     for veto in content["vetoes"]:
-        opened.add(VETOES, survey_id=survey_id, code=veto["code"], reason=veto["reason"])
+        opened.add(SURVEY_VETOES, survey_id=survey_id, code=veto["code"], reason=veto["reason"])
     for lift in content["refused"]:
         for number in lift["bundles"]:
             for veto in lift["vetoes"]:
                 opened.add(
-                    VETOES, survey_id=survey_id, bundle_id=ids[number], code=veto["code"],
+                    SURVEY_VETOES, survey_id=survey_id, bundle_id=ids[number], code=veto["code"],
                     reason=veto["reason"],
                 )  # fmt: skip
     for lift in content["lifts"] if is_newest else ():

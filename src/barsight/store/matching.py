@@ -70,8 +70,10 @@ class FoundBundle:
 
 @dataclass(frozen=True)
 class MatchedBundles:
-    """Tell what became of the known bundles. found: position in `found` by position in `known`; carried: those of
-    them that were told by their figures elsewhere; findings: of the known ones that were not found.
+    """Outcome of a match, by positions in `known` and `found`.
+
+    found: the found bundle of each known one that was told. carried: those of them that were told by their
+    figures, elsewhere. findings: of the known ones that were not found.
     """
 
     found: dict[int, int]

@@ -86,7 +86,7 @@ LIFT_STATES = Table(
     UniqueConstraint("lift_id", "step"),
 )  # fmt: skip
 
-VETOES = Table(
+SURVEY_VETOES = Table(
     "vetoes", METADATA, _key(), _of("surveys"), _of("bundles", is_optional=True), *_texts("code", "reason"),
 )  # fmt: skip
 """Vetoes of a survey's lifts.json; of the whole map where they name no bundle."""
