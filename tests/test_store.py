@@ -20,12 +20,12 @@ from sqlalchemy.exc import DBAPIError
 import barsight.store.opening as opening
 from barsight.cli.main import run
 from barsight.core.errors import Failed, InputError
-from barsight.store.adding import AddedSurvey, add_survey
+from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.history import parse_time
 from barsight.store.opening import Store, open_store
 from barsight.store.states import LIFT_STEPS, alarm_state, raise_alarm, step_alarm, step_lift
-from barsight.store.tables import ALARMS, AUDIT, METADATA, SURVEYS
+from barsight.store.tables import ALARMS, AUDIT, LIFTS, METADATA, SURVEY_VETOES, SURVEYS
 from store_yards import CraneYard
 from yard_folders import lifts, write_folder
 
@@ -106,8 +106,8 @@ def test_the_migrations_make_the_tables_of_the_code(store: Store) -> None:
 def test_a_map_is_added_once_and_a_changed_file_refused(store: Store, tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "out")
     assert lifts(folder) == 0
-    assert add_survey(store, folder, "ann").counts == {"found": 2}
-    again = add_survey(store, folder, "ann")
+    assert add_survey(store, read_survey(folder), "ann").counts == {"found": 2}
+    again = add_survey(store, read_survey(folder), "ann")
     assert not again.is_new
     chain = checked(store)
     assert isinstance(chain, AuditChain) and chain.entries == 1
@@ -119,10 +119,10 @@ def test_a_map_is_added_once_and_a_changed_file_refused(store: Store, tmp_path: 
         content = (other / name).read_bytes()
         (other / name).write_bytes(content.replace(old.encode(), new.encode(), 1) if old else content[:-1])
         with pytest.raises(InputError, match=name):
-            add_survey(store, other, "ann")
+            add_survey(store, read_survey(other), "ann")
     real = write_folder(tmp_path / "real", is_simulated=False)
     with pytest.raises(InputError, match="was measured, the store holds simulated"):
-        add_survey(store, real, "ann")
+        add_survey(store, read_survey(real), "ann")
     assert checked(store) == chain
 
 
@@ -150,7 +150,7 @@ def test_two_writers_at_once(store_url: str, tmp_path: Path) -> None:
         added = []
         with open_store(store_url, create=True) as store:
             for k in range(2):
-                added.append(add_survey(store, tmp_path / str(k), name))
+                added.append(add_survey(store, read_survey(tmp_path / str(k)), name))
                 for _ in range(5):
                     alarm(store, name)
         return added
@@ -169,7 +169,7 @@ WRITER = """
 import os, signal, sys
 from pathlib import Path
 import barsight.store.audit as audit
-from barsight.store.adding import add_survey
+from barsight.store.adding import add_survey, read_survey
 from barsight.store.opening import open_store
 from barsight.store.states import raise_alarm
 url, folder = sys.argv[1:]
@@ -177,7 +177,7 @@ with open_store(url, create=True) as store:
     print("open", flush=True)
     if folder:
         audit._append = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-        add_survey(store, Path(folder), "ann")
+        add_survey(store, read_survey(Path(folder)), "ann")
     while True:
         with audit.entry(store, "ann", "alarm") as opened:
             raise_alarm(opened, "rig-drift", "again")
@@ -205,7 +205,7 @@ def test_killed_while_it_writes_leaves_a_valid_store(store_url: str, tmp_path: P
         chain = checked(store)
         assert isinstance(chain, AuditChain)
         assert chain.entries == 1 if given else chain.entries > 5
-        assert add_survey(store, folder, "ann").is_new
+        assert add_survey(store, read_survey(folder), "ann").is_new
         assert isinstance(checked(store), AuditChain)
 
 
@@ -319,6 +319,7 @@ def test_bad_input_is_one_line(
     assert run(arguments) == code
     said = capsys.readouterr().err
     assert says in said and said.count("\n") == 1 and "secret" not in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["note.txt", "out"]
 
 
 def test_a_missing_extra_is_named(tmp_path: Path) -> None:
@@ -334,6 +335,16 @@ def test_a_missing_extra_is_named(tmp_path: Path) -> None:
 def test_times_are_exact() -> None:
     assert parse_time("1700000000000000001") == 1700000000000000001
     assert parse_time("2023-11-14T23:13:20.000001+01:00") == 1700000000000001000
+
+
+def test_vetoes_are_kept_for_the_map_and_for_its_bundles(store: Store, tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "out", age_s=1e6)
+    assert lifts(folder) == 0
+    add_survey(store, read_survey(folder), "ann")
+    with store.reading() as connection:
+        rows = connection.execute(select(SURVEY_VETOES.c.bundle_id, SURVEY_VETOES.c.code)).all()
+        assert connection.execute(select(func.count()).select_from(LIFTS)).scalar() == 0
+    assert {(None, "map-too-old"), (1, "map-too-old"), (2, "map-too-old")} <= {tuple(row) for row in rows}
 
 
 def test_the_audit_log_and_the_tables_have_their_names(store: Store) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from barsight.store.adding import AddedSurvey, add_survey
+from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.history import list_surveys, newest_sightings, present_yard
 from barsight.store.lift_records import add_lifts
@@ -90,7 +90,7 @@ def run_cycles(store: Store, folder: Path, seed: int, cycles: int) -> Judge:
     yard, judge = CraneYard(seed), Judge()
     everyone = tuple(range(1000))
     truth = yard.survey(folder / "0", never_missed=everyone)
-    judge.told(add_survey(store, folder / "0", "test"), truth, {})
+    judge.told(add_survey(store, read_survey(folder / "0"), "test"), truth, {})
     for cycle in range(1, cycles + 1):
         start = float(yard.rng.uniform(-1.0, 4.0))
         view = View(start, start + float(yard.rng.uniform(5.0, 13.0)), float(yard.rng.choice([1.6, 9.9])))
@@ -109,7 +109,7 @@ def run_cycles(store: Store, folder: Path, seed: int, cycles: int) -> Judge:
                 # Nobody told of the lift and a length isn't known: it may be another bundle.
                 changed, taken = {number: "added"}, {number}
         truth = yard.survey(folder / str(cycle), view, (*changed, *taken))
-        added = add_survey(store, folder / str(cycle), "test")
+        added = add_survey(store, read_survey(folder / str(cycle)), "test")
         judge.told(added, truth, changed)
         judge.note_open(folder / str(cycle), truth)
         gone = {name for name, kind in added.absences.items() if kind == "gone"}
@@ -145,7 +145,7 @@ def test_fifty_cycles_of_other_yards(seed: int, tmp_path: Path) -> None:
 
 
 def add_all(store: Store, folders: list[Path]) -> list[AddedSurvey]:
-    return [add_survey(store, folder, "test") for folder in folders]
+    return [add_survey(store, read_survey(folder), "test") for folder in folders]
 
 
 def names(store: Store, at_ns: int | None = None) -> set[str]:
@@ -190,7 +190,7 @@ def test_lifts_are_verified_or_failed_by_the_next_survey(store: Store, tmp_path:
     yard = CraneYard(4)
     everyone = tuple(range(99))
     truth = yard.survey(tmp_path / "0", never_missed=everyone)
-    added = add_survey(store, tmp_path / "0", "test")
+    added = add_survey(store, read_survey(tmp_path / "0"), "test")
     name = dict(zip(truth.values(), added.changes, strict=True))
     moved_from, left_alone, offered = yard.liftable(WHOLE)[:3]
     at_ns = START_NS + HOUR_NS * 3 // 2
@@ -205,7 +205,7 @@ def test_lifts_are_verified_or_failed_by_the_next_survey(store: Store, tmp_path:
         add_lifts(opened, 1, {"vetoes": [], "refused": [], "lifts": [lift]}, {0: bundle_id}, is_newest=True)
         (waiting,) = opened.rows["lifts"]
     truth = yard.survey(tmp_path / "1", never_missed=everyone)
-    added = add_survey(store, tmp_path / "1", "test")
+    added = add_survey(store, read_survey(tmp_path / "1"), "test")
     assert dict(zip(truth.values(), added.changes, strict=True))[number] == name[number]
     assert added.changes[name[number]] == "moved"
     with store.reading() as connection:
@@ -219,12 +219,12 @@ def test_two_alike_that_change_places_keep_apart_only_by_what_is_told(store: Sto
     kind = Laid(0, 0, 0, 0, length_m=5.0, roll_deg=0.0)
     first, second = (yard.deliver((slot, 0), kind) for slot in (2, 5))
     yard.survey(tmp_path / "0", never_missed=(1, 2))
-    add_survey(store, tmp_path / "0", "test")
+    add_survey(store, read_survey(tmp_path / "0"), "test")
     lifted = [yard.lying.pop((slot, 0)) for slot in (2, 5)]
     for slot, (number, one) in zip((9, 12), lifted, strict=True):
         yard.lay((slot, 0), number, one)
     yard.survey(tmp_path / "1", never_missed=(1, 2))
-    added = add_survey(store, tmp_path / "1", "test")
+    added = add_survey(store, read_survey(tmp_path / "1"), "test")
     assert (first, second) == (1, 2)
     assert added.changes == {"B3": "added", "B4": "added"}, "either may be either: nobody told"
     assert added.absences == {"B1": "gone", "B2": "gone"}
@@ -235,10 +235,10 @@ def test_what_was_not_seen_is_not_gone(store: Store, tmp_path: Path) -> None:
     for slot in (2, 8):
         yard.deliver((slot, 0))
     yard.survey(tmp_path / "0", never_missed=(1, 2))
-    add_survey(store, tmp_path / "0", "test")
+    add_survey(store, read_survey(tmp_path / "0"), "test")
     yard.lying.clear()
     yard.survey(tmp_path / "1", View(-1.0, 3.5))
-    added = add_survey(store, tmp_path / "1", "test")
+    added = add_survey(store, read_survey(tmp_path / "1"), "test")
     assert added.absences == {"B1": "gone"}
     assert names(store) == {"B2"}
     with store.reading() as connection:

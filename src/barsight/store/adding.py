@@ -69,8 +69,11 @@ class AddedSurvey:
 
 
 @dataclass(frozen=True, eq=False)
-class _Folder:
-    """A measured folder, read. from_ns, to_ns: of its frames. records: of bundles.json, without the bars."""
+class MeasuredSurvey:
+    """A measured folder, read and held against its digests.
+
+    from_ns, to_ns: of its frames. records: of bundles.json, without the bars.
+    """
 
     path: Path
     identity: MapIdentity
@@ -84,14 +87,12 @@ class _Folder:
     lifts: dict[str, Any] | None
 
 
-def add_survey(store: Store, folder: Path, who: str) -> AddedSurvey:
-    """Add a folder in one transaction; one that is there already changes nothing.
+def add_survey(store: Store, read: MeasuredSurvey, who: str) -> AddedSurvey:
+    """Add a survey in one transaction; one that is there already changes nothing.
 
     An older survey is put into its place in time: its bundles are matched to those seen before it and to
-    those seen first after it. Raises InputError for a folder that was changed, isn't of this yard's kind or
-    has no times, MeasurementError where its map has no place in the yard.
+    those seen first after it. Raises InputError where simulated and measured surveys would mix.
     """
-    read = _read(folder)
     heights = pack(read.heights)
     with entry(store, who, f"survey {read.identity.map_id}") as opened:
         if not _expect_new(opened.connection, read):
@@ -130,8 +131,12 @@ def add_survey(store: Store, folder: Path, who: str) -> AddedSurvey:
     )
 
 
-def _read(folder: Path) -> _Folder:
-    """Open a folder, with every file held against its digest."""
+def read_survey(folder: Path) -> MeasuredSurvey:
+    """Open a measured folder, with every file held against its digest.
+
+    Raises InputError for a folder that was changed or has no bundles or times, MeasurementError where its
+    map has no place in the yard.
+    """
     summary, identity = open_folder(folder, cloud=True)
     path = folder / "bundles.json"
     if identity is None or not path.is_file():
@@ -152,14 +157,14 @@ def _read(folder: Path) -> _Folder:
     own = {name: file_digest(folder / name) for name in ("result.json", "bundles.json")}
     if chosen.is_file():
         own["lifts.json"] = file_digest(chosen)
-    return _Folder(
+    return MeasuredSurvey(
         folder.absolute(), identity, identity.captured_from_ns, identity.captured_to_ns,
         str((summary.get("software") or {}).get("version")), {**summary["files"], **own}, records, found,
         read_heights(folder), read_lifts(chosen) if chosen.is_file() else None,
     )  # fmt: skip
 
 
-def _expect_new(connection: Connection, read: _Folder) -> bool:
+def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
     """Check that the store has no such map. Raises InputError where simulated and real ones would mix."""
     kinds = select(SURVEYS.c.is_simulated).limit(1)
     simulated = connection.execute(kinds).scalar()
@@ -172,7 +177,7 @@ def _expect_new(connection: Connection, read: _Folder) -> bool:
     return connection.execute(same).first() is None
 
 
-def _arrivals(connection: Connection, read: _Folder, new: tuple[int, ...]) -> dict[int, str]:
+def _arrivals(connection: Connection, read: MeasuredSurvey, new: tuple[int, ...]) -> dict[int, str]:
     """Tell how bundles came that no earlier survey saw: `added` where the newest earlier survey that saw the
     place saw it empty, else `found`. new: positions in `read.found`.
     """
@@ -194,7 +199,7 @@ def _arrivals(connection: Connection, read: _Folder, new: tuple[int, ...]) -> di
     return {j: told.get(j, "found") for j in new}
 
 
-def _add_row(opened: Entry, read: _Folder, heights: bytes) -> int:
+def _add_row(opened: Entry, read: MeasuredSurvey, heights: bytes) -> int:
     identity = read.identity
     return opened.add(
         SURVEYS, map_id=identity.map_id, captured_from_ns=read.from_ns, captured_to_ns=read.to_ns,
@@ -204,7 +209,7 @@ def _add_row(opened: Entry, read: _Folder, heights: bytes) -> int:
     )  # fmt: skip
 
 
-def _known(connection: Connection, read: _Folder) -> tuple[tuple[KnownBundle, ...], dict[int, Bundle]]:
+def _known(connection: Connection, read: MeasuredSurvey) -> tuple[tuple[KnownBundle, ...], dict[int, Bundle]]:
     """Gather the bundles that lay in the yard before this survey or were first seen after it; and of the
     former, as seen last.
     """

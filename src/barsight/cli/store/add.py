@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from barsight.cli.arguments import call
-from barsight.store.adding import AddedSurvey, add_survey
+from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.opening import DEFAULT_URL, open_store
 
 
@@ -35,14 +36,22 @@ def run(arguments: Sequence[str]) -> None:
             by: Who adds it, for the audit log; the name of the user if not given.
             migrate: Bring the tables of an earlier version on PostgreSQL up to date; back them up before.
         """
+        survey = read_survey(out)
         with open_store(url, create=True, migrate=migrate) as store:
-            added = add_survey(store, out, by or getpass.getuser())
+            added = add_survey(store, survey, by or _user())
         _print(added, Console())
 
     words = list(arguments)
     if len(words) == 1 and not words[0].startswith("-"):
         words.insert(0, DEFAULT_URL)
     call(command, "store add", words)
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container's user may have no name
+        return f"uid {os.getuid()}"
 
 
 def _print(added: AddedSurvey, console: Console) -> None:
