@@ -230,6 +230,21 @@ def test_two_alike_that_change_places_keep_apart_only_by_what_is_told(store: Sto
     assert added.absences == {"B1": "gone", "B2": "gone"}
 
 
+def test_what_a_move_uncovers_is_not_taken_for_what_moved(store: Store, tmp_path: Path) -> None:
+    yard = CraneYard(7, full=0)
+    kind = Laid(0, 0, 0, 0, length_m=5.0, roll_deg=0.0)
+    for place in ((2, 0), (2, 1)):
+        yard.deliver(place, kind)
+    yard.survey(tmp_path / "0", never_missed=(1, 2))
+    assert add_survey(store, read_survey(tmp_path / "0"), "test").changes == {"B1": "found"}
+    number, one = yard.lying.pop((2, 1))
+    yard.lay((6, 0), number, one)
+    truth = yard.survey(tmp_path / "1", never_missed=(1, 2))
+    added = add_survey(store, read_survey(tmp_path / "1"), "test")
+    assert list(truth.values()) == [1, 2]
+    assert added.changes == {"B2": "found", "B1": "moved"} and added.absences == {}
+
+
 def test_what_was_not_seen_is_not_gone(store: Store, tmp_path: Path) -> None:
     yard = CraneYard(6, full=0)
     for slot in (2, 8):

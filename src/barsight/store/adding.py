@@ -28,7 +28,8 @@ from barsight.store.matching import (
     KnownBundle,
     has_moved,
     look_at,
-    match_bundles,
+    match_by_place,
+    match_carried,
 )  # fmt: skip
 from barsight.store.opening import Store
 from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEYS
@@ -98,14 +99,17 @@ def add_survey(store: Store, read: MeasuredSurvey, who: str) -> AddedSurvey:
         if not _expect_new(opened.connection, read):
             return AddedSurvey(read.identity.map_id, False, {}, {})
         known, last = _known(opened.connection, read)
-        pairing = match_bundles(known, read.found, read.heights)
-        partner = {j: i for i, j in pairing.found.items()}
+        matched = match_by_place(known, read.found, read.heights)
+        partner = {j: i for i, j in matched.found.items()}
         before = {j: last[known[i].bundle_id] for j, i in partner.items() if known[i].bundle_id in last}
-        told = _arrivals(
-            opened.connection, read, tuple(j for j in range(len(read.found)) if j not in before)
-        ) | {
-            j: _change(seen, read.found[j].bundle, is_carried=partner[j] in pairing.carried)
-            for j, seen in before.items()
+        shown = _shown_before(opened.connection, read, set(range(len(read.found))) - set(before))
+        # What lay covered was not laid there since.
+        laid = [j for j, finding in shown.items() if j not in partner and finding != "covered"]
+        carried = match_carried(known, read.found, matched, laid)
+        partner |= {j: i for i, j in carried.items()}
+        told = {
+            j: "moved" if j in carried.values() else _change(before.get(j), one.bundle, shown.get(j))
+            for j, one in enumerate(read.found)
         }
         survey_id = _add_row(opened, read, heights)
         changes: dict[int, str] = {}
@@ -116,8 +120,8 @@ def add_survey(store: Store, read: MeasuredSurvey, who: str) -> AddedSurvey:
             changes[number], ids[one.bundle.id] = told[j], number
         absences = {
             known[i].bundle_id: finding
-            for i, finding in pairing.findings.items()
-            if finding != "unseen" and known[i].last is not None
+            for i, finding in matched.findings.items()
+            if i not in carried and finding != "unseen" and known[i].last is not None
         }
         for number, finding in absences.items():
             opened.add(ABSENCES, survey_id=survey_id, bundle_id=number, kind=finding, reason=REASONS[finding])
@@ -177,26 +181,24 @@ def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
     return connection.execute(same).first() is None
 
 
-def _arrivals(connection: Connection, read: MeasuredSurvey, new: tuple[int, ...]) -> dict[int, str]:
-    """Tell how bundles came that no earlier survey saw: `added` where the newest earlier survey that saw the
-    place saw it empty, else `found`. new: positions in `read.found`.
+def _shown_before(connection: Connection, read: MeasuredSurvey, new: set[int]) -> dict[int, Finding]:
+    """Tell what the newest earlier survey that saw a bundle's place saw there. new: positions in
+    `read.found`.
     """
-    told: dict[int, str] = {}
+    told: dict[int, Finding] = dict.fromkeys(new, "unseen")
     earlier = (
         select(SURVEYS.c.id)
         .where(SURVEYS.c.captured_to_ns <= read.to_ns)
         .order_by(SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
     )
-    for survey_id in connection.execute(earlier).scalars().all() if new else ():
+    for survey_id in connection.execute(earlier).scalars().all():
+        unseen = [j for j, finding in told.items() if finding == "unseen"]
+        if not unseen:
+            break
         packed = select(SURVEYS.c.heights).where(SURVEYS.c.id == survey_id)
         heights = unpack(connection.execute(packed).scalar_one())
-        for j in set(new) - set(told):
-            shown = look_at(read.found[j].bundle, heights)
-            if shown != "unseen":
-                told[j] = "added" if shown == "gone" else "found"
-        if len(told) == len(new):
-            break
-    return {j: told.get(j, "found") for j in new}
+        told |= {j: look_at(read.found[j].bundle, heights) for j in unseen}
+    return told
 
 
 def _add_row(opened: Entry, read: MeasuredSurvey, heights: bytes) -> int:
@@ -239,8 +241,11 @@ def _known(connection: Connection, read: MeasuredSurvey) -> tuple[tuple[KnownBun
     return tuple(known), last
 
 
-def _change(before: Bundle, found: Bundle, *, is_carried: bool) -> str:
-    return "moved" if is_carried or has_moved(before, found) else "same"
+def _change(before: Bundle | None, found: Bundle, shown: Finding | None) -> str:
+    """Tell what became of a bundle at its place, or how a new one came: shown, what its place was before."""
+    if before is not None:
+        return "moved" if has_moved(before, found) else "same"
+    return "added" if shown == "gone" else "found"
 
 
 def _add_sighting(

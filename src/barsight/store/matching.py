@@ -72,21 +72,17 @@ class FoundBundle:
 class MatchedBundles:
     """Outcome of a match, by positions in `known` and `found`.
 
-    found: the found bundle of each known one that was told. carried: those of them that were told by their
-    figures, elsewhere. findings: of the known ones that were not found.
+    found: the found bundle of each known one that was told. findings: of the known ones that were not found.
     """
 
     found: dict[int, int]
-    carried: frozenset[int]
     findings: dict[int, Finding]
 
 
-def match_bundles(
+def match_by_place(
     known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...], heights: YardMap
 ) -> MatchedBundles:
-    """Match by place first, with the least sum of squared normalised differences; then what is gone from one
-    place and new at another, where its figures leave no choice. heights: the survey's map.
-    """
+    """Match with the least sum of squared normalised differences. heights: the survey's map."""
     shape = (len(known), len(found))
     cost, is_taken = np.full(shape, _NO_PAIR), np.zeros(shape, np.bool_)
     for i, j in _near(known, found):
@@ -98,12 +94,7 @@ def match_bundles(
         for i, one in enumerate(known)
         if i not in pairs
     }
-    gone = [i for i, finding in findings.items() if finding == "gone"]
-    new = [j for j in range(len(found)) if j not in set(pairs.values())]
-    carried = _carried(known, found, gone, new)
-    for i in carried:
-        del findings[i]
-    return MatchedBundles(pairs | carried, frozenset(carried), findings)
+    return MatchedBundles(pairs, findings)
 
 
 def _near(known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...]) -> list[tuple[int, int]]:
@@ -222,10 +213,13 @@ def look_at(bundle: Bundle, heights: YardMap) -> Finding:
     return "covered" if (above[known] > margin).mean() > 0.5 else "not-found"
 
 
-def _carried(
-    known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...], gone: list[int], new: list[int]
+def match_carried(
+    known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...], matched: MatchedBundles, new: list[int]
 ) -> dict[int, int]:
-    """Pair what is gone with what is new, where each agrees with no other one: by name, else by figures."""
+    """Pair what is gone with what is new elsewhere, where each agrees with no other one: by name, else by
+    figures. new: positions in `found` at which a bundle may have been laid.
+    """
+    gone = [i for i, finding in matched.findings.items() if finding == "gone"]
     agree = np.array([[_is_carried(known[i], found[j]) for j in new] for i in gone], dtype=bool)
     agree = agree.reshape(len(gone), len(new))
     return {
