@@ -138,8 +138,15 @@ def test_fifty_cycles_of_survey_lift_and_set_down(store: Store, tmp_path: Path) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1000, 1010))
-def test_fifty_cycles_of_other_yards(seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("seed", "pitch_m", "slots"),
+    [*((seed, 0.7, 16) for seed in range(1000, 1010)), *((seed, 0.4, 26) for seed in range(2100, 2104))],
+)
+def test_fifty_cycles_of_other_yards(
+    seed: int, pitch_m: float, slots: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("store_yards.PITCH_M", pitch_m)
+    monkeypatch.setattr("store_yards.SLOTS", slots)
     with open_store(f"sqlite:///{tmp_path / 'yard.db'}", create=True) as store:
         expect_true_history(store, run_cycles(store, tmp_path / "out", seed, 50))
 
