@@ -2,12 +2,18 @@
 
 import os
 import shutil
+import uuid
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from barsight.simulation.simulate import simulate
 from cli_runs import TINY
+
+if TYPE_CHECKING:
+    from barsight.store.opening import Store
 
 DATA = Path(os.environ.get("BARSIGHT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -29,3 +35,29 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def recording(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "recording"))
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[str]:
+    from store_servers import postgres  # here and below: other tests run without the extra `store`
+
+    with postgres() as folder:
+        yield folder
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Of an empty database: a file, or one of PostgreSQL where it is installed."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'yard.db'}"
+    from store_servers import add_database
+
+    return add_database(request.getfixturevalue("server"), f"yard_{uuid.uuid4().hex}")
+
+
+@pytest.fixture
+def store(store_url: str) -> Iterator["Store"]:
+    from barsight.store.opening import open_store
+
+    with open_store(store_url, create=True) as opened:
+        yield opened

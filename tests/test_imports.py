@@ -16,6 +16,7 @@ FLOORS = {
     "yard": 5,
     "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "simulation": 6, "board_views": 6,
     "measure_settings": 6,
+    "store": 7,
     "pair_chain": 7,
     "map_building": 8,
     "live_map": 9,
@@ -40,7 +41,8 @@ ROOMS = {
     "report": (".", "calibration"),
     "simulation": ("effects", ".", "worlds"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
-    "cli": (".", "calibrate", "bench", "yard"),
+    "store": (".", "migrations", "migrations.versions"),
+    "cli": (".", "calibrate", "bench", "yard", "store"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {
@@ -60,11 +62,12 @@ APART = {
     ("benchmarks.yard", "benchmarks.stereo"), ("benchmarks.yard", "benchmarks.motion"),
     ("benchmarks.motion", "benchmarks.stereo"), ("cli.bench", "cli.calibrate"),
     ("cli.yard", "cli.calibrate"), ("cli.yard", "cli.bench"),
+    ("cli.store", "cli.calibrate"), ("cli.store", "cli.bench"), ("cli.store", "cli.yard"),
 }  # fmt: skip
 """Rooms of which the first doesn't import the second either."""
 MAX_MODULES = 16
 ROOT = Path(barsight.__file__).parent
-OPTIONAL = {"viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1}
+OPTIONAL = {"viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1, "alembic": 3}
 """Optional libraries, and the number of files that import them: of rosbags one reads and one writes."""
 
 

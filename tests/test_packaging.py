@@ -28,6 +28,17 @@ EXTRAS = {
     "export": {"report/export.py"},
     "bench": {"features/detectors.py", "simulation/worlds/settling.py"},
     "notebook": {"yard/types.py"},
+    "store": {
+        "store/tables.py",
+        "store/opening.py",
+        "store/audit.py",
+        "store/states.py",
+        "store/history.py",
+        "store/adding.py",
+        "store/lift_records.py",
+        "store/migrations/env.py",
+        "store/migrations/versions/v0001_first.py",
+    },
 }
 """Which modules may import what an extra installs."""
 

@@ -17,6 +17,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.result_folder import seal_map
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.magnet.description import example_magnet
+from barsight.yard.types import HeightMap
 from lift_yards import laid, map_of, record, sure_travel
 from result_folders import summary
 from yard_maps import Laid
@@ -55,17 +56,7 @@ def write_folder(
         rows = np.abs(heights.y_m - 2.0) < 0.05
         columns = np.abs(heights.x_m - 0.65) < 0.03
         heights.z_m[np.ix_(rows, columns)] = stock[1].top_z_m + block_m
-    bands = np.stack([heights.z_m, heights.sigma_m, heights.views, heights.source.astype(np.float32)])
-    top = heights.y0_m + (heights.z_m.shape[0] - 0.5) * heights.cell_m
-    place = [
-        (33550, "d", 3, (heights.cell_m, heights.cell_m, 0.0), True),
-        (33922, "d", 6, (0.0, 0.0, 0.0, heights.x0_m - heights.cell_m / 2, top, 0.0), True),
-    ]
-    tifffile.imwrite(
-        folder / "height.tif", np.ascontiguousarray(bands[:, ::-1]), photometric="minisblack",
-        planarconfig="separate", tile=(256, 256), metadata=None,
-        extratags=place,
-    )  # fmt: skip
+    place = write_heights(heights, folder / "height.tif")
     photo = np.full(heights.z_m.shape, 90, np.uint8)
     tifffile.imwrite(
         folder / "tops.tif", photo, photometric="minisblack", tile=(256, 256), metadata=None, extratags=place
@@ -80,3 +71,18 @@ def write_folder(
     (folder / "result.json").write_text(json.dumps(content), encoding="utf-8")
     write_bundles(bundles, None, "yard", identity, folder / "bundles.json")
     return folder
+
+
+def write_heights(heights: HeightMap, path: Path) -> list[tuple[Any, ...]]:
+    """Write height.tif; return the tags that place it, for the other layers of the map."""
+    bands = np.stack([heights.z_m, heights.sigma_m, heights.views, heights.source.astype(np.float32)])
+    top = heights.y0_m + (heights.z_m.shape[0] - 0.5) * heights.cell_m
+    place = [
+        (33550, "d", 3, (heights.cell_m, heights.cell_m, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, heights.x0_m - heights.cell_m / 2, top, 0.0), True),
+    ]
+    tifffile.imwrite(
+        path, np.ascontiguousarray(bands[:, ::-1]), photometric="minisblack", planarconfig="separate",
+        tile=(256, 256), metadata=None, extratags=place,
+    )  # fmt: skip
+    return place

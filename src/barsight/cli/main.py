@@ -19,6 +19,8 @@ COMMANDS = {
     "lifts": "Choose lift targets anew from a measured yard, for another magnet",
     "explain": "Tell why a lift is offered or refused: every check, and a picture of the place",
     "compare": "Compare two measured yards: moved, settled, taken, added",
+    "store": "Keep the yard over time: add a survey, list, verify; bundles keep their names",
+    "yard": "Print the yard as the store knows it, now or at any past time",
     "view": "Show a measured yard in 3D in the browser",
     "info": "Say what is in a recording: sensors, rates, gaps, calibration",
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
@@ -31,10 +33,10 @@ COMMANDS = {
     "export": "Write a measured cloud or map as PLY, PCD, LAS, LAZ, E57, GeoTIFF or CSV",
     "report": "Write report.html anew from a measured yard's files",
 }
-GROUPS = ("bench", "calibrate")
+GROUPS = ("bench", "calibrate", "store")
 """Commands that are packages: `command.py` in them finds the second word."""
-OF_A_YARD = ("lifts", "explain", "compare")
-"""Commands in the package `yard`."""
+ROOMS = {"yard": ("lifts", "explain", "compare"), "store": ("yard",)}
+"""Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
 _interrupts: list[int] = []
 """Signals that have ended this run."""
@@ -44,7 +46,7 @@ _AGAIN_S = 20.0
 
 def home(name: str) -> str:
     """Return the module that runs a command."""
-    room = "yard." if name in OF_A_YARD else ""
+    room = next((f"{room}." for room, names in ROOMS.items() if name in names), "")
     return f"barsight.cli.{room}{name}" + (".command" if name in GROUPS else "")
 
 

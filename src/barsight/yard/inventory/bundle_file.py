@@ -40,7 +40,7 @@ def read_bundles(path: Path) -> tuple[Bundle, ...]:
     """Read bundles.json. Raises InputError where it is missing, torn, changed or of another version."""
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
     try:
-        return tuple(_bundle(record) for record in content["bundles"])
+        return tuple(bundle_of(record) for record in content["bundles"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(path, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
 
@@ -113,7 +113,9 @@ def _record(bundle: Bundle) -> dict[str, Any]:
     return plain
 
 
-def _bundle(record: dict[str, Any]) -> Bundle:
+def bundle_of(record: dict[str, Any]) -> Bundle:
+    """Build a bundle from its record in bundles.json; without bars where the record has no `bar_axes`."""
+
     def figure(value: float | None) -> float:
         return float("nan") if value is None else value
 
@@ -148,6 +150,6 @@ def _bundle(record: dict[str, Any]) -> Bundle:
                 np.array(bar["centre_m"]), np.array(bar["direction"]), bar["diameter_m"], bar["length_m"],
                 np.array(bar["covariance"]),
             )
-            for bar in record["bar_axes"]
+            for bar in record.get("bar_axes", ())
         ),
     )  # fmt: skip

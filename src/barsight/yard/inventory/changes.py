@@ -82,7 +82,7 @@ def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
     cost = np.full((len(old), len(new)), _NO_PAIR)
     for i, before in enumerate(old):
         for j, after in enumerate(new):
-            across, along, up, _ = _moved(before, after)
+            across, along, up, _ = displacement(before, after)
             same = abs(after.width_m - before.width_m) < SAME_WIDTH * before.width_m
             open_end = any(before.ends_open) or any(after.ends_open)
             way = math.hypot(across, 0.0 if open_end else along, 2 * up)
@@ -92,7 +92,7 @@ def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
     return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if cost[i, j] < _NO_PAIR}
 
 
-def _moved(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
+def displacement(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
     """Compute the displacement across, along, up (m) and yaw (rad), in the old bundle's axes; up is of the
     top.
     """
@@ -105,7 +105,7 @@ def _moved(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
 
 
 def _change(before: Bundle, after: Bundle) -> Change:
-    across, along, up, turned = _moved(before, after)
+    across, along, up, turned = displacement(before, after)
     a, b = before.sigma, after.sigma
     sigmas = (
         math.hypot(a.lateral_m, b.lateral_m), math.hypot(a.along_m, b.along_m),
@@ -141,10 +141,15 @@ def _alone(kind: Kind, old: int | None, new: int | None, mass: Mass, sign: int) 
 
 def _seen(bundle: Bundle, heights: YardMap) -> bool:
     """Check whether a map saw the place where a bundle lies in the other."""
+    return bool(np.isfinite(heights_over(bundle, heights)).mean() >= MIN_KNOWN)
+
+
+def heights_over(bundle: Bundle, heights: YardMap) -> Float64:
+    """Look up a map's heights (40, 5) over a bundle's outline, along it and across; NaN where it saw none."""
     u = np.linspace(-0.4, 0.4, 5) * bundle.width_m
     v = np.linspace(-0.45, 0.45, 40) * bundle.length_m
-    vv, uu = np.meshgrid(v, u)
+    vv, uu = np.meshgrid(v, u, indexing="ij")
     cos, sin = math.cos(bundle.yaw_rad), math.sin(bundle.yaw_rad)
     x: Float64 = bundle.centre_m[0] + uu * cos - vv * sin
     y: Float64 = bundle.centre_m[1] + uu * sin + vv * cos
-    return bool(np.isfinite(lookup_heights(part_about(heights, x, y), x, y)).mean() >= MIN_KNOWN)
+    return lookup_heights(part_about(heights, x, y), x, y)

@@ -1,0 +1,35 @@
+"""Run `barsight store verify URL`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import tyro
+from rich.console import Console
+
+from barsight.cli.arguments import call
+from barsight.core.errors import Failed, MeasurementError
+from barsight.store.audit import verify_chain
+from barsight.store.opening import DEFAULT_URL, open_store
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, walk and print."""
+
+    def command(url: tyro.conf.Positional[str] = DEFAULT_URL) -> None:
+        """Check the audit chain and the rows that it covers; exit code 5 names the first that doesn't hold.
+
+        Prints the number of rows and the last digest. A chain that was cut off at its end holds too: note
+        both elsewhere and compare.
+
+        Args:
+            url: SQLAlchemy's URL of the database.
+        """
+        with open_store(url) as store, store.reading() as connection:
+            chain = verify_chain(connection)
+        if isinstance(chain, Failed):
+            raise MeasurementError(f"{store.name}: {chain.reason}")
+        told = f"{chain.entries} rows of the audit log hold; the last digest is {chain.digest}"
+        Console().print(told, highlight=False, soft_wrap=True)
+
+    call(command, "store verify", arguments)

@@ -1,0 +1,94 @@
+"""Run `barsight yard URL`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from barsight.cli.arguments import call
+from barsight.core.json_values import json_value
+from barsight.core.stamps import NS_PER_S
+from barsight.store.history import PresentBundle, parse_time, present_yard, time_text
+from barsight.store.opening import DEFAULT_URL, open_store
+
+_UNITS = ((86400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, read and print."""
+
+    def command(
+        url: tyro.conf.Positional[str] = DEFAULT_URL, at: str | None = None, json: bool = False
+    ) -> None:
+        """Print the yard as it was known at a time: of each bundle the newest sighting, with its age.
+
+        Args:
+            url: SQLAlchemy's URL of the database.
+            at: ISO 8601 with its zone, like 2026-11-23T14:00:00Z, or integer ns; now if not given.
+            json: Write JSON, with each bundle's record as in bundles.json and its identity.
+        """
+        at_ns = None if at is None else parse_time(at)
+        with open_store(url) as store, store.reading() as connection:
+            present = present_yard(connection, at_ns)
+        now_ns = time.time_ns() if at_ns is None else at_ns
+        if json:
+            write_json({"at_ns": now_ns, "bundles": yard_records(present, now_ns)})
+            return
+        Console().print(bundle_table(f"Yard at {time_text(now_ns)}", present, now_ns))
+
+    call(command, "yard", arguments)
+
+
+def write_json(content: object) -> None:
+    """Print a JSON document."""
+    sys.stdout.write(json.dumps(json_value(content), indent=1, allow_nan=False) + "\n")
+
+
+def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[str, Any]]:
+    """Build each bundle's record: as in bundles.json, with identity, survey, age and doubt."""
+    return [
+        {
+            "identity": each.sighting.identity,
+            "map_id": each.sighting.map_id,
+            "seen_ns": each.sighting.seen_ns,
+            "age_s": (now_ns - each.sighting.seen_ns) / NS_PER_S,
+            "stock_name": each.sighting.stock_name,
+            "doubt": None if each.doubt is None else {"code": each.doubt.kind, "reason": each.doubt.reason},
+            "bundle": each.sighting.record,
+        }
+        for each in present
+    ]
+
+
+def bundle_table(title: str, present: tuple[PresentBundle, ...], now_ns: int) -> Table:
+    """Format the bundles of a yard with place, age and doubt."""
+    table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for head in ("name", "stock", "x m", "y m", "top m", "yaw deg", "length m", "age", "last seen", "doubt"):
+        table.add_column(
+            head, justify="left" if head in ("name", "stock", "last seen", "doubt") else "right", no_wrap=True
+        )
+    for each in present:
+        one, bundle = each.sighting, each.sighting.record
+        x_m, y_m, _ = bundle["axis_centre_m"]
+        open_end = "+" if any(bundle["ends_open"]) else ""
+        table.add_row(
+            one.identity, one.stock_name or "", f"{x_m:.3f}", f"{y_m:.3f}", f"{bundle['top_z_m']:.3f}",
+            f"{bundle['yaw_deg']:.2f}", f"{bundle['length_m']:.2f}{open_end}", _age(now_ns - one.seen_ns),
+            time_text(one.seen_ns), "" if each.doubt is None else each.doubt.kind,
+        )  # fmt: skip
+    return table
+
+
+def _age(age_ns: int) -> str:
+    """Write an age in its largest whole unit."""
+    seconds = age_ns // NS_PER_S
+    size, unit = next(((size, unit) for size, unit in _UNITS if abs(seconds) >= size), (1, "s"))
+    return f"{seconds // size} {unit}"

@@ -1,0 +1,259 @@
+"""Add a measured folder to the store: its bundles get names, and what became of the others is told."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import InputError, MeasurementError
+from barsight.core.extras import extra
+from barsight.result_folder import file_digest, open_folder, read_heights
+from barsight.store.audit import Entry, entry
+from barsight.store.coarse_map import pack, unpack
+from barsight.store.history import (
+    BundleSighting,
+    executed_lifts,
+    identity_name,
+    newest_absences,
+    newest_sightings,
+    next_sightings,
+)  # fmt: skip
+from barsight.store.lift_records import add_lifts, settle_lifts
+from barsight.store.matching import (
+    Finding,
+    FoundBundle,
+    KnownBundle,
+    has_moved,
+    look_at,
+    match_by_place,
+    match_carried,
+)  # fmt: skip
+from barsight.store.opening import Store
+from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEYS
+from barsight.yard.identity import MapIdentity
+from barsight.yard.inventory.bundle_file import bundle_of, read_match
+from barsight.yard.lifting.lift_file import read_lifts
+from barsight.yard.types import Bundle, YardMap
+
+with extra("store"):
+    from sqlalchemy import Connection, select
+
+REMEDY = "measure the recording again"
+REASONS: dict[Finding, str] = {
+    "gone": "its place was seen, and it is empty or something else lies there",
+    "covered": "something lies over its place",
+    "not-found": "something as high lies at its place, but no such bundle was told",
+}
+
+
+@dataclass(frozen=True)
+class AddedSurvey:
+    """One survey's place in the yard's history.
+
+    is_new: False where the store had it before. changes: of its bundles by name: `same`, `moved`, `added`
+    (its place was empty before), `found` (its place had not been seen, or lay covered). absences: of bundles
+    that it did not see.
+    """
+
+    map_id: str
+    is_new: bool
+    changes: dict[str, str]
+    absences: dict[str, str]
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Count changes and absences by kind."""
+        return Counter([*self.changes.values(), *self.absences.values()])
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSurvey:
+    """A measured folder, read and held against its digests.
+
+    from_ns, to_ns: of its frames. records: of bundles.json, without the bars.
+    """
+
+    path: Path
+    identity: MapIdentity
+    from_ns: int
+    to_ns: int
+    software_version: str
+    files: dict[str, str]
+    records: tuple[dict[str, Any], ...]
+    found: tuple[FoundBundle, ...]
+    heights: YardMap
+    lifts: dict[str, Any] | None
+
+
+def add_survey(store: Store, read: MeasuredSurvey, who: str) -> AddedSurvey:
+    """Add a survey in one transaction; one that is there already changes nothing.
+
+    An older survey is put into its place in time: its bundles are matched to those seen before it and to
+    those seen first after it. Raises InputError where simulated and measured surveys would mix.
+    """
+    heights = pack(read.heights)
+    with entry(store, who, f"survey {read.identity.map_id}") as opened:
+        if not _expect_new(opened.connection, read):
+            return AddedSurvey(read.identity.map_id, False, {}, {})
+        known, last = _known(opened.connection, read)
+        matched = match_by_place(known, read.found, read.heights)
+        partner = {j: i for i, j in matched.found.items()}
+        before = {j: last[known[i].bundle_id] for j, i in partner.items() if known[i].bundle_id in last}
+        shown = _shown_before(opened.connection, read, set(range(len(read.found))) - set(before))
+        # What lay covered was not laid there since.
+        laid = [j for j, finding in shown.items() if j not in partner and finding != "covered"]
+        carried = match_carried(known, read.found, matched, laid)
+        partner |= {j: i for i, j in carried.items()}
+        told = {
+            j: "moved" if j in carried.values() else _change(before.get(j), one.bundle, shown.get(j))
+            for j, one in enumerate(read.found)
+        }
+        survey_id = _add_row(opened, read, heights)
+        changes: dict[int, str] = {}
+        ids: dict[int, int] = {}
+        for j, one in enumerate(read.found):
+            number = known[partner[j]].bundle_id if j in partner else opened.add(BUNDLES, survey_id=survey_id)
+            _add_sighting(opened, survey_id, number, told[j], one, read.records[j])
+            changes[number], ids[one.bundle.id] = told[j], number
+        absences = {
+            known[i].bundle_id: finding
+            for i, finding in matched.findings.items()
+            if i not in carried and finding != "unseen" and known[i].last is not None
+        }
+        for number, finding in absences.items():
+            opened.add(ABSENCES, survey_id=survey_id, bundle_id=number, kind=finding, reason=REASONS[finding])
+        is_newest = not next_sightings(opened.connection, read.to_ns)
+        settle_lifts(opened, changes | absences, read.from_ns, is_newest=is_newest)
+        if read.lifts is not None:
+            add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest)
+    named = {identity_name(number): change for number, change in changes.items()}
+    return AddedSurvey(
+        read.identity.map_id, True, named, {identity_name(n): kind for n, kind in absences.items()}
+    )
+
+
+def read_survey(folder: Path) -> MeasuredSurvey:
+    """Open a measured folder, with every file held against its digest.
+
+    Raises InputError for a folder that was changed or has no bundles or times, MeasurementError where its
+    map has no place in the yard.
+    """
+    summary, identity = open_folder(folder, cloud=True)
+    path = folder / "bundles.json"
+    if identity is None or not path.is_file():
+        raise InputError(folder, "has no bundles.json", REMEDY)
+    if summary.get("reference") != "yard":
+        raise MeasurementError(
+            f"{folder}: is in the {summary.get('reference')} frame; only maps with a crane's place are kept"
+        )
+    if identity.captured_from_ns is None or identity.captured_to_ns is None:
+        raise InputError(folder / "result.json", "has no captured_from_ns and captured_to_ns", REMEDY)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    records = tuple({k: v for k, v in one.items() if k != "bar_axes"} for one in content["bundles"])
+    match = read_match(path)
+    matched = () if match is None else (one for one in match.matched if one.name not in match.moved)
+    names = {one.bundle: one.name for one in matched if not one.disagrees}
+    found = tuple(FoundBundle(bundle_of(one), names.get(one["id"])) for one in records)
+    chosen = folder / "lifts.json"
+    own = {name: file_digest(folder / name) for name in ("result.json", "bundles.json")}
+    if chosen.is_file():
+        own["lifts.json"] = file_digest(chosen)
+    return MeasuredSurvey(
+        folder.absolute(), identity, identity.captured_from_ns, identity.captured_to_ns,
+        str((summary.get("software") or {}).get("version")), {**summary["files"], **own}, records, found,
+        read_heights(folder), read_lifts(chosen) if chosen.is_file() else None,
+    )  # fmt: skip
+
+
+def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
+    """Check that the store has no such map. Raises InputError where simulated and real ones would mix."""
+    kinds = select(SURVEYS.c.is_simulated).limit(1)
+    simulated = connection.execute(kinds).scalar()
+    if simulated is not None and simulated != read.identity.is_simulated:
+        told = ("was measured", "simulated") if simulated else ("is simulated", "measured")
+        raise InputError(
+            read.path, f"{told[0]}, the store holds {told[1]} surveys", "keep it in a store of its own"
+        )
+    same = select(SURVEYS.c.id).where(SURVEYS.c.map_id == read.identity.map_id)
+    return connection.execute(same).first() is None
+
+
+def _shown_before(connection: Connection, read: MeasuredSurvey, new: set[int]) -> dict[int, Finding]:
+    """Tell what the newest earlier survey that saw a bundle's place saw there. new: positions in
+    `read.found`.
+    """
+    told: dict[int, Finding] = dict.fromkeys(new, "unseen")
+    earlier = (
+        select(SURVEYS.c.id)
+        .where(SURVEYS.c.captured_to_ns <= read.to_ns)
+        .order_by(SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
+    )
+    for survey_id in connection.execute(earlier).scalars().all():
+        unseen = [j for j, finding in told.items() if finding == "unseen"]
+        if not unseen:
+            break
+        packed = select(SURVEYS.c.heights).where(SURVEYS.c.id == survey_id)
+        heights = unpack(connection.execute(packed).scalar_one())
+        told |= {j: look_at(read.found[j].bundle, heights) for j in unseen}
+    return told
+
+
+def _add_row(opened: Entry, read: MeasuredSurvey, heights: bytes) -> int:
+    identity = read.identity
+    return opened.add(
+        SURVEYS, map_id=identity.map_id, captured_from_ns=read.from_ns, captured_to_ns=read.to_ns,
+        added_ns=opened.at_ns, calibration_id=identity.calibration_id, yard_frame_id=identity.yard_frame_id,
+        is_simulated=identity.is_simulated, software_version=read.software_version, folder=str(read.path),
+        files=json.dumps(read.files, sort_keys=True), heights=heights,
+    )  # fmt: skip
+
+
+def _known(connection: Connection, read: MeasuredSurvey) -> tuple[tuple[KnownBundle, ...], dict[int, Bundle]]:
+    """Gather the bundles that lay in the yard before this survey or were first seen after it; and of the
+    former, as seen last.
+    """
+    before = newest_sightings(connection, read.to_ns)
+    after = next_sightings(connection, read.to_ns)
+    absences = newest_absences(connection, read.to_ns)
+    lifts = {each.bundle_id: each for each in executed_lifts(connection)}
+    known, last = [], {}
+    for number in sorted({*before, *after}):
+        seen: BundleSighting | None = before.get(number)
+        absent = absences.get(number)
+        is_gone = bool(seen and absent and absent.kind == "gone" and absent.looked_ns >= seen.seen_ns)
+        if is_gone and number not in after:
+            continue
+        place = None if seen is None or is_gone else seen.bundle
+        later = after[number].bundle if number in after else None
+        lift = lifts.get(number)
+        is_lifted = bool(
+            lift and place and seen and lift.state != "failed"
+            and seen.seen_ns < lift.executed_ns <= read.to_ns
+        )  # fmt: skip
+        laid = lift.laid(place) if lift and place and is_lifted else None
+        name = (seen or after[number]).stock_name
+        known.append(KnownBundle(number, place, later, name, is_lifted, laid))
+        if seen is not None:
+            last[number] = seen.bundle
+    return tuple(known), last
+
+
+def _change(before: Bundle | None, found: Bundle, shown: Finding | None) -> str:
+    """Tell what became of a bundle at its place, or how a new one came: shown, what its place was before."""
+    if before is not None:
+        return "moved" if has_moved(before, found) else "same"
+    return "added" if shown == "gone" else "found"
+
+
+def _add_sighting(
+    opened: Entry, survey_id: int, bundle_id: int, change: str, one: FoundBundle, record: dict[str, Any]
+) -> None:
+    x_m, y_m, _ = record["axis_centre_m"]
+    figures = {name: record[name] for name in ("top_z_m", "yaw_deg", "length_m", "width_m")}
+    opened.add(
+        SIGHTINGS, survey_id=survey_id, bundle_id=bundle_id, number=record["id"], change=change,
+        stock_name=one.stock_name, x_m=x_m, y_m=y_m, **figures, record=json.dumps(record, sort_keys=True),
+    )  # fmt: skip

@@ -1,0 +1,144 @@
+"""Log each addition to the store in a chain of digests, and check the chain and the rows that it covers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from barsight.core.errors import Failed
+from barsight.core.extras import extra
+from barsight.store.opening import Store
+from barsight.store.tables import AUDIT, METADATA
+
+with extra("store"):
+    from sqlalchemy import Connection, Table, func, insert, select
+
+_FIRST = "0" * 64
+_CHUNK = 500
+"""Ids asked for at once: databases limit the parameters of a statement."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One addition under way. at_ns: when it happened. rows: ids of what was added, by table."""
+
+    connection: Connection
+    who: str
+    at_ns: int
+    rows: dict[str, list[int]] = field(default_factory=dict)
+
+    def add(self, table: Table, **values: Any) -> int:
+        """Insert a row and return its id."""
+        key = self.connection.execute(insert(table).values(**values)).inserted_primary_key
+        assert key is not None
+        number = int(key[0])
+        self.rows.setdefault(table.name, []).append(number)
+        return number
+
+
+@dataclass(frozen=True)
+class AuditChain:
+    """A chain that holds. entries: their number. digest: of the last; whoever notes it elsewhere can tell
+    later whether the end of the chain was cut off.
+    """
+
+    entries: int
+    digest: str
+
+
+@contextmanager
+def entry(store: Store, who: str, what: str, at_ns: int | None = None) -> Iterator[Entry]:
+    """Begin one addition: all of its rows and its line in the audit log are committed together, or none.
+
+    at_ns: when it happened; now where None.
+    """
+    with store.writing() as connection:
+        opened = Entry(connection, who, time.time_ns() if at_ns is None else at_ns)
+        yield opened
+        if opened.rows:
+            _append(opened, what)
+
+
+def _append(opened: Entry, what: str) -> None:
+    last = opened.connection.execute(select(AUDIT).order_by(AUDIT.c.id.desc()).limit(1)).mappings().first()
+    content = {"rows": opened.rows, "rows_sha256": _rows_digest(opened.connection, opened.rows)}
+    row = {
+        "id": 1 if last is None else last["id"] + 1,
+        "at_ns": opened.at_ns,
+        "who": opened.who,
+        "what": what,
+        "content": _canonical(content),
+        "previous": _FIRST if last is None else last["digest"],
+    }
+    opened.connection.execute(insert(AUDIT).values(**row, digest=_digest(row)))
+
+
+def verify_chain(connection: Connection) -> AuditChain | Failed:
+    """Walk the log from its first row: each digest, the row before it, and the rows that it covers.
+
+    Fails with the first row that doesn't hold, or where a table has rows that no row of the log covers.
+    """
+    previous, count = _FIRST, 0
+    covered: dict[str, set[int]] = {}
+    for row in connection.execute(select(AUDIT).order_by(AUDIT.c.id)).mappings().all():
+        count += 1
+        problem = _problem(connection, dict(row), count, previous, covered)
+        if problem:
+            return Failed("audit", f"audit row {count} does not hold: {problem}")
+        previous = row["digest"]
+    for name, table in METADATA.tables.items():
+        found = connection.execute(select(func.count()).select_from(table)).scalar_one()
+        if table is not AUDIT and found != len(covered.get(name, ())):
+            told = f"{found} rows, the audit log covers {len(covered.get(name, ()))}"
+            return Failed("audit", f"table {name} has {told}")
+    return AuditChain(count, previous)
+
+
+def _problem(
+    connection: Connection, row: dict[str, Any], count: int, previous: str, covered: dict[str, set[int]]
+) -> str:
+    """Tell what is wrong with a row of the log; empty where nothing is. covered: takes its rows' ids."""
+    digest = row.pop("digest")
+    if row["id"] != count:
+        return f"it is missing, row {row['id']} follows"
+    if row["previous"] != previous:
+        return "it does not follow from the row before"
+    if digest != _digest(row):
+        return "it was changed after it was written"
+    content = json.loads(row["content"])
+    if content["rows_sha256"] != _rows_digest(connection, content["rows"]):
+        tables = ", ".join(content["rows"])
+        return f"what it added on {row['what']} was changed or removed (tables {tables})"
+    for name, ids in content["rows"].items():
+        covered.setdefault(name, set()).update(ids)
+    return ""
+
+
+def _rows_digest(connection: Connection, rows: dict[str, list[int]]) -> str:
+    """Compute SHA-256 over rows as the database has them."""
+    found: list[Any] = []
+    for name in sorted(rows):
+        table, ids = METADATA.tables[name], sorted(rows[name])
+        for first in range(0, len(ids), _CHUNK):
+            part = select(table).where(table.c.id.in_(ids[first : first + _CHUNK])).order_by(table.c.id)
+            found += [[name, *_plain(row)] for row in connection.execute(part).all()]
+    return hashlib.sha256(_canonical(found).encode()).hexdigest()
+
+
+def _plain(row: Any) -> list[Any]:
+    return [hashlib.sha256(value).hexdigest() if isinstance(value, bytes) else value for value in row]
+
+
+def _digest(row: dict[str, Any]) -> str:
+    """Compute SHA-256 of the digest before and a row's canonical JSON."""
+    return hashlib.sha256((row["previous"] + _canonical(row)).encode()).hexdigest()
+
+
+def _canonical(value: Any) -> str:
+    """Write JSON with sorted keys and without spaces, so that the same value is the same text."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

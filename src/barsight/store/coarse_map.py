@@ -1,0 +1,45 @@
+"""Keep a coarse copy of each survey's heights in the store, to tell later what a place looked like."""
+
+from __future__ import annotations
+
+import json
+import zlib
+
+import numpy as np
+
+from barsight.core.arrays import Float32
+from barsight.yard.types import HeightMap, YardMap
+
+CELL_M = 0.1
+_STRIPE = 256
+_UNKNOWN = np.iinfo(np.int16).min
+
+
+def pack(heights: YardMap) -> bytes:
+    """Take every tenth cell of 10 mm in both directions, in mm; cells that were filled are unknown."""
+    step = max(1, round(CELL_M / heights.cell_m))
+    rows, columns = heights.shape
+    stripe = step * max(1, _STRIPE // step)
+    parts = [
+        _seen(heights.part(slice(first, min(first + stripe, rows)), slice(0, columns)))[::step, ::step]
+        for first in range(0, rows, stripe)
+    ]
+    z = np.concatenate(parts)
+    mm = np.where(np.isfinite(z), np.clip(np.round(1e3 * z), -32000, 32000), _UNKNOWN).astype("<i2")
+    head = json.dumps([heights.x0_m, heights.y0_m, step * heights.cell_m, *mm.shape])
+    return zlib.compress(head.encode() + b"\n" + mm.tobytes())
+
+
+def _seen(part: HeightMap) -> Float32:
+    """Return a part's heights (rows, columns), NaN where no sensor saw the cell."""
+    return np.where((part.source == 1) | (part.source == 2), part.z_m, np.float32(np.nan))
+
+
+def unpack(packed: bytes) -> HeightMap:
+    """Read what `pack` wrote; sigma and views are not kept."""
+    head, _, body = zlib.decompress(packed).partition(b"\n")
+    x0_m, y0_m, cell_m, rows, columns = json.loads(head)
+    mm = np.frombuffer(body, "<i2").reshape(rows, columns)
+    known = mm != _UNKNOWN
+    z = np.where(known, mm / np.float32(1e3), np.float32(np.nan)).astype(np.float32)
+    return HeightMap(x0_m, y0_m, cell_m, z, np.full_like(z, np.nan), np.zeros_like(z), known.astype(np.uint8))

@@ -1,0 +1,227 @@
+"""Read from the store what was known of each bundle at a time, and what came of the lifts."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from barsight.core.errors import ConfigError
+from barsight.core.extras import extra
+from barsight.core.stamps import NS_PER_S
+from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
+from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.types import Bundle
+
+with extra("store"):
+    from sqlalchemy import Connection, Row, Select, func, select, true
+    from sqlalchemy.sql.elements import ColumnElement
+
+
+@dataclass(frozen=True, eq=False)
+class BundleSighting:
+    """A bundle as one survey saw it. record: its JSON of bundles.json, without the bars' axes."""
+
+    bundle_id: int
+    survey_id: int
+    map_id: str
+    seen_ns: int
+    change: str
+    stock_name: str | None
+    record: dict[str, Any]
+
+    @property
+    def identity(self) -> str:
+        """Return the bundle's name in the store."""
+        return identity_name(self.bundle_id)
+
+    @property
+    def bundle(self) -> Bundle:
+        """Return it as the stages of the yard know bundles."""
+        return bundle_of(self.record)
+
+
+@dataclass(frozen=True)
+class Absence:
+    """A survey that looked for a bundle and did not see it. kind: `gone`, `covered` or `not-found`."""
+
+    bundle_id: int
+    looked_ns: int
+    kind: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class PresentBundle:
+    """A bundle of the yard at a time: its newest sighting, and what a later survey says against it."""
+
+    sighting: BundleSighting
+    doubt: Absence | None
+
+
+def identity_name(bundle_id: int) -> str:
+    """Name a bundle for people and files."""
+    return f"B{bundle_id}"
+
+
+@dataclass(frozen=True)
+class SurveyRow:
+    """A survey, and how many bundles it told `same`, `moved`, `added`, `found`, `gone` ... when added."""
+
+    map_id: str
+    captured_from_ns: int
+    captured_to_ns: int
+    is_simulated: bool
+    folder: str
+    changes: dict[str, int]
+
+
+def list_surveys(connection: Connection) -> tuple[SurveyRow, ...]:
+    """List the surveys in the order of time."""
+    counts: dict[int, Counter[str]] = {}
+    for table, kind in ((SIGHTINGS, SIGHTINGS.c.change), (ABSENCES, ABSENCES.c.kind)):
+        grouped = select(table.c.survey_id, kind, func.count()).group_by(table.c.survey_id, kind)
+        for survey_id, name, count in connection.execute(grouped).all():
+            counts.setdefault(survey_id, Counter())[name] += count
+    rows = connection.execute(select(SURVEYS).order_by(SURVEYS.c.captured_to_ns, SURVEYS.c.id)).all()
+    return tuple(
+        SurveyRow(
+            r.map_id, r.captured_from_ns, r.captured_to_ns, r.is_simulated, r.folder,
+            dict(counts.get(r.id, {})),
+        )
+        for r in rows
+    )  # fmt: skip
+
+
+def parse_time(text: str) -> int:
+    """Read a time in ns from ISO 8601 with a zone, or from integer ns. Raises ConfigError."""
+    if text.isascii() and text.isdigit():
+        return int(text)
+    try:
+        parsed = datetime.fromisoformat(text)
+    except ValueError:
+        parsed = None
+    if parsed is None or parsed.tzinfo is None:
+        raise ConfigError(f"{text!r} is no time; write it like 2026-11-23T14:00:00Z, with the zone")
+    return (parsed - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
+
+
+def time_text(stamp_ns: int) -> str:
+    """Format a stamp in UTC, to the second."""
+    return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def newest_sightings(connection: Connection, until_ns: int | None) -> dict[int, BundleSighting]:
+    """Find each bundle's newest sighting up to a time (any time where None), by bundle."""
+    condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
+    return _sightings(connection, condition, is_newest=True)
+
+
+def next_sightings(connection: Connection, after_ns: int) -> dict[int, BundleSighting]:
+    """Find each bundle's first sighting after a time, by bundle."""
+    return _sightings(connection, SURVEYS.c.captured_to_ns > after_ns, is_newest=False)
+
+
+def newest_absences(connection: Connection, until_ns: int | None) -> dict[int, Absence]:
+    """Find the newest survey up to a time that looked for a bundle and did not see it, by bundle."""
+    condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
+    chosen = select(ABSENCES, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition)
+    rows = _first_of_each(connection, chosen, ABSENCES.c.bundle_id, is_newest=True)
+    return {r.bundle_id: Absence(r.bundle_id, r.captured_to_ns, r.kind, r.reason) for r in rows}
+
+
+def present_yard(connection: Connection, at_ns: int | None = None) -> tuple[PresentBundle, ...]:
+    """List the bundles of the yard at a time (now where None), in the order of their names.
+
+    A bundle that a survey found gone isn't there any more; one that was covered, or not told where it lay,
+    is, with that doubt.
+    """
+    absences = newest_absences(connection, at_ns)
+    present = []
+    for number, sighting in sorted(newest_sightings(connection, at_ns).items()):
+        doubt = absences.get(number)
+        if doubt is not None and doubt.looked_ns < sighting.seen_ns:
+            doubt = None
+        if doubt is None or doubt.kind != "gone":
+            present.append(PresentBundle(sighting, doubt))
+    return tuple(present)
+
+
+def _sightings(
+    connection: Connection, condition: ColumnElement[bool], *, is_newest: bool
+) -> dict[int, BundleSighting]:
+    chosen = select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition)
+    rows = _first_of_each(connection, chosen, SIGHTINGS.c.bundle_id, is_newest=is_newest)
+    return {
+        r.bundle_id: BundleSighting(
+            r.bundle_id, r.survey_id, r.map_id, r.captured_to_ns, r.change, r.stock_name, json.loads(r.record)
+        )
+        for r in rows
+    }
+
+
+def _first_of_each(
+    connection: Connection, chosen: Select[Any], key: ColumnElement[int], *, is_newest: bool
+) -> Iterable[Row[Any]]:
+    """Keep of each key the newest row by its survey's time, or the oldest."""
+    times = (SURVEYS.c.captured_to_ns, SURVEYS.c.id)
+    order = [time.desc() if is_newest else time.asc() for time in times]
+    place = func.row_number().over(partition_by=key, order_by=order).label("place")
+    inner = chosen.add_columns(place).subquery()
+    return connection.execute(select(inner).where(inner.c.place == 1)).all()
+
+
+@dataclass(frozen=True)
+class ExecutedLift:
+    """A lift that took a bundle. target, set_down: its JSON in lifts.json. state: `executed` or later."""
+
+    lift_id: int
+    bundle_id: int
+    executed_ns: int
+    state: str
+    set_down: dict[str, float] | None
+
+    def laid(self, bundle: Bundle) -> Bundle | None:
+        """Return the bundle as it would lie where it was set down; None where that isn't known."""
+        if self.set_down is None:
+            return None
+        to = self.set_down
+        turned = (math.radians(to["yaw_deg"]) + math.pi / 2) % math.pi - math.pi / 2
+        centre = np.array([to["x_m"], to["y_m"], to["z_m"] + bundle.width_m / 2])
+        return replace(
+            bundle, centre_m=centre, yaw_rad=turned, pitch_rad=0.0, top_z_m=to["z_m"] + bundle.width_m
+        )
+
+
+def executed_lifts(connection: Connection) -> tuple[ExecutedLift, ...]:
+    """List the lifts that took a single bundle, each with its last state, in the order of their ids."""
+    newest = (
+        select(LIFT_STATES.c.lift_id, func.max(LIFT_STATES.c.step).label("step"))
+        .group_by(LIFT_STATES.c.lift_id)
+        .subquery()
+    )
+    done = LIFT_STATES.alias("done")
+    last = LIFT_STATES.alias("last")
+    alone = (
+        select(LIFT_BUNDLES.c.lift_id, func.min(LIFT_BUNDLES.c.bundle_id).label("bundle_id"))
+        .group_by(LIFT_BUNDLES.c.lift_id)
+        .having(func.count() == 1)
+        .subquery()
+    )
+    rows = connection.execute(
+        select(LIFTS.c.id, alone.c.bundle_id, done.c.at_ns, last.c.state, LIFTS.c.record)
+        .join(done, (done.c.lift_id == LIFTS.c.id) & (done.c.state == "executed"))
+        .join(newest, newest.c.lift_id == LIFTS.c.id)
+        .join(last, (last.c.lift_id == LIFTS.c.id) & (last.c.step == newest.c.step))
+        .join(alone, alone.c.lift_id == LIFTS.c.id)
+        .order_by(LIFTS.c.id)
+    ).all()
+    return tuple(
+        ExecutedLift(r.id, r.bundle_id, r.at_ns, r.state, json.loads(r.record)["set_down"]) for r in rows
+    )

@@ -1,0 +1,68 @@
+"""Keep a survey's lifts and vetoes, and settle the lifts that were offered or executed before it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from barsight.core.extras import extra
+from barsight.store.audit import Entry
+from barsight.store.history import executed_lifts
+from barsight.store.states import step_lift
+from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SURVEY_VETOES
+
+with extra("store"):
+    from sqlalchemy import select
+
+
+def add_lifts(
+    opened: Entry, survey_id: int, content: dict[str, Any], ids: dict[int, int], *, is_newest: bool
+) -> None:
+    """Add what lifts.json says. ids: identities by id in bundles.json.
+
+    Lifts are offered only where no later survey is known (is_newest); vetoes are kept of any.
+    """
+    for veto in content["vetoes"]:
+        opened.add(SURVEY_VETOES, survey_id=survey_id, code=veto["code"], reason=veto["reason"])
+    for lift in content["refused"]:
+        for number in lift["bundles"]:
+            for veto in lift["vetoes"]:
+                opened.add(
+                    SURVEY_VETOES, survey_id=survey_id, bundle_id=ids[number], code=veto["code"],
+                    reason=veto["reason"],
+                )  # fmt: skip
+    for lift in content["lifts"] if is_newest else ():
+        record = {key: value for key, value in lift.items() if key not in ("poles", "checks")}
+        lift_id = opened.add(
+            LIFTS, survey_id=survey_id, rank=lift["rank"], record=json.dumps(record, sort_keys=True)
+        )
+        for number in lift["bundles"]:
+            opened.add(LIFT_BUNDLES, lift_id=lift_id, bundle_id=ids[number])
+        step_lift(opened, lift_id, "offered")
+
+
+def settle_lifts(opened: Entry, told: dict[int, str], seen_from_ns: int, *, is_newest: bool) -> None:
+    """Judge executed lifts by what a later survey tells of their bundles; let offers of those expire.
+
+    told: change or absence by bundle. A lift holds where its bundle moved or is gone, it failed where the
+    bundle lies as it lay.
+    """
+    for lift in executed_lifts(opened.connection):
+        if lift.state != "executed" or lift.executed_ns > seen_from_ns:
+            continue
+        found = told.get(lift.bundle_id)
+        if found in ("moved", "gone"):
+            step_lift(opened, lift.lift_id, "verified", f"the next survey: {found}")
+        elif found == "same":
+            step_lift(opened, lift.lift_id, "failed", "the next survey found it where it lay")
+    if not is_newest:
+        return
+    offers = select(LIFT_STATES.c.lift_id).distinct().where(LIFT_STATES.c.state == "offered")
+    closed = select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.state != "offered")
+    rows = opened.connection.execute(
+        select(LIFT_BUNDLES.c.lift_id, LIFT_BUNDLES.c.bundle_id)
+        .where(LIFT_BUNDLES.c.lift_id.in_(offers), LIFT_BUNDLES.c.lift_id.not_in(closed))
+        .order_by(LIFT_BUNDLES.c.lift_id)
+    ).all()
+    for lift_id in sorted({row.lift_id for row in rows if row.bundle_id in told}):
+        step_lift(opened, lift_id, "expired", "a later survey saw its bundles")

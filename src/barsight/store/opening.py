@@ -1,0 +1,195 @@
+"""Open a store: find the database, bring its tables up to date, lend connections."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import ConfigError, InputError
+from barsight.core.extras import extra
+from barsight.core.files import atomic_path
+from barsight.store.tables import METADATA
+
+with extra("store"):
+    from alembic import command
+    from alembic.config import Config
+    from alembic.runtime.migration import MigrationContext
+    from alembic.script import ScriptDirectory
+    from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, text
+    from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError, OperationalError
+
+DEFAULT_URL = "sqlite:///barsight.db"
+MIGRATIONS = Path(__file__).parent / "migrations"
+WAIT_S = 60
+"""Time that a writer waits for another one."""
+_LOCK = 0x62617273
+"""PostgreSQL's advisory lock that writers of a store take."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """An open store. engine: SQLAlchemy's. name: its URL without the password."""
+
+    engine: Engine
+    name: str
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """Lend a connection in a transaction that only reads."""
+        with _told(self.name), self.engine.connect() as connection:
+            if not self._is_sqlite:
+                connection.execute(text("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY"))
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """Lend a connection in a transaction of its only writer; it commits unless an error is raised."""
+        writer = self.engine.execution_options(is_writer=True)
+        with _told(self.name), writer.begin() as connection:
+            if not self._is_sqlite:
+                connection.execute(text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
+            yield connection
+
+    @property
+    def _is_sqlite(self) -> bool:
+        return self.engine.dialect.name == "sqlite"
+
+
+@contextmanager
+def open_store(url: str, *, create: bool = False, migrate: bool = False) -> Iterator[Store]:
+    """Open a store and close it at the end.
+
+    create: whether to make one where there is none. migrate: whether tables of an earlier version on
+    PostgreSQL may be brought up to date; a SQLite file is backed up and brought up to date without being
+    asked. Raises ConfigError for a URL that is none, InputError for a database that can't be used.
+    """
+    parsed = _parse(url)
+    store = Store(_engine(parsed), parsed.render_as_string(hide_password=True))
+    try:
+        if parsed.get_backend_name() == "sqlite" and not create:
+            _expect_file(parsed)
+        _bring_up_to_date(store, parsed, create=create, migrate=migrate)
+        yield store
+    finally:
+        store.engine.dispose()
+
+
+def _parse(url: str) -> URL:
+    try:
+        parsed = make_url(url)
+    except ArgumentError as error:
+        remedy = "write sqlite:///FILE or postgresql://USER@HOST/NAME"
+        raise ConfigError(f"{url!r} is no database URL; {remedy}") from error
+    if parsed.get_backend_name() not in ("sqlite", "postgresql"):
+        raise ConfigError(f"{parsed.get_backend_name()}: a store is in SQLite or PostgreSQL")
+    if parsed.get_backend_name() == "sqlite" and parsed.database in (None, "", ":memory:"):
+        raise ConfigError(f"{url}: names no file; write sqlite:///FILE")
+    return parsed
+
+
+def _expect_file(url: URL) -> None:
+    path = Path(str(url.database))
+    if not path.is_file():
+        raise InputError(path, "there is no such store", "barsight store add makes one")
+
+
+def _engine(url: URL) -> Engine:
+    is_sqlite = url.get_backend_name() == "sqlite"
+    options: dict[str, Any] = {"timeout": WAIT_S} if is_sqlite else {"connect_timeout": 10}
+    try:
+        with extra("store" if is_sqlite else "postgres"):
+            engine = create_engine(url, connect_args=options)
+    except NoSuchModuleError as error:
+        raise ConfigError(f"{url.drivername}: SQLAlchemy knows no such driver") from error
+    if is_sqlite:
+        event.listen(engine, "connect", _set_up_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _set_up_sqlite(connection: Any, _: Any) -> None:
+    """Leave BEGIN to `_begin_sqlite`: the driver's own comes after the first read, and not before DDL."""
+    connection.isolation_level = None
+    connection.execute("PRAGMA foreign_keys = ON")
+    connection.execute("PRAGMA synchronous = FULL")
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    """Take the writer's lock at once, so that no other writer comes in between its reads and writes."""
+    is_writer = connection.get_execution_options().get("is_writer")
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if is_writer else "BEGIN")
+
+
+@contextmanager
+def _told(name: str) -> Iterator[None]:
+    """Turn a database that can't be reached, read or written into an InputError of one line.
+
+    A statement that it refuses is a bug and raised as it is.
+    """
+    try:
+        yield
+    except DatabaseError as error:
+        if not isinstance(error, OperationalError) and type(error) is not DatabaseError:
+            raise
+        problem = str(error.orig).strip().splitlines()[0]
+        raise InputError(
+            name, problem, "see that the database is there, is a store and may be written"
+        ) from error
+
+
+def _bring_up_to_date(store: Store, url: URL, *, create: bool, migrate: bool) -> None:
+    """Migrate inside the writer's transaction: killed in between, the database is as it was."""
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
+    config.set_main_option("version_locations", str(MIGRATIONS / "versions").replace("%", "%%"))
+    config.set_main_option("path_separator", "os")
+    script = ScriptDirectory.from_config(config)
+    newest = str(script.get_current_head())
+    with store.reading() as connection:
+        if MigrationContext.configure(connection).get_current_revision() == newest:
+            return
+    with store.writing() as connection:
+        found = MigrationContext.configure(connection).get_current_revision()
+        if found == newest:
+            return  # another one made it in the meantime
+        _expect_migration(store.name, connection, found, script, create=create)
+        if found is not None:
+            _back_up(store.name, url, found, migrate=migrate)
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+
+
+def _expect_migration(
+    name: str, connection: Connection, found: str | None, script: ScriptDirectory, *, create: bool
+) -> None:
+    """Raise InputError where a database's tables aren't a store's, or are a newer version's."""
+    if found is None:
+        if set(inspect(connection).get_table_names()) & set(METADATA.tables):
+            raise InputError(name, "has tables of another program", "name a database of its own")
+        if not create:
+            raise InputError(name, "there is no store in it", "barsight store add makes one")
+    elif found not in {each.revision for each in script.walk_revisions()}:
+        raise InputError(name, f"was written by a newer version (schema {found})", "update Barsight")
+
+
+def _back_up(name: str, url: URL, found: str, *, migrate: bool) -> None:
+    """Copy a SQLite file while its writer's lock is held; on PostgreSQL ask the operator."""
+    if url.get_backend_name() != "sqlite":
+        if not migrate:
+            raise ConfigError(
+                f"{name}: has schema {found} of an earlier version; back it up with pg_dump, then run "
+                "barsight store list URL --migrate"
+            )
+        return
+    path = Path(str(url.database))
+    # SQLite's own copy: closing a file that was opened beside it would drop SQLite's locks on it.
+    with (
+        atomic_path(path.with_name(f"{path.name}.schema-{found}.backup")) as backup,
+        closing(sqlite3.connect(path)) as source,
+        closing(sqlite3.connect(backup)) as target,
+    ):
+        source.backup(target)

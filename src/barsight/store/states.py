@@ -1,0 +1,76 @@
+"""Step lifts and alarms from state to state, each step a row with who and when."""
+
+from __future__ import annotations
+
+from barsight.core.errors import InputError
+from barsight.core.extras import extra
+from barsight.store.audit import Entry
+from barsight.store.tables import ALARM_STATES, ALARMS, LIFT_STATES
+
+with extra("store"):
+    from sqlalchemy import Connection, Table, select
+
+LIFT_STEPS: dict[str | None, tuple[str, ...]] = {
+    None: ("offered",),
+    "offered": ("claimed", "expired"),
+    "claimed": ("executed", "failed", "expired"),
+    "executed": ("verified", "failed"),
+}
+"""Which states may follow a lift's state; none follows `failed`, `verified` and `expired`."""
+ALARM_STEPS: dict[str | None, tuple[str, ...]] = {
+    None: ("raised",),
+    "raised": ("acknowledged", "cleared"),
+    "acknowledged": ("cleared",),
+}
+
+
+def step_lift(opened: Entry, lift_id: int, state: str, note: str | None = None) -> None:
+    """Bring a lift into a state. Raises InputError where that may not follow the state that it is in."""
+    _step(opened, LIFT_STATES, "lift", lift_id, LIFT_STEPS, state, note)
+
+
+def raise_alarm(opened: Entry, code: str, reason: str) -> int:
+    """Raise an alarm and return its id."""
+    alarm_id = opened.add(ALARMS, code=code, reason=reason)
+    _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, "raised", None)
+    return alarm_id
+
+
+def step_alarm(opened: Entry, alarm_id: int, state: str, note: str | None = None) -> None:
+    """Acknowledge or clear an alarm. Raises InputError where that may not follow the state that it is in."""
+    _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, state, note)
+
+
+def lift_state(connection: Connection, lift_id: int) -> str | None:
+    """Return a lift's state, None where there is no such lift."""
+    return _last(connection, LIFT_STATES, "lift", lift_id)[1]
+
+
+def alarm_state(connection: Connection, alarm_id: int) -> str | None:
+    """Return an alarm's state, None where there is no such alarm."""
+    return _last(connection, ALARM_STATES, "alarm", alarm_id)[1]
+
+
+def _last(connection: Connection, table: Table, owner: str, number: int) -> tuple[int, str | None]:
+    """Find an owner's last step and state."""
+    found = connection.execute(
+        select(table.c.step, table.c.state)
+        .where(table.c[f"{owner}_id"] == number)
+        .order_by(table.c.step.desc())
+        .limit(1)
+    ).first()
+    return (0, None) if found is None else (int(found[0]), str(found[1]))
+
+
+def _step(
+    opened: Entry, table: Table, owner: str, number: int, steps: dict[str | None, tuple[str, ...]],
+    state: str, note: str | None,
+) -> None:  # fmt: skip
+    count, present = _last(opened.connection, table, owner, number)
+    if state not in steps.get(present, ()):
+        allowed = ", ".join(steps.get(present, ())) or "nothing"
+        raise InputError(
+            f"{owner} {number}", f"is {present}: {state} can't follow", f"what can follow is {allowed}"
+        )
+    values = {f"{owner}_id": number, "step": count + 1, "state": state, "who": opened.who, "note": note}
+    opened.add(table, at_ns=opened.at_ns, **values)

@@ -1,0 +1,106 @@
+"""Define the store's tables: facts that are added and never changed or removed.
+
+Times are integers in ns on the frames' clock (`captured_*`) or this computer's (`at_ns`, `added_ns`).
+"""
+
+from __future__ import annotations
+
+from barsight.core.extras import extra
+
+with extra("store"):
+    from sqlalchemy import (
+        BigInteger,
+        Boolean,
+        Column,
+        Double,
+        ForeignKey,
+        Integer,
+        LargeBinary,
+        MetaData,
+        Table,
+        Text,
+        UniqueConstraint,
+    )  # fmt: skip
+
+METADATA = MetaData()
+
+
+def _figures(*names: str) -> list[Column[float]]:
+    return [Column(name, Double, nullable=False) for name in names]
+
+
+def _texts(*names: str) -> list[Column[str]]:
+    return [Column(name, Text, nullable=False) for name in names]
+
+
+def _stamps(*names: str) -> list[Column[int]]:
+    return [Column(name, BigInteger, nullable=False) for name in names]
+
+
+def _of(table: str, *, is_optional: bool = False) -> Column[int]:
+    name = f"{table.removesuffix('s')}_id"
+    return Column(name, Integer, ForeignKey(f"{table}.id"), nullable=is_optional, index=True)
+
+
+def _key() -> Column[int]:
+    return Column("id", Integer, primary_key=True)
+
+
+SURVEYS = Table(
+    "surveys", METADATA, _key(), Column("map_id", Text, nullable=False, unique=True),
+    *_stamps("captured_from_ns", "captured_to_ns", "added_ns"), *_texts("calibration_id"),
+    Column("yard_frame_id", Text), Column("is_simulated", Boolean, nullable=False),
+    *_texts("software_version", "folder", "files"), Column("heights", LargeBinary, nullable=False),
+)  # fmt: skip
+"""Measured folders. files: JSON, SHA-256 of each file. heights: of `coarse_map.pack`."""
+
+BUNDLES = Table("bundles", METADATA, _key(), _of("surveys"))
+"""Identities: one row per bundle that ever lay in the yard, with the survey that named it."""
+
+SIGHTINGS = Table(
+    "sightings", METADATA, _key(), _of("surveys"), _of("bundles"),
+    Column("number", Integer, nullable=False), *_texts("change"), Column("stock_name", Text),
+    *_figures("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m"), *_texts("record"),
+    UniqueConstraint("survey_id", "number"), UniqueConstraint("survey_id", "bundle_id"),
+)  # fmt: skip
+"""Bundles as a survey saw them. number: id in bundles.json; record: its JSON there, without `bar_axes`."""
+
+ABSENCES = Table(
+    "absences", METADATA, _key(), _of("surveys"), _of("bundles"), *_texts("kind", "reason"),
+    UniqueConstraint("survey_id", "bundle_id"),
+)  # fmt: skip
+"""Bundles that a survey looked for and did not see: `gone`, `covered` or `not-found`."""
+
+LIFTS = Table(
+    "lifts", METADATA, _key(), _of("surveys"), Column("rank", Integer, nullable=False), *_texts("record"),
+)  # fmt: skip
+"""Lifts that a survey's lifts.json offered. record: its JSON there, without poles and checks."""
+
+LIFT_BUNDLES = Table(
+    "lift_bundles", METADATA, _key(), _of("lifts"), _of("bundles"), UniqueConstraint("lift_id", "bundle_id")
+)
+
+LIFT_STATES = Table(
+    "lift_states", METADATA, _key(), _of("lifts"), Column("step", Integer, nullable=False),
+    *_texts("state"), *_stamps("at_ns"), *_texts("who"), Column("note", Text),
+    UniqueConstraint("lift_id", "step"),
+)  # fmt: skip
+
+SURVEY_VETOES = Table(
+    "vetoes", METADATA, _key(), _of("surveys"), _of("bundles", is_optional=True), *_texts("code", "reason"),
+)  # fmt: skip
+"""Vetoes of a survey's lifts.json; of the whole map where they name no bundle."""
+
+ALARMS = Table("alarms", METADATA, _key(), *_texts("code", "reason"))
+
+ALARM_STATES = Table(
+    "alarm_states", METADATA, _key(), _of("alarms"), Column("step", Integer, nullable=False),
+    *_texts("state"), *_stamps("at_ns"), *_texts("who"), Column("note", Text),
+    UniqueConstraint("alarm_id", "step"),
+)  # fmt: skip
+
+AUDIT = Table(
+    "audit", METADATA, _key(), *_stamps("at_ns"), *_texts("who", "what", "content"),
+    Column("previous", Text, nullable=False, unique=True), Column("digest", Text, nullable=False),
+)  # fmt: skip
+"""The chain of what was added; see `audit`."""
