@@ -34,10 +34,10 @@ def run(arguments: Sequence[str]) -> None:
     ) -> None:
         """Measure while pictures and readings come, each at its time: poses, a growing map, lifts at the end.
 
-        Capture, tracking and mapping are processes of their own; each is started anew if it ends. OUT tells at
-        any time how the run stands (state.json, health.json, health.prom, pose.json) and has at the end all that
-        measure writes, and latency.json. Ctrl-C ends the run as the recording's end does. Cameras can't be
-        connected yet: only recordings are replayed.
+        Capture, tracking and mapping are processes of their own; each is started anew if it ends. OUT tells
+        at any time how the run stands (state.json, health.json, health.prom, pose.json) and has at the end
+        all that measure writes, and latency.json. Ctrl-C ends the run as the recording's end does. Cameras
+        can't be connected yet: only recordings are replayed.
 
         Args:
             replay: The recording to replay.

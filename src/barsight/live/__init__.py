@@ -1,1 +1,1 @@
-"""Measuring beside the crane: capture, track and map as processes under a supervisor, from a recording so far."""
+"""Measuring while the crane travels: capture, track and map are processes under a supervisor."""

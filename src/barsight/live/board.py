@@ -1,4 +1,4 @@
-"""Count in shared memory: one row for each process, which alone writes it, so that no lock can be left held."""
+"""Count in shared memory: each process writes a row of its own, so that no lock can be left held."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from barsight.core.arrays import Int64
 ROWS: dict[str, tuple[str, ...]] = {
     "supervisor": ("began_ns", "stop"),
     "capture": (
-        "ready", "ended", "pictures_cam0", "pictures_cam1", "paired", "unpaired_cam0", "unpaired_cam1", "torn",
-        "capture_down", "last_cam0_ns", "last_cam1_ns", "longest_cam0_ns", "longest_cam1_ns", "first_ns",
+        "ready", "ended", "pictures_cam0", "pictures_cam1", "paired", "unpaired_cam0", "unpaired_cam1",
+        "torn", "capture_down", "last_cam0_ns", "last_cam1_ns", "interval_ns", "first_ns",
     ),
-    "track": ("ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "last_pose_ns"),
+    "track": ("ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed"),
     "map": ("ready", "mapped", "refused", "backlog", "snapshots"),
 }  # fmt: skip
-"""Names of the counters of each process. Those that end in _ns are stamps or spans, began_ns is of the monotonic
-clock."""
+"""Counters of each process. Those in _ns are stamps or spans; began_ns is of the monotonic clock."""
 _WIDTH = max(len(names) for names in ROWS.values())
 
 

@@ -27,6 +27,7 @@ def capture(link: Link) -> None:
         time.sleep(POLL_S)
     clock = ReplayClock(began_ns, first_ns, link.speed)
     source = ReplaySource(recording, clock, lambda: not board["supervisor", "stop"])
+    board["capture", "interval_ns"] = source.interval_ns
     Capture(link, board, link.open_ring(recording)).run(source)
     board["capture", "ended"] = 1
 
@@ -57,11 +58,8 @@ class Capture:
         self._count_lost()
 
     def _take(self, picture: Picture) -> None:
-        """Note the camera's last picture and longest interval, and write the pair that a picture completes."""
+        """Note the camera's last picture, and write the pair that a picture completes."""
         board, camera = self._board, f"cam{picture.camera}"
-        if last_ns := board["capture", f"last_{camera}_ns"]:
-            longest = f"longest_{camera}_ns"
-            board["capture", longest] = max(board["capture", longest], picture.stamp_ns - last_ns)
         board["capture", f"last_{camera}_ns"] = picture.stamp_ns
         board.add("capture", f"pictures_{camera}")
         for frame, exposed_ns in self._pairs.push(picture):
@@ -80,4 +78,3 @@ class Capture:
     def _count_lost(self) -> None:
         for camera, before in enumerate(self._lost):
             self._board["capture", f"unpaired_cam{camera}"] = before + self._pairs.lost[camera]
-

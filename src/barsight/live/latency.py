@@ -13,7 +13,7 @@ from barsight.live.link import Link
 
 
 def latencies(link: Link, board: Board, lifts_s: float | None) -> dict[str, Any]:
-    """Build the content of latency.json. lifts_s: from the last frame's exposure to the lifts, if there are any.
+    """Build the content of latency.json. lifts_s: from the last frame's exposure to the lifts, if they came.
 
     A pose counts from its exposure to where it is published, a tile from its keyframe's exposure to where the
     keyframe is fused; keyframes that only the end fused have none.
@@ -46,11 +46,16 @@ def counts(board: Board) -> dict[str, Any]:
     capture, track, built = (board.row(role) for role in ("capture", "track", "map"))
     causes = ("unpaired_cam0", "unpaired_cam1", "torn", "capture_down")
     dropped = {cause: capture[cause] for cause in causes}
+    lost = sum(dropped.values())
+    dropped |= {name: track[name] for name in ("newer_pair", "not_placed")}
+    tracked_or_told = sum(track[name] for name in ("tracked", "kept_passed", "newer_pair", "not_placed"))
+    dropped["track_down"] = max(track["taken"] - tracked_or_told, 0)
     return {
-        "captured": capture["paired"] + sum(dropped.values()),
+        "captured": capture["paired"] + lost,
         "paired": capture["paired"],
         "tracked": track["tracked"],
         "kept": track["kept"],
         "mapped": built["mapped"],
-        "dropped": dropped | {name: track[name] for name in ("newer_pair", "not_placed")},
+        "kept_without_pose": track["kept_passed"],
+        "dropped": dropped,
     }

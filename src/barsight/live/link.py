@@ -14,8 +14,8 @@ from barsight.live.ring import PairRing
 from barsight.live.settings import LiveSettings
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import FrameIndex, Recording
-from barsight.recording.packets import PacketRecording
 from barsight.recording.open import open_recording
+from barsight.recording.packets import PacketRecording
 from barsight.recording.stored_images import StoredPictures
 from barsight.recording.wrapper import RecordingProxy
 

@@ -62,7 +62,7 @@ class NumberLog:
 
     def append(self, numbers: Iterable[int]) -> None:
         """Append a line in one write; the first cuts off what a killed writer left."""
-        line = (",".join((str(int(number)) for number in numbers)) + "\n").encode("ascii")
+        line = (",".join(str(int(number)) for number in numbers) + "\n").encode("ascii")
         if not self._is_whole and self._path.exists():
             os.truncate(self._path, self._path.read_bytes().rfind(b"\n") + 1)
         self._is_whole = True

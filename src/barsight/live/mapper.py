@@ -7,6 +7,7 @@ import time
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.checkpoint import read_checkpoint
+from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import BarsightError, MeasurementError
 from barsight.core.memory import trim_heap
 from barsight.core.timing import Stopwatch
@@ -28,6 +29,7 @@ def build_live_map(link: Link) -> None:
     """Map keyframes until the supervisor says so."""
     os.nice(NICENESS)
     board = link.open_board()
+    load_kernels("measure")
     mapping = Mapping(link, GrowingRecording(link.open_recording(), [], link))
     board["map", "mapped"] = board["map", "refused"] = 0
     board["map", "ready"] = 1

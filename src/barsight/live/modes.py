@@ -22,26 +22,26 @@ MODES: dict[ModeName, str] = {
     "blind": "Neither pictures nor encoders: nothing is known, no lift.",
 }
 FOR_LIFTS = ("full", "no-imu")
-MIN_CAMERA_SILENCE_S, FIRST_SILENCE_S = 0.3, 5.0
-"""A camera's bound at least, and before its second picture."""
+MIN_CAMERA_SILENCE_S = 0.3
 
 
 @dataclass(frozen=True)
 class HeardSensors:
-    """When each sensor was last heard, stamps on the cameras' clock, 0 for never; those of `cam0` and `cam1`,
-    then of `imu` and `crane` where the recording has them. longest_ns: the cameras' longest intervals. frozen:
-    whether the encoders repeat one reading that a moving crane can't.
+    """When each sensor was last heard: stamps on the cameras' clock, 0 for never.
+
+    cameras_ns: of cam0 and cam1. interval_ns: between pictures, at most. readings_ns: of `imu` and `crane`,
+    where the recording has them. frozen: whether the encoders repeat one reading that a moving crane can't.
     """
 
     cameras_ns: tuple[int, int]
-    longest_ns: tuple[int, int]
+    interval_ns: int
     readings_ns: dict[str, int]
     frozen: bool = False
 
 
 @dataclass(frozen=True)
 class Mode:
-    """name: of MODES. reasons: why it isn't `full`, and which process is down. lifts: whether any may stand."""
+    """name: of MODES. reasons: why not `full`, or which process is down. lifts: whether any may stand."""
 
     name: ModeName
     reasons: tuple[str, ...]
@@ -73,12 +73,10 @@ def judge_mode(
 def _silent_cameras(heard: HeardSensors, now_ns: int, settings: LiveSettings) -> list[str]:
     """Tell which cameras gave no picture for too long."""
     told = []
-    for camera, (last_ns, longest_ns) in enumerate(zip(heard.cameras_ns, heard.longest_ns, strict=True)):
-        bound_s = FIRST_SILENCE_S
-        if longest_ns:
-            bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * longest_ns / NS_PER_S)
+    bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
+    for camera, last_ns in enumerate(heard.cameras_ns):
         if not last_ns:
-            told.append(f"cam{camera} gave no picture yet")
+            told.append(f"cam{camera}: no picture yet")
         elif now_ns - last_ns > seconds_to_ns(bound_s):
             told.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s))
     return told

@@ -38,7 +38,10 @@ class PairFormer:
             exposed_ns = max(left.exposed_ns, right.exposed_ns)
             yield StereoFrame(left.stamp_ns, left.image, right.image), exposed_ns
         for camera in (0, 1):
-            while self._waiting[camera] and picture.stamp_ns - self._waiting[camera][0].stamp_ns > self.tolerance_ns:
+            while (
+                self._waiting[camera]
+                and picture.stamp_ns - self._waiting[camera][0].stamp_ns > self.tolerance_ns
+            ):
                 self._drop(camera)
 
     def end(self) -> None:

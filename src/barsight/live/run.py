@@ -186,4 +186,6 @@ def read_keyframes(path: Path) -> Keyframes:
     except FileNotFoundError as error:
         raise InputError(path, "no such file", remedy) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(path, f"is no list of keyframes ({type(error).__name__}: {error})", remedy) from error
+        raise InputError(
+            path, f"is no list of keyframes ({type(error).__name__}: {error})", remedy
+        ) from error

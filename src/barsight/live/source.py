@@ -17,6 +17,7 @@ from barsight.recording.stored_images import StoredImage, StoredPictures
 
 BATCH_NS = 10_000_000
 """Readings come in batches of so much time."""
+USUAL_PERCENT = 95
 AHEAD_NS = NS_PER_S // 5
 """As fast as possible, readings come so far ahead of the pictures: more than any pose waits for."""
 
@@ -42,7 +43,7 @@ class LostPicture:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Readings of `imu` (gyro rad/s, then accelerometer m/s2, body) or `crane` (place, m): (N,), (N, width)."""
+    """Readings of `imu` (gyro rad/s, then accelerometer m/s2) or `crane` (place, m): (N,), (N, width)."""
 
     sensor: str
     stamp_ns: Int64
@@ -50,21 +51,26 @@ class Readings:
 
 
 class Source(Protocol):
-    """Protocol of cameras, IMU and encoders. All stamps are of exposure or measurement, never of arrival, and on
-    the recording's clocks: pictures' on the cameras', readings' on the IMU's.
+    """Protocol of cameras, IMU and encoders. All stamps are of exposure or measurement, never of arrival:
+    pictures' on the cameras' clock, readings' on the IMU's.
     """
 
+    @property
+    def interval_ns(self) -> int:
+        """Return the time between two pictures of a camera, at most, as long as all is well."""
+        ...
+
     def packets(self, after: dict[str, int]) -> Iterator[Picture | LostPicture | Readings]:
-        """Yield what comes, when it comes. after: last stamp already taken, of `cam0`, `cam1`, `imu`, `crane`;
-        0 where none was.
+        """Yield what comes, when it comes. after: last stamp already taken, of `cam0`, `cam1`, `imu` and
+        `crane`; 0 where none was.
         """
         ...
 
 
 @dataclass(frozen=True)
 class ReplayClock:
-    """Relates stamps to the monotonic clock. began_ns: when (monotonic) `first_ns` (stamp) was. speed: recorded
-    seconds a second; 0: as fast as possible, where a stamp's time is when it is asked for.
+    """Relates stamps to the monotonic clock. began_ns: when (monotonic) `first_ns` (stamp) was. speed:
+    recorded seconds a second; 0: as fast as possible, where a stamp is due when it is asked for.
     """
 
     began_ns: int
@@ -87,13 +93,11 @@ class ReplayClock:
 class ReplaySource:
     """`Source` of a recording. It ends with the pictures: readings after them come at once.
 
-    may_go_on: asked before each picture and while waiting; the source ends where it says no. A capture that was
-    begun anew finds all readings, as a driver would have kept them, but the pictures due meanwhile are lost.
+    may_go_on: asked before each picture and while waiting; the source ends where it says no. A capture begun
+    anew finds all readings, as a driver would have kept them, but the pictures due meanwhile are lost.
     """
 
-    def __init__(
-        self, recording: StoredPictures, clock: ReplayClock, may_go_on: Callable[[], bool]
-    ) -> None:
+    def __init__(self, recording: StoredPictures, clock: ReplayClock, may_go_on: Callable[[], bool]) -> None:
         self._recording, self._clock, self._may_go_on = recording, clock, may_go_on
         imu, crane = recording.imu(), recording.crane()
         self._readings: dict[str, tuple[Int64, Float64]] = {}
@@ -102,6 +106,12 @@ class ReplaySource:
         if crane is not None:
             self._readings["crane"] = crane.stamp_ns, crane.position_m
         self._shift_ns = recording.rig.timeshift_cam_imu_ns
+
+    @property
+    def interval_ns(self) -> int:
+        """Return an interval that only a twentieth of cam0's exceed: a recording may have gaps."""
+        stamps = self._recording.camera_stamps.left_ns
+        return int(np.percentile(np.diff(stamps), USUAL_PERCENT)) if len(stamps) > 1 else 0
 
     def packets(self, after: dict[str, int]) -> Iterator[Picture | LostPicture | Readings]:
         """Yield what comes, when it is due; see `Source.packets`."""

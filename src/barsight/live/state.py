@@ -1,4 +1,4 @@
-"""Write what a run is and does for readers: state.json, health.json and health.prom, each whole or not at all."""
+"""Write a run's state and health for readers: state.json, health.json and health.prom."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def write_state(state: RunState, board: Board, out: Path) -> None:
 
 
 def write_health(state: RunState, board: Board, seconds: float, out: Path) -> None:
-    """Write health.json and health.prom, Prometheus' text for a collector of files. seconds: since the begin."""
+    """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since it began."""
     frames = counts(board)
     memory = {name: _memory_bytes(process.pid) for name, process in state.processes.items()}
     content = {
@@ -100,7 +100,10 @@ def prometheus(health: Mapping[str, Any]) -> str:
     for name, (kind, label, values) in metrics.items():
         lines.append(f"# TYPE {name} {kind}")
         lines += [f'{name}{{{label}="{key}"}} {value}' for key, value in values.items()]
-    lines += ["# TYPE barsight_disk_free_bytes gauge", f"barsight_disk_free_bytes {health['disk_free_bytes']}"]
+    lines += [
+        "# TYPE barsight_disk_free_bytes gauge",
+        f"barsight_disk_free_bytes {health['disk_free_bytes']}",
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -68,7 +68,7 @@ class Supervisor:
         self.stop_because = ""
 
     def run(self) -> None:
-        """Run until the recording's end, `stop` or a process that can't be kept up; then end all processes."""
+        """Run until the recording ends, `stop` is called or a process can't be kept up; then end all."""
         try:
             for role in PROCESSES:
                 self._start(role)
@@ -134,7 +134,9 @@ class Supervisor:
             now = time.monotonic()
             self._ends[role] = [at for at in self._ends[role] if now - at < RESTARTS_WITHIN_S] + [now]
             if len(self._ends[role]) > MOST_RESTARTS:
-                self.stop(f"{role} {state.reason}, {MOST_RESTARTS + 1} times within {RESTARTS_WITHIN_S:.0f} s")
+                self.stop(
+                    f"{role} {state.reason}, {MOST_RESTARTS + 1} times within {RESTARTS_WITHIN_S:.0f} s"
+                )
                 return
             self._board[role, "ready"] = 0
             self._start(role)
@@ -155,7 +157,9 @@ class Supervisor:
         if now_ns is None or self._board["capture", "ended"]:
             now_ns = self._last_picture_ns()
         down = {
-            role: one.reason for role, one in self.state.processes.items() if one.state not in ("running", "done")
+            role: one.reason
+            for role, one in self.state.processes.items()
+            if one.state not in ("running", "done")
         }
         mode = judge_mode(heard, now_ns, self._link.live, down)
         self.state.now_ns = now_ns
@@ -176,8 +180,7 @@ class Supervisor:
             if sensor == "crane" and self._freeze is not None:
                 frozen = self._freeze.check(stamps, values)
         last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
-        longest_ns = board["capture", "longest_cam0_ns"], board["capture", "longest_cam1_ns"]
-        return HeardSensors(last_ns, longest_ns, readings, frozen)
+        return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen)
 
     def _last_picture_ns(self) -> int:
         return max(self._board["capture", f"last_cam{camera}_ns"] for camera in (0, 1))

@@ -11,14 +11,15 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.checkpoint import write_checkpoint
 from barsight.core.arrays import Float64
+from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
-from barsight.core.stamps import NS_PER_S
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
 from barsight.live.board import Board
 from barsight.live.link import GrowingRecording, Link
-from barsight.live.ring import CapturedPair
+from barsight.live.ring import CapturedPair, PairRing
 from barsight.motion.estimator import PoseEstimator
 from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -34,7 +35,9 @@ AGAIN_FRAMES = 10
 def track(link: Link) -> None:
     """Track until capture has ended and its last pair is taken, or the supervisor says so."""
     whole, board = link.open_recording(), link.open_board()
-    ring, tracking = link.open_ring(whole), Tracking(link, GrowingRecording(whole, [], link), board)
+    ring = link.open_ring(whole)
+    tracking = Tracking(link, GrowingRecording(whole, [], link), board, ring)
+    load_kernels("measure")
     tracking.follow_again()
     board["track", "ready"] = 1
     while not board["supervisor", "stop"]:
@@ -48,17 +51,16 @@ def track(link: Link) -> None:
         pair = ring.read(newest)
         if pair is None:
             continue
-        board.add("track", "newer_pair", newest - taken - 1)
         board["track", "taken"] = newest
-        tracking.take(pair)
+        tracking.take(pair, range(taken + 1, newest))
     board["track", "done"] = 1
 
 
 class Tracking:
     """Estimates each pair's pose with what is known when it comes, and keeps those that are keyframes."""
 
-    def __init__(self, link: Link, recording: GrowingRecording, board: Board) -> None:
-        self._link, self._recording, self._board = link, recording, board
+    def __init__(self, link: Link, recording: GrowingRecording, board: Board, ring: PairRing) -> None:
+        self._link, self._recording, self._board, self._ring = link, recording, board, ring
         self._rectifier = Rectifier(recording.rig)
         self._pairs = RectifiedPairs(recording, self._rectifier, link.checkpoints)
         self._frames = link.frames()
@@ -67,50 +69,82 @@ class Tracking:
         self._estimator = make_estimator(motion)
         self._poses: PoseEstimator | None = None
         self._last_kept: Float64 | None = None
+        self._last_kept_ns, self._still = 0, 0
 
     def follow_again(self) -> None:
-        """Follow the last keyframes anew after a restart, all of them where no encoder says where they are."""
+        """Follow the last keyframes anew after a restart, all of them without encoders."""
         kept = [stamp for stamp, _, _, is_kept, _ in self._frames.read() if is_kept]
         self._recording.grow()
         again = kept if self._source.crane() is None else kept[-AGAIN_FRAMES:]
         self._recording.stamps_ns[:] = kept
         for seen in self._pairs(frozenset(again)) if again else ():
             posed = self._placed(seen)
+            self._last_kept_ns = seen.stamp_ns
             if isinstance(posed, PosedFrame):
                 self._last_kept = posed.reference_from_body.translation
 
-    def take(self, pair: CapturedPair) -> None:
-        """Track a pair from the ring, keep it if it is a keyframe, and note when that was done."""
-        board, stamp = self._board, pair.frame.stamp_ns
+    def take(self, pair: CapturedPair, passed: range) -> None:
+        """Track a pair from the ring and keep it if it is a keyframe. passed: numbers of the pairs before it
+        that were passed over; of these are kept, without a pose, as many as the map would lack.
+        """
+        stamp = pair.frame.stamp_ns
         rectified = self._rectifier(pair.frame)
         if isinstance(rectified, Failed):
             posed: PosedFrame | RefusedFrame = RefusedFrame(stamp, rectified.reason)
         else:
             self._wait_for_readings(stamp)
             posed = self._placed(rectified)
-        board.add("track", "tracked" if isinstance(posed, PosedFrame) else "not_placed")
+        has_pose = isinstance(posed, PosedFrame)
+        self._board.add("track", "tracked" if has_pose else "not_placed")
         if isinstance(posed, PosedFrame):
-            board["track", "last_pose_ns"] = stamp
             _publish(posed, self._link)
         done_ns = time.monotonic_ns()
+        for number in passed:
+            self._keep_passed(self._ring.read(number))
         is_kept = isinstance(rectified, RectifiedPair) and self._is_keyframe(stamp, posed)
-        if is_kept:
-            self._pairs.store(rectified)
-            if isinstance(posed, PosedFrame):
-                self._last_kept = posed.reference_from_body.translation
-                with atomic_path(self._link.posed_file(stamp)) as path:
-                    write_checkpoint(posed, path)
-            board.add("track", "kept")
-        self._frames.append((stamp, pair.exposed_ns, done_ns, is_kept, isinstance(posed, PosedFrame)))
+        if isinstance(rectified, RectifiedPair) and is_kept:
+            self._keep(rectified)
+        if isinstance(posed, PosedFrame) and is_kept:
+            self._last_kept = posed.reference_from_body.translation
+            with atomic_path(self._link.posed_file(stamp)) as path:
+                write_checkpoint(posed, path)
+        self._frames.append((stamp, pair.exposed_ns, done_ns, is_kept, has_pose))
+
+    def _keep_passed(self, pair: CapturedPair | None) -> None:
+        """Keep a pair that was passed over if it is far enough from the last one kept."""
+        if pair is not None and self._is_wanted(pair.frame.stamp_ns):
+            rectified = self._rectifier(pair.frame)
+            if isinstance(rectified, RectifiedPair):
+                self._keep(rectified)
+                self._board.add("track", "kept_passed")
+                self._frames.append((pair.frame.stamp_ns, pair.exposed_ns, time.monotonic_ns(), True, False))
+                return
+        self._board.add("track", "newer_pair")
+
+    def _is_wanted(self, stamp_ns: int) -> bool:
+        if self._link.keyframes is not None:
+            return stamp_ns in self._link.keyframes
+        return stamp_ns - self._last_kept_ns >= seconds_to_ns(self._link.live.passed_every_s)
+
+    def _keep(self, pair: RectifiedPair) -> None:
+        self._pairs.store(pair)
+        self._last_kept_ns = pair.stamp_ns
+        self._board.add("track", "kept")
 
     def _is_keyframe(self, stamp_ns: int, posed: PosedFrame | RefusedFrame) -> bool:
-        """Choose what is kept: pairs that the body has gone far enough for, and those whose place isn't known."""
+        """Choose what is kept: pairs that the body has gone far enough for, the first few of a crane
+        that stands, and those whose place isn't known.
+        """
         if self._link.keyframes is not None:
             return stamp_ns in self._link.keyframes
         if isinstance(posed, RefusedFrame) or self._last_kept is None:
             return True
         way_m = np.linalg.norm(posed.reference_from_body.translation - self._last_kept)
-        return bool(way_m >= self._link.live.keyframe_way_m)
+        if way_m >= self._link.live.keyframe_way_m:
+            self._still = 0
+            return True
+        self._still += self._is_wanted(stamp_ns)
+        return self._is_wanted(stamp_ns) and self._still <= self._link.live.still_pairs
 
     def _wait_for_readings(self, stamp_ns: int) -> None:
         """Wait for the readings that the pose needs, `GRACE_S` at most."""
