@@ -75,8 +75,8 @@ def write_measured(
     report: bool = True,
     notices: tuple[Notice, ...] = (),
 ) -> dict[str, Any]:
-    """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from. notices: what
-    the caller knows besides.
+    """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from. notices:
+    what the caller knows besides.
     """
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
