@@ -43,13 +43,14 @@ class RunState:
 
     def content(self, board: Board) -> dict[str, Any]:
         """Build the content of state.json."""
+        may_stand = self.mode.lifts and self.phase != "failed"
         return {
             "schema_version": 1,
             "phase": self.phase,
             "now_ns": self.now_ns,
             "mode": self.mode.name,
             "reasons": list(self.mode.reasons),
-            "lifts": {"may_stand": self.mode.lifts, "offered": self.offered if self.mode.lifts else 0},
+            "lifts": {"may_stand": may_stand, "offered": self.offered if may_stand else 0},
             "processes": {name: vars(process).copy() for name, process in self.processes.items()},
             "backlog_keyframes": board["map", "backlog"],
             "frames": counts(board),
