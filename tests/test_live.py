@@ -12,7 +12,7 @@ import pytest
 import barsight as bs
 from barsight.cli.main import run
 from barsight.core.types import CraneSamples, StereoFrame
-from barsight.live.board import Board
+from barsight.live.counters import Counters
 from barsight.live.latency import counts, spread
 from barsight.live.logs import NumberLog, ReadingLog
 from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
@@ -20,7 +20,7 @@ from barsight.live.pairing import PairFormer
 from barsight.live.ring import PairRing
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
-from barsight.live.source import Picture, Readings, ReplayClock, ReplaySource
+from barsight.live.source import LivePicture, Readings, ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.yard.magnet.description import example_magnet
 from cli_runs import FAST
@@ -43,8 +43,8 @@ def content(path: Path) -> Any:
 
 
 @pytest.fixture
-def board() -> Iterator[Board]:
-    one = Board()
+def board() -> Iterator[Counters]:
+    one = Counters()
     yield one
     one.remove()
 
@@ -182,11 +182,11 @@ def test_pairs_form_by_stamp_and_each_lone_picture_counts() -> None:
     pairs = [
         (found.stamp_ns, exposed)
         for camera, stamp in order
-        for found, exposed in former.push(Picture(camera, stamp, 1000 + stamp, DARK))
+        for found, exposed in former.push(LivePicture(camera, stamp, 1000 + stamp, DARK))
     ]
     assert pairs == [(0, 1001), (30, 1030), (41, 1041)]
     assert former.lost == [1, 1]
-    list(former.push(Picture(0, 50, 0, DARK)))
+    list(former.push(LivePicture(0, 50, 0, DARK)))
     former.end()
     assert former.lost == [2, 1]
 
@@ -239,19 +239,19 @@ def test_a_replay_gives_all_in_order_and_goes_on_where_it_was(whole: Path) -> No
     source = ReplaySource(recording, ReplayClock(0, 0, 0.0), lambda: True)
     start = dict.fromkeys(("cam0", "cam1", "imu", "crane"), 0)
     packets = list(source.packets(start))
-    taken = [packet for packet in packets if isinstance(packet, Picture)]
+    taken = [packet for packet in packets if isinstance(packet, LivePicture)]
     assert [p.stamp_ns for p in taken if p.camera == 0] == list(recording.index.stamps_ns)
     imu = recording.imu()
     assert imu is not None
     given = [p.stamp_ns for p in packets if isinstance(p, Readings) and p.sensor == "imu"]
     assert np.array_equal(np.concatenate(given), imu.stamp_ns)
     after = {"cam0": taken[2].stamp_ns, "cam1": taken[2].stamp_ns, "imu": int(given[0][-1]), "crane": 0}
-    again = [p for p in source.packets(after) if isinstance(p, Picture)]
+    again = [p for p in source.packets(after) if isinstance(p, LivePicture)]
     assert [(p.camera, p.stamp_ns) for p in again] == [(p.camera, p.stamp_ns) for p in taken[4:]]
 
 
-def test_counters_and_health_are_text_that_adds_up(board: Board) -> None:
-    seen = Board(board.name)
+def test_counters_and_health_are_text_that_adds_up(board: Counters) -> None:
+    seen = Counters(board.name)
     seen["capture", "paired"] = 5
     seen.add("capture", "unpaired_cam1", 2)
     assert board["capture", "paired"] == 5 and counts(board)["captured"] == 7

@@ -5,18 +5,18 @@ from __future__ import annotations
 import time
 
 from barsight.core.stamps import seconds_to_ns
-from barsight.live.board import Board
+from barsight.live.counters import Counters
 from barsight.live.link import Link
 from barsight.live.pairing import PairFormer
 from barsight.live.ring import PairRing
-from barsight.live.source import LostPicture, Picture, Readings, ReplayClock, ReplaySource, Source
+from barsight.live.source import LivePicture, LostPicture, Readings, ReplayClock, ReplaySource, Source
 
 POLL_S = 0.002
 
 
 def capture(link: Link) -> None:
     """Capture until the source ends or the supervisor says so."""
-    board, recording = link.open_board(), link.open_recording()
+    board, recording = link.open_counters(), link.open_recording()
     stamps = recording.camera_stamps
     first_ns = int(min(stamps.left_ns[0], stamps.right_ns[0]))
     board["capture", "first_ns"] = first_ns
@@ -35,7 +35,7 @@ def capture(link: Link) -> None:
 class Capture:
     """Takes what a source gives, and counts it."""
 
-    def __init__(self, link: Link, board: Board, ring: PairRing) -> None:
+    def __init__(self, link: Link, board: Counters, ring: PairRing) -> None:
         self._board, self._ring, self._speed = board, ring, link.speed
         self._readings = {sensor: link.readings(sensor) for sensor in ("imu", "crane")}
         self._pairs = PairFormer(seconds_to_ns(link.settings.recording.pair_tolerance_s))
@@ -57,7 +57,7 @@ class Capture:
         self._pairs.end()
         self._count_lost()
 
-    def _take(self, picture: Picture) -> None:
+    def _take(self, picture: LivePicture) -> None:
         """Note the camera's last picture, and write the pair that a picture completes."""
         board, camera = self._board, f"cam{picture.camera}"
         board["capture", f"last_{camera}_ns"] = picture.stamp_ns

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from barsight.core.stamps import NS_PER_S
-from barsight.live.board import Board
+from barsight.live.counters import Counters
 from barsight.live.link import Link
 
 
-def latencies(link: Link, board: Board, lifts_s: float | None) -> dict[str, Any]:
+def latencies(link: Link, board: Counters, lifts_s: float | None) -> dict[str, Any]:
     """Build the content of latency.json. lifts_s: from the last frame's exposure to the lifts, if they came.
 
     A pose counts from its exposure to where it is published, a tile from its keyframe's exposure to where the
@@ -38,7 +38,7 @@ def spread(seconds: Sequence[float]) -> dict[str, Any]:
     return {"n": len(seconds), "p50": round(low, 4), "p99": round(high, 4), "max": round(max(seconds), 4)}
 
 
-def counts(board: Board) -> dict[str, Any]:
+def counts(board: Counters) -> dict[str, Any]:
     """Count frames on their way, and those lost by cause. captured: pairs, and pictures without a partner.
 
     Pictures that were torn, or due while capture was down, count one by one.

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame, StereoFrame
-from barsight.live.board import Board
+from barsight.live.counters import Counters
 from barsight.live.logs import NumberLog, ReadingLog
 from barsight.live.ring import PairRing
 from barsight.live.settings import LiveSettings
@@ -22,10 +22,11 @@ from barsight.recording.wrapper import RecordingProxy
 
 @dataclass(frozen=True)
 class Link:
-    """What a run's processes share. checkpoints: the folder in `folder` for pictures and disparities.
+    """Share a run's settings, files and memory among its processes.
 
-    speed: recorded seconds a second; 0: as fast as possible. ring, board: names of the shared memory.
-    keyframes: stamps of the only pairs to keep, None where the run chooses.
+    speed: recorded seconds a second; 0: as fast as possible. checkpoints: the folder in `folder` for pictures
+    and disparities. ring, counters: names of the shared memory. keyframes: stamps of the only pairs to keep,
+    None where the run chooses.
     """
 
     recording: Path
@@ -35,7 +36,7 @@ class Link:
     folder: Path
     checkpoints: Path
     ring: str
-    board: str
+    counters: str
     keyframes: tuple[int, ...] | None
 
     def open_recording(self) -> StoredPictures:
@@ -52,9 +53,9 @@ class Link:
         camera = recording.rig.cam0
         return PairRing(self.live.ring_pairs, camera.height, camera.width, self.ring)
 
-    def open_board(self) -> Board:
+    def open_counters(self) -> Counters:
         """Attach to the counters."""
-        return Board(self.board)
+        return Counters(self.counters)
 
     def readings(self, sensor: str) -> ReadingLog:
         """Open the log of `imu` or `crane`."""

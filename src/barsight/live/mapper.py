@@ -28,7 +28,7 @@ LIVE_MAP = "live_height.tif"
 def build_live_map(link: Link) -> None:
     """Map keyframes until the supervisor says so."""
     os.nice(NICENESS)
-    board = link.open_board()
+    board = link.open_counters()
     load_kernels("measure")
     mapping = Mapping(link, GrowingRecording(link.open_recording(), [], link))
     board["map", "mapped"] = board["map", "refused"] = 0

@@ -27,7 +27,7 @@ MIN_CAMERA_SILENCE_S = 0.3
 
 @dataclass(frozen=True)
 class HeardSensors:
-    """When each sensor was last heard: stamps on the cameras' clock, 0 for never.
+    """Last signs of each sensor: stamps on the cameras' clock, 0 for never.
 
     cameras_ns: of cam0 and cam1. interval_ns: between pictures, at most. readings_ns: of `imu` and `crane`,
     where the recording has them. frozen: whether the encoders repeat one reading that a moving crane can't.

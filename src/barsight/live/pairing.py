@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from barsight.core.types import StereoFrame
-from barsight.live.source import Picture
+from barsight.live.source import LivePicture
 
 
 @dataclass(eq=False)
@@ -19,9 +19,11 @@ class PairFormer:
 
     tolerance_ns: int
     lost: list[int] = field(default_factory=lambda: [0, 0])
-    _waiting: tuple[deque[Picture], deque[Picture]] = field(default_factory=lambda: (deque(), deque()))
+    _waiting: tuple[deque[LivePicture], deque[LivePicture]] = field(
+        default_factory=lambda: (deque(), deque())
+    )
 
-    def push(self, picture: Picture) -> Iterator[tuple[StereoFrame, int]]:
+    def push(self, picture: LivePicture) -> Iterator[tuple[StereoFrame, int]]:
         """Take the next picture in time's order; yield pairs that are certain, each with its exposure (ns,
         monotonic clock).
         """

@@ -20,7 +20,7 @@ from barsight.core.errors import ConfigError, InputError, MeasurementError, Outp
 from barsight.core.files import atomic_path, expect_empty, translated_os_errors
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
-from barsight.live.board import Board
+from barsight.live.counters import Counters
 from barsight.live.latency import latencies
 from barsight.live.link import KeptRecording, Link
 from barsight.live.mapper import LIVE_MAP
@@ -45,7 +45,7 @@ LATEST = ("pose.json", LIVE_MAP)
 
 @dataclass(frozen=True)
 class Keyframes:
-    """What a run kept (stamps, ns) and the mode that it ended in."""
+    """Pairs that a run kept (stamps, ns), and the mode that it ended in."""
 
     stamps_ns: tuple[int, ...]
     mode: Mode
@@ -85,7 +85,7 @@ def replay(
         KeptRecording(recording, []), to_json(asdict(chosen)), KeptRecording(recording, []).digests()
     )
     camera = recording.rig.cam0
-    board, ring = Board(), PairRing(live.ring_pairs, camera.height, camera.width)
+    board, ring = Counters(), PairRing(live.ring_pairs, camera.height, camera.width)
     try:
         link = Link(
             path.absolute(), chosen, live, speed, folder.absolute(),
@@ -107,7 +107,7 @@ def replay(
 
 
 def _finish(
-    supervisor: Supervisor, link: Link, board: Board, recording: StoredPictures, settings: MeasureSettings,
+    supervisor: Supervisor, link: Link, board: Counters, recording: StoredPictures, settings: MeasureSettings,
     magnet: Magnet | None, judged_at: Literal["now", "end"], advance: ProgressCallback,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure what was kept, with the poses' and disparities' work that is done already."""

@@ -23,7 +23,7 @@ AHEAD_NS = NS_PER_S // 5
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class LivePicture:
     """A picture of one camera. image: (H, W) uint8. exposed_ns: the exposure on the monotonic clock."""
 
     camera: int
@@ -60,7 +60,7 @@ class Source(Protocol):
         """Return the time between two pictures of a camera, at most, as long as all is well."""
         ...
 
-    def packets(self, after: dict[str, int]) -> Iterator[Picture | LostPicture | Readings]:
+    def packets(self, after: dict[str, int]) -> Iterator[LivePicture | LostPicture | Readings]:
         """Yield what comes, when it comes. after: last stamp already taken, of `cam0`, `cam1`, `imu` and
         `crane`; 0 where none was.
         """
@@ -113,7 +113,7 @@ class ReplaySource:
         stamps = self._recording.camera_stamps.left_ns
         return int(np.percentile(np.diff(stamps), USUAL_PERCENT)) if len(stamps) > 1 else 0
 
-    def packets(self, after: dict[str, int]) -> Iterator[Picture | LostPicture | Readings]:
+    def packets(self, after: dict[str, int]) -> Iterator[LivePicture | LostPicture | Readings]:
         """Yield what comes, when it is due; see `Source.packets`."""
         given = {
             sensor: int(np.searchsorted(stamps, after[sensor], side="right"))
@@ -155,10 +155,10 @@ class ReplaySource:
                 given[sensor] = end
                 yield Readings(sensor, stamps[first:end], values[first:end])
 
-    def _decoded(self, stored: StoredImage) -> Picture | LostPicture:
+    def _decoded(self, stored: StoredImage) -> LivePicture | LostPicture:
         rig = self._recording.rig
         try:
             image = decode_for((rig.cam0, rig.cam1)[stored.camera], stored.data)
         except TornImageError:
             return LostPicture(stored.camera, stored.stamp_ns, "torn")
-        return Picture(stored.camera, stored.stamp_ns, self._clock.due_ns(stored.stamp_ns), image)
+        return LivePicture(stored.camera, stored.stamp_ns, self._clock.due_ns(stored.stamp_ns), image)

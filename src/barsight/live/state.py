@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.files import atomic_path
-from barsight.live.board import Board
+from barsight.live.counters import Counters
 from barsight.live.latency import counts
 from barsight.live.modes import Mode
 
@@ -41,7 +41,7 @@ class RunState:
     processes: dict[str, ProcessState] = field(default_factory=dict)
     offered: int | None = None
 
-    def content(self, board: Board) -> dict[str, Any]:
+    def content(self, board: Counters) -> dict[str, Any]:
         """Build the content of state.json."""
         may_stand = self.mode.lifts and self.phase != "failed"
         return {
@@ -57,12 +57,12 @@ class RunState:
         }
 
 
-def write_state(state: RunState, board: Board, out: Path) -> None:
+def write_state(state: RunState, board: Counters, out: Path) -> None:
     """Write state.json."""
     _write_json(state.content(board), out / "state.json")
 
 
-def write_health(state: RunState, board: Board, seconds: float, out: Path) -> None:
+def write_health(state: RunState, board: Counters, seconds: float, out: Path) -> None:
     """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since it began."""
     frames = counts(board)
     memory = {name: _memory_bytes(process.pid) for name, process in state.processes.items()}

@@ -14,8 +14,8 @@ from multiprocessing.process import BaseProcess
 
 from barsight.core.errors import BarsightError
 from barsight.core.stamps import NS_PER_S
-from barsight.live.board import Board
 from barsight.live.capture import capture
+from barsight.live.counters import Counters
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
 from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
@@ -51,7 +51,7 @@ def run_process(role: str, link: Link) -> None:
 class Supervisor:
     """Runs the processes of a run. tell: takes each line of the log."""
 
-    def __init__(self, link: Link, board: Board, tell: Callable[[str], None]) -> None:
+    def __init__(self, link: Link, board: Counters, tell: Callable[[str], None]) -> None:
         self._link, self._board, self._tell = link, board, tell
         self._out = link.folder.parent
         self._context = multiprocessing.get_context("forkserver")

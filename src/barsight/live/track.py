@@ -17,7 +17,7 @@ from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
-from barsight.live.board import Board
+from barsight.live.counters import Counters
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.ring import CapturedPair, PairRing
 from barsight.motion.estimator import PoseEstimator
@@ -34,7 +34,7 @@ AGAIN_FRAMES = 10
 
 def track(link: Link) -> None:
     """Track until capture has ended and its last pair is taken, or the supervisor says so."""
-    whole, board = link.open_recording(), link.open_board()
+    whole, board = link.open_recording(), link.open_counters()
     ring = link.open_ring(whole)
     tracking = Tracking(link, GrowingRecording(whole, [], link), board, ring)
     load_kernels("measure")
@@ -59,7 +59,7 @@ def track(link: Link) -> None:
 class Tracking:
     """Estimates each pair's pose with what is known when it comes, and keeps those that are keyframes."""
 
-    def __init__(self, link: Link, recording: GrowingRecording, board: Board, ring: PairRing) -> None:
+    def __init__(self, link: Link, recording: GrowingRecording, board: Counters, ring: PairRing) -> None:
         self._link, self._recording, self._board, self._ring = link, recording, board, ring
         self._rectifier = Rectifier(recording.rig)
         self._pairs = RectifiedPairs(recording, self._rectifier, link.checkpoints)

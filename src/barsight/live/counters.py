@@ -21,7 +21,7 @@ ROWS: dict[str, tuple[str, ...]] = {
 _WIDTH = max(len(names) for names in ROWS.values())
 
 
-class Board:
+class Counters:
     """Counters in shared memory: `board["track", "taken"]`. A process writes its own row only.
 
     name: of an existing board; a new one is made without it, which its maker unlinks by `remove`.
