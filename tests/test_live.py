@@ -1,6 +1,7 @@
 """The live run: what it keeps gives measure's bytes, faults show by name, and lifts don't outlive them."""
 
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from barsight.live.pairing import PairFormer
 from barsight.live.ring import PairRing
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
-from barsight.live.source import LivePicture, Readings, ReplayClock, ReplaySource
+from barsight.live.source import LivePicture, LostPicture, Readings, ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.yard.magnet.description import example_magnet
 from cli_runs import FAST
@@ -248,6 +249,18 @@ def test_a_replay_gives_all_in_order_and_goes_on_where_it_was(whole: Path) -> No
     after = {"cam0": taken[2].stamp_ns, "cam1": taken[2].stamp_ns, "imu": int(given[0][-1]), "crane": 0}
     again = [p for p in source.packets(after) if isinstance(p, LivePicture)]
     assert [(p.camera, p.stamp_ns) for p in again] == [(p.camera, p.stamp_ns) for p in taken[4:]]
+
+
+def test_a_resumed_replay_loses_what_was_due_meanwhile_and_no_more(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    stamps = recording.index.stamps_ns
+    clock = ReplayClock(time.monotonic_ns(), stamps[1] + 1, 100.0)
+    after = {"cam0": stamps[0], "cam1": stamps[0], "imu": 0, "crane": 0}
+    packets = list(ReplaySource(recording, clock, lambda: True).packets(after))
+    lost = [(p.camera, p.stamp_ns) for p in packets if isinstance(p, LostPicture)]
+    came = [(p.camera, p.stamp_ns) for p in packets if isinstance(p, LivePicture)]
+    assert lost == [(0, stamps[1]), (1, stamps[1])]
+    assert came == [(camera, stamp) for stamp in stamps[2:] for camera in (0, 1)]
 
 
 def test_counters_and_health_are_text_that_adds_up(board: Counters) -> None:

@@ -119,12 +119,11 @@ class ReplaySource:
             sensor: int(np.searchsorted(stamps, after[sensor], side="right"))
             for sensor, (stamps, _) in self._readings.items()
         }
-        resumed = any(after.values())
+        resumed_ns = self._clock.stamp_now_ns() if any(after.values()) else None
         for stored in self._recording.stored_images():
             if stored.stamp_ns <= after[f"cam{stored.camera}"]:
                 continue
-            now_ns = self._clock.stamp_now_ns()
-            if resumed and now_ns is not None and stored.stamp_ns < now_ns:
+            if resumed_ns is not None and stored.stamp_ns < resumed_ns:
                 yield LostPicture(stored.camera, stored.stamp_ns, "capture_down")
                 continue
             found = self._decoded(stored)
