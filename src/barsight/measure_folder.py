@@ -9,6 +9,7 @@ from typing import Any, Literal
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_directory
+from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.settings.values import expect_choice
 from barsight.evaluation.score import score_folder
@@ -72,8 +73,11 @@ def write_measured(
     magnet: Magnet | None = None,
     judged_at: Literal["now", "end"] = "now",
     report: bool = True,
+    notices: tuple[Notice, ...] = (),
 ) -> dict[str, Any]:
-    """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from."""
+    """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from. notices:
+    what the caller knows besides.
+    """
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
@@ -81,7 +85,7 @@ def write_measured(
         mapped = map_yard(recording, settings, scratch, advance, keep)
         built = mapped.built
         with in_background(lambda: write_surface(mapped.surface, built.free, built.tops, staging)):
-            measured = find_lifts(mapped, magnet, judged_at)
+            measured = find_lifts(mapped, magnet, judged_at, notices)
         content = summary(measured)
         write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)

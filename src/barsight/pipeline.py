@@ -110,13 +110,14 @@ def map_yard(
 
 
 def find_lifts(
-    mapped: MappedYard, magnet: Magnet | None = None, judged_at: Literal["now", "end"] = "now"
-) -> Measurement:
+    mapped: MappedYard, magnet: Magnet | None = None, judged_at: Literal["now", "end"] = "now",
+    notices: tuple[Notice, ...] = (),
+) -> Measurement:  # fmt: skip
     """Find the bundles of a mapped yard and choose lifts.
 
     magnet: what lifts are chosen for; where there is none, they are judged for the package's example and all
     forbidden (`no-magnet`). judged_at: when lifts are judged: now, or at the recording's last frame, to look
-    back.
+    back. notices: warnings that the caller has.
     """
     settings, probed, way, built = mapped.settings, mapped.probed, mapped.way, mapped.built
     watch, trajectory, surface, profiles = probed.watch, way.trajectory, mapped.surface, mapped.profiles
@@ -125,7 +126,7 @@ def find_lifts(
         bundles = find_bundles(heights, settings.bundles)
         placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
         stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None
-    warnings = _warnings(probed, way, built, profiles)
+    warnings = [*_warnings(probed, way, built, profiles), *notices]
     if mapped.stock is not None:
         warnings += [Notice("stock-list", text) for text in stock_warnings(mapped.stock, stock)]
         contradiction = None if stock is None else list_contradiction(mapped.stock, stock)

@@ -10,6 +10,7 @@ WARNINGS = {
     "calibration-drift": "The crane's travel contradicts the calibration; no lift is offered.",
     "frames-refused": "Frames were refused; `frames.refused` gives each one's stamp, stage and reason.",
     "laser-frame": "Without a crane the map isn't in the laser's yard, so there is no agreement.",
+    "live-state": "The live run ended in a mode that forbids lifts; the message says why.",
     "mounting-doubtful": "Gravity or floor contradict the stated mounting; no lift is offered.",
     "no-overlap": "A laser profile and the map share fewer than two points, so there is no agreement for it.",
     "one-view": "One frame made the map, so no height is confirmed by another; no lift is offered.",
@@ -24,6 +25,7 @@ WARNINGS = {
 FORBIDS = {
     "calibration": "calibration-drift",
     "calibration-drift": "calibration-drift",
+    "live-state": "live-state",
     "mounting-doubtful": "mounting-doubtful",
     "one-view": "one-view",
     "stock-contradicts": "stock-list",

@@ -62,10 +62,11 @@ class RectifiedPairs:
                 pair = self.rectifier(frame)
             if isinstance(pair, Failed):
                 return RefusedFrame(frame.stamp_ns, pair.reason)
-            self._store(pair)
+            self.store(pair)
             return pair
 
-    def _store(self, pair: RectifiedPair) -> None:
+    def store(self, pair: RectifiedPair) -> None:
+        """Store a pair for who asks for it later."""
         with self._lock:
             if self._folder is not None and self._bytes < MAX_STORED_BYTES:
                 self._bytes += pair.left.nbytes + pair.right.nbytes

@@ -15,6 +15,7 @@ VETOES = {
     "calibration-changed": "The calibration that the map was measured with was changed since.",
     "calibration-drift": "The cameras' calibration doesn't fit the pictures any more.",
     "trajectory-degraded": "Trajectory or encoders aren't as sure as the magnet needs, near it or at all.",
+    "live-state": "The live run ended without a sensor that lifts need.",
     "units-doubtful": "A sensor's numbers are of a size that can't be: a wrong unit.",
     "mounting-doubtful": "Gravity or the floor contradict how rig, IMU and encoders are said to be mounted.",
     "stock-list": "The stock list says another bundle than the one that was found.",

@@ -59,6 +59,13 @@ def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> Non
             worker.wait()
 
 
+def load_kernels(*groups: str) -> None:
+    """Load the kernels of some groups from the cache now, not each at its first call."""
+    if not numba.config.DISABLE_JIT:
+        for one in listed(*groups):
+            one.compile()
+
+
 def main() -> None:
     """Compile the kernels whose places in the list stand in the standard input, and tell which are done."""
     kernels = listed(*sys.argv[1:])

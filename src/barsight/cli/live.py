@@ -1,0 +1,66 @@
+"""Run `barsight live --replay RECORDING -o OUT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from barsight.cli.arguments import call, config_path, load_settings
+from barsight.cli.measure import print_outcome
+from barsight.cli.progress import stages
+from barsight.live.run import replay as replay_recording
+from barsight.live.settings import LiveSettings
+from barsight.measure_settings import MeasureSettings
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse and run."""
+    default = load_settings(config_path(arguments), MeasureSettings)
+
+    def command(
+        replay: Path,
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        settings: Annotated[MeasureSettings, tyro.conf.arg(name="")] = default,
+        live: LiveSettings = LiveSettings(),  # noqa: B008
+        speed: float = 1.0,
+        config: Path | None = None,
+        magnet: Path | None = None,
+        at: Literal["now", "end"] = "now",
+        keyframes: Path | None = None,
+    ) -> None:
+        """Measure while pictures and readings come, each at its time: poses, a growing map, lifts at the end.
+
+        Capture, tracking and mapping are processes of their own; each is started anew if it ends. OUT tells
+        at any time how the run stands (state.json, health.json, health.prom, pose.json) and has at the end
+        all that measure writes, and latency.json. Ctrl-C ends the run as the recording's end does. Cameras
+        can't be connected yet: only recordings are replayed.
+
+        Args:
+            replay: The recording to replay.
+            out: An empty or new folder.
+            settings: Settings of measuring.
+            live: Settings of the run.
+            speed: Recorded seconds a second; 0: as fast as possible, and nothing is lost.
+            config: TOML file with settings of measuring; flags go before it.
+            magnet: TOML file of the magnet that lifts are chosen for; without it nothing is offered.
+            at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
+            keyframes: keyframes.json of an earlier run: keep just the pairs that it kept.
+        """
+        console = Console(stderr=True)
+
+        def tell(line: str) -> None:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+        with stages(console) as advance:
+            measured = replay_recording(
+                replay, out, settings, live, speed=speed, magnet=magnet, judged_at=at, keyframes=keyframes,
+                tell=tell, advance=advance,
+            )  # fmt: skip
+        print_outcome(measured, console, verbose=False)
+        console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+
+    call(command, "live", arguments)

@@ -1,0 +1,65 @@
+"""Count in shared memory: each process writes a row of its own, so that no lock can be left held."""
+
+from __future__ import annotations
+
+from multiprocessing.shared_memory import SharedMemory
+
+import numpy as np
+
+from barsight.core.arrays import Int64
+
+ROWS: dict[str, tuple[str, ...]] = {
+    "supervisor": ("began_ns", "stop"),
+    "capture": (
+        "ready", "ended", "pictures_cam0", "pictures_cam1", "paired", "unpaired_cam0", "unpaired_cam1",
+        "torn", "capture_down", "last_cam0_ns", "last_cam1_ns", "interval_ns", "first_ns",
+    ),
+    "track": ("ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed"),
+    "map": ("ready", "mapped", "refused", "backlog", "snapshots"),
+}  # fmt: skip
+"""Counters of each process. Those in _ns are stamps or spans; began_ns is of the monotonic clock."""
+_WIDTH = max(len(names) for names in ROWS.values())
+
+
+class Counters:
+    """Counters in shared memory: `board["track", "taken"]`. A process writes its own row only.
+
+    name: of an existing board; a new one is made without it, which its maker unlinks by `remove`.
+    """
+
+    def __init__(self, name: str | None = None) -> None:
+        size = len(ROWS) * _WIDTH * 8
+        self._memory = SharedMemory(name, create=name is None, size=size)
+        self.name = self._memory.name
+        self._rows = {role: k for k, role in enumerate(ROWS)}
+        self._cells: Int64 = np.ndarray((len(ROWS), _WIDTH), np.int64, self._memory.buf)
+        if name is None:
+            self._cells[:] = 0
+
+    def __getitem__(self, key: tuple[str, str]) -> int:
+        return int(self._cells[self._place(key)])
+
+    def __setitem__(self, key: tuple[str, str], value: int) -> None:
+        self._cells[self._place(key)] = value
+
+    def add(self, role: str, name: str, count: int = 1) -> None:
+        """Add to a counter of the caller's own row."""
+        self[role, name] += count
+
+    def row(self, role: str) -> dict[str, int]:
+        """Return all counters of a process."""
+        return {name: self[role, name] for name in ROWS[role]}
+
+    def remove(self) -> None:
+        """Unlink the memory; for its maker."""
+        self.close()
+        self._memory.unlink()
+
+    def close(self) -> None:
+        """Detach from the memory."""
+        self._cells = np.empty((0, 0), np.int64)
+        self._memory.close()
+
+    def _place(self, key: tuple[str, str]) -> tuple[int, int]:
+        role, name = key
+        return self._rows[role], ROWS[role].index(name)

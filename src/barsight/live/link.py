@@ -1,0 +1,127 @@
+"""Tell a process of the run what it needs: settings, files and shared memory."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame, StereoFrame
+from barsight.live.counters import Counters
+from barsight.live.logs import NumberLog, ReadingLog
+from barsight.live.ring import PairRing
+from barsight.live.settings import LiveSettings
+from barsight.measure_settings import MeasureSettings
+from barsight.recording.base import FrameIndex, Recording
+from barsight.recording.open import open_recording
+from barsight.recording.packets import PacketRecording
+from barsight.recording.stored_images import StoredPictures
+from barsight.recording.wrapper import RecordingProxy
+
+
+@dataclass(frozen=True)
+class Link:
+    """Share a run's settings, files and memory among its processes.
+
+    speed: recorded seconds a second; 0: as fast as possible. checkpoints: the folder in `folder` for pictures
+    and disparities. ring, counters: names of the shared memory. keyframes: stamps of the only pairs to keep,
+    None where the run chooses.
+    """
+
+    recording: Path
+    settings: MeasureSettings
+    live: LiveSettings
+    speed: float
+    folder: Path
+    checkpoints: Path
+    ring: str
+    counters: str
+    keyframes: tuple[int, ...] | None
+
+    def open_recording(self) -> StoredPictures:
+        """Open the recording that is replayed."""
+        return open_recording(self.recording, self.settings.recording)
+
+    def sensors(self, recording: Recording) -> set[str]:
+        """Tell which of `imu` and `crane` the recording has and may be used."""
+        have = {"imu": recording.imu, "crane": recording.crane}
+        return {sensor for sensor, read in have.items() if sensor in self.settings.use and read() is not None}
+
+    def open_ring(self, recording: StoredPictures) -> PairRing:
+        """Attach to the ring of pairs."""
+        camera = recording.rig.cam0
+        return PairRing(self.live.ring_pairs, camera.height, camera.width, self.ring)
+
+    def open_counters(self) -> Counters:
+        """Attach to the counters."""
+        return Counters(self.counters)
+
+    def readings(self, sensor: str) -> ReadingLog:
+        """Open the log of `imu` or `crane`."""
+        return ReadingLog(self.folder / f"{sensor}.log", {"imu": 6, "crane": 3}[sensor])
+
+    def frames(self) -> NumberLog:
+        """Open the log of tracked frames: stamp, exposure and end (ns, monotonic), is kept, has a pose."""
+        return NumberLog(self.folder / "frames.log")
+
+    def tiles(self) -> NumberLog:
+        """Open the log of mapped frames: stamp, exposure and end (ns, monotonic)."""
+        return NumberLog(self.folder / "tiles.log")
+
+    def posed_file(self, stamp_ns: int) -> Path:
+        """Return the file of a kept frame's pose."""
+        return self.checkpoints / f"posed_{stamp_ns}.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class KeptRecording(RecordingProxy):
+    """`whole` as if it had no pairs but those of `stamps_ns`, which may grow."""
+
+    stamps_ns: list[int]
+
+    @property
+    def index(self) -> FrameIndex:
+        return FrameIndex(self.stamps_ns, self.whole.index.unpaired)
+
+    def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
+        kept = set(self.stamps_ns)
+        yield from self.whole.frames({s for s in kept if wanted is None or s in wanted})
+
+
+@dataclass(frozen=True, eq=False)
+class GrowingRecording(KeptRecording):
+    """A `KeptRecording` with those readings only that have come so far; `grow` takes in what came since."""
+
+    link: Link
+
+    def imu(self) -> ImuSamples | None:
+        return self._held.imu()
+
+    def crane(self) -> CraneSamples | None:
+        return self._held.crane()
+
+    def grow(self) -> None:
+        """Take in the readings that came since the last call."""
+        stamps, values = self._logs["imu"].read()
+        self._held.add(ImuSamples(stamps, values[:, :3], values[:, 3:]))
+        stamps, values = self._logs["crane"].read()
+        if self._mounted is not None:
+            self._held.add(replace(self._mounted, stamp_ns=stamps, position_m=values))
+
+    def last_readings_ns(self) -> dict[str, int]:
+        """Return the stamp of the last reading of each sensor that gave any."""
+        use = self.link.settings.use
+        return {sensor: last for sensor in use for last in self._held.last_readings_ns((sensor,))}
+
+    @cached_property
+    def _held(self) -> PacketRecording:
+        return PacketRecording(self.rig, self.link.folder)
+
+    @cached_property
+    def _mounted(self) -> CraneSamples | None:
+        return self.whole.crane()
+
+    @cached_property
+    def _logs(self) -> dict[str, ReadingLog]:
+        return {sensor: self.link.readings(sensor) for sensor in ("imu", "crane")}

@@ -1,0 +1,120 @@
+"""Tell what the run can do at the moment, and why no more: the mode, its reasons, and whether lifts hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples
+from barsight.live.settings import LiveSettings
+from barsight.motion.batch.fault_detection import frozen_stretches
+
+ModeName = Literal["full", "no-imu", "no-encoders", "encoders-only", "blind"]
+MODES: dict[ModeName, str] = {
+    "full": "Pictures, IMU and encoders: poses, a map, lifts.",
+    "no-imu": "Pictures and encoders: poses, a map, lifts.",
+    "no-encoders": "Pictures without encoders: poses and a map that drift in the yard, no lift.",
+    "encoders-only": "Encoders without pairs of pictures: no new map, no lift.",
+    "blind": "Neither pictures nor encoders: nothing is known, no lift.",
+}
+FOR_LIFTS = ("full", "no-imu")
+MIN_CAMERA_SILENCE_S = 0.3
+
+
+@dataclass(frozen=True)
+class HeardSensors:
+    """Last signs of each sensor: stamps on the cameras' clock, 0 for never.
+
+    cameras_ns: of cam0 and cam1. interval_ns: between pictures, at most. readings_ns: of `imu` and `crane`,
+    where the recording has them. frozen: whether the encoders repeat one reading that a moving crane can't.
+    """
+
+    cameras_ns: tuple[int, int]
+    interval_ns: int
+    readings_ns: dict[str, int]
+    frozen: bool = False
+
+
+@dataclass(frozen=True)
+class Mode:
+    """name: of MODES. reasons: why not `full`, or which process is down. lifts: whether any may stand."""
+
+    name: ModeName
+    reasons: tuple[str, ...]
+    lifts: bool
+
+
+def judge_mode(
+    heard: HeardSensors, now_ns: int, settings: LiveSettings, down: Mapping[str, str] = MappingProxyType({})
+) -> Mode:
+    """Judge the mode at a stamp of the cameras' clock. down: processes that don't run, each with why."""
+    reasons = [f"{process} is down: {why}" for process, why in down.items()]
+    silent = _silent_cameras(heard, now_ns, settings)
+    imu = _silent_sensor("imu", "the IMU", heard, now_ns, settings.imu_silence_s)
+    crane = _silent_sensor("crane", "the encoders", heard, now_ns, settings.encoder_silence_s)
+    if heard.frozen:
+        crane = "the encoders are frozen: they repeat one reading while the crane must be moving"
+    if "capture" in down:
+        name: ModeName = "blind"
+    elif silent or "track" in down:
+        name = "blind" if crane else "encoders-only"
+    elif crane:
+        name = "no-encoders"
+    else:
+        name = "no-imu" if imu else "full"
+    reasons += [*silent, *(why for why in (imu, crane) if why)]
+    return Mode(name, tuple(reasons), name in FOR_LIFTS and not down)
+
+
+def _silent_cameras(heard: HeardSensors, now_ns: int, settings: LiveSettings) -> list[str]:
+    """Tell which cameras gave no picture for too long."""
+    told = []
+    bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
+    for camera, last_ns in enumerate(heard.cameras_ns):
+        if not last_ns:
+            told.append(f"cam{camera}: no picture yet")
+        elif now_ns - last_ns > seconds_to_ns(bound_s):
+            told.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s))
+    return told
+
+
+def _silent_sensor(sensor: str, name: str, heard: HeardSensors, now_ns: int, bound_s: float) -> str | None:
+    """Tell why a sensor is out, None if it isn't."""
+    if sensor not in heard.readings_ns:
+        return f"{name}: none in use"
+    last_ns = heard.readings_ns[sensor]
+    if not last_ns:
+        return f"{name}: no reading yet"
+    return _silence(name, now_ns - last_ns, bound_s) if now_ns - last_ns > seconds_to_ns(bound_s) else None
+
+
+def _silence(name: str, silent_ns: int, bound_s: float) -> str:
+    return f"{name}: silent for {silent_ns / NS_PER_S:.2f} s (bound {bound_s:.2f} s)"
+
+
+class FreezeWatch:
+    """Tells whether the encoders are frozen now. mounted: gives all but the readings."""
+
+    def __init__(self, mounted: CraneSamples) -> None:
+        self._mounted = mounted
+        self._since: Float64 | None = None
+
+    def check(self, stamp_ns: Int64, position_m: Float64) -> bool:
+        """Look at the newest readings: (N,) and (N, 3), the last few seconds."""
+        if len(stamp_ns) == 0:
+            return False
+        if self._since is not None and (position_m[-1] == self._since).all():
+            return True
+        self._since = None
+        crane = replace(self._mounted, stamp_ns=stamp_ns, position_m=position_m)
+        if any(last == len(stamp_ns) - 1 for _, last in frozen_stretches(crane)):
+            self._since = position_m[-1]
+        return self._since is not None
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._since = None

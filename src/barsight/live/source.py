@@ -1,0 +1,163 @@
+"""Define the protocol of what gives pictures and readings, and replay a recording at its own pace."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64, UInt8
+from barsight.core.stamps import NS_PER_S
+from barsight.recording.image_decoding import TornImageError
+from barsight.recording.pairing import decode_for
+from barsight.recording.stored_images import StoredImage, StoredPictures
+
+BATCH_NS = 10_000_000
+"""Readings come in batches of so much time."""
+USUAL_PERCENT = 95
+AHEAD_NS = NS_PER_S // 5
+"""As fast as possible, readings come so far ahead of the pictures: more than any pose waits for."""
+
+
+@dataclass(frozen=True, eq=False)
+class LivePicture:
+    """A picture of one camera. image: (H, W) uint8. exposed_ns: the exposure on the monotonic clock."""
+
+    camera: int
+    stamp_ns: int
+    exposed_ns: int
+    image: UInt8
+
+
+@dataclass(frozen=True)
+class LostPicture:
+    """A picture that was lost before it could be used. cause: `torn` or `capture_down`."""
+
+    camera: int
+    stamp_ns: int
+    cause: str
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Readings of `imu` (gyro rad/s, then accelerometer m/s2) or `crane` (place, m): (N,), (N, width)."""
+
+    sensor: str
+    stamp_ns: Int64
+    values: Float64
+
+
+class Source(Protocol):
+    """Protocol of cameras, IMU and encoders. All stamps are of exposure or measurement, never of arrival:
+    pictures' on the cameras' clock, readings' on the IMU's.
+    """
+
+    @property
+    def interval_ns(self) -> int:
+        """Return the time between two pictures of a camera, at most, as long as all is well."""
+        ...
+
+    def packets(self, after: dict[str, int]) -> Iterator[LivePicture | LostPicture | Readings]:
+        """Yield what comes, when it comes. after: last stamp already taken, of `cam0`, `cam1`, `imu` and
+        `crane`; 0 where none was.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ReplayClock:
+    """Relates stamps to the monotonic clock. began_ns: when (monotonic) `first_ns` (stamp) was. speed:
+    recorded seconds a second; 0: as fast as possible, where a stamp is due when it is asked for.
+    """
+
+    began_ns: int
+    first_ns: int
+    speed: float
+
+    def due_ns(self, stamp_ns: int) -> int:
+        """Return when (monotonic) a stamp is due."""
+        if self.speed == 0:
+            return time.monotonic_ns()
+        return self.began_ns + round((stamp_ns - self.first_ns) / self.speed)
+
+    def stamp_now_ns(self) -> int | None:
+        """Return the stamp that is due now; None as fast as possible, which has no now."""
+        if self.speed == 0:
+            return None
+        return self.first_ns + round((time.monotonic_ns() - self.began_ns) * self.speed)
+
+
+class ReplaySource:
+    """`Source` of a recording. It ends with the pictures: readings after them come at once.
+
+    may_go_on: asked before each picture and while waiting; the source ends where it says no. A capture begun
+    anew finds all readings, as a driver would have kept them, but the pictures due meanwhile are lost.
+    """
+
+    def __init__(self, recording: StoredPictures, clock: ReplayClock, may_go_on: Callable[[], bool]) -> None:
+        self._recording, self._clock, self._may_go_on = recording, clock, may_go_on
+        imu, crane = recording.imu(), recording.crane()
+        self._readings: dict[str, tuple[Int64, Float64]] = {}
+        if imu is not None:
+            self._readings["imu"] = imu.stamp_ns, np.hstack([imu.gyro_radps, imu.accel_mps2])
+        if crane is not None:
+            self._readings["crane"] = crane.stamp_ns, crane.position_m
+        self._shift_ns = recording.rig.timeshift_cam_imu_ns
+
+    @property
+    def interval_ns(self) -> int:
+        """Return an interval that only a twentieth of cam0's exceed: a recording may have gaps."""
+        stamps = self._recording.camera_stamps.left_ns
+        return int(np.percentile(np.diff(stamps), USUAL_PERCENT)) if len(stamps) > 1 else 0
+
+    def packets(self, after: dict[str, int]) -> Iterator[LivePicture | LostPicture | Readings]:
+        """Yield what comes, when it is due; see `Source.packets`."""
+        given = {
+            sensor: int(np.searchsorted(stamps, after[sensor], side="right"))
+            for sensor, (stamps, _) in self._readings.items()
+        }
+        resumed_ns = self._clock.stamp_now_ns() if any(after.values()) else None
+        for stored in self._recording.stored_images():
+            if stored.stamp_ns <= after[f"cam{stored.camera}"]:
+                continue
+            if resumed_ns is not None and stored.stamp_ns < resumed_ns:
+                yield LostPicture(stored.camera, stored.stamp_ns, "capture_down")
+                continue
+            found = self._decoded(stored)
+            yield from self._until(stored.stamp_ns, given)
+            if not self._may_go_on():
+                return
+            yield found
+        yield from self._given(given, None)
+
+    def _until(self, stamp_ns: int, given: dict[str, int]) -> Iterator[Readings]:
+        """Yield the readings that are due before a picture, and wait for its time."""
+        if self._clock.speed == 0:
+            yield from self._given(given, stamp_ns + self._shift_ns + AHEAD_NS)
+            return
+        while self._may_go_on():
+            now_ns = self._clock.stamp_now_ns()
+            assert now_ns is not None
+            yield from self._given(given, now_ns + self._shift_ns)
+            if now_ns >= stamp_ns:
+                return
+            time.sleep(min(stamp_ns - now_ns, BATCH_NS * self._clock.speed) / self._clock.speed / NS_PER_S)
+
+    def _given(self, given: dict[str, int], until_ns: int | None) -> Iterator[Readings]:
+        for sensor, (stamps, values) in self._readings.items():
+            first = given[sensor]
+            end = len(stamps) if until_ns is None else int(np.searchsorted(stamps, until_ns, side="right"))
+            if end > first:
+                given[sensor] = end
+                yield Readings(sensor, stamps[first:end], values[first:end])
+
+    def _decoded(self, stored: StoredImage) -> LivePicture | LostPicture:
+        rig = self._recording.rig
+        try:
+            image = decode_for((rig.cam0, rig.cam1)[stored.camera], stored.data)
+        except TornImageError:
+            return LostPicture(stored.camera, stored.stamp_ns, "torn")
+        return LivePicture(stored.camera, stored.stamp_ns, self._clock.due_ns(stored.stamp_ns), image)

@@ -1,0 +1,121 @@
+"""Write a run's state and health for readers: state.json, health.json and health.prom."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from barsight.core.files import atomic_path
+from barsight.live.counters import Counters
+from barsight.live.latency import counts
+from barsight.live.modes import Mode
+
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
+
+
+@dataclass
+class ProcessState:
+    """A process of the run. state: `starting`, `running`, `restarting`, `done`. reason: of its last end."""
+
+    pid: int = 0
+    state: str = "starting"
+    restarts: int = 0
+    reason: str = ""
+
+
+@dataclass
+class RunState:
+    """The run as state.json has it. phase: `starting`, `measuring`, `finishing`, `done` or `failed`.
+
+    now_ns: on the cameras' clock. lifts_until: why lifts may not stand, empty where they may.
+    """
+
+    phase: str = "starting"
+    now_ns: int = 0
+    mode: Mode = field(default_factory=lambda: Mode("blind", ("starting",), False))
+    processes: dict[str, ProcessState] = field(default_factory=dict)
+    offered: int | None = None
+
+    def content(self, board: Counters) -> dict[str, Any]:
+        """Build the content of state.json."""
+        may_stand = self.mode.lifts and self.phase != "failed"
+        return {
+            "schema_version": 1,
+            "phase": self.phase,
+            "now_ns": self.now_ns,
+            "mode": self.mode.name,
+            "reasons": list(self.mode.reasons),
+            "lifts": {"may_stand": may_stand, "offered": self.offered if may_stand else 0},
+            "processes": {name: vars(process).copy() for name, process in self.processes.items()},
+            "backlog_keyframes": board["map", "backlog"],
+            "frames": counts(board),
+        }
+
+
+def write_state(state: RunState, board: Counters, out: Path) -> None:
+    """Write state.json."""
+    _write_json(state.content(board), out / "state.json")
+
+
+def write_health(state: RunState, board: Counters, seconds: float, out: Path) -> None:
+    """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since it began."""
+    frames = counts(board)
+    memory = {name: _memory_bytes(process.pid) for name, process in state.processes.items()}
+    content = {
+        "schema_version": 1,
+        "seconds": round(seconds, 3),
+        "mode": state.mode.name,
+        "rates_hz": {
+            name: round(frames[name] / seconds, 3) if seconds > 0 else 0.0
+            for name in ("captured", "paired", "tracked", "kept", "mapped")
+        },
+        "frames": frames,
+        "queues": {"keyframes": board["map", "backlog"]},
+        "restarts": {name: process.restarts for name, process in state.processes.items()},
+        "memory_bytes": memory | {"supervisor": _memory_bytes(os.getpid())},
+        "disk_free_bytes": shutil.disk_usage(out).free,
+    }
+    _write_json(content, out / "health.json")
+    with atomic_path(out / "health.prom") as path:
+        path.write_text(prometheus(content), encoding="utf-8")
+
+
+def prometheus(health: Mapping[str, Any]) -> str:
+    """Write health as Prometheus' text format, one metric a line."""
+    frames = dict(health["frames"])
+    dropped = frames.pop("dropped")
+    metrics = {
+        "barsight_frames_total": ("counter", "stage", frames),
+        "barsight_frames_dropped_total": ("counter", "cause", dropped),
+        "barsight_restarts_total": ("counter", "process", health["restarts"]),
+        "barsight_queue_length": ("gauge", "queue", health["queues"]),
+        "barsight_memory_bytes": ("gauge", "process", health["memory_bytes"]),
+        "barsight_mode": ("gauge", "mode", {health["mode"]: 1}),
+    }
+    lines = []
+    for name, (kind, label, values) in metrics.items():
+        lines.append(f"# TYPE {name} {kind}")
+        lines += [f'{name}{{{label}="{key}"}} {value}' for key, value in values.items()]
+    lines += [
+        "# TYPE barsight_disk_free_bytes gauge",
+        f"barsight_disk_free_bytes {health['disk_free_bytes']}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _write_json(content: dict[str, Any], target: Path) -> None:
+    with atomic_path(target) as path:
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _memory_bytes(pid: int) -> int:
+    """Read a process's resident memory; 0 where it is gone or the system doesn't tell."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
+    except (OSError, IndexError, ValueError):
+        return 0

@@ -1,0 +1,209 @@
+"""Supervise capture, track and map: start them, restart each alone, judge the mode, tell it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
+
+from barsight.core.errors import BarsightError
+from barsight.core.stamps import NS_PER_S
+from barsight.live.capture import capture
+from barsight.live.counters import Counters
+from barsight.live.link import Link
+from barsight.live.mapper import build_live_map
+from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
+from barsight.live.source import ReplayClock
+from barsight.live.state import ProcessState, RunState, write_health, write_state
+from barsight.live.track import track
+
+PROCESSES: dict[str, Callable[[Link], None]] = {"capture": capture, "track": track, "map": build_live_map}
+BEAT_S = 0.1
+"""How often the mode is judged and processes are looked after."""
+MOST_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
+"""A process that ends more often than that ends the run."""
+START_S = 120.0
+"""Processes may take so long to start on a busy machine."""
+FREEZE_READINGS = 100
+
+
+def run_process(role: str, link: Link) -> None:
+    """Run a process of the run; Ctrl-C is its parent's to handle, who takes it along when it dies."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    reason = link.folder / f"{role}.reason"
+    reason.unlink(missing_ok=True)
+    try:
+        PROCESSES[role](link)
+    except Exception as error:
+        reason.write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
+        if not isinstance(error, BarsightError):
+            traceback.print_exc()
+        sys.exit(1)
+
+
+class Supervisor:
+    """Runs the processes of a run. tell: takes each line of the log."""
+
+    def __init__(self, link: Link, board: Counters, tell: Callable[[str], None]) -> None:
+        self._link, self._board, self._tell = link, board, tell
+        self._out = link.folder.parent
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([__name__])
+        self._running: dict[str, BaseProcess] = {}
+        self._ends: dict[str, list[float]] = {role: [] for role in PROCESSES}
+        self.state = RunState(processes={role: ProcessState() for role in PROCESSES})
+        recording = link.open_recording()
+        self._sensors, self._shift_ns = link.sensors(recording), recording.rig.timeshift_cam_imu_ns
+        crane = recording.crane() if "crane" in self._sensors else None
+        self._freeze = None if crane is None else FreezeWatch(crane)
+        self._clock: ReplayClock | None = None
+        self._health_at = 0.0
+        self.stop_because = ""
+
+    def run(self) -> None:
+        """Run until the recording ends, `stop` is called or a process can't be kept up; then end all."""
+        try:
+            for role in PROCESSES:
+                self._start(role)
+            self._await_start()
+            while not (self._board["track", "done"] or self.stop_because):
+                wait([process.sentinel for process in self._running.values()], BEAT_S)
+                self._look_after()
+                self._judge()
+        finally:
+            self._end_all()
+        self.state.mode = self.final_mode()
+        self._write(health=True)
+
+    def stop(self, because: str) -> None:
+        """Ask the run to end."""
+        self.stop_because = self.stop_because or because
+
+    def final_mode(self) -> Mode:
+        """Judge the mode at the last picture, whatever the processes' pace was."""
+        heard = self._heard()
+        if self._freeze is not None:
+            self._freeze.forget()
+            heard = replace(heard, frozen=self._freeze.check(*self._link.readings("crane").read()))
+        return judge_mode(heard, self._last_picture_ns(), self._link.live)
+
+    def _start(self, role: str) -> None:
+        process = self._context.Process(
+            target=run_process, args=(role, self._link), name=f"barsight {role}", daemon=True
+        )
+        process.start()
+        self._running[role] = process
+        self.state.processes[role].pid = process.pid or 0
+
+    def _await_start(self) -> None:
+        """Wait until all are ready, then let the recording's time begin."""
+        give_up = time.monotonic() + START_S
+        while not all(self._board[role, "ready"] for role in PROCESSES) and not self.stop_because:
+            wait([process.sentinel for process in self._running.values()], BEAT_S)
+            self._look_after()
+            if time.monotonic() > give_up:
+                self.stop("the processes didn't start")
+        began_ns = time.monotonic_ns()
+        self._clock = ReplayClock(began_ns, self._board["capture", "first_ns"], self._link.speed)
+        self._board["supervisor", "began_ns"] = began_ns
+        self.state.phase = "measuring"
+
+    def _look_after(self) -> None:
+        """Start each process anew that has ended and wasn't done."""
+        done = {"capture": self._board["capture", "ended"], "track": self._board["track", "done"], "map": 0}
+        for role, process in list(self._running.items()):
+            state = self.state.processes[role]
+            if process.is_alive():
+                if state.state != "running" and self._board[role, "ready"]:
+                    state.state = "running"
+                    if state.restarts:
+                        self._log(f"{role} is running again")
+                continue
+            if done[role]:
+                state.state = "done"
+                continue
+            state.state, state.restarts, state.reason = "restarting", state.restarts + 1, self._why(role)
+            self._log(f"{role} {state.reason}; starting it anew")
+            now = time.monotonic()
+            self._ends[role] = [at for at in self._ends[role] if now - at < RESTARTS_WITHIN_S] + [now]
+            if len(self._ends[role]) > MOST_RESTARTS:
+                self.stop(
+                    f"{role} {state.reason}, {MOST_RESTARTS + 1} times within {RESTARTS_WITHIN_S:.0f} s"
+                )
+                return
+            self._board[role, "ready"] = 0
+            self._start(role)
+
+    def _why(self, role: str) -> str:
+        code, told = self._running[role].exitcode or 0, self._link.folder / f"{role}.reason"
+        if code < 0:
+            return f"was ended by {signal.Signals(-code).name}"
+        if told.is_file():
+            return f"ended by {' '.join(told.read_text(encoding='utf-8').split())}"
+        return f"ended with code {code}"
+
+    def _judge(self) -> None:
+        """Judge the mode and write it, to the log too where it changed."""
+        assert self._clock is not None
+        now_ns = self._clock.stamp_now_ns()
+        heard = self._heard()
+        if now_ns is None or self._board["capture", "ended"]:
+            now_ns = self._last_picture_ns()
+        down = {
+            role: one.reason
+            for role, one in self.state.processes.items()
+            if one.state not in ("running", "done")
+        }
+        mode = judge_mode(heard, now_ns, self._link.live, down)
+        self.state.now_ns = now_ns
+        before = self.state.mode
+        changed = (mode.name, mode.lifts) != (before.name, before.lifts)
+        self.state.mode = mode
+        if changed:
+            lifts = "" if mode.lifts else "; lifts are revoked"
+            self._log(f"mode {mode.name}{lifts}" + "".join(f"; {reason}" for reason in mode.reasons))
+        self._write(health=time.monotonic() >= self._health_at)
+
+    def _heard(self) -> HeardSensors:
+        board, frozen = self._board, False
+        readings: dict[str, int] = {}
+        for sensor in sorted(self._sensors):
+            stamps, values = self._link.readings(sensor).last(FREEZE_READINGS)
+            readings[sensor] = int(stamps[-1]) - self._shift_ns if len(stamps) else 0
+            if sensor == "crane" and self._freeze is not None:
+                frozen = self._freeze.check(stamps, values)
+        last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
+        return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen)
+
+    def _last_picture_ns(self) -> int:
+        return max(self._board["capture", f"last_cam{camera}_ns"] for camera in (0, 1))
+
+    def _write(self, health: bool) -> None:
+        write_state(self.state, self._board, self._out)
+        if health:
+            self._health_at = time.monotonic() + self._link.live.health_every_s
+            began_ns = self._board["supervisor", "began_ns"] or time.monotonic_ns()
+            write_health(self.state, self._board, (time.monotonic_ns() - began_ns) / NS_PER_S, self._out)
+
+    def _log(self, text: str) -> None:
+        seconds = 0.0
+        if self._clock is not None:
+            seconds = (time.monotonic_ns() - self._clock.began_ns) / NS_PER_S
+        self._tell(f"{seconds:8.2f} s  {text}")
+
+    def _end_all(self) -> None:
+        """End the processes: those that are at a frame finish it only if that takes no time."""
+        self._board["supervisor", "stop"] = 1
+        for role, process in self._running.items():
+            process.join(1.0 if role == "map" else 5.0)
+            if process.is_alive():
+                process.kill()
+                process.join()
+            self.state.processes[role].state = "done"

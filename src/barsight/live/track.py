@@ -1,0 +1,191 @@
+"""Run the track process: the newest pair from the ring, its pose at once, keyframes kept for the map."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.checkpoint import write_checkpoint
+from barsight.core.arrays import Float64
+from barsight.core.compiling.ahead import load_kernels
+from barsight.core.errors import Failed, MeasurementError
+from barsight.core.files import atomic_path
+from barsight.core.json_values import DIGITS, json_value
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
+from barsight.live.counters import Counters
+from barsight.live.link import GrowingRecording, Link
+from barsight.live.ring import CapturedPair, PairRing
+from barsight.motion.estimator import PoseEstimator
+from barsight.motion.settings import make_estimator
+from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.recording.sensor_selection import SelectedSensors
+
+POLL_S = 0.002
+GRACE_S = 0.3
+"""A frame waits so long for the readings of a sensor that has become silent."""
+AGAIN_FRAMES = 10
+"""A process begun anew follows so many of the last keyframes first: more than the window holds."""
+
+
+def track(link: Link) -> None:
+    """Track until capture has ended and its last pair is taken, or the supervisor says so."""
+    whole, board = link.open_recording(), link.open_counters()
+    ring = link.open_ring(whole)
+    tracking = Tracking(link, GrowingRecording(whole, [], link), board, ring)
+    load_kernels("measure")
+    tracking.follow_again()
+    board["track", "ready"] = 1
+    while not board["supervisor", "stop"]:
+        ended = board["capture", "ended"]
+        newest, taken = ring.newest, board["track", "taken"]
+        if newest <= taken:
+            if ended:
+                break
+            time.sleep(POLL_S)
+            continue
+        pair = ring.read(newest)
+        if pair is None:
+            continue
+        board["track", "taken"] = newest
+        tracking.take(pair, range(taken + 1, newest))
+    board["track", "done"] = 1
+
+
+class Tracking:
+    """Estimates each pair's pose with what is known when it comes, and keeps those that are keyframes."""
+
+    def __init__(self, link: Link, recording: GrowingRecording, board: Counters, ring: PairRing) -> None:
+        self._link, self._recording, self._board, self._ring = link, recording, board, ring
+        self._rectifier = Rectifier(recording.rig)
+        self._pairs = RectifiedPairs(recording, self._rectifier, link.checkpoints)
+        self._frames = link.frames()
+        self._source = SelectedSensors(recording, link.settings.use)
+        motion = replace(link.settings.motion, estimator="live")
+        self._estimator = make_estimator(motion)
+        self._poses: PoseEstimator | None = None
+        self._last_kept: Float64 | None = None
+        self._last_kept_ns, self._still = 0, 0
+
+    def follow_again(self) -> None:
+        """Follow the last keyframes anew after a restart, all of them without encoders."""
+        kept = [stamp for stamp, _, _, is_kept, _ in self._frames.read() if is_kept]
+        self._recording.grow()
+        again = kept if self._source.crane() is None else kept[-AGAIN_FRAMES:]
+        self._recording.stamps_ns[:] = kept
+        for seen in self._pairs(frozenset(again)) if again else ():
+            posed = self._placed(seen)
+            self._last_kept_ns = seen.stamp_ns
+            if isinstance(posed, PosedFrame):
+                self._last_kept = posed.reference_from_body.translation
+
+    def take(self, pair: CapturedPair, passed: range) -> None:
+        """Track a pair from the ring and keep it if it is a keyframe. passed: numbers of the pairs before it
+        that were passed over; of these are kept, without a pose, as many as the map would lack.
+        """
+        stamp = pair.frame.stamp_ns
+        rectified = self._rectifier(pair.frame)
+        if isinstance(rectified, Failed):
+            posed: PosedFrame | RefusedFrame = RefusedFrame(stamp, rectified.reason)
+        else:
+            self._wait_for_readings(stamp)
+            posed = self._placed(rectified)
+        has_pose = isinstance(posed, PosedFrame)
+        self._board.add("track", "tracked" if has_pose else "not_placed")
+        if isinstance(posed, PosedFrame):
+            _publish(posed, self._link)
+        done_ns = time.monotonic_ns()
+        for number in passed:
+            self._keep_passed(self._ring.read(number))
+        is_kept = isinstance(rectified, RectifiedPair) and self._is_keyframe(stamp, posed)
+        if isinstance(rectified, RectifiedPair) and is_kept:
+            self._keep(rectified)
+        if isinstance(posed, PosedFrame) and is_kept:
+            self._last_kept = posed.reference_from_body.translation
+            with atomic_path(self._link.posed_file(stamp)) as path:
+                write_checkpoint(posed, path)
+        self._frames.append((stamp, pair.exposed_ns, done_ns, is_kept, has_pose))
+
+    def _keep_passed(self, pair: CapturedPair | None) -> None:
+        """Keep a pair that was passed over if it is far enough from the last one kept."""
+        if pair is not None and self._is_wanted(pair.frame.stamp_ns):
+            rectified = self._rectifier(pair.frame)
+            if isinstance(rectified, RectifiedPair):
+                self._keep(rectified)
+                self._board.add("track", "kept_passed")
+                self._frames.append((pair.frame.stamp_ns, pair.exposed_ns, time.monotonic_ns(), True, False))
+                return
+        self._board.add("track", "newer_pair")
+
+    def _is_wanted(self, stamp_ns: int) -> bool:
+        if self._link.keyframes is not None:
+            return stamp_ns in self._link.keyframes
+        return stamp_ns - self._last_kept_ns >= seconds_to_ns(self._link.live.passed_every_s)
+
+    def _keep(self, pair: RectifiedPair) -> None:
+        self._pairs.store(pair)
+        self._last_kept_ns = pair.stamp_ns
+        self._board.add("track", "kept")
+
+    def _is_keyframe(self, stamp_ns: int, posed: PosedFrame | RefusedFrame) -> bool:
+        """Choose what is kept: pairs that the body has gone far enough for, the first few of a crane
+        that stands, and those whose place isn't known.
+        """
+        if self._link.keyframes is not None:
+            return stamp_ns in self._link.keyframes
+        if isinstance(posed, RefusedFrame) or self._last_kept is None:
+            return True
+        way_m = np.linalg.norm(posed.reference_from_body.translation - self._last_kept)
+        if way_m >= self._link.live.keyframe_way_m:
+            self._still = 0
+            return True
+        self._still += self._is_wanted(stamp_ns)
+        return self._is_wanted(stamp_ns) and self._still <= self._link.live.still_pairs
+
+    def _wait_for_readings(self, stamp_ns: int) -> None:
+        """Wait for the readings that the pose needs, `GRACE_S` at most."""
+        delay_ns = 0 if self._poses is None else self._poses.delay_ns or 0
+        due_ns = stamp_ns + self._recording.rig.timeshift_cam_imu_ns + delay_ns
+        give_up_ns = time.monotonic_ns() + int(GRACE_S * NS_PER_S)
+        while True:
+            self._recording.grow()
+            last = self._recording.last_readings_ns()
+            if all(last.get(sensor, 0) >= due_ns for sensor in self._expected):
+                return
+            if time.monotonic_ns() >= give_up_ns or self._board["supervisor", "stop"]:
+                return
+            time.sleep(POLL_S)
+
+    @property
+    def _expected(self) -> set[str]:
+        return self._link.sensors(self._recording.whole)
+
+    def _placed(self, seen: RectifiedPair | RefusedFrame) -> PosedFrame | RefusedFrame:
+        try:
+            if self._poses is None and "crane" in self._expected and self._source.crane() is None:
+                return RefusedFrame(seen.stamp_ns, "the encoders have given no reading yet")
+            if self._poses is None:
+                self._poses = self._estimator.begin(self._source, self._rectifier)
+            posed = self._poses.push(seen)
+        except MeasurementError as error:
+            return RefusedFrame(seen.stamp_ns, str(error))
+        assert posed is not None, "the live estimator's poses are final at once"
+        return posed
+
+
+def _publish(posed: PosedFrame, link: Link) -> None:
+    """Write the latest pose for readers, whole or not at all."""
+    pose = posed.reference_from_body
+    content = {
+        "stamp_ns": posed.stamp_ns,
+        "frame": pose.target,
+        "position_m": pose.translation,
+        "quaternion_xyzw": pose.quaternion_xyzw,
+        "sigma_m": np.sqrt(np.diag(posed.covariance)[3:]),
+    }
+    with atomic_path(link.folder.parent / "pose.json") as path:
+        path.write_text(json.dumps(json_value(content, DIGITS)) + "\n", encoding="utf-8")

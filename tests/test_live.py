@@ -1,0 +1,282 @@
+"""The live run: what it keeps gives measure's bytes, faults show by name, and lifts don't outlive them."""
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import barsight as bs
+from barsight.cli.main import run
+from barsight.core.types import CraneSamples, StereoFrame
+from barsight.live.counters import Counters
+from barsight.live.latency import counts, spread
+from barsight.live.logs import NumberLog, ReadingLog
+from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
+from barsight.live.pairing import PairFormer
+from barsight.live.ring import PairRing
+from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
+from barsight.live.settings import LiveSettings
+from barsight.live.source import LivePicture, LostPicture, Readings, ReplayClock, ReplaySource
+from barsight.live.state import prometheus
+from barsight.yard.magnet.description import example_magnet
+from cli_runs import FAST
+
+SETTINGS = bs.MeasureSettings(
+    stereo=replace(bs.MeasureSettings().stereo, method="sgbm"),
+    map=replace(bs.MeasureSettings().map, cell_m=0.05),
+)
+FILES = ("height.tif", "trajectory.tum", "cloud.ply", "contour.csv", "bundles.json", "lifts.json")
+BEGIN_NS = 1_700_000_000_000_000_000
+DARK = np.zeros((4, 6), np.uint8)
+
+
+def files(out: Path) -> dict[str, bytes]:
+    return {name: (out / name).read_bytes() for name in FILES}
+
+
+def content(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture
+def board() -> Iterator[Counters]:
+    one = Counters()
+    yield one
+    one.remove()
+
+
+@pytest.fixture
+def ring() -> Iterator[PairRing]:
+    one = PairRing(3, 4, 6)
+    yield one
+    one.remove()
+
+
+def frame(number: int) -> StereoFrame:
+    return StereoFrame(number, np.full((4, 6), number, np.uint8), np.full((4, 6), 100 + number, np.uint8))
+
+
+def test_a_run_as_fast_as_possible_is_measure(whole: Path, tmp_path: Path) -> None:
+    magnet = tmp_path / "magnet.toml"
+    magnet.write_text(example_magnet(), encoding="utf-8")
+    told: list[str] = []
+    out = tmp_path / "out"
+    replay(
+        whole, out, SETTINGS, LiveSettings(), speed=0, magnet=magnet, judged_at="end", tell=told.append
+    )  # fmt: skip
+    fields: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
+    batch = bs.measure(whole, magnet=magnet, at="end", **fields)
+    assert files(out) == files(batch.folder)
+    assert told == [line for line in told if "mode full" in line] and len(told) == 1
+    latency, state = content(out / "latency.json"), content(out / "state.json")
+    frames = latency["frames"]
+    assert [frames[name] for name in ("captured", "paired", "tracked", "kept")] == [4] * 4
+    assert set(frames["dropped"].values()) == {0}
+    assert latency["pose_s"]["n"] == 4 and latency["lifts_s"]["n"] == 1
+    assert (state["phase"], state["mode"], state["lifts"]["may_stand"]) == ("done", "full", True)
+    assert content(out / "keyframes.json")["keyframes_ns"] == list(bs.open_recording(whole).index.stamps_ns)
+    assert not {".live", "pose.json", "live_height.tif"} & {path.name for path in out.iterdir()}
+
+
+def test_what_was_kept_replays_to_the_byte(whole: Path, tmp_path: Path) -> None:
+    """At another pace, with pairs passed over and a mode that forbids lifts."""
+    stamps = list(bs.open_recording(whole).index.stamps_ns)
+    mode = Mode("no-encoders", ("the encoders: silent for 1.00 s (bound 0.30 s)",), False)
+    write_keyframes(Keyframes((*stamps[:2], stamps[3]), mode), tmp_path / "keyframes.json")
+    outs = []
+    for speed in (20.0, 0.0):
+        outs.append(tmp_path / f"out{speed:.0f}")
+        given = tmp_path / "keyframes.json" if speed else outs[0] / "keyframes.json"
+        replay(
+            whole, outs[-1], SETTINGS, LiveSettings(), speed=speed, keyframes=given, judged_at="end",
+            tell=lambda _: None,
+        )  # fmt: skip
+    assert content(outs[0] / "keyframes.json")["keyframes_ns"] == [*stamps[:2], stamps[3]]
+    assert files(outs[0]) == files(outs[1])
+    lifts = content(outs[1] / "lifts.json")
+    assert lifts["lifts"] == [] and "live-state" in [veto["code"] for veto in lifts["vetoes"]]
+    assert content(outs[1] / "state.json")["lifts"] == {"may_stand": False, "offered": 0}
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--replay", "{tmp}/nowhere"), ("nowhere",)),
+        (("--replay", "{whole}", "--speed", "-1"), ("speed must lie in 0...1000",)),
+        (("--replay", "{whole}", "--speed", "nan"), ("speed must lie in 0...1000",)),
+        (("--replay", "{whole}", "--magnet", "{tmp}/no.toml"), ("no.toml: no such file",)),
+        (("--replay", "{whole}", "--keyframes", "{tmp}/no.json"), ("no.json: no such file",)),
+        (("--replay", "{whole}", "--live.ring-pairs", "1"), ("live.ring_pairs must lie in 2...1000",)),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    flags: tuple[str, ...], words: tuple[str, ...], whole: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    filled = [flag.format(whole=whole, tmp=tmp_path) for flag in flags]
+    assert run(["live", *filled, "-o", str(tmp_path / "out"), *FAST]) in (2, 3)
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and all(word in line for word in words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_not_empty_is_refused(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    assert run(["live", "--replay", str(whole), "-o", str(tmp_path)]) == 4
+    assert "not empty" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_keyframes_come_back_and_torn_ones_are_refused(tmp_path: Path) -> None:
+    kept = Keyframes((1, 2), Mode("blind", ("why",), False))
+    write_keyframes(kept, tmp_path / "keyframes.json")
+    assert read_keyframes(tmp_path / "keyframes.json") == kept
+    (tmp_path / "keyframes.json").write_text('{"keyframes_ns": [1]}')
+    with pytest.raises(bs.BarsightError, match="is no list of keyframes"):
+        read_keyframes(tmp_path / "keyframes.json")
+
+
+def test_the_ring_gives_whole_pairs_only(ring: PairRing) -> None:
+    assert ring.newest == 0 and ring.read(1) is None
+    reader = PairRing(3, 4, 6, ring.name)
+    for number in range(1, 6):
+        assert ring.write(frame(number), 7 * number) == number
+        found = reader.read(reader.newest)
+        assert found is not None and (found.number, found.exposed_ns) == (number, 7 * number)
+        assert found.frame.stamp_ns == number and found.frame.right[3, 5] == 100 + number
+    assert reader.read(2) is None, "written over"
+    ring._heads[6 % 3, 0] = 2 * 6 - 1  # a writer is killed while it writes the sixth
+    assert reader.newest == 5 and reader.read(6) is None and reader.read(3) is None
+    assert ring.write(frame(7), 0) == 7 and reader.newest == 7
+    reader.close()
+
+
+def test_logs_skip_what_a_killed_writer_left(tmp_path: Path) -> None:
+    log, lines = ReadingLog(tmp_path / "imu.log", 2), NumberLog(tmp_path / "frames.log")
+    log.append(np.array([BEGIN_NS, BEGIN_NS + 1]), np.array([[1.0, 2.0], [3.0, 4.0]]))
+    lines.append((BEGIN_NS, True))
+    with (tmp_path / "imu.log").open("ab") as file:
+        file.write(b"torn")
+    with (tmp_path / "frames.log").open("ab") as file:
+        file.write(b"17,")
+    reader, numbers = ReadingLog(tmp_path / "imu.log", 2), NumberLog(tmp_path / "frames.log")
+    assert reader.read()[0].tolist() == [BEGIN_NS, BEGIN_NS + 1] and numbers.read() == [(BEGIN_NS, 1)]
+    ReadingLog(tmp_path / "imu.log", 2).append(np.array([BEGIN_NS + 2]), np.array([[5.0, 6.0]]))
+    NumberLog(tmp_path / "frames.log").append((18,))
+    stamps, values = reader.read()
+    assert stamps.tolist() == [BEGIN_NS + 2] and values.tolist() == [[5.0, 6.0]]
+    assert numbers.read() == [(18,)] and numbers.read() == []
+    assert reader.last(2)[0].tolist() == [BEGIN_NS + 1, BEGIN_NS + 2]
+
+
+def test_pairs_form_by_stamp_and_each_lone_picture_counts() -> None:
+    """cam0 at 0, 10, 30, 41 and cam1 at 1, 20, 30, 40, tolerance 2."""
+    former = PairFormer(2)
+    order = [(0, 0), (1, 1), (0, 10), (1, 20), (0, 30), (1, 30), (1, 40), (0, 41)]
+    pairs = [
+        (found.stamp_ns, exposed)
+        for camera, stamp in order
+        for found, exposed in former.push(LivePicture(camera, stamp, 1000 + stamp, DARK))
+    ]
+    assert pairs == [(0, 1001), (30, 1030), (41, 1041)]
+    assert former.lost == [1, 1]
+    list(former.push(LivePicture(0, 50, 0, DARK)))
+    former.end()
+    assert former.lost == [2, 1]
+
+
+HEARD = HeardSensors((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9})
+
+
+@pytest.mark.parametrize(
+    ("heard", "after_s", "down", "name", "lifts", "word"),
+    [
+        (HEARD, 0.05, {}, "full", True, None),
+        (HEARD, 0.25, {}, "no-imu", True, "the IMU: silent for 0.25 s (bound 0.20 s)"),
+        (replace(HEARD, readings_ns={"crane": 10**9}), 0.05, {}, "no-imu", True, "none in use"),
+        (replace(HEARD, frozen=True), 0.05, {}, "no-encoders", False, "frozen"),
+        (replace(HEARD, readings_ns={"imu": 10**9, "crane": 10**8}), 0, {}, "no-encoders", False, "silent"),
+        (replace(HEARD, cameras_ns=(10**9, 10**8)), 0.05, {}, "encoders-only", False, "cam1: silent"),
+        (replace(HEARD, cameras_ns=(0, 10**9)), 0.05, {}, "encoders-only", False, "cam0: no picture yet"),
+        (HEARD, 1.0, {}, "blind", False, "cam0: silent"),
+        (HEARD, 0, {"capture": "killed"}, "blind", False, "capture is down: killed"),
+        (HEARD, 0, {"track": "x"}, "encoders-only", False, "track is down"),
+        (HEARD, 0, {"map": "x"}, "full", False, "map is down"),
+    ],
+)  # fmt: skip
+def test_modes_have_reasons(
+    heard: HeardSensors, after_s: float, down: dict[str, str], name: str, lifts: bool, word: str | None
+) -> None:
+    mode = judge_mode(heard, 10**9 + round(after_s * 1e9), LiveSettings(), down)
+    assert (mode.name, mode.lifts) == (name, lifts)
+    assert (word is None and mode.reasons == ()) or any(word in reason for reason in mode.reasons if word)
+
+
+def test_a_freeze_shows_within_a_second_and_a_stop_is_none() -> None:
+    """0.5 m/s at 20 Hz; frozen from 3 s on, or braked by 0.25 m/s2 to a stand."""
+    t = np.arange(0, 8, 0.05)
+    mounted = CraneSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.eye(3), 0.002)
+    braking = np.where(t < 3, 0.5 * t, 1.5 + 0.5 * (t - 3) - 0.125 * (t - 3) ** 2)
+    braking = np.where(t > 5, 2.0, braking)
+    stamps = (1e9 * t).astype(np.int64)
+    for way, frozen in ((np.where(t < 3, 0.5 * t, 1.5), True), (braking, False)):
+        place = np.zeros((t.size, 3))
+        place[:, 0] = np.round(way, 3)
+        watch = FreezeWatch(mounted)
+        seen = [watch.check(stamps[max(k - 100, 0) : k], place[max(k - 100, 0) : k]) for k in range(t.size)]
+        first = t[seen.index(True)] if any(seen) else None
+        assert (first is not None and 3 < first < 4 and all(seen[80:])) if frozen else first is None
+
+
+def test_a_replay_gives_all_in_order_and_goes_on_where_it_was(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    source = ReplaySource(recording, ReplayClock(0, 0, 0.0), lambda: True)
+    start = dict.fromkeys(("cam0", "cam1", "imu", "crane"), 0)
+    packets = list(source.packets(start))
+    taken = [packet for packet in packets if isinstance(packet, LivePicture)]
+    assert [p.stamp_ns for p in taken if p.camera == 0] == list(recording.index.stamps_ns)
+    imu = recording.imu()
+    assert imu is not None
+    given = [p.stamp_ns for p in packets if isinstance(p, Readings) and p.sensor == "imu"]
+    assert np.array_equal(np.concatenate(given), imu.stamp_ns)
+    after = {"cam0": taken[2].stamp_ns, "cam1": taken[2].stamp_ns, "imu": int(given[0][-1]), "crane": 0}
+    again = [p for p in source.packets(after) if isinstance(p, LivePicture)]
+    assert [(p.camera, p.stamp_ns) for p in again] == [(p.camera, p.stamp_ns) for p in taken[4:]]
+
+
+def test_a_resumed_replay_loses_what_was_due_meanwhile_and_no_more(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    stamps = recording.index.stamps_ns
+    clock = ReplayClock(time.monotonic_ns(), stamps[1] + 1, 5.0)
+    after = {"cam0": stamps[0], "cam1": stamps[0], "imu": 0, "crane": 0}
+    packets = list(ReplaySource(recording, clock, lambda: True).packets(after))
+    lost = [(p.camera, p.stamp_ns) for p in packets if isinstance(p, LostPicture)]
+    came = [(p.camera, p.stamp_ns) for p in packets if isinstance(p, LivePicture)]
+    assert lost == [(0, stamps[1]), (1, stamps[1])]
+    assert came == [(camera, stamp) for stamp in stamps[2:] for camera in (0, 1)]
+
+
+def test_counters_and_health_are_text_that_adds_up(board: Counters) -> None:
+    seen = Counters(board.name)
+    seen["capture", "paired"] = 5
+    seen.add("capture", "unpaired_cam1", 2)
+    assert board["capture", "paired"] == 5 and counts(board)["captured"] == 7
+    seen.close()
+    text = prometheus(
+        {
+            "frames": counts(board), "restarts": {"map": 1}, "queues": {"keyframes": 3}, "mode": "full",
+            "memory_bytes": {"map": 9}, "disk_free_bytes": 7,
+        }
+    )  # fmt: skip
+    assert 'barsight_frames_total{stage="captured"} 7\n' in text
+    assert 'barsight_frames_dropped_total{cause="unpaired_cam1"} 2\n' in text
+    assert all(len(line.split(" ")) in (2, 4) for line in text.splitlines())
+    assert spread([]) == {"n": 0, "p50": None, "p99": None, "max": None}
+    assert spread([1.0, 3.0, 2.0])["p50"] == 2.0
