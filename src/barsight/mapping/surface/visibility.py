@@ -51,6 +51,9 @@ def may_be_occluded(
 ) -> bool:
     """Check for possible occlusion: within `_CUT_CELLS` along x or y, a much higher surface ends where fewer
     than min_views views could see it go on towards the point: their pictures end there.
+
+    point: (3,), m. around: (rows, columns) the tile's heights with a tile around it, m; row, column: the
+    point's, in the tile. planes: of all views, as `has_enough_views` takes them.
     """
     x_m, y_m = point[0], point[1]
     if has_enough_views(x_m, y_m, ceiling, planes, min_views):
