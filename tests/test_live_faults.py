@@ -105,6 +105,20 @@ def test_a_killed_process_is_told_and_comes_back(longer: Path, tmp_path: Path) -
     expect_replays(live.out, longer, tmp_path / "again")
 
 
+@pytest.mark.slow
+def test_a_process_that_hangs_is_ended_and_comes_back(longer: Path, tmp_path: Path) -> None:
+    live = Run(longer, tmp_path / "out", 0.07, "--live.hang-s", "5")
+    for role in ("capture", "track", "map"):
+        live.running()
+        os.kill(live.state()["processes"][role]["pid"], signal.SIGSTOP)
+        told_s = live.until(lambda s, role=role: s["processes"][role]["restarts"] == 1, 15.0)  # type: ignore[misc]
+        assert told_s < 7.0
+        assert any(f"{role} is down: did not go on for 5 s" in r for r in live.state()["reasons"])
+        assert live.running(20.0) < 15.0
+    live.process.send_signal(signal.SIGINT)
+    live.end()
+
+
 def is_told(role: str, restarts: int, state: Any) -> bool:
     """Whether the state names the process that was killed, and lets no lift stand."""
     reasons = " ".join(state["reasons"])

@@ -20,13 +20,19 @@ def capture(link: Link) -> None:
     stamps = recording.camera_stamps
     first_ns = int(min(stamps.left_ns[0], stamps.right_ns[0]))
     board["capture", "first_ns"] = first_ns
+
+    def may_go_on() -> bool:
+        board.beat("capture")
+        return not board["supervisor", "stop"]
+
+    board.beat("capture")
     board["capture", "ready"] = 1
     while not (began_ns := board["supervisor", "began_ns"]):
-        if board["supervisor", "stop"]:
+        if not may_go_on():
             return
         time.sleep(POLL_S)
     clock = ReplayClock(began_ns, first_ns, link.speed)
-    source = ReplaySource(recording, clock, lambda: not board["supervisor", "stop"])
+    source = ReplaySource(recording, clock, may_go_on)
     board["capture", "interval_ns"] = source.interval_ns
     Capture(link, board, link.open_ring(recording)).run(source)
     board["capture", "ended"] = 1
@@ -73,6 +79,7 @@ class Capture:
         """Wait until the last pair was taken: as fast as possible, none may be lost."""
         board, newest = self._board, self._ring.newest
         while board["track", "taken"] < newest and not board["supervisor", "stop"]:
+            board.beat("capture")
             time.sleep(POLL_S)
 
     def _count_lost(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from multiprocessing.shared_memory import SharedMemory
 
 import numpy as np
@@ -12,12 +13,15 @@ ROWS: dict[str, tuple[str, ...]] = {
     "supervisor": ("began_ns", "stop"),
     "capture": (
         "ready", "ended", "pictures_cam0", "pictures_cam1", "paired", "unpaired_cam0", "unpaired_cam1",
-        "torn", "capture_down", "last_cam0_ns", "last_cam1_ns", "interval_ns", "first_ns",
+        "torn", "capture_down", "last_cam0_ns", "last_cam1_ns", "interval_ns", "first_ns", "beat_ns",
     ),
-    "track": ("ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed"),
-    "map": ("ready", "mapped", "refused", "backlog", "snapshots"),
+    "track": (
+        "ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed", "beat_ns",
+    ),
+    "map": ("ready", "mapped", "refused", "backlog", "snapshots", "beat_ns"),
 }  # fmt: skip
-"""Counters of each process. Those in _ns are stamps or spans; began_ns is of the monotonic clock."""
+"""Counters of each process. Those in _ns are stamps or spans; began_ns and beat_ns, when a process last went
+round its loop, are of the monotonic clock."""
 _WIDTH = max(len(names) for names in ROWS.values())
 
 
@@ -45,6 +49,10 @@ class Counters:
     def add(self, role: str, name: str, count: int = 1) -> None:
         """Add to a counter of the caller's own row."""
         self[role, name] += count
+
+    def beat(self, role: str) -> None:
+        """Note that a process goes on."""
+        self[role, "beat_ns"] = time.monotonic_ns()
 
     def row(self, role: str) -> dict[str, int]:
         """Return all counters of a process."""

@@ -32,9 +32,11 @@ def build_live_map(link: Link) -> None:
     load_kernels("measure")
     mapping = Mapping(link, GrowingRecording(link.open_recording(), [], link))
     board["map", "mapped"] = board["map", "refused"] = 0
+    board.beat("map")
     board["map", "ready"] = 1
     shown = 0
     while not board["supervisor", "stop"]:
+        board.beat("map")
         board["map", "backlog"] = mapping.read_queue()
         if mapping.queue:
             board.add("map", "mapped" if mapping.add_next() else "refused")

@@ -25,6 +25,8 @@ class LiveSettings:
     """Encoders without readings for so long are out."""
     camera_silence_intervals: float = 2.5
     """A camera without pictures for so many of its intervals, at least 0.3 s, is out."""
+    hang_s: float = 30.0
+    """A process that hasn't gone round its loop for so long hangs: it is ended and started anew."""
     health_every_s: float = 1.0
     """How often health.json and health.prom are written."""
 
@@ -33,5 +35,6 @@ class LiveSettings:
         expect_ranges(
             self, "live.", ring_pairs=(2, 1000), keyframe_way_m=(0, 10), still_pairs=(0, 1000),
             passed_every_s=(0, 60), imu_silence_s=(0.02, 10), encoder_silence_s=(0.02, 10),
-            camera_silence_intervals=(1.5, 100), health_every_s=(0.1, 60),
+            camera_silence_intervals=(1.5, 100), hang_s=(1, 3600),
+            health_every_s=(0.1, 60),
         )  # fmt: skip

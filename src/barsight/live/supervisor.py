@@ -58,6 +58,7 @@ class Supervisor:
         self._context.set_forkserver_preload([__name__])
         self._running: dict[str, BaseProcess] = {}
         self._ends: dict[str, list[float]] = {role: [] for role in PROCESSES}
+        self._hung: dict[str, str] = {}
         self.state = RunState(processes={role: ProcessState() for role in PROCESSES})
         recording = link.open_recording()
         self._sensors, self._shift_ns = link.sensors(recording), recording.rig.timeshift_cam_imu_ns
@@ -98,6 +99,7 @@ class Supervisor:
         process = self._context.Process(
             target=run_process, args=(role, self._link), name=f"barsight {role}", daemon=True
         )
+        self._board.beat(role)
         process.start()
         self._running[role] = process
         self.state.processes[role].pid = process.pid or 0
@@ -125,6 +127,8 @@ class Supervisor:
                     state.state = "running"
                     if state.restarts:
                         self._log(f"{role} is running again")
+                if not done[role]:
+                    self._end_if_hung(role, process)
                 continue
             if done[role]:
                 state.state = "done"
@@ -141,7 +145,17 @@ class Supervisor:
             self._board[role, "ready"] = 0
             self._start(role)
 
+    def _end_if_hung(self, role: str, process: BaseProcess) -> None:
+        """End a process that lives but doesn't go on; while it starts, `START_S` bounds it."""
+        silent_s = (time.monotonic_ns() - self._board[role, "beat_ns"]) / NS_PER_S
+        bound_s = self._link.live.hang_s if self._board[role, "ready"] else START_S
+        if silent_s > bound_s:
+            self._hung[role] = f"did not go on for {bound_s:g} s"
+            process.kill()
+
     def _why(self, role: str) -> str:
+        if role in self._hung:
+            return self._hung.pop(role)
         code, told = self._running[role].exitcode or 0, self._link.folder / f"{role}.reason"
         if code < 0:
             return f"was ended by {signal.Signals(-code).name}"

@@ -39,8 +39,10 @@ def track(link: Link) -> None:
     tracking = Tracking(link, GrowingRecording(whole, [], link), board, ring)
     load_kernels("measure")
     tracking.follow_again()
+    board.beat("track")
     board["track", "ready"] = 1
     while not board["supervisor", "stop"]:
+        board.beat("track")
         ended = board["capture", "ended"]
         newest, taken = ring.newest, board["track", "taken"]
         if newest <= taken:
