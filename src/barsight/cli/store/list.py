@@ -47,7 +47,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def _table(surveys: tuple[SurveyRow, ...]) -> Table:
     table = Table(title="Surveys", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for head in ("map", "last frame", "bundles", "same", "moved", "added", "found", "gone"):
+    for head in ("map", "last frame", "seen", "same", "moved", "added", "found", "gone"):
         table.add_column(head, justify="left" if head in ("map", "last frame") else "right", no_wrap=True)
     for each in surveys:
         counts = [each.changes.get(kind, 0) for kind in ("same", "moved", "added", "found")]

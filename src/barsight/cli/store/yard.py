@@ -71,18 +71,19 @@ def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[s
 def bundle_table(title: str, present: tuple[PresentBundle, ...], now_ns: int) -> Table:
     """Format the bundles of a yard with place, age and doubt."""
     table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for head in ("name", "stock", "x m", "y m", "top m", "yaw deg", "length m", "age", "last seen", "doubt"):
+    for head in ("name", "x m", "y m", "top m", "yaw deg", "length m", "age", "stock", "doubt"):
         table.add_column(
-            head, justify="left" if head in ("name", "stock", "last seen", "doubt") else "right", no_wrap=True
-        )
+            head, justify="left" if head in ("name", "stock", "doubt") else "right",
+            no_wrap=head not in ("stock", "doubt"),
+        )  # fmt: skip
     for each in present:
         one, bundle = each.sighting, each.sighting.record
         x_m, y_m, _ = bundle["axis_centre_m"]
         open_end = "+" if any(bundle["ends_open"]) else ""
         table.add_row(
-            one.identity, one.stock_name or "", f"{x_m:.3f}", f"{y_m:.3f}", f"{bundle['top_z_m']:.3f}",
+            one.identity, f"{x_m:.3f}", f"{y_m:.3f}", f"{bundle['top_z_m']:.3f}",
             f"{bundle['yaw_deg']:.2f}", f"{bundle['length_m']:.2f}{open_end}", _age(now_ns - one.seen_ns),
-            time_text(one.seen_ns), "" if each.doubt is None else each.doubt.kind,
+            one.stock_name or "", "" if each.doubt is None else each.doubt.kind,
         )  # fmt: skip
     return table
 
