@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import importlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 import tyro
 
+from barsight.core.errors import ConfigError
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.renamed import refuse_old_flags
 
@@ -20,6 +23,23 @@ def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> N
     """Parse `arguments` by the function's signature and call it; wrong usage exits with 2."""
     refuse_old_flags(arguments)
     tyro.cli(command, prog=f"barsight {name}", args=_listed(arguments), compact_help=False)
+
+
+def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[str]) -> None:
+    """Pass the rest of `name KIND ...` on to the module of that kind. kinds: each with its summary; noun: of
+    a kind, for the errors.
+    """
+    if not arguments:
+        raise ConfigError(f"{name} needs a kind: {', '.join(kinds)}; --help says what each does")
+    if arguments[0] in ("-h", "--help"):
+        width = max(map(len, kinds)) + 1
+        lines = "\n".join(f"  {kind:<{width}}{summary}" for kind, summary in kinds.items())
+        sys.stdout.write(f"usage: barsight {name} KIND ...\n\nkinds:\n{lines}\n\n")
+        return
+    kind, rest = arguments[0], arguments[1:]
+    if kind not in kinds:
+        raise ConfigError(f"there is no {noun} {kind!r}; known are {', '.join(kinds)}")
+    importlib.import_module(f"barsight.cli.{name}.{kind.replace('-', '_')}").run(rest)
 
 
 def _listed(arguments: Sequence[str]) -> list[str]:

@@ -28,7 +28,7 @@ class LiveSettings:
     hang_s: float = 30.0
     """A process that hasn't gone round its loop for so long hangs: it is ended and started anew."""
     health_every_s: float = 1.0
-    """How often health.json and health.prom are written."""
+    """Interval between writings of health.json and health.prom."""
 
     def __post_init__(self) -> None:
         expect_values(self, "live.")

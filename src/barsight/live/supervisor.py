@@ -25,7 +25,7 @@ from barsight.live.track import track
 
 PROCESSES: dict[str, Callable[[Link], None]] = {"capture": capture, "track": track, "map": build_live_map}
 BEAT_S = 0.1
-"""How often the mode is judged and processes are looked after."""
+"""Interval between judgements of the mode and looks after the processes."""
 MOST_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
 """A process that ends more often than that ends the run."""
 START_S = 120.0

@@ -20,7 +20,7 @@ MOVED_M = 0.05
 MOVED_RAD = math.radians(1.0)
 _PLACE_SIGMA_M = 0.02
 _YAW_SIGMA_RAD = math.radians(0.3)
-"""How far surveys of one yard disagree beyond the stated sigmas, as by their places in the yard."""
+"""Error common to a whole survey, beside the stated sigmas: of its place in the yard."""
 _MIN_LENGTH_TOLERANCE_M = 0.1
 _LEFT_BEHIND = 100.0
 """Cost of a lifted bundle being where it was lifted from."""

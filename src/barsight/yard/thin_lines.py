@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int64, kernel
-from barsight.core.linalg.robust import mad_sigma, running_median
+from barsight.core.linalg.robust import known_median, mad_sigma, running_median
 from barsight.yard.types import Bundle, HeightMap
 
 KNOWN_ACROSS = "crosses over it"
@@ -184,9 +184,7 @@ def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
 def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]:
     """Compute each place's contrast (V, U) to its column around it, in sigmas, and the columns' weights."""
     seen = np.isfinite(level)
-    ordered = np.sort(level, axis=0)
-    typical = np.take_along_axis(ordered, np.maximum(seen.sum(axis=0) - 1, 0)[None] // 2, axis=0)
-    filled = np.where(seen, level, np.nan_to_num(typical))
+    filled = np.where(seen, level, np.nan_to_num(known_median(level)))
     around = running_median(filled, 2 * round(AROUND_M / STEP_M / 2 - 0.5) + 1)
     off = np.where(seen, filled - around, 0)
     off -= np.median(off, axis=0)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Sequence
 
-from barsight.core.errors import ConfigError
+from barsight.cli.arguments import pass_on
 
 KINDS = {
     "board": "Draw a board to print in its true size, or how to hold it before the cameras",
@@ -21,13 +19,4 @@ KINDS = {
 
 def run(arguments: Sequence[str]) -> None:
     """Pass the rest of the line on to the calibration named first."""
-    if not arguments:
-        raise ConfigError(f"calibrate needs a kind: {', '.join(KINDS)}; --help says what each does")
-    if arguments[0] in ("-h", "--help"):
-        lines = "\n".join(f"  {name:<11}{summary}" for name, summary in KINDS.items())
-        sys.stdout.write(f"usage: barsight calibrate KIND ...\n\nkinds:\n{lines}\n\n")
-        return
-    kind, rest = arguments[0], arguments[1:]
-    if kind not in KINDS:
-        raise ConfigError(f"there is no calibration {kind!r}; known are {', '.join(KINDS)}")
-    importlib.import_module(f"barsight.cli.calibrate.{kind.replace('-', '_')}").run(rest)
+    pass_on("calibrate", "calibration", KINDS, arguments)

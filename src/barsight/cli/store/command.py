@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Sequence
 
-from barsight.core.errors import ConfigError
+from barsight.cli.arguments import pass_on
 
 KINDS = {
     "add": "Add a measured folder: its bundles get names that they keep",
@@ -17,13 +15,4 @@ KINDS = {
 
 def run(arguments: Sequence[str]) -> None:
     """Pass the rest of the line on."""
-    if not arguments:
-        raise ConfigError(f"store needs a word: {', '.join(KINDS)}; --help says what each does")
-    if arguments[0] in ("-h", "--help"):
-        lines = "\n".join(f"  {name:<8}{summary}" for name, summary in KINDS.items())
-        sys.stdout.write(f"usage: barsight store {'|'.join(KINDS)} ...\n\n{lines}\n\n")
-        return
-    kind, rest = arguments[0], arguments[1:]
-    if kind not in KINDS:
-        raise ConfigError(f"store can't {kind!r}; known are {', '.join(KINDS)}")
-    importlib.import_module(f"barsight.cli.store.{kind}").run(rest)
+    pass_on("store", "task of the store", KINDS, arguments)

@@ -22,6 +22,12 @@ def mad_sigma(deviation: NDArray[Any], axis: int | None = None) -> float | NDArr
     return SIGMA_PER_MAD * (float(median) if axis is None else median)
 
 
+def known_median(values: NDArray[Any]) -> NDArray[Any]:
+    """Compute the lower median (1, U) of the known values of each column (V, U); NaN where none is known."""
+    middle = np.maximum(np.isfinite(values).sum(axis=0) - 1, 0)[None] // 2
+    return np.take_along_axis(np.sort(values, axis=0), middle, axis=0)
+
+
 def running_median(values: NDArray[Any], count: int) -> NDArray[Any]:
     """Compute the median of `count` (odd) rows about each, (N, M); the first and last row are repeated.
 

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, UInt8
+from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.crossing_bundles import rise_over
 from barsight.yard.bundles.fitting.ends import End
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, LOOSENESS
@@ -125,10 +126,7 @@ def measure_laid(reading: Reading) -> float:
     inside = (column >= 0) & (column < sheet.z_m.shape[1])
     z = sheet.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
     z = np.where(inside, z - fit.values[SLOPE_Z] * along[:, None], np.nan)
-    known = np.isfinite(z)
-    ordered = np.sort(z, axis=0)
-    typical = np.take_along_axis(ordered, np.maximum(known.sum(axis=0) - 1, 0)[None] // 2, axis=0)
-    rise = np.where(known, z - typical, -np.inf)
+    rise = np.where(np.isfinite(z), z - known_median(z), -np.inf)
     size = [max(round(side / sheet.cell_m), 1) for side in _LAID_SIZE_M]
     laid = ndimage.binary_opening(rise > _LAID_M, np.ones(size, bool))
     return float(rise[laid].max(initial=0.0))

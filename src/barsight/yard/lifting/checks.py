@@ -246,10 +246,10 @@ def _unexplained(
     rectangles = near.rectangles
     outlines[:, :2], outlines[:, 2:4] = rectangles.centre, rectangles.along
     open_m = rectangles.open_ends.any(axis=1) * BEYOND_OPEN_END_M
-    spread = np.hypot(rectangles.sigma[:, 0], rectangles.sigma[:, 3])
-    margin = MARGIN_M + 2.0 * float(spread[list(held.gripped)].max(initial=0.0))
+    spread = np.hypot(rectangles.sigma[:, :2], rectangles.sigma[:, 3:])
+    margin = MARGIN_M + 2.0 * float(spread[list(held.gripped), 0].max(initial=0.0))
     for first, sigmas in ((4, 2.0), (6, 1.0)):
-        wider = MARGIN_M + sigmas * np.hypot(rectangles.sigma[:, :2], rectangles.sigma[:, 3:])
+        wider = MARGIN_M + sigmas * spread
         outlines[:, first : first + 2] = rectangles.half + wider
         outlines[:, first + 1] += open_m
     return _stray_shares(
