@@ -305,7 +305,7 @@ def test_the_commands_from_an_empty_folder_to_a_tampered_store(
         (["store", "verify", "postgresql://user:secret@127.0.0.1:9/none"], 3, "127.0.0.1"),
         (["store", "add", "none"], 3, "no such folder"),
         (["store", "add", "sqlite:///no/yard.db", "out"], 3, "unable to open"),
-        (["store", "grow"], 2, "can't 'grow'"),
+        (["store", "grow"], 2, "no task of the store 'grow'"),
         (["yard", "sqlite:///note.txt", "--at", "2001-01-01"], 2, "zone"),
     ],
 )
