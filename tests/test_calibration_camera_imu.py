@@ -66,6 +66,7 @@ def mean_square(seeds: range) -> float:
     return float(np.mean(found))
 
 
+@pytest.mark.slow
 def test_a_bent_board_of_known_shape_is_no_error() -> None:
     board = apply_shape(BOARD, {"bow_x_m": 2e-3, "bow_y_m": -1e-3, "stretch_share": 3e-3, "skew_rad": 0.0,
                          "tag_share": -9e-3})  # fmt: skip

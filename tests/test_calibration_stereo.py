@@ -61,6 +61,7 @@ def test_without_noise_the_rig_is_found_exactly() -> None:
     assert abs(calibration.rig.baseline_m - np.linalg.norm(TRANSLATION_M)) < 1e-8
 
 
+@pytest.mark.slow
 def test_errors_over_sigma_over_24_seeds() -> None:
     ratios, mahalanobis, depth = [], [], []
     for seed in range(24):

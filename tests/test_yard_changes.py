@@ -48,9 +48,9 @@ def test_what_errs_as_stated_is_rarely_called_a_change() -> None:
         )  # fmt: skip
         return record(drawn, number, top_z_m=one.top_z_m + rng.normal(0, SIGMA.top_z_m))
 
-    kinds = [compared([measured(0)], [measured(1)])[0].kind for _ in range(300)]
+    kinds = [compared([measured(0)], [measured(1)])[0].kind for _ in range(100)]
     # Four figures at one per cent each.
-    assert 1 - kinds.count("same") / 300 < 0.08
+    assert kinds.count("same") > 90
 
 
 def test_what_the_other_map_did_not_see_is_neither_taken_nor_added() -> None:

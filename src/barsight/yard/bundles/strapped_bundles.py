@@ -51,7 +51,7 @@ def held_by_straps(
         shown = reading.found.shades is not None
         if shown or abs(pack.middle_m) < _SAME_MIDDLE_M:
             own = replace(bundle, sigma=irregular)
-            return _covered(_confirmed(own, pack, floor_m, is_hexagon=shown), pack)
+            return _covered(_confirmed(own, pack, floor_m, _pack_sigma(reading)), pack)
     return _covered(_as_pack(bundle, irregular, reading, pack, floor_m), pack)
 
 
@@ -84,7 +84,7 @@ def _as_pack(
             bundle.sigma,
             lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
             yaw_rad=irregular.yaw_rad,
-            width_m=float(np.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * fit.sigma_m)),
+            width_m=_pack_sigma(reading),
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
             bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
             section_m2=section_sigma,
@@ -137,25 +137,30 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
     return bundle
 
 
-def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, *, is_hexagon: bool) -> Bundle:
-    """Keep a fitted outline that ends where the pack does; they are as sure as they agree. Its width is the
-    mean of both by their sigma unless the pictures show the hexagon that was fitted.
+def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: float) -> Bundle:
+    """Keep a fitted outline that ends where the pack does. Its width is the mean of both by their sigmas; they
+    are as sure as they agree.
     """
     section, section_sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if abs(pack.diameter_m - diameter) > DIAMETER_SIGMA_RATIO * diameter:
         diameter, spread = pack.diameter_m, DIAMETER_SIGMA_RATIO * pack.diameter_m
+    own, packs = bundle.sigma.width_m**-2, pack_sigma_m**-2
+    scatter_m = (bundle.width_m - pack.width_m) / 2
     sigma = replace(
         bundle.sigma,
         bar_diameter_m=spread,
         lateral_m=float(np.hypot(bundle.sigma.lateral_m, pack.middle_m)),
-        width_m=float(np.hypot(bundle.sigma.width_m, bundle.width_m - pack.width_m)),
+        width_m=float(np.hypot((own + packs) ** -0.5, scatter_m)),
         section_m2=section_sigma,
     )
-    own, packs = bundle.sigma.width_m**-2, _PACK_WIDTH_M**-2
-    mean = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
-    width = bundle.width_m if is_hexagon else mean
+    width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
     return replace(bundle, width_m=width, section_m2=section, bar_diameter_m=diameter, sigma=sigma)
+
+
+def _pack_sigma(reading: Reading) -> float:
+    """Compute the standard deviation of a pack's width."""
+    return float(np.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m))
 
 
 def _over(top_z_m: float, floor_m: float | None) -> float:
