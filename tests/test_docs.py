@@ -97,6 +97,8 @@ def test_shown_commands_parse(
     monkeypatch.setattr(tyro, "cli", parse_only)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "settings.toml").write_text("")
+    (crane,) = blocks(ROOT / "docs" / "how-to" / "run-a-crane.md", "toml")
+    (tmp_path / "crane.toml").write_text(crane, encoding="utf-8")
     assert main.run(shlex.split(command)) == 0
     assert called
 

@@ -10,7 +10,7 @@ import barsight
 FLOORS = {
     "core": 0,
     "calibration": 1,
-    "recording": 2, "stereo": 2, "features": 2, "inertial": 2, "registration": 2,
+    "recording": 2, "sensors": 2, "stereo": 2, "features": 2, "inertial": 2, "registration": 2,
     "motion": 3,
     "mapping": 4,
     "yard": 5,
@@ -41,6 +41,7 @@ ROOMS = {
     "report": (".", "calibration"),
     "simulation": ("effects", ".", "worlds"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
+    "live": (".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
     "cli": (".", "calibrate", "bench", "yard", "store"),
 }  # fmt: skip
@@ -67,7 +68,7 @@ APART = {
 """Rooms of which the first doesn't import the second either."""
 MAX_MODULES = 16
 ROOT = Path(barsight.__file__).parent
-OPTIONAL = {"viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1, "alembic": 3}
+OPTIONAL = {"viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1, "alembic": 3, "viva_genicam": 1}
 """Optional libraries, and the number of files that import them: of rosbags one reads and one writes."""
 
 

@@ -21,8 +21,9 @@ from barsight.live.pairing import PairFormer
 from barsight.live.ring import PairRing
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
-from barsight.live.source import LivePicture, LostPicture, Readings, ReplayClock, ReplaySource
+from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
+from barsight.sensors.source import LivePicture, LostPicture, Readings
 from barsight.yard.magnet.description import example_magnet
 from cli_runs import FAST
 
@@ -272,11 +273,13 @@ def test_counters_and_health_are_text_that_adds_up(board: Counters) -> None:
     text = prometheus(
         {
             "frames": counts(board), "restarts": {"map": 1}, "queues": {"keyframes": 3}, "mode": "full",
-            "memory_bytes": {"map": 9}, "disk_free_bytes": 7,
+            "memory_bytes": {"map": 9}, "disk_free_bytes": 7, "disk_days": 1.5,
+            "sensors": {"cam0_drift_ppb": -40}, "record": {"paused": 1},
         }
     )  # fmt: skip
     assert 'barsight_frames_total{stage="captured"} 7\n' in text
     assert 'barsight_frames_dropped_total{cause="unpaired_cam1"} 2\n' in text
+    assert 'barsight_sensor{sign="cam0_drift_ppb"} -40\n' in text and "barsight_disk_days 1.5\n" in text
     assert all(len(line.split(" ")) in (2, 4) for line in text.splitlines())
     assert spread([]) == {"n": 0, "p50": None, "p99": None, "max": None}
     assert spread([1.0, 3.0, 2.0])["p50"] == 2.0

@@ -16,7 +16,7 @@ from barsight.core.errors import BarsightError
 COMMANDS = {
     "demo": "Simulate a small yard, measure it and compare with truth and laser: try this first",
     "measure": "Measure a stereo recording: map, contours, trajectory, cloud, report",
-    "live": "Measure while pictures and readings come, so far from a replayed recording",
+    "live": "Measure while pictures and readings come, from a crane's sensors or a replayed recording",
     "lifts": "Choose lift targets anew from a measured yard, for another magnet",
     "explain": "Tell why a lift is offered or refused: every check, and a picture of the place",
     "compare": "Compare two measured yards: moved, settled, taken, added",

@@ -3,39 +3,62 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.stamps import seconds_to_ns
 from barsight.live.counters import Counters
 from barsight.live.link import Link
 from barsight.live.pairing import PairFormer
 from barsight.live.ring import PairRing
-from barsight.live.source import LivePicture, LostPicture, Readings, ReplayClock, ReplaySource, Source
+from barsight.live.settings import CraneConfig
+from barsight.live.source import ReplayClock, ReplaySource
+from barsight.sensors.crane import CraneSource
+from barsight.sensors.datagrams import ReadingReceiver
+from barsight.sensors.source import LivePicture, LostPicture, Readings, SensorSigns, Source
 
 POLL_S = 0.002
 
 
 def capture(link: Link) -> None:
     """Capture until the source ends or the supervisor says so."""
-    board, recording = link.open_counters(), link.open_recording()
-    stamps = recording.camera_stamps
-    first_ns = int(min(stamps.left_ns[0], stamps.right_ns[0]))
-    board["capture", "first_ns"] = first_ns
+    board = link.open_counters()
 
     def may_go_on() -> bool:
         board.beat("capture")
         return not board["supervisor", "stop"]
 
+    if link.crane is None:
+        recording = link.open_replayed()
+        stamps = recording.camera_stamps
+        first_ns = int(min(stamps.left_ns[0], stamps.right_ns[0]))
+        board["capture", "first_ns"] = first_ns
     board.beat("capture")
     board["capture", "ready"] = 1
     while not (began_ns := board["supervisor", "began_ns"]):
         if not may_go_on():
             return
         time.sleep(POLL_S)
-    clock = ReplayClock(began_ns, first_ns, link.speed)
-    source = ReplaySource(recording, clock, may_go_on)
+    if link.crane is None:
+        source: Source = ReplaySource(recording, ReplayClock(began_ns, first_ns, link.speed), may_go_on)
+    else:
+        # Not before: what comes while nobody reads would be lost.
+        source = open_crane(link.crane, link.open_recording().rig, link.epoch_ns, may_go_on)
     board["capture", "interval_ns"] = source.interval_ns
-    Capture(link, board, link.open_ring(recording)).run(source)
+    Capture(link, board, link.open_ring()).run(source)
     board["capture", "ended"] = 1
+
+
+def open_crane(
+    crane: CraneConfig, rig: StereoRig, epoch_ns: int, may_go_on: Callable[[], bool]
+) -> CraneSource:
+    """Open the sensors of crane.toml. Raises ConfigError where a port or a library is missing."""
+    from barsight.sensors.gige import GigeCamera  # an extra, which replays do without
+
+    sizes = rig.cam0.width, rig.cam0.height
+    cameras = GigeCamera(0, crane.cameras, sizes), GigeCamera(1, crane.cameras, sizes)
+    receivers = {name: ReadingReceiver(name, one.port) for name, one in crane.sensors().items()}
+    return CraneSource(cameras, receivers, crane.cameras.rate_hz, epoch_ns, may_go_on)
 
 
 class Capture:
@@ -46,6 +69,7 @@ class Capture:
         self._readings = {sensor: link.readings(sensor) for sensor in ("imu", "crane")}
         self._pairs = PairFormer(seconds_to_ns(link.settings.recording.pair_tolerance_s))
         self._lost = [board["capture", f"unpaired_cam{camera}"] for camera in (0, 1)]
+        self._contradicted = board["capture", "trigger"]
 
     def run(self, source: Source) -> None:
         """Take packets until there are no more."""
@@ -57,7 +81,10 @@ class Capture:
             if isinstance(packet, Readings):
                 self._readings[packet.sensor].append(packet.stamp_ns, packet.values)
             elif isinstance(packet, LostPicture):
-                self._board.add("capture", packet.cause)
+                self._board.add("capture", packet.cause, packet.count)
+            elif isinstance(packet, SensorSigns):
+                for name, value in packet.values.items():
+                    self._board["sensors", name] = value
             else:
                 self._take(packet)
         self._pairs.end()
@@ -85,3 +112,6 @@ class Capture:
     def _count_lost(self) -> None:
         for camera, before in enumerate(self._lost):
             self._board["capture", f"unpaired_cam{camera}"] = before + self._pairs.lost[camera]
+        self._board["capture", "trigger"] = self._contradicted + self._pairs.contradicted
+        self._board["capture", "skew_ns"] = self._pairs.skew_ns
+        self._board["capture", "max_skew_ns"] = self._pairs.max_skew_ns

@@ -10,18 +10,26 @@ import numpy as np
 from barsight.core.arrays import Int64
 
 ROWS: dict[str, tuple[str, ...]] = {
-    "supervisor": ("began_ns", "stop"),
+    "supervisor": ("began_ns", "stop", "alarms"),
     "capture": (
         "ready", "ended", "pictures_cam0", "pictures_cam1", "paired", "unpaired_cam0", "unpaired_cam1",
-        "torn", "capture_down", "last_cam0_ns", "last_cam1_ns", "interval_ns", "first_ns", "beat_ns",
+        "torn", "capture_down", "incomplete", "missed", "backpressure", "late", "clock", "trigger", "skew_ns",
+        "max_skew_ns", "last_cam0_ns", "last_cam1_ns", "interval_ns", "first_ns", "beat_ns",
     ),
     "track": (
         "ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed", "beat_ns",
     ),
+    "sensors": (
+        "cam0_settled", "cam0_drift_ppb", "cam0_jitter_ns", "cam0_jumps", "cam0_lost", "cam0_connects",
+        "cam1_settled", "cam1_drift_ppb", "cam1_jitter_ns", "cam1_jumps", "cam1_lost", "cam1_connects",
+        "imu_settled", "imu_drift_ppb", "imu_jitter_ns", "imu_jumps", "imu_lost", "imu_torn",
+        "crane_settled", "crane_drift_ppb", "crane_jitter_ns", "crane_jumps", "crane_lost", "crane_torn",
+    ),
+    "record": ("ready", "pairs", "readings", "deleted", "paused", "alarms", "backlog", "bytes", "beat_ns"),
     "map": ("ready", "mapped", "refused", "backlog", "snapshots", "beat_ns"),
 }  # fmt: skip
-"""Counters of each process. Those in _ns are stamps or spans; began_ns and beat_ns, when a process last went
-round its loop, are of the monotonic clock."""
+"""Counters of each process; those of `sensors` are capture's too. Those in _ns are stamps or spans; began_ns
+and beat_ns, when a process last went round its loop, are of the monotonic clock."""
 _WIDTH = max(len(names) for names in ROWS.values())
 
 

@@ -11,6 +11,15 @@ from barsight.core.stamps import NS_PER_S
 from barsight.live.counters import Counters
 from barsight.live.link import Link
 
+LOST = (
+    "unpaired_cam0", "unpaired_cam1", "torn", "capture_down", "incomplete", "missed", "backpressure", "late",
+    "clock", "trigger",
+)  # fmt: skip
+"""Causes that capture counts pictures by: no partner; damaged; due while capture was down; packets missing;
+all packets missing; the host too slow; out of order; while a camera's clock settles; a trigger's number that
+contradicts the stamps.
+"""
+
 
 def latencies(link: Link, board: Counters, lifts_s: float | None) -> dict[str, Any]:
     """Build the content of latency.json. lifts_s: from the last frame's exposure to the lifts, if they came.
@@ -44,8 +53,7 @@ def counts(board: Counters) -> dict[str, Any]:
     Pictures that were torn, or due while capture was down, count one by one.
     """
     capture, track, built = (board.row(role) for role in ("capture", "track", "map"))
-    causes = ("unpaired_cam0", "unpaired_cam1", "torn", "capture_down")
-    dropped = {cause: capture[cause] for cause in causes}
+    dropped = {cause: capture[cause] for cause in LOST}
     lost = sum(dropped.values())
     dropped |= {name: track[name] for name in ("newer_pair", "not_placed")}
     tracked_or_told = sum(track[name] for name in ("tracked", "kept_passed", "newer_pair", "not_placed"))

@@ -11,7 +11,7 @@ from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame, StereoFr
 from barsight.live.counters import Counters
 from barsight.live.logs import NumberLog, ReadingLog
 from barsight.live.ring import PairRing
-from barsight.live.settings import LiveSettings
+from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import FrameIndex, Recording
 from barsight.recording.open import open_recording
@@ -26,7 +26,8 @@ class Link:
 
     speed: recorded seconds a second; 0: as fast as possible. checkpoints: the folder in `folder` for pictures
     and disparities. ring, counters: names of the shared memory. keyframes: stamps of the only pairs to keep,
-    None where the run chooses.
+    None where the run chooses. crane: the sensors of crane.toml in place of a recording; then `recording` is
+    the folder that the run records into. epoch_ns: what stamps are ahead of the monotonic clock there.
     """
 
     recording: Path
@@ -38,8 +39,14 @@ class Link:
     ring: str
     counters: str
     keyframes: tuple[int, ...] | None
+    crane: CraneConfig | None = None
+    epoch_ns: int = 0
 
-    def open_recording(self) -> StoredPictures:
+    def open_recording(self) -> Recording:
+        """Open the recording that is replayed, or of a crane what is known beforehand."""
+        return self.open_replayed() if self.crane is None else self.crane.awaited(self.recording)
+
+    def open_replayed(self) -> StoredPictures:
         """Open the recording that is replayed."""
         return open_recording(self.recording, self.settings.recording)
 
@@ -48,9 +55,9 @@ class Link:
         have = {"imu": recording.imu, "crane": recording.crane}
         return {sensor for sensor, read in have.items() if sensor in self.settings.use and read() is not None}
 
-    def open_ring(self, recording: StoredPictures) -> PairRing:
+    def open_ring(self) -> PairRing:
         """Attach to the ring of pairs."""
-        camera = recording.rig.cam0
+        camera = self.open_recording().rig.cam0
         return PairRing(self.live.ring_pairs, camera.height, camera.width, self.ring)
 
     def open_counters(self) -> Counters:
@@ -68,6 +75,10 @@ class Link:
     def tiles(self) -> NumberLog:
         """Open the log of mapped frames: stamp, exposure and end (ns, monotonic)."""
         return NumberLog(self.folder / "tiles.log")
+
+    def raw_file(self, stamp_ns: int) -> Path:
+        """Return the file of a kept pair's pictures as they came, until they are recorded."""
+        return self.folder / f"raw_{stamp_ns}.npy"
 
     def posed_file(self, stamp_ns: int) -> Path:
         """Return the file of a kept frame's pose."""

@@ -1,4 +1,4 @@
-"""Run `barsight live --replay`: supervise until the recording ends, then measure what was kept."""
+"""Run `barsight live`: supervise until the recording or the crane's run ends, then measure what was kept."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,19 +22,19 @@ from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.counters import Counters
 from barsight.live.latency import latencies
-from barsight.live.link import KeptRecording, Link
+from barsight.live.link import GrowingRecording, KeptRecording, Link
 from barsight.live.mapper import LIVE_MAP
 from barsight.live.modes import Mode
 from barsight.live.ring import PairRing
-from barsight.live.settings import LiveSettings
+from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.state import write_state
 from barsight.live.supervisor import Supervisor
 from barsight.map_building import ProgressCallback, checkpoint_key
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import to_json
+from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
-from barsight.recording.stored_images import StoredPictures
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.magnet.description import Magnet, load_magnet
 
@@ -69,45 +69,67 @@ def replay(
     if path.resolve() in (out.resolve(), *out.resolve().parents):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
-    compile_ahead(advance, "measure")
-    chosen = settings.chosen()
-    with translated_os_errors(out):
-        folder = out / ".live"
-        folder.mkdir(parents=True)
-    log = out / "live.log"
+    run = LiveRun(recording, path.absolute(), out, settings, live, speed, tell)
+    return run.measure(given, described, judged_at, advance)
 
-    def tell_all(line: str) -> None:
-        with log.open("a", encoding="utf-8") as file:
+
+class LiveRun:
+    """A run into `out`. recording: what is known of it beforehand; it lies, or will lie, at `path`.
+
+    crane: where it comes from a crane; epoch_ns: see `Link`.
+    """
+
+    def __init__(
+        self, recording: Recording, path: Path, out: Path, settings: MeasureSettings, live: LiveSettings,
+        speed: float, tell: Callable[[str], None], crane: CraneConfig | None = None, epoch_ns: int = 0,
+    ) -> None:  # fmt: skip
+        self._recording, self._path, self._out, self._asked = recording, path, out, settings
+        self._live, self._speed, self._tell = live, speed, tell
+        self._crane, self._epoch_ns = crane, epoch_ns
+
+    def measure(
+        self, given: Keyframes | None, magnet: Magnet | None, judged_at: Literal["now", "end"],
+        advance: ProgressCallback,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Run until the recording ends or a signal comes, then measure what was kept."""
+        compile_ahead(advance, "measure")
+        folder = self._out.absolute() / ".live"
+        with translated_os_errors(self._out):
+            folder.mkdir(parents=True, exist_ok=True)
+        camera = self._recording.rig.cam0
+        board, ring = Counters(), PairRing(self._live.ring_pairs, camera.height, camera.width)
+        try:
+            link = Link(
+                self._path, self._asked.chosen(), self._live, self._speed, folder,
+                checkpoint_folder(folder / "checkpoints", _key(self._recording, self._asked)), ring.name,
+                board.name, None if given is None else given.stamps_ns, self._crane, self._epoch_ns,
+            )  # fmt: skip
+            supervisor = Supervisor(link, board, self._tell_all)
+            with _stopped_by_signals(supervisor):
+                supervisor.run()
+            if supervisor.stop_because:
+                self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
+            if given is not None:
+                supervisor.state.mode = given.mode
+            return _finish(supervisor, link, board, self._recording, self._asked, magnet, judged_at, advance)
+        finally:
+            ring.remove()
+            board.remove()
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _tell_all(self, line: str) -> None:
+        with (self._out / "live.log").open("a", encoding="utf-8") as file:
             file.write(line + "\n")
-        tell(line)
+        self._tell(line)
 
-    key = checkpoint_key(
-        KeptRecording(recording, []), to_json(asdict(chosen)), KeptRecording(recording, []).digests()
-    )
-    camera = recording.rig.cam0
-    board, ring = Counters(), PairRing(live.ring_pairs, camera.height, camera.width)
-    try:
-        link = Link(
-            path.absolute(), chosen, live, speed, folder.absolute(),
-            checkpoint_folder(folder.absolute() / "checkpoints", key), ring.name, board.name,
-            None if given is None else given.stamps_ns,
-        )  # fmt: skip
-        supervisor = Supervisor(link, board, tell_all)
-        with _stopped_by_signals(supervisor):
-            supervisor.run()
-        if supervisor.stop_because:
-            tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
-        if given is not None:
-            supervisor.state.mode = given.mode
-        return _finish(supervisor, link, board, recording, settings, described, judged_at, advance)
-    finally:
-        ring.remove()
-        board.remove()
-        shutil.rmtree(folder, ignore_errors=True)
+
+def _key(recording: Recording, settings: MeasureSettings) -> str:
+    empty = KeptRecording(recording, [])
+    return checkpoint_key(empty, to_json(asdict(settings.chosen())), empty.digests())
 
 
 def _finish(
-    supervisor: Supervisor, link: Link, board: Counters, recording: StoredPictures, settings: MeasureSettings,
+    supervisor: Supervisor, link: Link, board: Counters, recording: Recording, settings: MeasureSettings,
     magnet: Magnet | None, judged_at: Literal["now", "end"], advance: ProgressCallback,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure what was kept, with the poses' and disparities' work that is done already."""
@@ -123,6 +145,8 @@ def _finish(
         if not kept:
             why = supervisor.stop_because or "; ".join(state.mode.reasons)
             raise MeasurementError(f"{link.recording}: no pair was kept; {why}")
+        if link.crane is not None:
+            recording, link = _recorded(link, kept, settings)
         write_keyframes(Keyframes(tuple(kept), state.mode), out / "keyframes.json")
         forbidden = () if state.mode.lifts else (Notice("live-state", _why_no_lifts(state.mode)),)
         content = write_measured(
@@ -137,6 +161,20 @@ def _finish(
         with atomic_path(out / "latency.json") as path:
             path.write_text(json.dumps(latencies(link, board, lifts_s), indent=1) + "\n", encoding="utf-8")
         write_state(state, board, out)
+
+
+def _recorded(link: Link, kept: list[int], settings: MeasureSettings) -> tuple[Recording, Link]:
+    """Open what a run at a crane recorded, with the work on it that is done already.
+
+    Where the recorder had to stop, the run's own notes take the recording's place.
+    """
+    recording: Recording = open_recording(link.recording, settings.recording)
+    if set(kept) - set(recording.index.stamps_ns):
+        growing = GrowingRecording(recording, kept, link)
+        growing.grow()
+        recording = growing
+    folder = link.checkpoints.with_name(_key(recording, settings)[:32])
+    return recording, replace(link, checkpoints=link.checkpoints.rename(folder))
 
 
 def _why_no_lifts(mode: Mode) -> str:

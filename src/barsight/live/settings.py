@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import numpy as np
+
+from barsight.calibration.files.kalibr import read_camchain, read_imu_file
+from barsight.calibration.files.rig_file import read_serials
+from barsight.calibration.files.rig_formats import read_rig_file
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.errors import CalibrationError, ConfigError
+from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import expect_ranges, expect_values
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.measure_settings import MeasureSettings
+from barsight.recording.awaited import AwaitedRecording
+from barsight.sensors.settings import CamerasSettings, EncodersSettings, ImuSettings
 
 
 @dataclass(frozen=True)
@@ -38,3 +51,105 @@ class LiveSettings:
             camera_silence_intervals=(1.5, 100), hang_s=(1, 3600),
             health_every_s=(0.1, 60),
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RecorderSettings:
+    """Settings of the recorder at a crane, for keyframes, IMU and encoders, and the ring around alarms."""
+
+    folder: Path | None = None
+    """Folder of the recordings, a folder in it for each run; one in the output where it isn't given."""
+    max_used_ratio: float = 0.85
+    """From so full a disk on the oldest unprotected segments of earlier recordings are deleted."""
+    stop_used_ratio: float = 0.95
+    """From so full a disk on nothing is recorded; measuring goes on."""
+    segment_mib: int = 256
+    """Size of a segment."""
+    alarm_after_s: float = 1.0
+    """After an alarm all pairs are saved for so long, besides those that the ring holds."""
+
+    def __post_init__(self) -> None:
+        expect_values(self, "recorder.")
+        expect_ranges(
+            self, "recorder.", max_used_ratio=(0.05, 0.99), stop_used_ratio=(0.05, 1.0),
+            segment_mib=(1, 4096), alarm_after_s=(0, 60),
+        )  # fmt: skip
+        if self.stop_used_ratio < self.max_used_ratio:
+            raise ConfigError("recorder.stop_used_ratio must be at least recorder.max_used_ratio")
+
+
+@dataclass(frozen=True)
+class CraneConfig:
+    """A crane as crane.toml describes it."""
+
+    calibration: Path
+    """Rig file of the two cameras: ours, Kalibr's, OpenCV's or an EuRoC folder."""
+    cameras: CamerasSettings
+    imu: ImuSettings | None = None
+    encoders: EncodersSettings | None = None
+    recorder: RecorderSettings = RecorderSettings()
+    measure: MeasureSettings = field(default_factory=MeasureSettings)
+    live: LiveSettings = LiveSettings()
+
+    def sensors(self) -> dict[str, ImuSettings | EncodersSettings]:
+        """Return the settings of `imu` and `crane`, where there are any."""
+        have = {"imu": self.imu, "crane": self.encoders}
+        return {name: one for name, one in have.items() if one is not None}
+
+    def rig(self) -> StereoRig:
+        """Read the calibration, and check that it is of these cameras by their serial numbers."""
+        rig = read_rig_file(self.calibration)
+        calibrated, here = read_serials(self.calibration), self.cameras.serials
+        if None not in calibrated and calibrated == here[::-1]:
+            raise CalibrationError(
+                self.calibration,
+                f"cam0 is {calibrated[0]} and cam1 {calibrated[1]}: crane.toml exchanges them",
+                "exchange the two in cameras.serials, or the cameras' places",
+            )  # fmt: skip
+        for number, (one, other) in enumerate(zip(calibrated, here, strict=True)):
+            if one is not None and one != other:
+                raise CalibrationError(
+                    self.calibration,
+                    f"was made with {one} as cam{number}, crane.toml names {other}: it is of another rig",
+                    "name the calibration of these two cameras",
+                )  # fmt: skip
+        sizes = [(camera.width, camera.height) for camera in (rig.cam0, rig.cam1)]
+        if sizes[0] != sizes[1]:
+            raise CalibrationError(self.calibration, "the two cameras differ in size", "use two of one kind")
+        return rig
+
+    def described(self, folder: Path) -> AwaitedRecording:
+        """Return the recording that is to come into `folder`, as crane.toml describes it."""
+        noise = None if self.imu is None or self.imu.noise is None else read_imu_file(self.imu.noise).noise
+        return AwaitedRecording(folder, self.rig(), self._no_imu(), self._no_crane(), noise)
+
+    def awaited(self, folder: Path) -> AwaitedRecording:
+        """Return the same with the calibration as it stands in `folder`, so that replays have just that."""
+        noise = read_imu_file(folder / "imu.yaml").noise if (folder / "imu.yaml").is_file() else None
+        rig = read_camchain(folder / "camchain-imucam.yaml").rig
+        return AwaitedRecording(folder, rig, self._no_imu(), self._no_crane(), noise)
+
+    def _no_imu(self) -> ImuSamples | None:
+        if self.imu is None:
+            return None
+        return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+
+    def _no_crane(self) -> CraneSamples | None:
+        if (mounted := self.encoders) is None:
+            return None
+        return CraneSamples(
+            np.zeros(0, np.int64), np.zeros((0, 3)), np.array(mounted.p_crane_body_m),
+            np.reshape(mounted.R_yard_body, (3, 3)).astype(np.float64), mounted.position_std_m,
+        )  # fmt: skip
+
+
+def read_crane(path: Path) -> CraneConfig:
+    """Read crane.toml; paths in it are relative to it. Raises InputError or ConfigError."""
+    crane = read_settings(path, CraneConfig, "docs/how-to/run-a-crane.md has an example", "config")
+    at = path.absolute().parent
+    recorder, imu = crane.recorder, crane.imu
+    if recorder.folder is not None:
+        recorder = replace(recorder, folder=at / recorder.folder)
+    if imu is not None and imu.noise is not None:
+        imu = replace(imu, noise=at / imu.noise)
+    return replace(crane, calibration=at / crane.calibration, recorder=recorder, imu=imu)

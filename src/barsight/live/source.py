@@ -1,70 +1,25 @@
-"""Define the protocol of what gives pictures and readings, and replay a recording at its own pace."""
+"""Replay a recording at its own pace, as a `Source`."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
-from barsight.core.arrays import Float64, Int64, UInt8
+from barsight.core.arrays import Float64, Int64
 from barsight.core.stamps import NS_PER_S
 from barsight.recording.image_decoding import TornImageError
 from barsight.recording.pairing import decode_for
 from barsight.recording.stored_images import StoredImage, StoredPictures
+from barsight.sensors.source import LivePicture, LostPicture, Readings
 
 BATCH_NS = 10_000_000
 """Readings come in batches of so much time."""
 USUAL_PERCENT = 95
 AHEAD_NS = NS_PER_S // 5
 """As fast as possible, readings come so far ahead of the pictures: more than any pose waits for."""
-
-
-@dataclass(frozen=True, eq=False)
-class LivePicture:
-    """A picture of one camera. image: (H, W) uint8. exposed_ns: the exposure on the monotonic clock."""
-
-    camera: int
-    stamp_ns: int
-    exposed_ns: int
-    image: UInt8
-
-
-@dataclass(frozen=True)
-class LostPicture:
-    """A picture that was lost before it could be used. cause: `torn` or `capture_down`."""
-
-    camera: int
-    stamp_ns: int
-    cause: str
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """Readings of `imu` (gyro rad/s, then accelerometer m/s2) or `crane` (place, m): (N,), (N, width)."""
-
-    sensor: str
-    stamp_ns: Int64
-    values: Float64
-
-
-class Source(Protocol):
-    """Protocol of cameras, IMU and encoders. All stamps are of exposure or measurement, never of arrival:
-    pictures' on the cameras' clock, readings' on the IMU's.
-    """
-
-    @property
-    def interval_ns(self) -> int:
-        """Return the time between two pictures of a camera, at most, as long as all is well."""
-        ...
-
-    def packets(self, after: dict[str, int]) -> Iterator[LivePicture | LostPicture | Readings]:
-        """Yield what comes, when it comes. after: last stamp already taken, of `cam0`, `cam1`, `imu` and
-        `crane`; 0 where none was.
-        """
-        ...
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ def write_state(state: RunState, board: Counters, out: Path) -> None:
 def write_health(state: RunState, board: Counters, seconds: float, out: Path) -> None:
     """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since it began."""
     frames = counts(board)
+    free = shutil.disk_usage(out).free
     memory = {name: _memory_bytes(process.pid) for name, process in state.processes.items()}
     content = {
         "schema_version": 1,
@@ -78,7 +79,11 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "queues": {"keyframes": board["map", "backlog"]},
         "restarts": {name: process.restarts for name, process in state.processes.items()},
         "memory_bytes": memory | {"supervisor": _memory_bytes(os.getpid())},
-        "disk_free_bytes": shutil.disk_usage(out).free,
+        "disk_free_bytes": free,
+        "disk_days": _disk_days(free, board["record", "bytes"], seconds),
+        "sensors": board.row("sensors")
+        | {name: board["capture", name] for name in ("skew_ns", "max_skew_ns")},
+        "record": board.row("record"),
     }
     _write_json(content, out / "health.json")
     with atomic_path(out / "health.prom") as path:
@@ -95,6 +100,8 @@ def prometheus(health: Mapping[str, Any]) -> str:
         "barsight_restarts_total": ("counter", "process", health["restarts"]),
         "barsight_queue_length": ("gauge", "queue", health["queues"]),
         "barsight_memory_bytes": ("gauge", "process", health["memory_bytes"]),
+        "barsight_sensor": ("gauge", "sign", health["sensors"]),
+        "barsight_recorder": ("gauge", "sign", health["record"]),
         "barsight_mode": ("gauge", "mode", {health["mode"]: 1}),
     }
     lines = []
@@ -105,7 +112,16 @@ def prometheus(health: Mapping[str, Any]) -> str:
         "# TYPE barsight_disk_free_bytes gauge",
         f"barsight_disk_free_bytes {health['disk_free_bytes']}",
     ]
+    if health["disk_days"] is not None:
+        lines += ["# TYPE barsight_disk_days gauge", f"barsight_disk_days {health['disk_days']}"]
     return "\n".join(lines) + "\n"
+
+
+def _disk_days(free_bytes: int, recorded_bytes: int, seconds: float) -> float | None:
+    """Compute how many days the free disk lasts at the pace so far; None where nothing is recorded."""
+    if recorded_bytes <= 0 or seconds <= 0:
+        return None
+    return round(free_bytes / (recorded_bytes / seconds) / 86400, 2)
 
 
 def _write_json(content: dict[str, Any], target: Path) -> None:

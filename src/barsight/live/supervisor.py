@@ -19,11 +19,14 @@ from barsight.live.counters import Counters
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
 from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
+from barsight.live.record import DRAIN, record
 from barsight.live.source import ReplayClock
 from barsight.live.state import ProcessState, RunState, write_health, write_state
 from barsight.live.track import track
 
-PROCESSES: dict[str, Callable[[Link], None]] = {"capture": capture, "track": track, "map": build_live_map}
+PROCESSES: dict[str, Callable[[Link], None]] = {
+    "capture": capture, "track": track, "map": build_live_map, "record": record,
+}  # fmt: skip
 BEAT_S = 0.1
 """Interval between judgements of the mode and looks after the processes."""
 MOST_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
@@ -31,6 +34,19 @@ MOST_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
 START_S = 120.0
 """Processes may take so long to start on a busy machine."""
 FREEZE_READINGS = 100
+DRAIN_S = 60.0
+"""The recorder may take so long to write what is left."""
+SIGNS = {
+    ("record", "paused"): "recording stopped, the disk is too full: {} (1: stopped, 0: goes on)",
+    ("record", "deleted"): "{} old segments were deleted so far, the disk is filling",
+    **{
+        ("sensors", f"{sensor}_{sign}"): f"{sensor}: {told}"
+        for sensor in ("cam0", "cam1", "imu", "crane")
+        for sign, told in (("settled", "its clock is settled: {}"), ("jumps", "its stamps jumped {} times"))
+    },
+    **{("sensors", f"cam{k}_connects"): f"cam{k}: connected {{}} times" for k in (0, 1)},
+}
+"""Counters whose changes go to the log, each with its line."""
 
 
 def run_process(role: str, link: Link) -> None:
@@ -57,21 +73,23 @@ class Supervisor:
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload([__name__])
         self._running: dict[str, BaseProcess] = {}
-        self._ends: dict[str, list[float]] = {role: [] for role in PROCESSES}
+        self._roles = [role for role in PROCESSES if role != "record" or link.crane is not None]
+        self._ends: dict[str, list[float]] = {role: [] for role in self._roles}
         self._hung: dict[str, str] = {}
-        self.state = RunState(processes={role: ProcessState() for role in PROCESSES})
+        self.state = RunState(processes={role: ProcessState() for role in self._roles})
         recording = link.open_recording()
         self._sensors, self._shift_ns = link.sensors(recording), recording.rig.timeshift_cam_imu_ns
         crane = recording.crane() if "crane" in self._sensors else None
         self._freeze = None if crane is None else FreezeWatch(crane)
         self._clock: ReplayClock | None = None
         self._health_at = 0.0
+        self._signs: dict[tuple[str, str], int] = {}
         self.stop_because = ""
 
     def run(self) -> None:
         """Run until the recording ends, `stop` is called or a process can't be kept up; then end all."""
         try:
-            for role in PROCESSES:
+            for role in self._roles:
                 self._start(role)
             self._await_start()
             while not (self._board["track", "done"] or self.stop_because):
@@ -107,19 +125,27 @@ class Supervisor:
     def _await_start(self) -> None:
         """Wait until all are ready, then let the recording's time begin."""
         give_up = time.monotonic() + START_S
-        while not all(self._board[role, "ready"] for role in PROCESSES) and not self.stop_because:
+        while not all(self._board[role, "ready"] for role in self._roles) and not self.stop_because:
             wait([process.sentinel for process in self._running.values()], BEAT_S)
             self._look_after()
             if time.monotonic() > give_up:
                 self.stop("the processes didn't start")
         began_ns = time.monotonic_ns()
-        self._clock = ReplayClock(began_ns, self._board["capture", "first_ns"], self._link.speed)
+        first_ns = self._board["capture", "first_ns"]
+        if self._link.crane is not None:
+            first_ns = began_ns + self._link.epoch_ns
+        self._clock = ReplayClock(began_ns, first_ns, self._link.speed)
         self._board["supervisor", "began_ns"] = began_ns
         self.state.phase = "measuring"
 
     def _look_after(self) -> None:
         """Start each process anew that has ended and wasn't done."""
-        done = {"capture": self._board["capture", "ended"], "track": self._board["track", "done"], "map": 0}
+        done = {
+            "capture": self._board["capture", "ended"],
+            "track": self._board["track", "done"],
+            "map": 0,
+            "record": 0,
+        }
         for role, process in list(self._running.items()):
             state = self.state.processes[role]
             if process.is_alive():
@@ -173,17 +199,28 @@ class Supervisor:
         down = {
             role: one.reason
             for role, one in self.state.processes.items()
-            if one.state not in ("running", "done")
+            if one.state not in ("running", "done") and role != "record"
         }
         mode = judge_mode(heard, now_ns, self._link.live, down)
         self.state.now_ns = now_ns
         before = self.state.mode
         changed = (mode.name, mode.lifts) != (before.name, before.lifts)
         self.state.mode = mode
+        if changed and before.lifts and not mode.lifts:
+            self._board["supervisor", "alarms"] += 1
         if changed:
             lifts = "" if mode.lifts else "; lifts are revoked"
             self._log(f"mode {mode.name}{lifts}" + "".join(f"; {reason}" for reason in mode.reasons))
+        self._watch_sensors()
         self._write(health=time.monotonic() >= self._health_at)
+
+    def _watch_sensors(self) -> None:
+        """Log what the recorder and the sensors' clocks have come to."""
+        for key, told in SIGNS.items():
+            value = self._board[key]
+            if value != self._signs.get(key, 0):
+                self._log(told.format(value))
+            self._signs[key] = value
 
     def _heard(self) -> HeardSensors:
         board, frozen = self._board, False
@@ -216,7 +253,9 @@ class Supervisor:
         """End the processes: those that are at a frame finish it only if that takes no time."""
         self._board["supervisor", "stop"] = 1
         for role, process in self._running.items():
-            process.join(1.0 if role == "map" else 5.0)
+            if role == "record":
+                self._board["supervisor", "stop"] = DRAIN
+            process.join({"map": 1.0, "record": DRAIN_S}.get(role, 5.0))
             if process.is_alive():
                 process.kill()
                 process.join()

@@ -16,7 +16,7 @@ from barsight.core.errors import Failed, MeasurementError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
+from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
 from barsight.live.counters import Counters
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.ring import CapturedPair, PairRing
@@ -35,7 +35,7 @@ AGAIN_FRAMES = 10
 def track(link: Link) -> None:
     """Track until capture has ended and its last pair is taken, or the supervisor says so."""
     whole, board = link.open_recording(), link.open_counters()
-    ring = link.open_ring(whole)
+    ring = link.open_ring()
     tracking = Tracking(link, GrowingRecording(whole, [], link), board, ring)
     load_kernels("measure")
     tracking.follow_again()
@@ -105,7 +105,7 @@ class Tracking:
             self._keep_passed(self._ring.read(number))
         is_kept = isinstance(rectified, RectifiedPair) and self._is_keyframe(stamp, posed)
         if isinstance(rectified, RectifiedPair) and is_kept:
-            self._keep(rectified)
+            self._keep(rectified, pair.frame)
         if isinstance(posed, PosedFrame) and is_kept:
             self._last_kept = posed.reference_from_body.translation
             with atomic_path(self._link.posed_file(stamp)) as path:
@@ -117,7 +117,7 @@ class Tracking:
         if pair is not None and self._is_wanted(pair.frame.stamp_ns):
             rectified = self._rectifier(pair.frame)
             if isinstance(rectified, RectifiedPair):
-                self._keep(rectified)
+                self._keep(rectified, pair.frame)
                 self._board.add("track", "kept_passed")
                 self._frames.append((pair.frame.stamp_ns, pair.exposed_ns, time.monotonic_ns(), True, False))
                 return
@@ -128,8 +128,11 @@ class Tracking:
             return stamp_ns in self._link.keyframes
         return stamp_ns - self._last_kept_ns >= seconds_to_ns(self._link.live.passed_every_s)
 
-    def _keep(self, pair: RectifiedPair) -> None:
+    def _keep(self, pair: RectifiedPair, frame: StereoFrame) -> None:
         self._pairs.store(pair)
+        if self._link.crane is not None:
+            with atomic_path(self._link.raw_file(pair.stamp_ns)) as path, path.open("wb") as stream:
+                np.save(stream, np.stack([frame.left, frame.right]))
         self._last_kept_ns = pair.stamp_ns
         self._board.add("track", "kept")
 

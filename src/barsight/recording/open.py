@@ -13,12 +13,14 @@ from barsight.recording.formats.bag import BagRecording
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.euroc import EurocRecording
 from barsight.recording.formats.kitti import KittiRecording, is_kitti
+from barsight.recording.formats.segments import SEGMENTS, segments_of
 from barsight.recording.stored_images import StoredPictures
 
 BAG_KINDS = {".bag": "ros1", ".mcap": "ros2-mcap", ".db3": "ros2-sqlite3"}
 KNOWN = (
     "an EuRoC folder (holding mav0), a KITTI odometry sequence (calib.txt, image_0, image_1), a ROS 1 .bag, "
-    "a ROS 2 bag folder (metadata.yaml), a .mcap, a .db3 or a board's corners (camN_detections.npz)"
+    "a ROS 2 bag folder (metadata.yaml), a folder of live's segments, a .mcap, a .db3 or a board's corners "
+    "(camN_detections.npz)"
 )
 
 
@@ -43,6 +45,8 @@ def _open(path: Path, settings: RecordingSettings) -> StoredPictures:
         return BagRecording(path, path, BAG_KINDS[path.suffix], settings)
     if any((path / name).is_dir() for name in ("mav0", "cam0", "cam1")):
         return EurocRecording(path, settings)
+    if segments_of(path):
+        return BagRecording(path, path, SEGMENTS, settings)
     bags = sorted(file for file in path.iterdir() if file.suffix in BAG_KINDS and file.is_file())
     if (path / "metadata.yaml").is_file() or bags:
         return _open_bag_folder(path, bags, settings)

@@ -55,6 +55,20 @@ def read_own_rig(document: Document) -> StereoRig:
     return build_rig(document.path, cameras[0], cameras[1], mounts[0], mounts[1], shift)
 
 
+def read_serials(path: Path) -> tuple[str | None, str | None]:
+    """Read the serial numbers of cam0 and cam1 (key `serial`); None where a file of any format has none."""
+    if path.is_dir():
+        return None, None
+    values = read_document(path).values
+    cam0, cam1 = (values.get(name) for name in ("cam0", "cam1"))
+    return _serial(cam0), _serial(cam1)
+
+
+def _serial(section: object) -> str | None:
+    told = section.get("serial") if isinstance(section, Mapping) else None
+    return None if told is None else str(told)
+
+
 def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
     """Read parameter names (C,) and covariance (C, C) of a rig file, None where it carries none."""
     document = read_document(path)

@@ -28,6 +28,7 @@ from barsight.recording.formats.bag_file import BagFile, RawMessage
 from barsight.recording.formats.bag_images import file_of, gray_of
 from barsight.recording.formats.bag_laser import laser_rows
 from barsight.recording.formats.bag_setup import choose_topics, find_calibration
+from barsight.recording.formats.segments import SEGMENTS, SegmentFile
 from barsight.recording.image_decoding import TornImageError
 from barsight.recording.pairing import PairedStamps, expect_size, pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
@@ -63,7 +64,7 @@ class BagRecording:
         self.format = kind
         self._folder = path if path.is_dir() else path.parent
         self._settings = settings
-        self._bag = BagFile(bag_path)
+        self._bag = SegmentFile(bag_path) if kind == SEGMENTS else BagFile(bag_path)
         self._calibration = find_calibration(path, settings)
         self._topics = choose_topics(path, self._bag.topics, self._calibration, settings)
 

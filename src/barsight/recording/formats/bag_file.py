@@ -25,6 +25,11 @@ POINT_TYPE = "geometry_msgs/msg/PointStamped"
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 
 
+def ros2_types() -> Any:
+    """Return the message types of ROS 2, which read and write messages."""
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
 @dataclass(frozen=True)
 class Topic:
     """A topic of a bag, its message type and how many messages it holds."""
@@ -106,7 +111,7 @@ class BagFile:
     @contextlib.contextmanager
     def _opened(self) -> Iterator[AnyReader]:
         try:
-            reader = AnyReader(self._files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader = AnyReader(self._files, default_typestore=ros2_types())
             reader.open()
         except MemoryError:
             raise

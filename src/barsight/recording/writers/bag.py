@@ -17,11 +17,18 @@ from rosbags.typesys import Stores, get_typestore
 
 from barsight.calibration.files.kalibr import write_camchain, write_imu_file
 from barsight.calibration.files.yaml_document import write_document
-from barsight.core.arrays import Int64
+from barsight.core.arrays import Int64, UInt8
 from barsight.core.errors import InputError, OutputError
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
-from barsight.recording.formats.bag_file import CLOUD_TYPE, COMPRESSED_TYPE, IMU_TYPE, POINT_TYPE
+from barsight.recording.base import Recording
+from barsight.recording.formats.bag_file import (
+    CLOUD_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    IMU_TYPE,
+    POINT_TYPE,
+)
 from barsight.recording.formats.bag_laser import NAMES
 from barsight.recording.formats.bag_setup import CRANE_TOPIC, LASER_TOPIC
 from barsight.recording.stored_images import StoredPictures
@@ -63,7 +70,7 @@ def write_bag(
     Messages come in time's order, so that a reader need not hold more than a chunk.
     Raises `InputError` for stamps that ROS can't hold.
     """
-    messages = _Messages(ros1=flavour.storage is None)
+    messages = BagMessages(ros1=flavour.storage is None)
     imu, crane, laser = recording.imu(), recording.crane(), recording.laser()
     cameras = recording.camera_stamps
     for stamps in (cameras.left_ns, cameras.right_ns, *(s.stamp_ns for s in (imu, crane) if s is not None)):
@@ -79,7 +86,7 @@ def write_bag(
         written = _write(folder, name, flavour, messages, heapq.merge(*streams, key=_order), progress)
     except sqlite3.Error as error:
         raise OutputError(f"{folder.parent / name}: can't be written ({error}); free some space") from error
-    _write_descriptions(recording, folder)
+    write_descriptions(recording, folder)
     copy_truth(recording, folder)
     return written
 
@@ -93,7 +100,8 @@ def _expect_ros_times(path: Path, stamps: Int64) -> None:
             )
 
 
-def _write_descriptions(recording: StoredPictures, folder: Path) -> None:
+def write_descriptions(recording: Recording, folder: Path) -> None:
+    """Write the calibration and the other descriptions that lie beside a bag's messages."""
     write_camchain(folder / "camchain-imucam.yaml", recording.rig, CAMERA_TOPICS)
     if (noise := recording.imu_noise()) is not None:
         write_imu_file(folder / "imu.yaml", noise, IMU_TOPIC)
@@ -108,7 +116,7 @@ def _order(item: Item) -> tuple[int, int]:
     return item[0], item[1]
 
 
-class _Messages:
+class BagMessages:
     """Makes the messages of either ROS, stamped and in time's order per sensor."""
 
     def __init__(self, *, ros1: bool) -> None:
@@ -129,6 +137,13 @@ class _Messages:
             message = make(self._header(image.stamp_ns, f"cam{image.camera}"), kind, data)
             topic = f"{CAMERA_TOPICS[image.camera]}/compressed"
             yield image.stamp_ns, image.camera, topic, COMPRESSED_TYPE, message
+
+    def picture(self, camera: int, stamp_ns: int, image: UInt8) -> Item:
+        """Make the message of a picture (H, W) as it is."""
+        height, width = image.shape
+        make, header = self._types[IMAGE_TYPE], self._header(stamp_ns, f"cam{camera}")
+        message = make(header, height, width, "mono8", 0, width, np.ascontiguousarray(image).reshape(-1))
+        return stamp_ns, camera, CAMERA_TOPICS[camera], IMAGE_TYPE, message
 
     def imu(self, samples: ImuSamples) -> Iterator[Item]:
         vector = self._types["geometry_msgs/msg/Vector3"]
@@ -172,7 +187,7 @@ def _write(
     folder: Path,
     name: str,
     flavour: BagFlavour,
-    messages: _Messages,
+    messages: BagMessages,
     items: Iterator[Item],
     progress: Callable[[int], None],
 ) -> int:

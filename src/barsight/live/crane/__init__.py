@@ -1,0 +1,1 @@
+"""Run at a crane: prove its sensors, measure from them, check the machine."""

@@ -1,0 +1,67 @@
+"""Prove a crane's sensors before a run: cameras there and as calibrated, readings that can be a crane's."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.core.errors import InputError
+from barsight.live.settings import CraneConfig
+from barsight.recording.awaited import AwaitedRecording
+from barsight.recording.plausibility import doubts
+from barsight.sensors.datagrams import RawReading, ReadingReceiver
+
+LISTEN_S = 3.0
+ENOUGH_S = 0.5
+"""Readings of so much time are judged."""
+
+
+def prove_sensors(crane: CraneConfig, folder: AwaitedRecording) -> None:
+    """Prove that all sensors of crane.toml answer. Raises InputError naming the one that doesn't."""
+    from barsight.sensors.gige import prove_cameras  # an extra, which replays do without
+
+    cam0, cam1 = folder.rig.cam0, folder.rig.cam1
+    prove_cameras(crane.cameras, ((cam0.width, cam0.height), (cam1.width, cam1.height)))
+    for name, sensor in crane.sensors().items():
+        found = _listen(name, sensor.port, sensor.rate_hz)
+        stamps = np.array([one.device_ns for one in found], np.int64)
+        if (np.diff(stamps) <= 0).any():
+            raise InputError(name, "its stamps do not increase", "send the time of each measurement in ns")
+        rate_hz = 1e9 / float(np.median(np.diff(stamps)))
+        if not 0.5 < rate_hz / sensor.rate_hz < 2:
+            raise InputError(
+                name, f"its stamps give {rate_hz:.3g} readings a second, crane.toml says {sensor.rate_hz:g}",
+                "send stamps in ns, and state the rate that is sent",
+            )  # fmt: skip
+        values = np.array([one.values for one in found])
+        if name == "imu" and folder.imu_samples is not None:
+            heard = replace(
+                folder.imu_samples, stamp_ns=stamps, gyro_radps=values[:, :3], accel_mps2=values[:, 3:]
+            )
+            folder = replace(folder, imu_samples=heard)
+        elif folder.crane_samples is not None:
+            heard_crane = replace(folder.crane_samples, stamp_ns=stamps, position_m=values)
+            folder = replace(folder, crane_samples=heard_crane)
+    for notice in doubts(folder):
+        raise InputError("crane.toml", notice.message)
+
+
+def _listen(name: str, port: int, rate_hz: float) -> list[RawReading]:
+    """Receive a few readings."""
+    receiver = ReadingReceiver(name, port)
+    wanted, give_up = max(round(ENOUGH_S * rate_hz), 5), time.monotonic() + LISTEN_S
+    found: list[RawReading] = []
+    try:
+        for reading in receiver.readings(lambda: time.monotonic() < give_up, time.monotonic_ns):
+            found.append(reading)
+            if len(found) >= wanted:
+                return found
+    finally:
+        receiver.close()
+    torn = f", and {receiver.torn} datagrams of another form" if receiver.torn else ""
+    raise InputError(
+        name, f"{len(found)} readings came to UDP port {port} within {LISTEN_S:g} s{torn}",
+        "check the sender and its form (docs/how-to/run-a-crane.md), the port and the firewall",
+    )  # fmt: skip

@@ -1,0 +1,59 @@
+"""Keep a disk from filling: delete the oldest segments of earlier recordings, but for protected ones."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from barsight.recording.formats.segments import PATTERN
+
+PROTECTED = "PROTECTED"
+"""A file of this name in a recording's folder protects it."""
+
+
+def used_ratio(folder: Path) -> float:
+    """Compute the share of the disk that is used, as those who aren't root may use it."""
+    usage = shutil.disk_usage(folder)
+    return usage.used / max(usage.used + usage.free, 1)
+
+
+class Retention:
+    """Tidies the folder that `current`, a recording, lies in among earlier ones.
+
+    is_full: whether the disk is fuller than `stop_used_ratio`, and nothing more may be recorded.
+    """
+
+    def __init__(
+        self, current: Path, max_used_ratio: float, stop_used_ratio: float,
+        measure: Callable[[Path], float] = used_ratio,
+    ) -> None:  # fmt: skip
+        self._current, self._max, self._stop, self._measure = (
+            current,
+            max_used_ratio,
+            stop_used_ratio,
+            measure,
+        )
+        self.is_full = False
+
+    def tidy(self) -> int:
+        """Delete the oldest segments until the disk is emptier than `max_used_ratio`; return how many."""
+        deleted = 0
+        for path in self._deletable():
+            if self._measure(self._current) < self._max:
+                break
+            path.unlink(missing_ok=True)
+            deleted += 1
+            if not any(path.parent.glob(PATTERN)):
+                shutil.rmtree(path.parent, ignore_errors=True)
+        self.is_full = self._measure(self._current) >= self._stop
+        return deleted
+
+    def _deletable(self) -> list[Path]:
+        """List segments of the other recordings, the oldest first; folders are named by when they began."""
+        return [
+            path
+            for folder in sorted(self._current.parent.iterdir())
+            if folder.is_dir() and folder != self._current and not (folder / PROTECTED).exists()
+            for path in sorted(folder.glob(PATTERN))
+        ]

@@ -1,0 +1,142 @@
+"""Write a live run's recording as MCAP segments that a kill leaves readable."""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from barsight.core.arrays import UInt8
+from barsight.core.types import CraneSamples, ImuSamples
+from barsight.recording.formats.bag_file import IMAGE_TYPE, IMU_TYPE, POINT_TYPE
+from barsight.recording.formats.bag_setup import CRANE_TOPIC
+from barsight.recording.formats.segments import (
+    CHANNEL,
+    DATA_END,
+    FOOTER,
+    HEAD,
+    HEADER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    SCHEMA,
+    records,
+    segments_of,
+)
+from barsight.recording.writers.bag import CAMERA_TOPICS, IMU_TOPIC, BagMessages, Item
+
+KINDS = {
+    CAMERA_TOPICS[0]: IMAGE_TYPE,
+    CAMERA_TOPICS[1]: IMAGE_TYPE,
+    IMU_TOPIC: IMU_TYPE,
+    CRANE_TOPIC: POINT_TYPE,
+}
+"""Topics of a segment; a channel's number is its place here plus one."""
+SEGMENT_BYTES = 256 << 20
+END = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
+
+
+class SegmentWriter:
+    """Appends messages to the last segment of a folder, and begins a new one where that is full.
+
+    Each message goes to the system at once: a killed writer loses at most the one that it was writing, which
+    the next writer cuts off. last_ns: the last stamp of each topic that is written, 0 for none. bytes:
+    written by this writer.
+    """
+
+    def __init__(self, folder: Path, segment_bytes: int = SEGMENT_BYTES) -> None:
+        self._folder, self._limit = folder, segment_bytes
+        self._messages = BagMessages(ros1=False)
+        self._channels = {topic: number for number, topic in enumerate(KINDS, 1)}
+        self.last_ns = dict.fromkeys(KINDS, 0)
+        self._stream: BinaryIO | None = None
+        self._number, self._log_ns, self.bytes = 0, 0, 0
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in segments_of(folder):
+            self._take_up(path)
+
+    @property
+    def last_pair_ns(self) -> int:
+        """Return the stamp of the last whole pair, 0 before the first."""
+        return min(self.last_ns[topic] for topic in CAMERA_TOPICS)
+
+    def pair(self, stamp_ns: int, left: UInt8, right: UInt8) -> None:
+        """Append a pair of pictures (H, W) of one exposure."""
+        for camera, image in enumerate((left, right)):
+            if stamp_ns > self.last_ns[CAMERA_TOPICS[camera]]:
+                self._write(self._messages.picture(camera, stamp_ns, image))
+
+    def samples(self, samples: ImuSamples | CraneSamples) -> None:
+        """Append readings; those that are written already are left out."""
+        made = self._messages
+        items = made.imu(samples) if isinstance(samples, ImuSamples) else made.crane(samples)
+        for item in items:
+            if item[0] > self.last_ns[item[2]]:
+                self._write(item)
+
+    def sync(self) -> None:
+        """Wait until all is on the disk."""
+        if self._stream is not None:
+            os.fsync(self._stream.fileno())
+
+    def close(self) -> None:
+        """End the segment as MCAP asks."""
+        if self._stream is not None:
+            self._stream.write(END)
+            self.sync()
+            self._stream.close()
+            self._stream = None
+
+    def _write(self, item: Item) -> None:
+        stamp_ns, _, topic, kind, message = item
+        if self._stream is not None and self._stream.tell() >= self._limit:
+            self.close()
+        stream = self._stream or self._begin()
+        data = self._messages.serialize(message, kind)
+        self._log_ns = max(self._log_ns, stamp_ns)  # readers ask that the log's times do not go back
+        head = MESSAGE_HEAD.pack(self._channels[topic], 0, self._log_ns, stamp_ns)
+        self.bytes += stream.write(b"".join((HEAD.pack(MESSAGE, len(head) + len(data)), head, data)))
+        self.last_ns[topic] = stamp_ns
+
+    def _begin(self) -> BinaryIO:
+        self._number += 1
+        self._stream = (self._folder / f"segment_{self._number:06d}.mcap").open("wb", buffering=0)
+        parts = [MAGIC, _record(HEADER, _text("ros2") + _text("barsight"))]
+        for number, (topic, kind) in enumerate(KINDS.items(), 1):
+            definition, _ = self._messages.typestore.generate_msgdef(kind, ros_version=2)
+            schema = struct.pack("<H", number) + _text(kind) + _text("ros2msg") + _text(definition)
+            channel = struct.pack("<HH", number, number) + _text(topic) + _text("cdr")
+            about = _text("offered_qos_profiles") + _text("")
+            parts.append(_record(SCHEMA, schema))
+            parts.append(_record(CHANNEL, channel + struct.pack("<I", len(about)) + about))
+        self._stream.write(b"".join(parts))
+        return self._stream
+
+    def _take_up(self, path: Path) -> None:
+        """Note what an earlier writer wrote; end a segment that it did not end."""
+        self._number = int(path.stem.rpartition("_")[2])
+        topics, end, is_ended = list(KINDS), 0, False
+        for record in records(path):
+            if record.kind == MESSAGE:
+                channel, _, self._log_ns, stamp_ns = MESSAGE_HEAD.unpack_from(record.data)
+                self.last_ns[topics[channel - 1]] = stamp_ns
+            is_ended = record.kind == FOOTER
+            if record.kind not in (FOOTER, DATA_END):
+                end = record.end
+        if end == 0:
+            path.unlink()
+        elif not is_ended:
+            with path.open("r+b") as stream:
+                stream.truncate(end)
+                stream.seek(end)
+                stream.write(END)
+
+
+def _text(text: str) -> bytes:
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def _record(kind: int, data: bytes) -> bytes:
+    return HEAD.pack(kind, len(data)) + data

@@ -1,0 +1,1 @@
+"""Sensors beside the crane: cameras, IMU and encoders, each with its clock."""

@@ -1,0 +1,115 @@
+"""Map a device's stamps to the host's monotonic clock, by when they arrive, without asking the device."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from barsight.core.stamps import NS_PER_S
+
+BUCKET_NS = NS_PER_S
+BUCKETS = 120
+SETTLE_NS, SETTLE_COUNT = NS_PER_S, 3
+DRIFT_AFTER_NS = 10 * NS_PER_S
+"""Drift is estimated once so much time is there; before, delays of a busy host would pass for drift."""
+MAX_DRIFT = 2e-4
+"""Quartz clocks are within 1e-4 of each other: a line that is steeper is made by a few late stamps."""
+EARLY_NS = 50_000_000
+"""A stamp that would have arrived so long before it was made belongs to a clock that jumped."""
+LATE_NS, LATE_COUNT = NS_PER_S, 5
+"""So many stamps in turn that arrive so late do too."""
+RECENT = 300
+
+
+class DeviceClock:
+    """Estimates offset and drift of a device's clock against the host's.
+
+    A stamp s arrives at a = s + offset + drift s + delay with delay >= 0. The least delays hardly vary, so
+    the line that lies under all points (s, a - s) and nearest to their middle gives offset and drift: an
+    edge of the lower convex hull [Zhang, Liu, Xia 2002]. The least delay itself stays in the offset: it is
+    constant, and the calibration of the camera against the IMU holds it.
+    """
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._least: deque[tuple[int, int]] = deque(maxlen=BUCKETS)
+        self._delays: deque[int] = deque(maxlen=RECENT)
+        self._origin: tuple[int, int] | None = None
+        self._count, self._late, self._bucket = 0, 0, -1
+        self._offset_ns, self._drift = 0.0, 0.0
+
+    def add(self, device_ns: int, arrival_ns: int) -> bool:
+        """Take a stamp and when it arrived (monotonic); return whether the clock is settled."""
+        if self._origin is not None and self.is_settled:
+            delay = arrival_ns - self.host_ns(device_ns)
+            self._late = self._late + 1 if delay > LATE_NS else 0
+            if delay < -EARLY_NS or self._late >= LATE_COUNT:
+                self.jumps += 1
+                self._begin()
+            elif self._late:
+                return True
+        if self._origin is None:
+            self._origin = device_ns, arrival_ns - device_ns
+        since, apart = device_ns - self._origin[0], arrival_ns - device_ns - self._origin[1]
+        self._count += 1
+        bucket = since // BUCKET_NS
+        if bucket != self._bucket or not self._least:
+            self._bucket = bucket
+            self._least.append((since, apart))
+        elif apart >= self._least[-1][1]:
+            self._delays.append(arrival_ns - self.host_ns(device_ns))
+            return self.is_settled
+        else:
+            self._least[-1] = since, apart
+        self._fit()
+        self._delays.append(arrival_ns - self.host_ns(device_ns))
+        return self.is_settled
+
+    @property
+    def is_settled(self) -> bool:
+        """Check whether enough stamps came since the beginning or the last jump."""
+        if self._origin is None or not self._least:
+            return False
+        return self._count >= SETTLE_COUNT and self._bucket * BUCKET_NS >= SETTLE_NS
+
+    def host_ns(self, device_ns: int) -> int:
+        """Return a device's stamp on the host's monotonic clock."""
+        assert self._origin is not None
+        since = device_ns - self._origin[0]
+        return device_ns + self._origin[1] + round(self._offset_ns + self._drift * since)
+
+    @property
+    def drift_ppb(self) -> int:
+        """Return how much slower than the host's the device's clock runs, in 1e-9."""
+        return round(self._drift * 1e9)
+
+    @property
+    def jitter_ns(self) -> int:
+        """Return the 99th percentile of the last stamps' delays beyond the least one."""
+        return round(float(np.percentile(self._delays, 99))) if self._delays else 0
+
+    def _fit(self) -> None:
+        """Lay the line under the least delays."""
+        points = list(self._least)
+        if points[-1][0] - points[0][0] < DRIFT_AFTER_NS:
+            self._drift, self._offset_ns = 0.0, float(min(apart for _, apart in points))
+            return
+        hull: list[tuple[int, int]] = []
+        for point in points:
+            while len(hull) > 1 and _turns_down(hull[-2], hull[-1], point):
+                hull.pop()
+            hull.append(point)
+        middle = sum(since for since, _ in points) / len(points)
+        right = next(k for k in range(1, len(hull)) if hull[k][0] >= middle or k == len(hull) - 1)
+        (x0, y0), (x1, y1) = hull[right - 1], hull[right]
+        self._drift = float(np.clip((y1 - y0) / (x1 - x0), -MAX_DRIFT, MAX_DRIFT))
+        self._offset_ns = min(apart - self._drift * since for since, apart in points)
+
+
+def _turns_down(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:
+    """Check whether b lies on or above the line from a to c."""
+    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

@@ -1,0 +1,177 @@
+"""Bring cameras, IMU and encoders onto one clock and into time's order: the `Source` of a real crane."""
+
+from __future__ import annotations
+
+import heapq
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from barsight.core.stamps import NS_PER_S
+from barsight.sensors.clock import DeviceClock
+from barsight.sensors.datagrams import RawReading, ReadingReceiver
+from barsight.sensors.gige import GigeCamera, RawLoss, RawPicture
+from barsight.sensors.source import LivePicture, LostPicture, Packet, Readings, SensorSigns
+
+WAIT_S = 0.01
+SIGNS_EVERY_S = 1.0
+HOLD_INTERVALS = 3
+"""A picture waits so many intervals for an older one of the other camera."""
+RAW_QUEUE = 256
+
+Item = tuple[str, RawPicture | RawLoss | RawReading]
+
+
+@dataclass
+class _Stream:
+    """A sensor's clock, its last stamp given on, and what it lost."""
+
+    clock: DeviceClock = field(default_factory=DeviceClock)
+    last_ns: int = 0
+    lost: int = 0
+
+
+class CraneSource:
+    """`Source` of two GigE Vision cameras, an IMU and encoders.
+
+    Every stamp is the device's own, mapped to the host's monotonic clock by its `DeviceClock`; `epoch_ns`
+    added to that gives the run's stamps, which a step of the host's wall clock can't move.
+    """
+
+    def __init__(
+        self, cameras: tuple[GigeCamera, GigeCamera], receivers: dict[str, ReadingReceiver], rate_hz: float,
+        epoch_ns: int, may_go_on: Callable[[], bool],
+    ) -> None:  # fmt: skip
+        self._cameras, self._receivers, self._epoch_ns = cameras, receivers, epoch_ns
+        self._ask, self._going = may_go_on, True
+        self.interval_ns = round(NS_PER_S / rate_hz)
+        self._streams = {name: _Stream() for name in ("cam0", "cam1", *receivers)}
+        self._items: queue.Queue[Item] = queue.Queue(RAW_QUEUE)
+        self._held: list[tuple[int, int, int, LivePicture]] = []
+        self._overflow = 0
+
+    def packets(self, after: dict[str, int]) -> Iterator[Packet]:
+        """Yield what comes, pictures in time's order; see `Source.packets`."""
+        for name, stream in self._streams.items():
+            stream.last_ns = after[name]
+        threads = [
+            threading.Thread(target=self._take_pictures, args=(f"cam{k}", camera), daemon=True)
+            for k, camera in enumerate(self._cameras)
+        ]
+        threads += [
+            threading.Thread(target=self._take_readings, args=(name, one), daemon=True)
+            for name, one in self._receivers.items()
+        ]
+        for thread in threads:
+            thread.start()
+        signs_at = time.monotonic()
+        try:
+            while self._ask():
+                yield from self._next()
+                if time.monotonic() >= signs_at:
+                    signs_at = time.monotonic() + SIGNS_EVERY_S
+                    yield SensorSigns(self._signs())
+            yield from self._ordered(until_ns=None)
+        finally:
+            self._going = False
+            for thread in threads:
+                thread.join(2.0)
+            for receiver in self._receivers.values():
+                receiver.close()
+
+    def _take_pictures(self, name: str, camera: GigeCamera) -> None:
+        for item in camera.pictures(lambda: self._going):
+            self._put(name, item)
+
+    def _take_readings(self, name: str, receiver: ReadingReceiver) -> None:
+        for item in receiver.readings(lambda: self._going, time.monotonic_ns):
+            self._put(name, item)
+
+    def _put(self, name: str, item: RawPicture | RawLoss | RawReading) -> None:
+        try:
+            self._items.put_nowait((name, item))
+        except queue.Full:
+            self._overflow += 1
+
+    def _next(self) -> Iterator[Packet]:
+        """Yield what one wait gives; readings that came together make one packet."""
+        readings: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
+        try:
+            name, item = self._items.get(timeout=WAIT_S)
+            while True:
+                if isinstance(item, RawReading):
+                    self._read(name, item, readings)
+                else:
+                    yield from self._picture(name, item)
+                name, item = self._items.get_nowait()
+        except queue.Empty:
+            pass
+        for name, rows in readings.items():
+            stamps = np.array([stamp for stamp, _ in rows], np.int64)
+            yield Readings(name, stamps, np.array([values for _, values in rows], np.float64))
+        if self._overflow:
+            yield LostPicture(0, 0, "backpressure", self._overflow)
+            self._overflow = 0
+        yield from self._ordered(time.monotonic_ns() - HOLD_INTERVALS * self.interval_ns)
+
+    def _read(
+        self, name: str, item: RawReading, readings: dict[str, list[tuple[int, tuple[float, ...]]]]
+    ) -> None:
+        stream = self._streams[name]
+        stream.lost += item.lost
+        if not stream.clock.add(item.device_ns, item.arrival_ns):
+            return
+        stamp_ns = stream.clock.host_ns(item.device_ns) + self._epoch_ns
+        if stamp_ns <= stream.last_ns:
+            stream.lost += 1
+            return
+        stream.last_ns = stamp_ns
+        readings.setdefault(name, []).append((stamp_ns, item.values))
+
+    def _picture(self, name: str, item: RawPicture | RawLoss) -> Iterator[Packet]:
+        """Stamp a picture and hold it until its turn."""
+        camera, stream = int(name[-1]), self._streams[name]
+        if isinstance(item, RawLoss):
+            yield LostPicture(camera, 0, item.cause, item.count)
+            return
+        if not stream.clock.add(item.device_ns, item.arrival_ns):
+            yield LostPicture(camera, 0, "clock")
+            return
+        exposed_ns = stream.clock.host_ns(item.device_ns)
+        stamp_ns = exposed_ns + self._epoch_ns
+        if stamp_ns <= stream.last_ns:
+            yield LostPicture(camera, stamp_ns, "late")
+            return
+        stream.last_ns = stamp_ns
+        picture = LivePicture(camera, stamp_ns, exposed_ns, item.image, item.trigger)
+        heapq.heappush(self._held, (stamp_ns, camera, item.arrival_ns, picture))
+
+    def _ordered(self, until_ns: int | None) -> Iterator[Packet]:
+        """Yield held pictures that no older one can follow: both cameras are past them, or they came before
+        `until_ns` (monotonic); None: all.
+        """
+        past_ns = min(self._streams[f"cam{k}"].last_ns for k in (0, 1))
+        while self._held:
+            stamp_ns, _, arrival_ns, picture = self._held[0]
+            if until_ns is not None and stamp_ns > past_ns and arrival_ns > until_ns:
+                return
+            heapq.heappop(self._held)
+            yield picture
+
+    def _signs(self) -> dict[str, int]:
+        signs: dict[str, int] = {}
+        for name, stream in self._streams.items():
+            clock = stream.clock
+            signs |= {
+                f"{name}_settled": int(clock.is_settled), f"{name}_drift_ppb": clock.drift_ppb,
+                f"{name}_jitter_ns": clock.jitter_ns, f"{name}_jumps": clock.jumps,
+                f"{name}_lost": stream.lost,
+            }  # fmt: skip
+        signs |= {f"{name}_torn": receiver.torn for name, receiver in self._receivers.items()}
+        for number, camera in enumerate(self._cameras):
+            signs[f"cam{number}_connects"] = camera.connects
+        return signs

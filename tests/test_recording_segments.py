@@ -1,0 +1,74 @@
+"""Segments of a live recording: all of it back, up to where a kill cut it off."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+import barsight as bs
+from barsight.core.types import StereoFrame
+from barsight.recording.base import Recording
+from barsight.recording.formats.segments import segments_of
+from barsight.recording.writers.bag import write_descriptions
+from barsight.recording.writers.segments import SegmentWriter
+
+
+def write(recording: Recording, folder: Path, segment_bytes: int) -> int:
+    """Write a recording as a live run does; returns the bytes of the last segment before it was ended."""
+    writer = SegmentWriter(folder, segment_bytes)
+    write_descriptions(recording, folder)
+    imu, crane = recording.imu(), recording.crane()
+    assert imu is not None and crane is not None
+    writer.samples(crane)
+    for frame in recording.frames():
+        assert isinstance(frame, StereoFrame)
+        writer.pair(frame.stamp_ns, frame.left, frame.right)
+    writer.samples(imu)
+    size = segments_of(folder)[-1].stat().st_size
+    writer.close()
+    return size
+
+
+def test_segments_give_the_recording_back(whole: Path, tmp_path: Path) -> None:
+    wanted = bs.open_recording(whole)
+    write(wanted, tmp_path, 300_000)
+    found = bs.open_recording(tmp_path)
+    assert len(segments_of(tmp_path)) > 1 and found.format == "segments"
+    for one, other in zip(wanted.frames(), found.frames(), strict=True):
+        assert isinstance(one, StereoFrame) and isinstance(other, StereoFrame)
+        assert one.stamp_ns == other.stamp_ns
+        assert np.array_equal(one.left, other.left) and np.array_equal(one.right, other.right)
+    for sensor in ("imu", "crane"):
+        one, other = (getattr(recording, sensor)() for recording in (wanted, found))
+        for name, value in vars(one).items():
+            assert np.array_equal(value, getattr(other, name)), name
+    assert found.rig.baseline_m == wanted.rig.baseline_m and found.imu_noise() == wanted.imu_noise()
+    with AnyReader(segments_of(tmp_path)[:1]) as reader:  # others read whole segments too
+        assert sum(1 for _ in reader.messages()) > 0
+
+
+@pytest.mark.parametrize("cut", [1, 37, 60, 150, 5000])
+def test_a_torn_segment_is_read_up_to_the_tear_and_taken_up(whole: Path, tmp_path: Path, cut: int) -> None:
+    wanted = bs.open_recording(whole)
+    size = write(wanted, tmp_path, 1 << 30)
+    (path,) = segments_of(tmp_path)
+    imu = wanted.imu()
+    assert imu is not None
+    path.write_bytes(path.read_bytes()[: size - cut])
+    torn = bs.open_recording(tmp_path).imu()
+    assert torn is not None
+    count = len(torn.stamp_ns)
+    lost = len(imu.stamp_ns) - count
+    assert 0 < lost <= cut // 300 + 1 and np.array_equal(torn.accel_mps2, imu.accel_mps2[:count])
+    again = SegmentWriter(tmp_path)
+    again.samples(imu)
+    again.close()
+    mended = bs.open_recording(tmp_path).imu()
+    assert mended is not None and np.array_equal(mended.stamp_ns, imu.stamp_ns)
+
+
+def test_what_is_no_mcap_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "segment_000001.mcap").write_bytes(b"nothing of the kind")
+    with pytest.raises(bs.BarsightError, match=r"segment_000001\.mcap: is no MCAP file"):
+        bs.open_recording(tmp_path)

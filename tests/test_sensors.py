@@ -1,0 +1,162 @@
+"""Sensors at a crane: clocks, datagrams, pairs by trigger, retention, crane.toml."""
+
+import socket
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import barsight as bs
+from barsight.live.pairing import PairFormer
+from barsight.live.settings import read_crane
+from barsight.recording.writers.retention import PROTECTED, Retention
+from barsight.sensors.clock import DeviceClock
+from barsight.sensors.datagrams import ReadingReceiver, pack
+from barsight.sensors.source import LivePicture
+
+SECOND = 10**9
+DARK = np.zeros((4, 6), np.uint8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_clock_is_mapped_by_its_least_delays(seed: int) -> None:
+    """30 Hz for two minutes, -60 ppm, 7 s off; delays of 8 ms and more, one in twenty late by up to 0.3 s."""
+    rng = np.random.default_rng(seed)
+    clock, drift = DeviceClock(), -60e-6
+    wrong = []
+    for k in range(3600):
+        true_ns = k * SECOND // 30
+        delay_ns = 8e6 + rng.exponential(1e6) + (rng.uniform(0, 3e8) if rng.uniform() < 0.05 else 0)
+        device_ns = round(7 * SECOND + true_ns * (1 + drift))
+        if clock.add(device_ns, true_ns + round(delay_ns)):
+            wrong.append(clock.host_ns(device_ns) - true_ns - 8e6)
+    assert len(wrong) > 3500 and clock.jumps == 0
+    assert max(map(abs, wrong)) < 1.5e6 and max(map(abs, wrong[600:])) < 0.4e6
+    assert abs(clock.drift_ppb - 60_000) < 3_000 and 50e6 < clock.jitter_ns < 300e6
+
+
+def test_a_clock_that_jumps_settles_anew() -> None:
+    for jump_ns in (-20 * SECOND, 20 * SECOND):
+        clock = DeviceClock()
+        for k in range(300):
+            true_ns = k * SECOND // 30
+            device_ns = true_ns + 50 * SECOND + (jump_ns if k >= 150 else 0)
+            settled = clock.add(device_ns, true_ns + 5_000_000)
+            if 160 <= k < 170:
+                assert not settled
+        assert clock.jumps == 1 and settled
+        assert abs(clock.host_ns(device_ns) - true_ns - 5_000_000) < 1000
+
+
+def test_pairs_need_stamp_and_trigger_to_agree() -> None:
+    """cam1 counts two ahead; one number is wrong; later cam0 counts anew."""
+    former, paired = PairFormer(2), []
+    lefts, rights = (5, 6, 7, 8, 1, 2, 3, 4), (7, 8, 10, 10, 11, 12, 13, 14)
+    for stamp, left, right in zip(range(0, 80, 10), lefts, rights, strict=True):
+        for camera, trigger in enumerate((left, right)):
+            picture = LivePicture(camera, stamp + camera, stamp, DARK, trigger)
+            paired += [found.stamp_ns for found, _ in former.push(picture)]
+    assert paired == [0, 10, 30, 60, 70] and former.contradicted == 6
+    assert former.lost == [0, 0] and former.max_skew_ns == former.skew_ns == 1
+
+
+def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        port = one.getsockname()[1]
+    receiver, out = ReadingReceiver("crane", port), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    place = (1.5, -2.0, 8.0)
+    whole = [pack("crane", number, 100 + number, place) for number in (7, 8, 8, 11)]
+    sent = [whole[0] + whole[1], whole[2], b"BSC1", pack("imu", 1, 5, (0.0,) * 6), whole[3]]
+    sent += [struct.pack("<4sIq3d", b"BSC1", 12, 112, *place[:2], float("nan"))]
+    for data in sent:
+        out.sendto(data, ("127.0.0.1", port))
+    give_up = time.monotonic() + 0.5
+    found = list(receiver.readings(lambda: time.monotonic() < give_up, lambda: 42))
+    assert [(one.device_ns, one.values, one.lost) for one in found] == [
+        (107, place, 0), (108, place, 0), (111, place, 2),
+    ]  # fmt: skip
+    assert receiver.torn == 3 and found[0].arrival_ns == 42
+    with pytest.raises(bs.BarsightError, match=rf"crane: UDP port {port} can't be opened"):
+        ReadingReceiver("crane", port)
+    receiver.close()
+    out.close()
+
+
+def test_the_oldest_unprotected_segments_go_first(tmp_path: Path) -> None:
+    """Each segment is 10 % of a disk that holds ten."""
+    for day, count in (("20260101", 3), ("20260102", 3), ("20260103", 2)):
+        (tmp_path / day).mkdir()
+        for number in range(count):
+            (tmp_path / day / f"segment_{number:06d}.mcap").write_bytes(b"")
+    (tmp_path / "20260101" / PROTECTED).write_text("")
+    (tmp_path / "20260102" / "camchain.yaml").write_text("")
+    (tmp_path / "notes").mkdir()
+    more = 0
+
+    def used(_: Path) -> float:
+        return 0.1 * (len(list(tmp_path.rglob("*.mcap"))) + more)
+
+    keeper = Retention(tmp_path / "20260103", 0.75, 0.95, used)
+    assert keeper.tidy() == 1 and not keeper.is_full
+    assert not (tmp_path / "20260102" / "segment_000000.mcap").exists()
+    more = 4
+    assert keeper.tidy() == 2 and not (tmp_path / "20260102").exists() and not keeper.is_full
+    more = 5
+    assert keeper.tidy() == 0 and keeper.is_full, "nothing is left that may go"
+    assert len(list((tmp_path / "20260101").iterdir())) == 4 and (tmp_path / "notes").is_dir()
+    more = 0
+    assert keeper.tidy() == 0 and not keeper.is_full
+
+
+GOOD = """
+calibration = "rig.yaml"
+[cameras]
+serials = ["A1", "B2"]
+rate_hz = 30
+exposure_us = 800
+[encoders]
+port = 5602
+rate_hz = 20
+p_crane_body_m = [0.4, 0.0, -1.5]
+R_yard_body = [1, 0, 0, 0, -1, 0, 0, 0, -1]
+position_std_m = 0.002
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[0.4, 0.0, -1.5]", "[400, 0, -1500]", "encoders.p_crane_body_m must lie in -30...30"),
+        ("p_crane_body_m", "p_crane_body_mm", "did you mean p_crane_body_m"),
+        ("exposure_us = 800", "exposure_us = 0.0008", "cameras.exposure_us must lie in 5...200000"),
+        ('"B2"', '"A1"', "names A1 twice"),
+        ("0, -1, 0, 0", "0, 1, 0, 0", "encoders.R_yard_body"),
+        ("position_std_m = 0.002", "position_std_m = 2", "encoders.position_std_m must lie in"),
+        ("port = 5602", "port = 99999", "encoders.port must lie in 1...65535"),
+        ("rate_hz = 30", "", "cameras.rate_hz is missing"),
+        ("cam0: A1", "cam0: B2", "crane.toml exchanges them"),
+        ("cam0: A1", "cam0: C3", "it is of another rig"),
+    ],
+)
+def test_a_wrong_crane_toml_is_refused_by_name(
+    old: str, new: str, words: str, whole: Path, tmp_path: Path
+) -> None:
+    from barsight.calibration.files.rig_file import write_rig_file
+
+    serials = {"cam0: A1": ("A1", "B2"), "cam0: B2": ("B2", "A1"), "cam0: C3": ("C3", "B2")}
+    write_rig_file(tmp_path / "rig.yaml", bs.open_recording(whole).rig)
+    plain = (tmp_path / "rig.yaml").read_text()
+    config = tmp_path / "crane.toml"
+    config.write_text(GOOD)
+    for pair in (("A1", "B2"), serials.get(new, ("A1", "B2"))):
+        text = plain.replace("cam0:\n", f"cam0:\n  serial: {pair[0]}\n", 1)
+        (tmp_path / "rig.yaml").write_text(text.replace("cam1:\n", f"cam1:\n  serial: {pair[1]}\n", 1))
+        if pair == ("A1", "B2"):
+            assert read_crane(config).rig().baseline_m > 0
+    config.write_text(GOOD.replace(old, new))
+    with pytest.raises(bs.BarsightError) as error:
+        read_crane(config).rig()
+    assert words in str(error.value) and "\n" not in str(error.value)
