@@ -106,7 +106,7 @@ class Session:
             if self._poses is not None:
                 checkpointed(self._checkpoints, "trajectory", self._poses.finish)
         write_measured(
-            self._recording, self._yard, self._asked, keep=self._checkpoints.parent, magnet=self._magnet,
+            [self._recording], self._yard, self._asked, keep=self._checkpoints.parent, magnet=self._magnet,
             report=False,
         )  # fmt: skip
         return Yard(self._yard, self)
