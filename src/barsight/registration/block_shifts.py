@@ -160,9 +160,7 @@ def _contrast(gray: Float32, known: Bool) -> Float32:
     weight = known.astype(np.float32)
     filled = np.where(known, gray, 0).astype(np.float32)
     smooth = []
-    for sigma in (STRAY_M = 0.01
-"""A block that shows little strays no further than about this."""
-_FINE_CELLS, _COARSE_CELLS):
+    for sigma in (_FINE_CELLS, _COARSE_CELLS):
         held = cv2.GaussianBlur(weight, (0, 0), sigma)
         smooth.append(cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(held, 1e-3))
     return np.where(known, smooth[0] - smooth[1], 0).astype(np.float32)
