@@ -96,7 +96,7 @@ def design_at(points_m: Float64, about_m: Float64) -> Float64:
 
 
 def tie_passes(priors: Sequence[PassPrior], overlaps: Mapping[tuple[int, int], BlockShifts]) -> PassTies:
-    """Solve for all passes' corrections at once, by weighted least squares with Cauchy weights on the blocks.
+    """Solve for all passes' corrections at once, by weighted least squares; blocks count by Cauchy weights.
 
     overlaps: by (first, second). What a block says is spread over both passes by their sigmas; what no
     overlap shows stays at the prior. The blocks' sigmas grow or shrink as they really scatter, and no overlap
@@ -108,16 +108,14 @@ def tie_passes(priors: Sequence[PassPrior], overlaps: Mapping[tuple[int, int], B
     for k, one in enumerate(priors):
         part = slice(UNKNOWNS * k, UNKNOWNS * (k + 1))
         prior[part, part] = np.linalg.inv(one.covariance)
-    found: Any = np.zeros(size)
     normal: Any = prior
-    for _ in range(_ROUNDS):
-        normal, right = prior, np.zeros(size)
-        for overlap in chosen.values():
-            rows = _rows(overlap, priors)
-            weighted = overlap.weighted(overlap.shifts.shift_m - rows @ found)
-            normal = normal + np.einsum("kia,kij,kjb->ab", rows, weighted, rows)
-            right += np.einsum("kia,kij,kj->a", rows, weighted, overlap.shifts.shift_m)
-        found = np.linalg.solve(normal, right)
+    right: Any = np.zeros(size)
+    for overlap in chosen.values():
+        rows = _rows(overlap, priors)
+        weighted: Float64 = np.einsum("kia,kij->kaj", rows, overlap.information)
+        normal = normal + np.tensordot(weighted, rows, ((0, 2), (0, 1)))
+        right = right + np.tensordot(weighted, overlap.shifts.shift_m, ((0, 2), (0, 1)))
+    found: Float64 = np.linalg.solve(normal, right)
     left: Float64 = np.linalg.inv(normal)
     corrections = []
     for k, one in enumerate(priors):
@@ -128,19 +126,12 @@ def tie_passes(priors: Sequence[PassPrior], overlaps: Mapping[tuple[int, int], B
 
 @dataclass(frozen=True, eq=False)
 class _Overlap:
-    """Blocks with their information (K, 3, 3) by themselves, and as far as they are wrong together."""
+    """Blocks of two passes with the information (K, 3, 3) that they count by."""
 
     first: int
     second: int
     shifts: BlockShifts
-    own: Float64
-    bounded: Float64
-
-    def weighted(self, off_m: Float64) -> Float64:
-        """Weigh the blocks' information by how far they are off (K, 3): what changed counts little."""
-        weight = 1 / (1 + np.einsum("ki,kij,kj->k", off_m, self.own, off_m) / 9)
-        weighted: Float64 = weight[:, None, None] * self.bounded
-        return weighted
+    information: Float64
 
 
 def _rows(one: _Overlap, priors: Sequence[PassPrior]) -> Float64:
@@ -154,32 +145,33 @@ def _rows(one: _Overlap, priors: Sequence[PassPrior]) -> Float64:
 
 
 def _scaled(first: int, second: int, blocks: BlockShifts) -> _Overlap:
-    """Scale the blocks' information to how they scatter about a plane, and bound it for all together."""
-    place = np.column_stack([np.ones(len(blocks.place_m)), blocks.place_m[:, :2]])
-    place[:, 1:] -= place[:, 1:].mean(axis=0)
+    """Weigh blocks by how far they are off what all say (Cauchy), scale their information to how they scatter
+    about that, and bound it for all together.
+    """
+    count = len(blocks.place_m)
+    plane = np.ones((count, 1))
+    if count > MIN_PLANE:
+        plane = np.column_stack([plane, blocks.place_m[:, :2] - blocks.place_m[:, :2].mean(axis=0)])
     off = blocks.shift_m - np.median(blocks.shift_m, axis=0)
-    if len(place) > MIN_PLANE:
-        off = blocks.shift_m - place @ np.linalg.lstsq(place, blocks.shift_m, rcond=None)[0]
-    squares = np.einsum("ki,kij,kj->k", off, blocks.information, off)
-    inflation = FEW_INFLATION
-    if len(squares) >= MIN_BLOCKS:
-        inflation = max(float(np.median(squares)) / CHI2_MEDIAN, MIN_INFLATION)
+    inflation, weight = FEW_INFLATION, np.ones(count)
+    for _ in range(_ROUNDS):
+        squares = np.einsum("ki,kij,kj->k", off, blocks.information, off)
+        if count >= MIN_BLOCKS:
+            inflation = max(float(np.median(squares)) / CHI2_MEDIAN, MIN_INFLATION)
+        weight = 1 / (1 + squares / (9 * inflation))
+        fitted = np.linalg.lstsq(np.sqrt(weight)[:, None] * plane, np.sqrt(weight)[:, None] * blocks.shift_m,
+                                 rcond=None)[0]  # fmt: skip
+        off = blocks.shift_m - plane @ fitted
     covariance = inflation * np.linalg.inv(blocks.information + NOTHING * np.eye(3))
-    together = covariance + len(blocks.place_m) * np.diag(FLOOR_M**2)
-    return _Overlap(first, second, blocks, np.linalg.inv(covariance), np.linalg.inv(together))
+    together = covariance + float(weight.sum()) * np.diag(FLOOR_M**2)
+    return _Overlap(first, second, blocks, weight[:, None, None] * np.linalg.inv(together))
 
 
 def _told(one: _Overlap, priors: Sequence[PassPrior]) -> PairTie:
     """Average an overlap, and hold it against what the passes know of themselves."""
     shifts = one.shifts
-    shift: Any = np.median(shifts.shift_m, axis=0)
-    total = np.eye(3)
-    for _ in range(_ROUNDS):
-        weighted = one.weighted(shifts.shift_m - shift)
-        total = weighted.sum(axis=0)
-        said = np.einsum("kij,kj->i", weighted, shifts.shift_m)
-        shift = np.linalg.solve(total, said)
-    spread: Float64 = np.linalg.inv(total)
+    spread: Float64 = np.linalg.inv(one.information.sum(axis=0))
+    shift: Float64 = spread @ np.einsum("kij,kj->i", one.information, shifts.shift_m)
     allowed = np.zeros((3, 3))
     for number in (one.first, one.second):
         design = design_at(shifts.place_m.mean(axis=0, keepdims=True), priors[number].about_m)[0]
