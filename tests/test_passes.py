@@ -16,7 +16,7 @@ from barsight.registration.block_shifts import BlockShifts, Raster, block_shifts
 from barsight.registration.pass_ties import PassPrior, tie_passes
 from barsight.result_folder import changed_inputs
 from barsight.simulation.passes import simulate_passes
-from barsight.simulation.settings import PassesSettings, YardSettings
+from barsight.simulation.settings import CameraSettings, PassesSettings, YardSettings
 from cli_runs import TINY
 
 CELL_M = 0.01
@@ -159,6 +159,7 @@ def test_what_was_proven_free_is_given_up_where_it_changed() -> None:
 
 PASSES = replace(
     TINY, length_m=3.0, frames=7, seed=710010, yard=YardSettings(max_layers=1, bar_length_m=7.5),
+    camera=CameraSettings(width_px=512, height_px=400, focal_px=500, samples_per_side=1),
     passes=PassesSettings(trolley_y_m=(-2.0, 2.0), changes=("taken",)),
 )  # fmt: skip
 COARSE = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.02}}
