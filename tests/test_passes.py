@@ -12,7 +12,7 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.joined_passes import STALE
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
-from barsight.registration.block_shifts import BlockShifts, Raster, block_shifts
+from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts
 from barsight.registration.pass_ties import PassPrior, tie_passes
 from barsight.result_folder import changed_inputs
 from barsight.simulation.passes import simulate_passes
@@ -30,12 +30,12 @@ def yard(x: np.ndarray, y: np.ndarray, *, detail: bool) -> tuple[np.ndarray, np.
     return 0.3 + 0.015 * np.cos(2 * np.pi * x / 0.09), gray
 
 
-def raster(shift_m: np.ndarray, rng: np.random.Generator, *, detail: bool = True) -> Raster:
+def raster(shift_m: np.ndarray, rng: np.random.Generator, *, detail: bool = True) -> MatchedMap:
     """Sample the yard moved by a shift, blurred as matching does, with noise."""
     x, y = np.meshgrid(np.arange(400) * CELL_M - shift_m[0], np.arange(320) * CELL_M - shift_m[1])
     z, gray = yard(x, y, detail=detail)
     noise = rng.normal(0, 1, (2, *z.shape))
-    return Raster(
+    return MatchedMap(
         (z + shift_m[2] + 0.002 * noise[0]).astype(np.float32), np.full(z.shape, 0.002, np.float32),
         (gray + noise[1]).astype(np.float32),
     )  # fmt: skip

@@ -187,10 +187,8 @@ def find_lifts(
     forbidden (`no-magnet`). judged_at: when lifts are judged: now, or at the recording's last frame, to look
     back. notices: warnings that the caller has.
     """
-    settings, newest, trajectory, surface = (
-        mapped.settings, mapped.newest, mapped.trajectory, mapped.surface
-    )  # fmt: skip
-    watch, profiles = mapped.watch, mapped.profiles
+    settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
+    watch, profiles, surface = mapped.watch, mapped.profiles, mapped.surface
     with watch("bundles"):
         heights = surface_map(surface, mapped.free, mapped.tops)
         bundles = find_bundles(heights, settings.bundles)

@@ -25,14 +25,14 @@ _MIN_CONTRAST = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Raster:
+class MatchedMap:
     """Heights (H, W) m with sigma m, NaN where unknown, and gray levels, NaN where there are none."""
 
     z_m: Float32
     sigma_m: Float32
     gray: Float32
 
-    def moved(self, shift_m: Float64, cell_m: float) -> Raster:
+    def moved(self, shift_m: Float64, cell_m: float) -> MatchedMap:
         """Move the map by x, y and z; bilinear, unknown beside what is unknown."""
         rows, columns = self.z_m.shape
         x, y = np.meshgrid(
@@ -43,7 +43,7 @@ class Raster:
             cv2.remap(one, x, y, cv2.INTER_LINEAR, borderValue=float("nan"))
             for one in (self.z_m, self.sigma_m, self.gray)
         )
-        return Raster(z + np.float32(shift_m[2]), sigma, gray)
+        return MatchedMap(z + np.float32(shift_m[2]), sigma, gray)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,9 @@ class BlockShifts:
         )  # fmt: skip
 
 
-def block_shifts(first: Raster, second: Raster, origin_m: tuple[float, float], cell_m: float) -> BlockShifts:
+def block_shifts(
+    first: MatchedMap, second: MatchedMap, origin_m: tuple[float, float], cell_m: float
+) -> BlockShifts:
     """Measure the shifts of all blocks by least squares over heights and pictures (Lucas-Kanade).
 
     first, second: on one grid whose first cell's centre is origin_m (x, y). Bars alone say nothing of the
@@ -98,7 +100,9 @@ def _middle(found: BlockShifts) -> Float64:
     return np.asarray(np.linalg.solve(information.sum(axis=0) + ridge, said), np.float64)
 
 
-def _measured(first: Raster, second: Raster, origin_m: tuple[float, float], cell_m: float) -> BlockShifts:
+def _measured(
+    first: MatchedMap, second: MatchedMap, origin_m: tuple[float, float], cell_m: float
+) -> BlockShifts:
     known = np.isfinite(first.z_m) & np.isfinite(second.z_m)
     known &= np.abs(first.z_m - second.z_m) <= GATE_M
     known = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

@@ -31,7 +31,7 @@ _ROUNDS = 15
 
 @dataclass(frozen=True, eq=False)
 class PassPrior:
-    """How sure a pass is of its own place. about_m: (3,) its middle, about which it turns and stretches.
+    """Prior of a pass's own place. about_m: (3,) its middle, about which it turns and stretches.
     covariance: (7, 7) of the unknowns.
     """
 
@@ -58,7 +58,7 @@ class PassCorrection:
 
 @dataclass(frozen=True, eq=False)
 class PairTie:
-    """What the overlap of two passes says. first, second: their numbers from 0. blocks: in common. shift_m,
+    """Shift of two passes by their overlap. first, second: their numbers from 0. blocks: in common. shift_m,
     sigma_m: (3,) that takes the second onto the first in the overlap's middle, before any correction, and
     its sigma. expected_sigma_m: (3,) what the passes' own sigmas allow. off_sigmas: the shift over both.
     """

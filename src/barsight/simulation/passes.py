@@ -21,7 +21,7 @@ OVER_M = 0.02
 
 @dataclass(frozen=True, eq=False)
 class ChangedStock:
-    """What lies there before and after a change. rows: of truth/changes.json."""
+    """A yard before and after a change. rows: of truth/changes.json."""
 
     before: LaidYard
     after: LaidYard

@@ -17,7 +17,7 @@ from barsight.mapping.passes.changes import PLACE_M, PlaceHistory
 from barsight.mapping.surface.incremental import TileFigures, gather_surface, tile_figures
 from barsight.mapping.surface.surface import Layers, Surface, write_tile
 from barsight.mapping.tiles import TILE_CELLS, TileKey
-from barsight.registration.block_shifts import BLOCK_CELLS, BlockShifts, Raster, block_shifts
+from barsight.registration.block_shifts import BLOCK_CELLS, BlockShifts, MatchedMap, block_shifts
 from barsight.registration.pass_ties import PassCorrection
 
 EDGE_M = 0.03
@@ -58,11 +58,11 @@ def measure_overlaps(surfaces: Sequence[Surface]) -> dict[tuple[int, int], Block
     return found
 
 
-def _seen(layers: Layers) -> Raster:
+def _seen(layers: Layers) -> MatchedMap:
     """Leave what was filled out of a window."""
     seen = layers.source == HeightSource.VISION
     z_m, sigma_m = (np.where(seen, part, np.float32(np.nan)) for part in (layers.z_m, layers.sigma_m))
-    return Raster(z_m, sigma_m, layers.intensity)
+    return MatchedMap(z_m, sigma_m, layers.intensity)
 
 
 def _shared(first: Surface, second: Surface) -> Iterator[tuple[int, int, int, int]]:
