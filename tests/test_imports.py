@@ -18,7 +18,7 @@ FLOORS = {
     "measure_settings": 6,
     "store": 7,
     "pair_chain": 7,
-    "map_building": 8,
+    "map_building": 8, "joined_passes": 9,
     "live_map": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
     "result": 11, "pair_matching": 11, "measure_folder": 11,
@@ -34,7 +34,7 @@ ROOMS = {
         "settings",
     ),
     "core": ("compiling", ".", "linalg", "settings"),
-    "mapping": (".", "surface"),
+    "mapping": (".", "surface", "passes"),
     "yard": (
         ".", "bundles.fitting", "bundles.section", "bundles", "stability", "magnet", "lifting", "inventory",
     ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,7 +35,7 @@ def open_recording(path: Path | str) -> StoredPictures:
 
 
 def measure(
-    recording: Path | str,
+    recording: Path | str | Sequence[Path | str],
     /,
     *,
     preset: Literal["best", "fast"] = "best",
@@ -45,6 +46,8 @@ def measure(
 ) -> Yard:
     """Measure a recording; the files lie in a temporary folder, which goes with the yard unless saved.
 
+    recording: one, or several passes over one yard, which become one map.
+
     magnet: TOML file of the magnet that lifts are chosen for; without it none is offered. at: when lifts are
     judged: now, or at the recording's end, to look back. advance: told of progress (stage, done, total).
     settings: fields of `MeasureSettings`; those of a stage as a mapping, `map={"cell_m": 0.02}`.
@@ -52,11 +55,10 @@ def measure(
     """
     chosen = build_settings({"preset": preset, **settings}, MeasureSettings)
     described = None if magnet is None else Path(magnet)
+    passes = [Path(recording)] if isinstance(recording, (str, Path)) else [Path(one) for one in recording]
     out = Path(tempfile.mkdtemp(prefix="barsight."))
     try:
-        measure_into(
-            Path(recording), out, chosen, advance=advance, magnet=described, judged_at=at, report=False
-        )
+        measure_into(passes, out, chosen, advance=advance, magnet=described, judged_at=at, report=False)
     except BaseException:
         shutil.rmtree(out, ignore_errors=True)
         raise

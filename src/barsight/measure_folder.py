@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from barsight.core.compiling.ahead import compile_ahead
-from barsight.core.errors import OutputError
+from barsight.core.errors import ConfigError, OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
@@ -29,7 +30,7 @@ def ignore_progress(stage: str, done: int, total: int) -> None:
 
 
 def measure_into(
-    path: Path,
+    paths: Path | Sequence[Path],
     out: Path,
     settings: MeasureSettings,
     *,
@@ -43,17 +44,23 @@ def measure_into(
 ) -> dict[str, Any]:
     """Measure, write all files and, if asked, the report into `out`; return what result.json says.
 
+    paths: a recording, or several passes over one yard, which become one map.
     resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
     truth_of: a recording with truth to score against; only after the measuring is done. judged_at: when
     lifts are judged, see `barsight.pipeline.find_lifts`.
     """
     expect_choice("at", judged_at, ("now", "end"))
-    if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
-        raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
+    chosen = [paths] if isinstance(paths, Path) else list(paths)
+    if not chosen:
+        raise ConfigError("no recording is named: give one, or several passes over one yard")
+    for path in chosen:
+        if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
+            raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
     content = write_measured(
-        open_recording(path, settings.recording), out, settings, advance=advance, overwrite=overwrite,
-        keep=keep, truth_of=truth_of, magnet=None if magnet is None else load_magnet(magnet),
+        [open_recording(path, settings.recording) for path in chosen], out, settings, advance=advance,
+        overwrite=overwrite, keep=keep, truth_of=truth_of,
+        magnet=None if magnet is None else load_magnet(magnet),
         judged_at=judged_at, report=report,
     )  # fmt: skip
     if keep is not None:
@@ -62,7 +69,7 @@ def measure_into(
 
 
 def write_measured(
-    recording: Recording,
+    recordings: Sequence[Recording],
     out: Path,
     settings: MeasureSettings,
     *,
@@ -75,16 +82,15 @@ def write_measured(
     report: bool = True,
     notices: tuple[Notice, ...] = (),
 ) -> dict[str, Any]:
-    """Measure an open recording; see `measure_into`. keep: a folder of checkpoints to go on from. notices:
+    """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to go on from. notices:
     what the caller knows besides.
     """
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
         compile_ahead(advance, "measure")
-        mapped = map_yard(recording, settings, scratch, advance, keep)
-        built = mapped.built
-        with in_background(lambda: write_surface(mapped.surface, built.free, built.tops, staging)):
+        mapped = map_yard(recordings, settings, scratch, advance, keep)
+        with in_background(lambda: write_surface(mapped.surface, mapped.free, mapped.tops, staging)):
             measured = find_lifts(mapped, magnet, judged_at, notices)
         content = summary(measured)
         write_results(measured, seal_map(content, staging), staging)

@@ -11,7 +11,9 @@ import numpy as np
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.notices import Notice
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
+from barsight.mapping.passes.changes import HeightChange
 from barsight.mapping.surface.surface import Surface
+from barsight.registration.pass_ties import PairTie, PassCorrection
 from barsight.yard.inventory.stock_list import StockMatch
 from barsight.yard.lifting.targets import LiftPlan
 from barsight.yard.lifting.travel_accuracy import Travel
@@ -49,11 +51,32 @@ class Preview:
 
 
 @dataclass(frozen=True, eq=False)
+class PassRecord:
+    """One of several passes, the oldest first. captured_ns: stamps of its first and last measured frame.
+    first_ns, last_ns: of its part of the trajectory. ties: with passes before it; changes: which it saw.
+    """
+
+    recording_path: Path
+    recording_format: str
+    input_hashes: dict[str, str]
+    length_m: float
+    captured_ns: tuple[int, int] | None
+    first_ns: int
+    last_ns: int
+    frames_used: int
+    frames_total: int
+    correction: PassCorrection
+    ties: tuple[PairTie, ...]
+    changes: tuple[HeightChange, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """A measured recording; `surface` reads its tiles from a scratch folder that must still be there.
 
     seconds: by the clock on the wall; the stages' own seconds overlap. yard_frame_id: digest of how the body
-    hangs from the crane; None where the map isn't in the yard's frame.
+    hangs from the crane; None where the map isn't in the yard's frame. passes: of several recordings; the
+    recording is then the newest.
     """
 
     recording_path: Path
@@ -82,6 +105,7 @@ class Measurement:
     stock: StockMatch | None
     travel: Travel
     yard_frame_id: str | None
+    passes: tuple[PassRecord, ...] = ()
 
 
 def to_json(value: Any) -> Any:

@@ -8,18 +8,21 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from barsight.core.errors import Failed, MeasurementError
+from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.json_values import json_digest
 from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.timing import Stopwatch
 from barsight.core.types import Agreement, Contour, CraneSamples, LaserProfile, Trajectory
+from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
 from barsight.map_building import (
     BuiltMap,
     ProbedRecording,
@@ -30,12 +33,14 @@ from barsight.map_building import (
     inspect_recording,
 )
 from barsight.mapping.agreement import compute_agreement
+from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.surface.contours import cut_contours
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
+from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Measurement, StageTime, to_json
+from barsight.measurement import Measurement, PassRecord, StageTime, to_json
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.identity import ID_DIGITS
@@ -73,40 +78,103 @@ class Profiles:
 
 @dataclass(frozen=True, eq=False)
 class MappedYard:
-    """The first half's results: trajectory, map and contours. began_s: the clock when it was begun."""
+    """The first half's results: trajectories, map and contours. passes: the oldest first. joined: how several
+    became one map. trajectory: of all. watch: times what is done for all. began_s: the clock when it was
+    begun.
+    """
 
     settings: MeasureSettings
-    probed: ProbedRecording
-    way: TrackedRecording
-    built: BuiltMap
+    passes: tuple[MappedPass, ...]
+    joined: JoinedPasses | None
+    trajectory: Trajectory
     surface: Surface
+    free: FreeSpace
+    tops: TopPhoto
     profiles: Profiles
     stock: tuple[ListedBundle, ...] | None
+    watch: Stopwatch
     began_s: float
+
+    @property
+    def newest(self) -> MappedPass:
+        """Return the pass that was recorded last."""
+        return self.passes[-1]
 
 
 def map_yard(
-    recording: Recording, settings: MeasureSettings, scratch: Path, advance: ProgressCallback,
+    recordings: Sequence[Recording], settings: MeasureSettings, scratch: Path, advance: ProgressCallback,
     resume: Path | None = None,
 ) -> MappedYard:  # fmt: skip
     """Measure the surface. `scratch` is an empty folder for tiles and pictures; the caller removes it.
 
-    resume: a folder that keeps the trajectory and each frame's disparity (about 19 MB for 1.3 megapixels), so
-    that a killed run goes on where it was; the caller removes it when all is written.
+    recordings: passes over one yard, in any order; each is measured by itself, one after the other, then they
+    are tied and joined. resume: a folder that keeps the trajectory and each frame's disparity (about 19 MB
+    for 1.3 megapixels), so that a killed run goes on where it was; the caller removes it when all is written.
 
     Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
     and listed instead.
     """
     began_s, settings = time.perf_counter(), settings.chosen()
     stock = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
-    probed = inspect_recording(recording, settings, scratch, resume)
-    with estimate_trajectory(probed, settings, advance) as way:
-        built = build_map(probed, way, settings, scratch, advance)
-    with probed.watch("surface"):
-        surface = _elect(probed, way, built, settings, scratch)
-    with probed.watch("contours"):
-        profiles = _compare_with_laser(probed, way.trajectory, surface, settings)
-    return MappedYard(settings, probed, way, built, surface, profiles, stock, began_s)
+    ordered = in_order(recordings, settings)
+    several = len(ordered) > 1
+    passes, surfaces = [], []
+    for number, recording in enumerate(ordered, start=1):
+        own, kept = scratch, resume
+        if several:
+            own = scratch / f"pass_{number}"
+            own.mkdir()
+            kept = None if resume is None else resume / own.name
+        probed = inspect_recording(recording, settings, own, kept)
+        with estimate_trajectory(probed, settings, advance) as way:
+            built = build_map(probed, way, settings, own, advance)
+        with probed.watch("surface"):
+            surfaces.append(_elect(probed, way, built, settings, own))
+        passes.append(MappedPass(probed, way, built))
+        if several:
+            _expect_same_cells(passes)
+            _remove_pictures(own)
+    joined, watch = None, passes[0].probed.watch
+    if several:
+        watch = Stopwatch()
+        with watch("join"):
+            folder = scratch / "joined"
+            folder.mkdir()
+            joined = join_passes(passes, surfaces, folder)
+    done = joined.passes if joined else tuple(passes)
+    surface = joined.surface if joined else surfaces[0]
+    free, tops = (joined.free, joined.tops) if joined else (passes[0].built.free, passes[0].built.tops)
+    trajectory = _whole([one.way.trajectory for one in done])
+    with watch("contours"):
+        profiles = _compare_with_laser(done[-1].probed.source, trajectory, surface, settings)
+    return MappedYard(
+        settings, done, joined, trajectory, surface, free, tops, profiles, stock, watch, began_s
+    )
+
+
+def _expect_same_cells(passes: Sequence[MappedPass]) -> None:
+    first, last = (one.probed for one in (passes[0], passes[-1]))
+    if last.cell_m != first.cell_m:
+        problem = f"its map has cells of {last.cell_m:g} m, those before of {first.cell_m:g} m"
+        raise InputError(last.source.path, problem, "set map.cell_m")
+
+
+def _remove_pictures(folder: Path) -> None:
+    """Remove a finished pass's rectified pictures: the next one's shall have their room."""
+    for path in folder.glob("rectified_*.npy"):
+        path.unlink()
+
+
+def _whole(trajectories: Sequence[Trajectory]) -> Trajectory:
+    """Chain the trajectories of passes, the oldest first; what only one of them knows is left to it."""
+    if len(trajectories) == 1:
+        return trajectories[0]
+    return Trajectory(
+        trajectories[0].reference,
+        tuple(frame for one in trajectories for frame in one.frames),
+        tuple(frame for one in trajectories for frame in one.refused),
+        tuple(dict.fromkeys(name for one in trajectories for name in one.sensors)),
+    )
 
 
 def find_lifts(
@@ -119,52 +187,97 @@ def find_lifts(
     forbidden (`no-magnet`). judged_at: when lifts are judged: now, or at the recording's last frame, to look
     back. notices: warnings that the caller has.
     """
-    settings, probed, way, built = mapped.settings, mapped.probed, mapped.way, mapped.built
-    watch, trajectory, surface, profiles = probed.watch, way.trajectory, mapped.surface, mapped.profiles
+    settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
+    watch, profiles, surface = mapped.watch, mapped.profiles, mapped.surface
     with watch("bundles"):
-        heights = surface_map(surface, built.free, built.tops)
+        heights = surface_map(surface, mapped.free, mapped.tops)
         bundles = find_bundles(heights, settings.bundles)
+        if mapped.joined is not None:
+            bundles = mapped.joined.doubted(bundles)
         placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
         stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None
-    warnings = [*_warnings(probed, way, built, profiles), *notices]
+    warnings = [*_warnings(mapped), *notices]
     if mapped.stock is not None:
         warnings += [Notice("stock-list", text) for text in stock_warnings(mapped.stock, stock)]
         contradiction = None if stock is None else list_contradiction(mapped.stock, stock)
         warnings += [Notice("stock-contradicts", contradiction)] if contradiction else []
     with watch("lifts"):
-        travel = _travel(probed, way, built, settings)
+        travels = [_travel(one.probed, one.way, one.built, settings) for one in mapped.passes]
+        travel = travels[0] if len(travels) == 1 else Travel.joined(travels)
         lifts = _lifts(
             heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at, stock
         )
-    source = probed.source
+    source = newest.probed.source
     return Measurement(
         recording_path=source.path.resolve(),
         recording_format=source.format,
-        is_simulated=source.is_simulated,
+        is_simulated=any(one.probed.source.is_simulated for one in mapped.passes),
         calibration_hash=json_digest(to_json(asdict(source.rig))),
-        configuration_hash=json_digest(probed.configuration),
-        input_hashes=probed.inputs,
-        configuration=probed.configuration,
+        configuration_hash=json_digest(newest.probed.configuration),
+        input_hashes=_input_hashes(mapped.passes),
+        configuration=newest.probed.configuration,
         trajectory=trajectory,
-        frames_total=_frames_total(probed),
-        frames_used=len(built.placed),
-        refusals=built.refusals,
+        frames_total=sum(_frames_total(one.probed) for one in mapped.passes),
+        frames_used=sum(len(one.built.placed) for one in mapped.passes),
+        refusals=tuple(refusal for one in mapped.passes for refusal in one.built.refusals),
         sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors))),
         surface=surface,
         contours=profiles.contours,
         laser=profiles.laser,
         agreements=tuple(a for a in profiles.agreed if isinstance(a, Agreement)),
-        stages=tuple(StageTime(*entry) for entry in watch.entries()),
+        stages=_stages(mapped),
         warnings=tuple(warnings),
         seconds=time.perf_counter() - mapped.began_s,
         peak_memory_mib=peak_memory_mib(),
-        preview=built.preview,
+        preview=newest.built.preview,
         bundles=bundles,
         lifts=lifts,
         stock=stock,
         travel=travel,
         yard_frame_id=_yard_frame_id(source.crane(), trajectory),
+        passes=_records(mapped, travels),
     )
+
+
+def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:
+    """Gather the inputs' digests, by the pass's number where there are several."""
+    if len(passes) == 1:
+        return passes[0].probed.inputs
+    return {
+        f"pass_{number}/{name}": digest
+        for number, one in enumerate(passes, start=1) for name, digest in one.probed.inputs.items()
+    }  # fmt: skip
+
+
+def _stages(mapped: MappedYard) -> tuple[StageTime, ...]:
+    """Sum the stages' times over the passes, in the order in which the first pass did them."""
+    watches = [one.probed.watch for one in mapped.passes]
+    if mapped.joined is not None:
+        watches.append(mapped.watch)
+    total = dict[str, tuple[float, int]]()
+    for name, seconds, frames in (entry for watch in watches for entry in watch.entries()):
+        before = total.get(name, (0.0, 0))
+        total[name] = before[0] + seconds, before[1] + frames
+    return tuple(StageTime(name, *spent) for name, spent in total.items())
+
+
+def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord, ...]:
+    """Describe each of several passes for result.json."""
+    if mapped.joined is None:
+        return ()
+    ties = mapped.joined.ties
+    return tuple(
+        PassRecord(
+            one.probed.source.path.resolve(), one.probed.source.format, one.probed.inputs,
+            one.way.trajectory.length_m, travel.captured_ns, int(one.way.trajectory.stamp_ns[0]),
+            int(one.way.trajectory.stamp_ns[-1]), len(one.built.placed), _frames_total(one.probed),
+            correction, tuple(pair for pair in ties.pairs if pair.second == number),
+            tuple(change for change in mapped.joined.history.changes if change.pass_number == number),
+        )
+        for number, (one, travel, correction) in enumerate(
+            zip(mapped.passes, travels, ties.corrections, strict=True)
+        )
+    )  # fmt: skip
 
 
 def _yard_frame_id(crane: CraneSamples | None, trajectory: Trajectory) -> str | None:
@@ -192,13 +305,13 @@ def _elect(
 
 
 def _compare_with_laser(
-    probed: ProbedRecording, trajectory: Trajectory, surface: Surface, settings: MeasureSettings
+    source: Recording, trajectory: Trajectory, surface: Surface, settings: MeasureSettings
 ) -> Profiles:
     """Cut contours and hold them against the laser's profiles.
 
     Profiles are places in the yard: a map in a frame of its own can't be held against them.
     """
-    whole = probed.source.laser()
+    whole = source.laser()
     laser = whole if trajectory.reference == "yard" else ()
     contours = cut_contours(surface, laser, settings.map.profile_y_m, settings.map.contours)
     by_number = {contour.profile: contour for contour in contours}
@@ -209,10 +322,31 @@ def _compare_with_laser(
     return Profiles(contours, laser, agreed, len(laser) < len(whole))
 
 
-def _warnings(
-    probed: ProbedRecording, way: TrackedRecording, built: BuiltMap, profiles: Profiles
-) -> list[Notice]:
-    """Gather what every stage had to assume or leave out."""
+def _warnings(mapped: MappedYard) -> list[Notice]:
+    """Gather what every stage of every pass had to assume or leave out."""
+    warnings, profiles = list[Notice](), mapped.profiles
+    for number, one in enumerate(mapped.passes, start=1):
+        own = _pass_warnings(one.probed, one.way, one.built)
+        if mapped.joined is not None:
+            own = [Notice(notice.code, f"pass {number}: {notice.message}") for notice in own]
+        warnings += own
+    warnings += mapped.joined.notices() if mapped.joined is not None else ()
+    warnings += [Notice(a.code, a.reason) for a in profiles.agreed if isinstance(a, Failed)]
+    if profiles.left_out:
+        reason = "without a crane the map isn't in the laser's yard: no agreement"
+        warnings.append(Notice("laser-frame", reason))
+    for one in mapped.passes:
+        if len(one.built.placed) == 1:
+            reason = "one frame made the map: no height is confirmed by another"
+            warnings.append(Notice("one-view", reason))
+        if one.built.refusals:
+            reason = f"{len(one.built.refusals)} of {_frames_total(one.probed)} frames were refused"
+            warnings.append(Notice("frames-refused", reason))
+    return warnings
+
+
+def _pass_warnings(probed: ProbedRecording, way: TrackedRecording, built: BuiltMap) -> list[Notice]:
+    """Gather what a pass's sensors, calibration and trajectory had to assume or leave out."""
     warnings = [Notice("assumed", text) for text in probed.source.notes]
     warnings += probed.doubts
     warnings += [Notice("calibration", text) for text in probed.first.warnings]
@@ -221,17 +355,7 @@ def _warnings(
     warnings += [Notice("trajectory-degraded", text) for text in way.trajectory.doubts]
     if way.trajectory.reference == "yard" and "stereo" not in way.trajectory.sensors:
         warnings.append(Notice("trajectory-degraded", "no picture was held against the encoders"))
-    warnings += _floor_doubts(probed, built, way.trajectory)
-    warnings += [Notice(a.code, a.reason) for a in profiles.agreed if isinstance(a, Failed)]
-    if profiles.left_out:
-        reason = "without a crane the map isn't in the laser's yard: no agreement"
-        warnings.append(Notice("laser-frame", reason))
-    if len(built.placed) == 1:
-        warnings.append(Notice("one-view", "one frame made the map: no height is confirmed by another"))
-    if built.refusals:
-        reason = f"{len(built.refusals)} of {_frames_total(probed)} frames were refused"
-        warnings.append(Notice("frames-refused", reason))
-    return warnings
+    return warnings + _floor_doubts(probed, built, way.trajectory)
 
 
 def _floor_doubts(probed: ProbedRecording, built: BuiltMap, trajectory: Trajectory) -> list[Notice]:

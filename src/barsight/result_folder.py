@@ -149,12 +149,15 @@ def changed_inputs(summary: dict[str, Any]) -> str:
     """Find a calibration file of the recording that is no longer the one that was measured with; empty where
     none is, or the recording isn't there any more.
     """
-    recording = Path((summary.get("recording") or {}).get("path") or "")
-    for name, digest in ((summary.get("hashes") or {}).get("inputs") or {}).items():
-        for root in (recording, recording / "mav0"):
-            file = root / name
-            if file.suffix in (".yaml", ".yml") and file.is_file() and file_digest(file) != digest:
-                return str(file)
+    hashes = (summary.get("hashes") or {}).get("inputs") or {}
+    passes = summary.get("passes") or [{"recording": summary.get("recording"), "inputs": hashes}]
+    for one in passes:
+        recording = Path((one["recording"] or {}).get("path") or "")
+        for name, digest in one["inputs"].items():
+            for root in (recording, recording / "mav0"):
+                file = root / name
+                if file.suffix in (".yaml", ".yml") and file.is_file() and file_digest(file) != digest:
+                    return str(file)
     return ""
 
 

@@ -39,7 +39,7 @@ GRACE_NS = NS_PER_S
 
 
 class Session:
-    """Measures packets as they come; `snapshot` any time, `finish` once.
+    """Measures packets as they come; `snapshot` any time, `next_pass` between passes, `finish` once.
 
     Each picture is rectified once and each pair matched once, for the snapshots and the end; both lie on disk
     (20 MB a pair of 1.3 megapixels), in a temporary folder that goes with the session. The estimator `live`
@@ -65,11 +65,22 @@ class Session:
         self._folder = Path(tempfile.mkdtemp(prefix="barsight."))
         self._yard = self._folder / "yard"
         weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
-        self._recording = PacketRecording(rig, self._folder, imu_noise, is_simulated=is_simulated)
+        self._rig, self._noise, self._is_simulated = rig, imu_noise, is_simulated
+        self._recordings: list[PacketRecording] = []
+        self._begin_pass()
+
+    def _begin_pass(self) -> None:
+        name = f"pass_{len(self._recordings) + 1}"
+        self._here = self._folder / name
+        self._here.mkdir()
+        self._recording = PacketRecording(
+            self._rig, self._here, self._noise, is_simulated=self._is_simulated
+        )  # fmt: skip
+        self._recordings.append(self._recording)
         self._source = SelectedSensors(self._recording, self._settings.use)
         key = checkpoint_key(self._recording, to_json(asdict(self._settings)), {})
-        self._checkpoints = checkpoint_folder(self._folder / "checkpoints", key)
-        self._pairs = RectifiedPairs(self._source, Rectifier(rig), self._checkpoints)
+        self._checkpoints = checkpoint_folder(self._folder / "checkpoints" / name, key)
+        self._pairs = RectifiedPairs(self._source, Rectifier(self._rig), self._checkpoints)
         # A rig that is to be turned at the end gives other disparities then.
         checkpoints = self._checkpoints if self._settings.self_calibrate == "none" else None
         self._match = matching(self._pairs, self._settings, checkpoints, Stopwatch())
@@ -90,26 +101,39 @@ class Session:
         while self._waiting and self._is_due(self._waiting[0].stamp_ns):
             self._place(self._waiting.popleft())
 
+    def next_pass(self) -> None:
+        """Begin another pass over the same yard: packets from now on are of its own recording, and a snapshot
+        shows that pass alone. Raises MeasurementError after `finish`.
+        """
+        self._expect_open()
+        self._end_pass()
+        self._begin_pass()
+
     def snapshot(self) -> Snapshot:
-        """Return the map of what came so far; it changes nothing at the end."""
+        """Return the map of what came so far of this pass; it changes nothing at the end."""
         return Snapshot(None, 0) if self._map is None else self._map.snapshot(self)
 
     def finish(self) -> Yard:
-        """Return the yard from all packets, as `measure` has it of the same recording.
+        """Return the yard from all packets, as `measure` has it of the same recording or passes.
 
         Raises MeasurementError where it did already.
         """
         self._expect_open()
+        self._end_pass()
+        several = len(self._recordings) > 1
+        kept = self._checkpoints.parent
+        write_measured(
+            self._recordings, self._yard, self._asked, keep=kept.parent if several else kept,
+            magnet=self._magnet, report=False,
+        )  # fmt: skip
+        return Yard(self._yard, self)
+
+    def _end_pass(self) -> None:
         if make_estimator(self._settings.motion).begins_early:
             while self._waiting:
                 self._place(self._waiting.popleft())
             if self._poses is not None:
                 checkpointed(self._checkpoints, "trajectory", self._poses.finish)
-        write_measured(
-            self._recording, self._yard, self._asked, keep=self._checkpoints.parent, magnet=self._magnet,
-            report=False,
-        )  # fmt: skip
-        return Yard(self._yard, self)
 
     def _expect_open(self) -> None:
         if self._yard.exists():
@@ -136,7 +160,7 @@ class Session:
             return
         if self._map is None:
             try:
-                self._map = LiveMap(self._pairs, self._settings, self._folder, self._match)
+                self._map = LiveMap(self._pairs, self._settings, self._here, self._match)
             except MeasurementError:
                 return
         self._map.add(pair, posed)

@@ -1,4 +1,4 @@
-"""Run `barsight measure RECORDING -o OUT`."""
+"""Run `barsight measure RECORDING [RECORDING ...] -o OUT`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ def run(arguments: Sequence[str]) -> None:
     default = load_settings(config_path(arguments), MeasureSettings)
 
     def command(
-        recording: tyro.conf.Positional[Path],
+        recordings: tyro.conf.Positional[
+            Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RECORDING [RECORDING ...]")]
+        ],
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         settings: Annotated[MeasureSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
@@ -33,14 +35,16 @@ def run(arguments: Sequence[str]) -> None:
         resume: bool = False,
         verbose: Annotated[bool, tyro.conf.arg(aliases=("-v",))] = False,
     ) -> None:
-        """Measure a stereo recording into OUT: map, contours, trajectory, cloud and report.html.
+        """Measure a stereo recording, or several passes over one yard, into OUT: map, contours, trajectory,
+        cloud and report.html.
 
         The recording may be an EuRoC folder, a KITTI odometry sequence or a ROS bag; barsight info shows
         what is in it. Crane encoders give the trajectory in the yard; without them stereo odometry does.
         OUT is written whole or not at all.
 
         Args:
-            recording: The recording.
+            recordings: The recording; or several passes over one yard by one crane with encoders, in any
+                order: they become one map, in which the newer one counts where the yard changed.
             out: The folder for the results.
             settings: Settings of the stages.
             config: TOML file with settings; flags go before it.
@@ -54,7 +58,7 @@ def run(arguments: Sequence[str]) -> None:
         console = Console(stderr=True)
         with stages(console) as advance:
             measured = measure_into(
-                recording, out, settings, advance=advance, overwrite=overwrite, resume=resume, magnet=magnet,
+                recordings, out, settings, advance=advance, overwrite=overwrite, resume=resume, magnet=magnet,
                 judged_at=at,
             )  # fmt: skip
         print_outcome(measured, console, verbose=verbose)

@@ -13,6 +13,7 @@ from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import MAX_VALUE
+from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
 
@@ -39,7 +40,9 @@ def run(arguments: Sequence[str]) -> None:
         """
         console = Console(stderr=True)
         with stages(console) as advance:
-            if draw is None:
+            if draw is None and settings.passes.trolley_y_m:
+                simulate_passes(out, settings, lambda done, total: advance("render", done, total))
+            elif draw is None:
                 simulate(out, settings, lambda done, total: advance("render", done, total))
             else:
                 _simulate_drawn(out, draw, settings, lambda done, total: advance("render", done, total))

@@ -14,11 +14,14 @@ WARNINGS = {
     "mounting-doubtful": "Gravity or floor contradict the stated mounting; no lift is offered.",
     "no-overlap": "A laser profile and the map share fewer than two points, so there is no agreement for it.",
     "one-view": "One frame made the map, so no height is confirmed by another; no lift is offered.",
+    "passes-contradict": "Two passes lie further apart than their sigmas allow; no lift is offered.",
+    "passes-untied": "A pass shares no surface with another: its place beside them is the encoders' alone.",
     "stock-contradicts": "Half of the stock list or more contradicts the map; no lift is offered.",
     "stock-list": "Stock list and map disagree, or the map can't tell; bundles that disagree aren't offered.",
     "trajectory": "Sensors contradict each other here and there; the message says which.",
     "trajectory-degraded": "Readings or sensors were left out of the trajectory; no lift is offered.",
     "units-doubtful": "A sensor's numbers are of a size that can't be; no lift is offered.",
+    "yard-changed": "The yard changed between two passes; the newer one counts there.",
 }
 """Code to what it means."""
 
@@ -28,6 +31,7 @@ FORBIDS = {
     "live-state": "live-state",
     "mounting-doubtful": "mounting-doubtful",
     "one-view": "one-view",
+    "passes-contradict": "trajectory-degraded",
     "stock-contradicts": "stock-list",
     "trajectory-degraded": "trajectory-degraded",
     "units-doubtful": "units-doubtful",

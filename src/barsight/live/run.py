@@ -150,7 +150,7 @@ def _finish(
         write_keyframes(Keyframes(tuple(kept), state.mode), out / "keyframes.json")
         forbidden = () if state.mode.lifts else (Notice("live-state", _why_no_lifts(state.mode)),)
         content = write_measured(
-            KeptRecording(recording, kept), out, settings, advance=advance, overwrite=True,
+            [KeptRecording(recording, kept)], out, settings, advance=advance, overwrite=True,
             keep=link.checkpoints.parent, magnet=magnet, judged_at=judged_at, notices=forbidden,
         )  # fmt: skip
         lifts_s = (time.monotonic_ns() - frames[-1][1]) / NS_PER_S

@@ -6,8 +6,12 @@ higher, whether or not the cell itself was seen.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from barsight.core.arrays import Bool, Float32, Float64, Int32, kernel
 from barsight.mapping.observation import CellObservations
@@ -79,6 +83,20 @@ class FreeSpace:
         at_y = np.arange(row, row + rows) // COARSE_CELLS - low_y
         at_x = np.arange(column, column + columns) // COARSE_CELLS - low_x
         return out[at_y[:, None], at_x]
+
+    def join(
+        self, newer: FreeSpace, rise_m: float, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]
+    ) -> None:
+        """Take over what a newer pass proves, moved up by rise_m. forgotten: which places, by x and y (m) of
+        a grid, have changed since, so that only the newer pass tells of them.
+        """
+        cells = np.arange(TILE) * self._cell_m
+        for key in {*self._tiles, *newer._tiles}:
+            x, y = (cells + at * TILE * self._cell_m for at in key)
+            mine = self._tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
+            mine[:, forgotten(x, y)] = UNPROVEN
+            if key in newer._tiles:
+                np.minimum(mine, newer._tiles[key] + np.float32(rise_m), out=mine)
 
     def _merge(self, key: TileKey, column: int, row: int, bound: Float32) -> None:
         ours, theirs = tile_overlap(key, column, row, bound.shape)

@@ -6,8 +6,12 @@ thinner than matching can measure; what lies deeper is blurred, since each view 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, UInt16
 from barsight.core.pose import Pose
@@ -80,6 +84,22 @@ class TopPhoto:
                 mean = np.rint(total / np.maximum(count, 1)).clip(1, 255)
                 out[theirs] = np.where(count > 0, mean, 0).astype(np.uint8)
         return out
+
+    def join(self, newer: TopPhoto, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]) -> None:
+        """Add a newer pass's pictures. forgotten: see `FreeSpace.join`."""
+        cells = np.arange(TILE) * self._cell_m
+        for key, (sums, views) in self._tiles.items():
+            gone = forgotten(*(cells + at * TILE * self._cell_m for at in key))
+            sums[gone], views[gone] = 0, 0
+        for key, (total, count) in newer._tiles.items():
+            if key not in self._tiles:
+                self._tiles[key] = total.copy(), count.copy()
+                continue
+            sums, views = self._tiles[key]
+            full = views.astype(np.uint16) + count > MAX_VIEWS
+            sums[full], views[full] = 0, 0
+            sums += total
+            views += count
 
     def _merge(self, key: TileKey, column: int, row: int, total: UInt16, count: UInt8) -> None:
         ours, theirs = tile_overlap(key, column, row, count.shape)

@@ -22,7 +22,7 @@ from barsight.core.types import Contour, LaserProfile, Trajectory
 from barsight.mapping.free_space import UNPROVEN, FreeSpace
 from barsight.mapping.surface.surface import Layers, Surface
 from barsight.mapping.top_photo import TopPhoto
-from barsight.measurement import Measurement, Preview
+from barsight.measurement import Measurement, PassRecord, Preview
 from barsight.report.orthophoto import georeference, write_orthophoto, write_top_photo
 from barsight.yard.identity import ID_DIGITS, MapIdentity
 from barsight.yard.inventory.bundle_file import write_bundles
@@ -273,7 +273,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
             ],
         },
         "trajectory": {
-            "length_m": trajectory.length_m,
+            "length_m": sum(one.length_m for one in measurement.passes) or trajectory.length_m,
             "duration_s": float(stamps[-1] - stamps[0]) / NS_PER_S if stamps.size else 0.0,
         },
         "travel": measurement.travel.content(),
@@ -296,5 +296,38 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "warnings": [asdict(warning) for warning in measurement.warnings],
         "vetoes": [{"code": v.code, "message": v.reason} for v in measurement.lifts.vetoes],
     }
+    if measurement.passes:
+        content["passes"] = [_pass_content(number, one) for number, one in enumerate(measurement.passes, 1)]
     rounded: dict[str, Any] = json_value(content, decimals=6)
     return rounded
+
+
+def _pass_content(number: int, one: PassRecord) -> dict[str, Any]:
+    """Describe one of several passes; turns in degrees, the scale as a share."""
+    unknowns, sigma = one.correction.unknowns, np.sqrt(np.diag(one.correction.covariance))
+    return {
+        "number": number,
+        "recording": {"path": str(one.recording_path), "format": one.recording_format},
+        "inputs": one.input_hashes,
+        "captured_from_ns": one.captured_ns[0] if one.captured_ns else None,
+        "captured_to_ns": one.captured_ns[1] if one.captured_ns else None,
+        "frames": {"used": one.frames_used, "total": one.frames_total},
+        "trajectory": {"first_ns": one.first_ns, "last_ns": one.last_ns, "length_m": one.length_m},
+        "moved": {
+            "about_m": one.correction.about_m, "shift_m": unknowns[3:6], "shift_sigma_m": sigma[3:6],
+            "turn_deg": np.degrees(unknowns[:3]), "turn_sigma_deg": np.degrees(sigma[:3]),
+            "scale": unknowns[6], "scale_sigma": sigma[6],
+        },
+        "ties": [
+            {
+                "with_pass": tie.first + 1, "blocks": tie.blocks, "shift_m": tie.shift_m,
+                "sigma_m": tie.sigma_m, "expected_sigma_m": tie.expected_sigma_m,
+                "off_sigmas": tie.off_sigmas, "contradicts": tie.contradicts,
+            }
+            for tie in one.ties
+        ],
+        "changes": [
+            {"low_m": c.low_m, "high_m": c.high_m, "area_m2": c.area_m2, "rise_m": c.rise_m}
+            for c in one.changes
+        ],
+    }  # fmt: skip

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, Int32, Int64, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, kernel
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.stock import DunnageBeam, StackedBundle, Stock
 
@@ -75,6 +75,13 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
     primitives = Primitives(shape.reshape(-1, 15), material.reshape(-1, 10), len(cylinders))
     thickest = max(kind.diameter_m for kind in settings.kinds)
     return Scene(primitives, build_grid(primitives, (np.clip(thickest, 0.06, 0.12), 0.5)))
+
+
+def select_primitives(scene: Scene, kept: Bool) -> Scene:
+    """Leave out primitives; kept: (P,)."""
+    shape, material, cylinders = scene.primitives
+    left = Primitives(shape[kept], material[kept], int(kept[:cylinders].sum()))
+    return Scene(left, build_grid(left, (float(scene.grid.cell[0]), float(scene.grid.cell[1]))))
 
 
 def build_grid(primitives: Primitives, cell_m: tuple[float, float]) -> Grid:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.stamps import NS_PER_S
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
 from barsight.simulation.settings import SensorSettings
@@ -30,10 +30,11 @@ class ImuRecord:
     accel_bias_mps2: Float64
 
 
-def stamps(duration_s: float, rate_hz: int) -> Int64:
-    """Space stamps (N,) from EPOCH_NS on evenly to the nanosecond, over `duration_s`."""
-    count = int(duration_s * rate_hz) + 1
-    return EPOCH_NS + np.arange(count, dtype=np.int64) * NS_PER_S // rate_hz
+def stamps(trajectory: SimulatedTrajectory, rate_hz: int) -> Int64:
+    """Space stamps (N,) evenly to the nanosecond, from the recording's begin to its end."""
+    begin_s = trajectory.motion.begin_s
+    count = int((trajectory.duration_s - begin_s) * rate_hz) + 1
+    return EPOCH_NS + seconds_to_ns(begin_s) + np.arange(count, dtype=np.int64) * NS_PER_S // rate_hz
 
 
 def seconds(stamp_ns: Int64) -> Float64:
@@ -52,7 +53,7 @@ def record_imu(
     trajectory: SimulatedTrajectory, settings: SensorSettings, rng: np.random.Generator
 ) -> ImuRecord:
     """Record the IMU with white noise and biases that walk, both of the stated densities."""
-    stamp_ns = stamps(trajectory.duration_s, settings.imu_rate_hz)
+    stamp_ns = stamps(trajectory, settings.imu_rate_hz)
     gyro, accel = exact_imu(trajectory, stamp_ns)
     gyro_bias = _walk(rng, len(stamp_ns), settings.gyro_bias_radps, settings.gyro_random_walk, settings)
     accel_bias = _walk(rng, len(stamp_ns), settings.accel_bias_mps2, settings.accel_random_walk, settings)
@@ -78,7 +79,7 @@ def record_encoders(
 
     They read the wheels and the drum: not what springs and rails move.
     """
-    stamp_ns = stamps(trajectory.duration_s, settings.encoder_rate_hz)
+    stamp_ns = stamps(trajectory, settings.encoder_rate_hz)
     latency = np.full(len(stamp_ns), settings.encoder_latency_s)
     if settings.encoder_jitter_s > 0:
         latency += rng.uniform(0, settings.encoder_jitter_s, len(latency))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from math import inf
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -160,6 +160,10 @@ class TravelSettings:
     """Duration of a stop."""
     trolley_m: float = 0.0
     """Travel of the trolley during the pass."""
+    backward: bool = False
+    """Whether the bridge travels from high X to low X."""
+    begin_s: float = 0.0
+    """Time after the simulation's epoch at which the recording begins."""
     oscillation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Amplitudes at which bridge, trolley and hoist oscillate, unseen by their encoders."""
     oscillation_hz: tuple[float, float, float] = (0.7, 1.1, 1.9)
@@ -174,7 +178,7 @@ class TravelSettings:
             self, "motion.", speed_mps=(0.01, 5), acceleration_mps2=(0.01, 10), standstill_s=(1, 120),
             overrun_m=(0, 5), sway_deg=(0, 5), vibration_m=(0, 0.01), sway_hz=POSITIVE,
             vibration_hz=POSITIVE, oscillation_hz=POSITIVE, stops=(0, 20), stop_s=(0, 600),
-            trolley_m=(-20, 20), oscillation_m=(0, 0.1), rail_m=(0, 0.05), skew_deg=(0, 2),
+            trolley_m=(-20, 20), begin_s=(0, 1e8), oscillation_m=(0, 0.1), rail_m=(0, 0.05), skew_deg=(0, 2),
         )  # fmt: skip
 
 
@@ -233,6 +237,25 @@ class SensorSettings:
 
 
 @dataclass(frozen=True)
+class PassesSettings:
+    """Several passes over one yard, in time's order; OUT then holds a recording for each: pass_1, pass_2."""
+
+    trolley_y_m: tuple[float, ...] = ()
+    """Place of the body across the travel in each pass; none makes OUT a single recording."""
+    alternate: bool = True
+    """Every second pass travels back, from high X to low X."""
+    pause_s: float = 120.0
+    """Time from one pass's end to the next one's begin."""
+    changes: tuple[Literal["taken", "added", "moved"], ...] = ()
+    """What happens before the last pass to bundles on top, to one each: it is taken away, only comes then, or
+    is moved half a metre along itself."""
+
+    def __post_init__(self) -> None:
+        expect_ranges(self, "passes.", trolley_y_m=(-50, 50), pause_s=(0, 1e6))
+        _expect(not self.changes or len(self.trolley_y_m) > 1, "passes.changes needs two passes or more")
+
+
+@dataclass(frozen=True)
 class MagnetSettings:
     """A magnet's plate that hangs from the crane into the pictures, for a part of the travel."""
 
@@ -272,6 +295,7 @@ class SimulationSettings:
     yard: YardSettings = field(default_factory=YardSettings)
     motion: TravelSettings = field(default_factory=TravelSettings)
     sensors: SensorSettings = field(default_factory=SensorSettings)
+    passes: PassesSettings = field(default_factory=PassesSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
     light: LightSettings = field(default_factory=LightSettings)
     faults: FaultSettings = field(default_factory=FaultSettings)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,10 @@ from barsight.simulation.hanging_plate import paint_plate, plate_at
 from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
 from barsight.simulation.render import Shading, render_view
-from barsight.simulation.scene import Scene, build_scene
+from barsight.simulation.scene import Scene, build_scene, select_primitives
 from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, record_imu, seconds, stamps
 from barsight.simulation.settings import SimulationSettings
-from barsight.simulation.stock import stack_yard
+from barsight.simulation.stock import Stock, stack_yard
 from barsight.simulation.textures import surface_tile
 from barsight.simulation.trajectory import SimulatedTrajectory
 from barsight.simulation.truth import SurfaceTruth, bundle_rows, true_depth, write_rig_truth
@@ -36,6 +36,7 @@ GROUND_TRUTH_HZ = 200
 REST_BEFORE_FRAME_S = 0.6
 STACK_M = 0.4
 STEP_NS = 1_000_000
+SUNK_M = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,30 +49,36 @@ class LaidYard:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """All that is fixed before the first picture: yard, rig, way of the crane, frames' stamps."""
+    """All that is fixed before the first picture: yard, rig, way of the crane, frames' stamps.
+
+    number: of the pass over the yard, from 0; noise and sway are drawn anew for each.
+    """
 
     settings: SimulationSettings
     laid: LaidYard
     mounted: MountedRig
     trajectory: SimulatedTrajectory
     frame_stamp_ns: Int64
+    number: int = 0
 
     @classmethod
     def build(cls, settings: SimulationSettings) -> World:
         """Draw everything from the seed; each part has its own stream, so that one can change alone."""
-        stock = stack_yard(settings, _stream(settings, 0))
-        scene = build_scene(stock, settings, _stream(settings, 1))
-        return cls.over(LaidYard(scene, {"bundles.json": bundle_rows(stock.bundles)}), settings)
+        return cls.over(lay_stock(stack_yard(settings, stream(settings, 0)), settings), settings)
 
     @classmethod
-    def over(cls, laid: LaidYard, settings: SimulationSettings) -> World:
+    def over(cls, laid: LaidYard, settings: SimulationSettings, number: int = 0) -> World:
         """Draw rig and way over a yard that may come from elsewhere."""
-        mounted = mount_rig(settings, _stream(settings, 2))
+        mounted = mount_rig(settings, stream(settings, 2))
         trajectory = SimulatedTrajectory.plan(
             settings.length_m, settings.camera, settings.motion, mounted.nominal_yard_from_body,
-            _stream(settings, 3),
+            stream(settings, 3), stream(settings, 3, number) if number else None,
         )  # fmt: skip
-        return cls(settings, laid, mounted, trajectory, frame_stamps(settings, trajectory))
+        return cls(settings, laid, mounted, trajectory, frame_stamps(settings, trajectory), number)
+
+    def stream(self, *number: int) -> np.random.Generator:
+        """Make the stream of what is drawn anew in each pass."""
+        return stream(self.settings, *number, *((self.number,) if self.number else ()))
 
     @property
     def scene(self) -> Scene:
@@ -106,15 +113,16 @@ def simulate(
     settings: SimulationSettings,
     progress: Callable[[int, int], None] | None = None,
     laid: LaidYard | None = None,
+    number: int = 0,
 ) -> None:
     """Write a simulated recording with its truth to the new folder `out`.
 
     progress: called with (pairs written, pairs in all). laid: what lies there, instead of a stock drawn from
-    the seed. Raises OutputError where `out` can't be written; nothing half-written is left then, nor after
-    an interruption.
+    the seed. number: of the pass over it, see `World`. Raises OutputError where `out` can't be written;
+    nothing half-written is left then, nor after an interruption.
     """
     with atomic_directory(out) as folder:
-        world = World.build(settings) if laid is None else World.over(laid, settings)
+        world = World.build(settings) if laid is None else World.over(laid, settings, number)
         truth_folder = folder / "truth"
         truth_folder.mkdir()
         surface = SurfaceTruth(world.scene, settings)
@@ -135,6 +143,7 @@ def frame_stamps(settings: SimulationSettings, trajectory: SimulatedTrajectory) 
     """
     distance = settings.length_m + 2 * settings.motion.overrun_m
     inner = trajectory.begin_x_m + distance * np.arange(1, settings.frames - 1) / (settings.frames - 1)
+    inner = inner[::-1] if settings.motion.backward else inner
     times = [trajectory.start_s - REST_BEFORE_FRAME_S]
     times += [trajectory.time_at_x(float(x)) for x in inner]
     times.append(trajectory.settled_s + REST_BEFORE_FRAME_S)
@@ -147,21 +156,21 @@ def _write_slow_sensors(mav0: Path, world: World, surface: SurfaceTruth) -> ImuR
     sensors, lever = settings.sensors, np.array(CRANE_TO_BODY_M)
     euroc_files.write_cameras(mav0, rig, world.frame_stamp_ns)
     euroc_files.write_body(mav0)
-    imu = record_imu(trajectory, sensors, _stream(settings, 4))
+    imu = record_imu(trajectory, sensors, world.stream(4))
     euroc_files.write_imu(mav0 / "imu0", imu, sensors)
-    stamp_ns, place = record_encoders(trajectory, sensors, lever, _stream(settings, 5))
+    stamp_ns, place = record_encoders(trajectory, sensors, lever, world.stream(5))
     nominal = world.mounted.nominal_yard_from_body
     std_m = round(float(np.hypot(sensors.encoder_std_m, sensors.encoder_step_m / 12**0.5)), 6)
     euroc_files.write_crane(mav0 / "crane0", CraneSamples(stamp_ns, place, lever, nominal, std_m))
     if sensors.laser_y_m:
-        noise = _stream(settings, 6).normal(0, 1, surface.profile_z_m.shape) * sensors.laser_std_m
+        noise = world.stream(6).normal(0, 1, surface.profile_z_m.shape) * sensors.laser_std_m
         x_m, z_m = surface.profile_x_m, surface.profile_z_m + noise
         profiles = tuple(
             LaserProfile(k, x_m, np.full(x_m.size, y), z_m[k], sensors.laser_std_m)
             for k, y in enumerate(surface.profile_y_m)
         )
         euroc_files.write_laser(mav0 / "laser0", profiles)
-    truth_ns = stamps(trajectory.duration_s, GROUND_TRUTH_HZ)
+    truth_ns = stamps(trajectory, GROUND_TRUTH_HZ)
     motion = trajectory.at(seconds(truth_ns))
     euroc_files.write_ground_truth(
         mav0 / "state_groundtruth_estimate0", truth_ns, motion.position_m, _quaternions(motion.yard_from_body)
@@ -175,8 +184,8 @@ def _write_pictures(
     settings, rig = world.settings, world.mounted.rig
     lamps = hall_lamps(settings.camera.above_floor_m, settings.light)
     footprint_m = settings.camera.above_floor_m / settings.camera.focal_px
-    tile = surface_tile(_stream(settings, 7), footprint_m, settings.yard.texture_ratio)
-    look = Shading(lamps, bake(world.scene, lamps, _stream(settings, 8)), tile)
+    tile = surface_tile(stream(settings, 7), footprint_m, settings.yard.texture_ratio)
+    look = Shading(lamps, bake(world.scene, lamps, stream(settings, 8)), tile)
     side = settings.camera.samples_per_side
     cameras = (
         ("cam0", rig.cam0, rig.body_from_cam0, 1.0),
@@ -185,7 +194,7 @@ def _write_pictures(
     rays = [sample_rays(camera, side) for _, camera, _, _ in cameras]
     shares = [vignette(camera, settings.camera.vignetting) for _, camera, _, _ in cameras]
     shape = (settings.camera.height_px, settings.camera.width_px)
-    lenses = [SpoiledLens.draw(settings.faults, shape, _stream(settings, 10, k)) for k in range(2)]
+    lenses = [SpoiledLens.draw(settings.faults, shape, stream(settings, 10, k)) for k in range(2)]
     deep = depth_views(settings)
     for number, stamp in enumerate(world.frame_stamp_ns.tolist()):
         yard_from_body = world.yard_from_body(stamp)
@@ -196,13 +205,13 @@ def _write_pictures(
             radiance = render_view(world.scene, look, rays[k], side, yard_from_cam)
             if plate is not None:
                 paint_plate(radiance, plate, rays[k], side, yard_from_cam, tile)
-            step = float(_stream(settings, 11, number).normal())
-            phase = float(_stream(settings, 12, 2 * number + k).uniform(0, 2 * np.pi))
+            step = float(world.stream(11, number).normal())
+            phase = float(world.stream(12, 2 * number + k).uniform(0, 2 * np.pi))
             gain = exposure_gain(settings.faults, step, phase) * exposure
             radiance = lenses[k].spoil(
                 radiance, settings.faults, world.image_velocity(stamp, camera, mounting)
             )
-            image = expose(radiance, shares[k], gain, settings.camera, _stream(settings, 9, 2 * number + k))
+            image = expose(radiance, shares[k], gain, settings.camera, world.stream(9, 2 * number + k))
             lenses[k].kill(image)
             euroc_files.write_png(folder / "mav0" / name / "data" / f"{stamp}.png", image)
             if number in deep:
@@ -226,5 +235,20 @@ def _quaternions(rotations: Float64) -> Float64:
     return q
 
 
-def _stream(settings: SimulationSettings, *number: int) -> np.random.Generator:
+def lay_stock(stock: Stock, settings: SimulationSettings, gone: Collection[int] = ()) -> LaidYard:
+    """Lay a stock; the looks of each bundle stay the same whichever are gone, by their places in it."""
+    sunk = np.array([0.0, 0.0, -SUNK_M])
+    bundles = [
+        replace(b, centre_m=b.centre_m + sunk) if k in gone else b for k, b in enumerate(stock.bundles)
+    ]
+    scene = build_scene(replace(stock, bundles=tuple(bundles)), settings, stream(settings, 1))
+    if gone:
+        kept = scene.primitives.shape[:, 2] > -SUNK_M / 2
+        scene = select_primitives(scene, kept)
+    there = tuple(b for k, b in enumerate(stock.bundles) if k not in gone)
+    return LaidYard(scene, {"bundles.json": bundle_rows(there)})
+
+
+def stream(settings: SimulationSettings, *number: int) -> np.random.Generator:
+    """Make the stream of random numbers of one thing that is drawn."""
     return np.random.default_rng((settings.seed, *number))

@@ -16,6 +16,8 @@ SMOOTHSTEP_PEAK_SLOPE = 1.875
 RAIL_WAVE_M = (3.7, 5.3)
 """Lengths of the rails' waves, up and down and aside."""
 SKEW_WAVE_M = 6.1
+RAILS = 14
+"""Number of the first phase that belongs to the rails."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +84,10 @@ class BodyMotion:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTrajectory:
-    """The body's way, defined for every instant (s on the IMU's clock, 0 at its first sample).
+    """The body's way, defined for every instant (s on the IMU's clock since the epoch).
 
-    The crane rests until the first leg's start; after the last it settles.
+    The crane rests until the first leg's start; after the last it settles. begin_x_m, distance_m: where the
+    way begins at low X, and how long it is.
     """
 
     camera: CameraSettings
@@ -92,6 +95,7 @@ class SimulatedTrajectory:
     nominal_yard_from_body: Float64
     phases_rad: Float64
     begin_x_m: float
+    distance_m: float
     legs: tuple[Leg, ...]
     settled_s: float
     duration_s: float
@@ -99,20 +103,26 @@ class SimulatedTrajectory:
     @classmethod
     def plan(
         cls, length_m: float, camera: CameraSettings, motion: TravelSettings,
-        nominal_yard_from_body: Float64, rng: np.random.Generator,
+        nominal_yard_from_body: Float64, rng: np.random.Generator, again: np.random.Generator | None = None,
     ) -> SimulatedTrajectory:  # fmt: skip
-        """Plan the travel from `overrun_m` before the stack to as far behind it."""
+        """Plan the travel from `overrun_m` before the stack to as far behind it.
+
+        again: draws what is new where the yard is passed once more: all but the rails.
+        """
         distance = length_m + 2 * motion.overrun_m
         phases = rng.uniform(0, 2 * np.pi, 16)
+        if again is not None:
+            rng = again
+            phases[:RAILS] = rng.uniform(0, 2 * np.pi, RAILS)
         shares = [0.0, *np.sort(rng.uniform(0.15, 0.85, motion.stops)).tolist(), 1.0]
-        legs, start = [], motion.standstill_s
+        legs, start = [], motion.begin_s + motion.standstill_s
         for begin, end in pairwise(shares):
             legs.append(_leg(start, (end - begin) * distance, motion))
             start = legs[-1].end_s + motion.stop_s
         settled = legs[-1].end_s + 1.0
         return cls(
-            camera, motion, nominal_yard_from_body, phases, -motion.overrun_m, tuple(legs), settled,
-            settled + motion.standstill_s,
+            camera, motion, nominal_yard_from_body, phases, -motion.overrun_m, distance, tuple(legs),
+            settled, settled + motion.standstill_s,
         )  # fmt: skip
 
     @property
@@ -151,8 +161,9 @@ class SimulatedTrajectory:
         low, high = self.start_s, self.legs[-1].end_s
         for _ in range(60):
             middle = (low + high) / 2
-            reached = self.begin_x_m + self._travel(np.array([middle])).value[0]
-            low, high = (middle, high) if reached < x_m else (low, middle)
+            reached = self.begin_x_m + self._way(np.array([middle])).value[0]
+            is_before = reached > x_m if self.motion.backward else reached < x_m
+            low, high = (middle, high) if is_before else (low, middle)
         return (low + high) / 2
 
     def _travel(self, t: Float64) -> Jet:
@@ -163,6 +174,11 @@ class SimulatedTrajectory:
             total = one if total is None else total + one
         assert total is not None
         return total
+
+    def _way(self, t: Float64) -> Jet:
+        """Compute the distance from the end at low X."""
+        travel = self._travel(t)
+        return travel.scaled(-1).shifted(self.distance_m) if self.motion.backward else travel
 
     def _envelope(self, t: Float64) -> Jet:
         """Fade 0 at rest to 1 under way; the sway dies down while the crane brakes and settles."""
@@ -190,7 +206,7 @@ class SimulatedTrajectory:
         trolley = _smoothstep(t, self.start_s, self.legs[-1].end_s - self.start_s)
         trolley = trolley.scaled(self.motion.trolley_m).shifted(-self.motion.trolley_m / 2)
         return (
-            self._travel(t).shifted(self.begin_x_m) + envelope * x,
+            self._way(t).shifted(self.begin_x_m) + envelope * x,
             (envelope * y + trolley).shifted(self.camera.trolley_y_m),
             (envelope * z).shifted(self.camera.above_floor_m),
         )
@@ -204,12 +220,14 @@ class SimulatedTrajectory:
                 zip(motion.oscillation_hz, motion.oscillation_m, strict=True)
             )
         ]
-        up, aside = (self._along(t, wave, 14 + k).scaled(motion.rail_m) for k, wave in enumerate(RAIL_WAVE_M))
+        up, aside = (
+            self._along(t, wave, RAILS + k).scaled(motion.rail_m) for k, wave in enumerate(RAIL_WAVE_M)
+        )
         return envelope * waves[0], envelope * waves[1] + aside, envelope * waves[2] + up
 
     def _along(self, t: Float64, wave_m: float, number: int) -> Jet:
-        """Wave over the way that has been travelled."""
-        return self._travel(t).scaled(2 * np.pi / wave_m).shifted(float(self.phases_rad[number])).sine()
+        """Wave over the way along X: the same at a place, whichever way the crane travels."""
+        return self._way(t).scaled(2 * np.pi / wave_m).shifted(float(self.phases_rad[number])).sine()
 
     def _turn(self, t: Float64) -> tuple[Jet, Jet, Jet]:
         envelope, sway, shake = self._envelope(t), self.motion.sway_hz, self.motion.vibration_hz

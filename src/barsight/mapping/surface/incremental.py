@@ -50,7 +50,7 @@ _KEPT_HEIGHT_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class _Figures:
+class TileFigures:
     """A finished tile in figures. columns, rows: first and last known cell of the map, None without any."""
 
     seen: int
@@ -79,7 +79,7 @@ class SurfaceElection:
         self._states: dict[TileKey, tuple[int, int]] = {}
         self._heights = TileStore(asked, settings.resident_tiles, fields=3, fill=np.nan)
         self._views: dict[TileKey, int] = {}
-        self._figures: dict[TileKey, _Figures] = {}
+        self._figures: dict[TileKey, TileFigures] = {}
         self._height_m = np.inf
 
     def snapshot(self, min_views: int, sights: ViewFrusta) -> Surface:
@@ -118,20 +118,7 @@ class SurfaceElection:
         for key in keys:
             for name in names:
                 os.link(name(self._finished, key), name(folder, key))
-        figures = [self._figures[key] for key in keys]
-        columns = [column for one in figures if one.columns for column in one.columns]
-        rows = [row for one in figures if one.rows for row in one.rows]
-        sigmas = np.concatenate([one.sigmas_m for one in figures]) if figures else np.empty(0)
-        surface = Surface(
-            folder=folder,
-            cell_m=self._cell_m,
-            columns=(min(columns), max(columns) + 1) if columns else (0, 0),
-            rows=(min(rows), max(rows) + 1) if rows else (0, 0),
-            seen=sum(one.seen for one in figures),
-            filled=sum(one.filled for one in figures),
-            median_sigma_m=float(np.median(sigmas)) if sigmas.size else float("nan"),
-            tiles=frozenset(keys),
-        )
+        surface = gather_surface(folder, self._cell_m, {key: self._figures[key] for key in keys})
         weakref.finalize(surface, shutil.rmtree, folder, ignore_errors=True)
         return surface
 
@@ -169,7 +156,7 @@ class SurfaceElection:
         """
         known = frozenset(self._store.keys())
 
-        def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, _Figures]:
+        def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, TileFigures]:
             key, tile = item
             layers, blur = self._filled(key, known, sights)
             write_tile(self._finished, key, layers)
@@ -177,7 +164,7 @@ class SurfaceElection:
                 winner: Int8 = np.load(_winner_file(self._elected, key))
                 part = CloudPart.of(tile, winner, key, self._cell_m, cloud_views)
                 part.finished(layers.z_m, layers.sigma_m, blur).write(self._finished, key)
-            return key, _figures(key, layers)
+            return key, tile_figures(key, layers)
 
         read_tile.cache_clear()
         items = ((key, None if cloud_views is None else self._store.read(key)) for key in keys)
@@ -257,14 +244,33 @@ def _winner_file(folder: Path, key: TileKey) -> Path:
     return folder / f"winner_{key[0]}_{key[1]}.npy"
 
 
-def _figures(key: TileKey, layers: Layers) -> _Figures:
+def gather_surface(folder: Path, cell_m: float, tiles: dict[TileKey, TileFigures]) -> Surface:
+    """Describe the surface whose finished tiles lie in `folder`."""
+    figures = list(tiles.values())
+    columns = [column for one in figures if one.columns for column in one.columns]
+    rows = [row for one in figures if one.rows for row in one.rows]
+    sigmas = np.concatenate([one.sigmas_m for one in figures]) if figures else np.empty(0)
+    return Surface(
+        folder=folder,
+        cell_m=cell_m,
+        columns=(min(columns), max(columns) + 1) if columns else (0, 0),
+        rows=(min(rows), max(rows) + 1) if rows else (0, 0),
+        seen=sum(one.seen for one in figures),
+        filled=sum(one.filled for one in figures),
+        median_sigma_m=float(np.median(sigmas)) if sigmas.size else float("nan"),
+        tiles=frozenset(tiles),
+    )
+
+
+def tile_figures(key: TileKey, layers: Layers) -> TileFigures:
+    """Count what a finished tile knows."""
     there = layers.source != HeightSource.UNKNOWN
     seen, filled = ((layers.source == code).sum() for code in (HeightSource.VISION, HeightSource.FILLED))
     sigmas = (
         layers.sigma_m[layers.source == HeightSource.VISION][::17] if there.any() else np.empty(0, np.float32)
     )
     spans = [_span(there.any(axis=axis), key[axis] * TILE_CELLS) for axis in (0, 1)]
-    return _Figures(int(seen), int(filled), sigmas, *spans)
+    return TileFigures(int(seen), int(filled), sigmas, *spans)
 
 
 def _span(occupied: Bool, first: int) -> tuple[int, int] | None:

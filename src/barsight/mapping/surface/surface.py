@@ -80,7 +80,11 @@ class Surface:
         those that are the surface are as it has them. A snapshot has none.
         """
         for key in sorted(self.tiles):
-            yield read_part(self.folder, key)
+            yield self.cloud_of(key)
+
+    def cloud_of(self, key: TileKey) -> CloudPart:
+        """Read the points of one tile."""
+        return read_part(self.folder, key)
 
 
 def elected_layers(tile: Float32, winner: Int8) -> Layers:

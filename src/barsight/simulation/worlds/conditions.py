@@ -53,6 +53,8 @@ def draw_conditions(seed: int, given: SimulationSettings, *, hides: bool) -> Sim
 
 
 def _expect_ordinary(given: SimulationSettings) -> None:
+    if given.passes.changes:
+        raise ConfigError("simulate: --draw knows no passes.changes; leave one of them out")
     ordinary = SimulationSettings()
     own = [name for name in DRAWN if getattr(given, name) != getattr(ordinary, name)]
     own += [

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Int64
+from barsight.simulation.passes import simulate_passes
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
 from barsight.simulation.settings import SimulationSettings
@@ -60,7 +61,8 @@ def simulate_world(out: Path, world: DrawnWorld, progress: Callable[[int, int], 
     """Write the recording of a world, with its truth, to the new folder `out`; see `simulate`."""
     rows = bundle_truth(world)
     truth = {"bundles.json": rows, "world.json": world_truth(world)}
-    simulate(out, world.settings, progress, LaidYard(world.scene, truth))
+    write = simulate_passes if world.settings.passes.trolley_y_m else simulate
+    write(out, world.settings, progress, LaidYard(world.scene, truth))
 
 
 def bundle_truth(world: DrawnWorld) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ lift there.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -89,6 +89,19 @@ class Travel:
             range_m * min(camera.width, camera.height) / 2 / camera.focal_px,
             float(np.median(places[:, 2])),
             1 / camera.focal_px,
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, parts: Sequence[Travel]) -> Travel:
+        """Join the passes of one yard, the oldest first: a place is as old as the newest frame near it."""
+        place, sigma, off, refused, stamps, measured = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("place_m", "sigma_m", "off_m", "refused_m", "stamp_ns", "measured")
+        )
+        reach_m, sure_reach_m = max(part.reach_m for part in parts), min(part.sure_reach_m for part in parts)
+        eye_z_m, pixel_rad = max(part.eye_z_m for part in parts), max(part.pixel_rad for part in parts)
+        return cls(
+            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad
         )  # fmt: skip
 
     @classmethod

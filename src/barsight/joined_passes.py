@@ -1,0 +1,182 @@
+"""Join several passes over one yard, each measured as a recording of its own, into one map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import InputError
+from barsight.core.json_values import json_digest
+from barsight.core.notices import Notice
+from barsight.core.pose import Pose, nearest_rotation, skew
+from barsight.core.types import PosedFrame, Trajectory
+from barsight.map_building import BuiltMap, ProbedRecording, TrackedRecording
+from barsight.mapping.free_space import FreeSpace
+from barsight.mapping.passes.changes import HeightChange, PlaceHistory
+from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces, measure_overlaps
+from barsight.mapping.surface.surface import Surface
+from barsight.mapping.top_photo import TopPhoto
+from barsight.measure_settings import MeasureSettings
+from barsight.measurement import to_json
+from barsight.recording.base import Recording
+from barsight.registration.pass_ties import PairTie, PassCorrection, PassPrior, PassTies, tie_passes
+from barsight.yard.types import Bundle
+
+MIN_SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
+"""Turn (rad) and shift (m) that no pass is taken to know better: springs and rails that no encoder sees."""
+SCALE_SIGMA = 2e-4
+"""By which share two passes' ways along X may differ."""
+CHANGE_REACH_M = 0.5
+"""A change so near to a bundle that was not seen whole since may have been one of it."""
+STALE = "the yard changed beside it between two passes, and a part of it was not seen since"
+
+
+@dataclass(frozen=True, eq=False)
+class MappedPass:
+    """One recording, measured: what was looked at, its trajectory in the common map, its views."""
+
+    probed: ProbedRecording
+    way: TrackedRecording
+    built: BuiltMap
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedPasses:
+    """Several passes in one map. ties: how they lie against each other; history: what changed between."""
+
+    passes: tuple[MappedPass, ...]
+    surface: Surface
+    free: FreeSpace
+    tops: TopPhoto
+    ties: PassTies
+    history: PlaceHistory
+
+    def notices(self) -> Iterator[Notice]:
+        """Yield warnings: ties that are missing or contradict, and changes."""
+        tied = {number for pair in self.ties.pairs for number in (pair.first, pair.second)}
+        for number in range(len(self.passes)):
+            if number not in tied:
+                reason = f"pass {number + 1} shares nothing with another: encoders alone place it beside them"
+                yield Notice("passes-untied", reason)
+        for pair in self.ties.pairs:
+            if pair.contradicts:
+                yield Notice("passes-contradict", _contradiction(pair))
+        for change in self.history.changes:
+            yield Notice("yard-changed", _changed(change))
+
+    def doubted(self, bundles: Sequence[Bundle]) -> tuple[Bundle, ...]:
+        """Mark the bundles beside a change of which a part was not seen since."""
+        return tuple(
+            replace(bundle, cover_doubts=(*bundle.cover_doubts, STALE), reasons=(*bundle.reasons, STALE))
+            if self.history.is_stale(
+                bundle.centre_m, bundle.yaw_rad, bundle.length_m, bundle.width_m, CHANGE_REACH_M
+            )
+            else bundle
+            for bundle in bundles
+        )
+
+
+def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tuple[Recording, ...]:
+    """Sort passes by time. Raises InputError where they can't be joined: other cameras, mounting or crane, no
+    encoders, or two at the same time.
+    """
+    if len(recordings) == 1:
+        return tuple(recordings)
+    if "crane" not in settings.use or settings.self_calibrate != "none":
+        raise InputError(
+            recordings[0].path, "several passes are tied by the crane's encoders and one calibration",
+            "measure with use: stereo,imu,crane and self_calibrate: none",
+        )  # fmt: skip
+    for recording in recordings:
+        if not recording.index.stamps_ns:
+            raise InputError(recording.path, "no stereo pair at all", "leave it out")
+    ordered = sorted(recordings, key=lambda one: one.index.stamps_ns[0])
+    for before, after in pairwise(ordered):
+        if after.index.stamps_ns[0] <= before.index.stamps_ns[-1]:
+            problem = f"it and {before.path.name} were recorded at the same time"
+            raise InputError(after.path, problem, "name each pass once")
+    first = _mounting(ordered[0])
+    for other in ordered[1:]:
+        if _mounting(other) != first:
+            problem = f"its cameras, or how they hang from the crane, differ from those of {ordered[0].path}"
+            raise InputError(other.path, problem, "measure passes of one rig and crane together")
+    return tuple(ordered)
+
+
+def _mounting(recording: Recording) -> str:
+    """Return a digest of rig and mounting. Raises InputError without encoders."""
+    crane = recording.crane()
+    if crane is None:
+        problem = "it has no crane encoders, which place several passes in one yard"
+        raise InputError(recording.path, problem, "measure it by itself")
+    hung = {"lever": crane.crane_to_body_m, "attitude": crane.yard_from_body_nominal}
+    return json_digest(to_json([asdict(recording.rig), hung]))
+
+
+def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folder: Path) -> JoinedPasses:
+    """Tie passes by their overlaps and join their maps, the oldest first; `folder` takes the surface."""
+    ties = tie_passes([_prior(one.way.trajectory) for one in passes], measure_overlaps(surfaces))
+    placed = [PassSurface(*pair) for pair in zip(surfaces, ties.corrections, strict=True)]
+    joined = join_surfaces(placed, folder)
+    free, tops = passes[0].built.free, passes[0].built.tops
+    for number, (one, correction) in enumerate(zip(passes, ties.corrections, strict=True)):
+        if number == 0:
+            continue
+        rise_m = float(correction.unknowns[5] - ties.corrections[0].unknowns[5])
+
+        def forgotten(x_m: Float64, y_m: Float64, since: int = number) -> Bool:
+            return joined.history.last_change(x_m, y_m) >= since
+
+        free.join(one.built.free, rise_m, forgotten)
+        tops.join(one.built.tops, forgotten)
+    moved = tuple(
+        replace(one, way=replace(one.way, trajectory=_moved(one.way.trajectory, correction)))
+        for one, correction in zip(passes, ties.corrections, strict=True)
+    )
+    return JoinedPasses(moved, joined.surface, free, tops, ties, joined.history)
+
+
+def _prior(trajectory: Trajectory) -> PassPrior:
+    """State how far a whole pass may be off: as far as one of its frames, but no less than MIN_SIGMA."""
+    covariance = np.zeros((7, 7))
+    covariance[:6, :6] = np.median([frame.covariance for frame in trajectory.frames], axis=0)
+    floor = np.append(MIN_SIGMA, SCALE_SIGMA) ** 2
+    short = np.maximum(floor - np.diag(covariance), 0)
+    values, vectors = np.linalg.eigh(covariance + np.diag(short))
+    sound = (vectors * np.maximum(values, 1e-10)) @ vectors.T
+    return PassPrior(trajectory.positions_m.mean(axis=0), sound)
+
+
+def _moved(trajectory: Trajectory, correction: PassCorrection) -> Trajectory:
+    turn, frames = nearest_rotation(np.eye(3) + skew(correction.unknowns[:3])), []
+    for frame in trajectory.frames:
+        pose = frame.reference_from_body
+        place = pose.translation + correction.shift_at(pose.translation[None])[0]
+        moved = Pose(pose.target, pose.source, turn @ pose.rotation, place)
+        frames.append(PosedFrame(frame.stamp_ns, moved, frame.covariance))
+    return replace(trajectory, frames=tuple(frames))
+
+
+def _contradiction(pair: PairTie) -> str:
+    shift, sigma, allowed = (
+        ", ".join(f"{1e3 * value:.0f}" for value in values)
+        for values in (pair.shift_m, pair.sigma_m, pair.expected_sigma_m)
+    )
+    return (
+        f"pass {pair.second + 1} lies {shift} mm (x, y, z) off pass {pair.first + 1} by what both see "
+        f"(sigma {sigma} mm); their own sigmas allow {allowed} mm"
+    )
+
+
+def _changed(change: HeightChange) -> str:
+    (x0, y0), (x1, y1) = change.low_m, change.high_m
+    way = "higher" if change.rise_m > 0 else "lower"
+    return (
+        f"before pass {change.pass_number + 1} {change.area_m2:.2f} m² between x {x0:.2f} and {x1:.2f} m, "
+        f"y {y0:.2f} and {y1:.2f} m became {1e3 * abs(change.rise_m):.0f} mm {way}"
+    )

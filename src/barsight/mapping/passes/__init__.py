@@ -1,0 +1,1 @@
+"""Join the maps of several passes over one yard: ties between them, changes, one surface."""

@@ -1,0 +1,123 @@
+"""Find what changed between passes: places where a newer pass sees another height than those before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from barsight.core.arrays import Bool, Float32, Float64
+
+PLACE_M = 0.05
+"""About the side of the places in which heights are compared: their median stands for all cells."""
+MIN_CHANGE_M, CHANGE_SIGMAS = 0.04, 3.0
+"""Least difference of height that is a change, and in sigmas of both."""
+MIN_AREA_M2 = 0.04
+"""Smaller patches are errors of matching."""
+OPENING_PLACES = 3
+"""A change holds a square of so many places: at an edge two views differ over less."""
+MARGIN_M = 0.15
+"""So far around a change what was seen before is given up."""
+
+
+@dataclass(frozen=True)
+class HeightChange:
+    """A change of height. pass_number: of the pass that saw it first, from 0. low_m, high_m: its rectangle,
+    x and y. area_m2: of the places that changed. rise_m: median change of height, negative where something
+    was taken.
+    """
+
+    pass_number: int
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+    area_m2: float
+    rise_m: float
+
+
+class PlaceHistory:
+    """Knowledge of each place of the yard as pass after pass is added.
+
+    low_m: (x, y), the corner of the first place. shape: (rows, columns). place_m: side of a place. Memory: 10
+    bytes a place. seen_by: number of the newest pass that saw it, -1 for none; changed_by: of the pass that
+    saw it changed last, -1 for none. changes: all that were found.
+    """
+
+    def __init__(self, low_m: tuple[float, float], shape: tuple[int, int], place_m: float) -> None:
+        self.low_m, self.shape, self.place_m = low_m, shape, place_m
+        self._z_m, self._sigma_m = (np.full(shape, np.nan, np.float32) for _ in range(2))
+        self.seen_by, self.changed_by = (np.full(shape, -1, np.int8) for _ in range(2))
+        self.changes: list[HeightChange] = []
+
+    def add(self, number: int, z_m: Float32, sigma_m: Float32) -> None:
+        """Add the heights (rows, columns) of the next pass with their sigma, NaN where it saw none."""
+        rise = z_m - self._z_m
+        bound = np.maximum(MIN_CHANGE_M, CHANGE_SIGMAS * np.hypot(sigma_m, self._sigma_m))
+        changed = np.zeros(self.shape, np.bool_)
+        for way in (1, -1):
+            opened = ndimage.binary_opening(way * rise > bound, np.ones((OPENING_PLACES,) * 2, np.bool_))
+            labels, _ = ndimage.label(opened, np.ones((3, 3)))
+            for label, (rows, columns) in enumerate(ndimage.find_objects(labels), start=1):
+                box = rows, columns
+                inside = labels[box] == label
+                if inside.sum() * self.place_m**2 >= MIN_AREA_M2:
+                    changed[box] |= inside
+                    self.changes.append(self._change(number, box, inside, rise[box][inside]))
+        if changed.any():
+            away_m = ndimage.distance_transform_edt(~changed) * self.place_m
+            self.changed_by[away_m <= MARGIN_M] = number
+        seen = np.isfinite(z_m)
+        self.seen_by[seen] = number
+        self._z_m[seen], self._sigma_m[seen] = z_m[seen], sigma_m[seen]
+
+    def _change(self, number: int, box: tuple[slice, slice], inside: Bool, rise: Float32) -> HeightChange:
+        (left, bottom), (right, top) = (
+            tuple(
+                round(low + self.place_m * at, 3)
+                for low, at in zip(self.low_m, (column, row), strict=True)
+            )
+            for row, column in ((box[0].start, box[1].start), (box[0].stop, box[1].stop))
+        )  # fmt: skip
+        area_m2 = round(float(inside.sum()) * self.place_m**2, 4)
+        return HeightChange(number, (left, bottom), (right, top), area_m2, round(float(np.median(rise)), 4))
+
+    def last_change(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.int8]:
+        """Look up `changed_by` on a grid of columns x (X,) and rows y (Y,), (Y, X); -1 beyond the yard."""
+        x, y = np.meshgrid(x_m, y_m)
+        return self._look_up(self.changed_by, x, y)
+
+    def is_stale(
+        self, centre_m: Float64, yaw_rad: float, length_m: float, width_m: float, reach_m: float
+    ) -> bool:
+        """Check whether the yard changed within reach_m of a rectangle of which a part, or what lies just
+        beyond its ends, wasn't seen since.
+
+        centre_m: (2 or more,) x and y first; yaw_rad: of its length from +Y; length_m: along it.
+        """
+        along = np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
+        across = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+
+        def places(length: float, width: float) -> tuple[Float64, Float64]:
+            step = self.place_m / 2
+            v, u = (np.arange(-size / 2, size / 2 + step, step) for size in (length, width))
+            at = centre_m[:2] + v[:, None, None] * along + u[None, :, None] * across
+            return at[..., 0], at[..., 1]
+
+        last = int(
+            self._look_up(self.changed_by, *places(length_m + 2 * reach_m, width_m + 2 * reach_m)).max()
+        )
+        if last < 0:
+            return False
+        seen = self._look_up(self.seen_by, *places(length_m + 2 * reach_m, width_m))
+        return bool(((seen >= 0) & (seen < last)).any())
+
+    def _look_up(self, raster: NDArray[np.int8], x_m: Float64, y_m: Float64) -> NDArray[np.int8]:
+        column, row = (
+            np.floor((at - low) / self.place_m).astype(np.int64)
+            for at, low in zip((x_m, y_m), self.low_m, strict=True)
+        )
+        inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
+        found = raster[row.clip(0, self.shape[0] - 1), column.clip(0, self.shape[1] - 1)]
+        return np.where(inside, found, np.int8(-1))

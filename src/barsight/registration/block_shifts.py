@@ -1,0 +1,170 @@
+"""Measure by how much one height map with its picture is shifted against another, block by block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64
+
+BLOCK_CELLS = 64
+MIN_KNOWN_RATIO = 0.3
+"""A block in which both maps know less of the cells says nothing."""
+GATE_M = 0.06
+"""Heights further apart are not of the same surface, or it changed."""
+TOGETHER_CELLS = 40.0
+"""Cells whose errors are nearly the same: the map averages along a bar, and matching has a window."""
+STRAY_M = 0.01
+"""A block that shows little strays no further than about this."""
+_FINE_CELLS, _COARSE_CELLS = 1.0, 10.0
+_TURNS = 5
+_MIN_CONTRAST = 2.0
+"""Gray levels; where the picture has less, it is left out by its low weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedMap:
+    """Heights (H, W) m with sigma m, NaN where unknown, and gray levels, NaN where there are none."""
+
+    z_m: Float32
+    sigma_m: Float32
+    gray: Float32
+
+    def moved(self, shift_m: Float64, cell_m: float) -> MatchedMap:
+        """Move the map by x, y and z; bilinear, unknown beside what is unknown."""
+        rows, columns = self.z_m.shape
+        x, y = np.meshgrid(
+            np.arange(columns, dtype=np.float32) - np.float32(shift_m[0] / cell_m),
+            np.arange(rows, dtype=np.float32) - np.float32(shift_m[1] / cell_m),
+        )
+        z, sigma, gray = (
+            cv2.remap(one, x, y, cv2.INTER_LINEAR, borderValue=float("nan"))
+            for one in (self.z_m, self.sigma_m, self.gray)
+        )
+        return MatchedMap(z + np.float32(shift_m[2]), sigma, gray)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockShifts:
+    """K blocks that two maps share. place_m: (K, 3) their middles; shift_m: (K, 3) that takes the second onto
+    the first; information: (K, 3, 3) of it, 1 / m^2, which has no weight in directions that show nothing.
+    """
+
+    place_m: Float64
+    shift_m: Float64
+    information: Float64
+
+    @classmethod
+    def none(cls) -> BlockShifts:
+        """Nothing in common."""
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+    def __add__(self, other: BlockShifts) -> BlockShifts:
+        return BlockShifts(
+            np.concatenate([self.place_m, other.place_m]), np.concatenate([self.shift_m, other.shift_m]),
+            np.concatenate([self.information, other.information]),
+        )  # fmt: skip
+
+
+def block_shifts(
+    first: MatchedMap, second: MatchedMap, origin_m: tuple[float, float], cell_m: float
+) -> BlockShifts:
+    """Measure the shifts of all blocks by least squares over heights and pictures (Lucas-Kanade).
+
+    first, second: on one grid whose first cell's centre is origin_m (x, y). Bars alone say nothing of the
+    shift along themselves; straps, ends, rust and mill scale do. A place where heights differ by more than
+    GATE_M takes no part. Slow drifts of the brightness are taken off.
+    """
+    total, found = np.zeros(3), BlockShifts.none()
+    for _ in range(_TURNS):
+        found = _measured(first, second.moved(total, cell_m), origin_m, cell_m)
+        if not len(found.place_m):
+            return found
+        step = _middle(found)
+        total = total + step
+        if np.abs(step).max() < 1e-4:
+            break
+    return BlockShifts(found.place_m, found.shift_m + total - step, found.information)
+
+
+def _middle(found: BlockShifts) -> Float64:
+    """Average the blocks' shifts by their information, each no further from the median than they scatter."""
+    middle = np.median(found.shift_m, axis=0)
+    off = np.abs(found.shift_m - middle)
+    near = (off <= 3 * np.median(off, axis=0) + 1e-4).all(axis=1)
+    information = found.information[near]
+    ridge = 1e-6 * np.trace(information.sum(axis=0)) * np.eye(3)
+    said = np.einsum("kij,kj->i", information, found.shift_m[near])
+    return np.asarray(np.linalg.solve(information.sum(axis=0) + ridge, said), np.float64)
+
+
+def _measured(
+    first: MatchedMap, second: MatchedMap, origin_m: tuple[float, float], cell_m: float
+) -> BlockShifts:
+    known = np.isfinite(first.z_m) & np.isfinite(second.z_m)
+    known &= np.abs(first.z_m - second.z_m) <= GATE_M
+    known = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    heights = [np.where(known, one.z_m, 0).astype(np.float32) for one in (first, second)]
+    variance = np.nan_to_num(first.sigma_m**2 + second.sigma_m**2, nan=1.0) + 1e-8
+    pictured = known & np.isfinite(first.gray) & np.isfinite(second.gray)
+    pictures = [_contrast(one.gray, pictured) for one in (first, second)]
+    noise = pictures[0] - pictures[1]
+    spread = float(1.4826 * np.median(np.abs(noise[pictured]))) if pictured.any() else 1.0
+    normal = np.zeros((3, 3, *known.shape), np.float32)
+    said = np.zeros((3, *known.shape), np.float32)
+    for pair, weight, lifts in (
+        (heights, np.where(known, 1 / variance, 0), 1.0),
+        (pictures, np.where(pictured, 1 / max(spread, _MIN_CONTRAST) ** 2, 0), 0.0),
+    ):
+        middle = (pair[0] + pair[1]) / 2
+        down, right = np.gradient(middle, cell_m)
+        jacobian = (-right, -down, np.full_like(middle, lifts))
+        for i in range(3):
+            said[i] += weight * jacobian[i] * (pair[0] - pair[1])
+            for j in range(3):
+                normal[i, j] += weight * jacobian[i] * jacobian[j]
+    return _solved(known, heights[0], normal, said, origin_m, cell_m)
+
+
+def _solved(
+    known: Bool, z_m: Float32, normal: Float32, said: Float32, origin_m: tuple[float, float], cell_m: float
+) -> BlockShifts:
+    """Sum the equations of each block and solve them; directions without weight stay at zero."""
+    counts = _sums(known.astype(np.float32))
+    chosen = counts >= MIN_KNOWN_RATIO * BLOCK_CELLS**2
+    if not chosen.any():
+        return BlockShifts.none()
+    information = _sums(normal)[..., chosen].transpose(2, 0, 1) / TOGETHER_CELLS
+    right = _sums(said)[..., chosen].T / TOGETHER_CELLS
+    ridge = np.eye(3) / STRAY_M**2
+    shift = np.asarray(np.linalg.solve(information + ridge, right[..., None])[..., 0], np.float64)
+    rows, columns = np.nonzero(chosen)
+    middle = (BLOCK_CELLS - 1) / 2
+    place = np.column_stack([
+        origin_m[0] + cell_m * (columns * BLOCK_CELLS + middle),
+        origin_m[1] + cell_m * (rows * BLOCK_CELLS + middle),
+        _sums(np.where(known, z_m, 0))[chosen] / counts[chosen],
+    ])  # fmt: skip
+    return BlockShifts(place, shift, information)
+
+
+def _sums(values: Float32) -> Float64:
+    """Sum (..., H, W) over whole blocks, (..., H // BLOCK_CELLS, W // BLOCK_CELLS)."""
+    rows, columns = (size // BLOCK_CELLS for size in values.shape[-2:])
+    whole = values[..., : rows * BLOCK_CELLS, : columns * BLOCK_CELLS].astype(np.float64)
+    return np.asarray(
+        whole.reshape(*values.shape[:-2], rows, BLOCK_CELLS, columns, BLOCK_CELLS).sum(axis=(-3, -1))
+    )
+
+
+def _contrast(gray: Float32, known: Bool) -> Float32:
+    """Smooth a picture a little and take off its slow part, reading known cells only."""
+    weight = known.astype(np.float32)
+    filled = np.where(known, gray, 0).astype(np.float32)
+    smooth = []
+    for sigma in (_FINE_CELLS, _COARSE_CELLS):
+        held = cv2.GaussianBlur(weight, (0, 0), sigma)
+        smooth.append(cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(held, 1e-3))
+    return np.where(known, smooth[0] - smooth[1], 0).astype(np.float32)

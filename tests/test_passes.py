@@ -1,0 +1,280 @@
+"""Several passes over one yard: how they are tied, what changed between them, one map and one result."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import barsight as bs
+from barsight.core.errors import ConfigError, InputError
+from barsight.joined_passes import STALE
+from barsight.mapping.free_space import FreeSpace
+from barsight.mapping.passes.changes import PlaceHistory
+from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts
+from barsight.registration.pass_ties import PassPrior, tie_passes
+from barsight.result_folder import changed_inputs
+from barsight.simulation.passes import simulate_passes
+from barsight.simulation.settings import CameraSettings, PassesSettings, YardSettings
+from cli_runs import TINY
+
+CELL_M = 0.01
+
+
+def yard(x: np.ndarray, y: np.ndarray, *, detail: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Bars of 90 mm along Y; the picture has stripes and, if asked, specks."""
+    gray = 90 + 40 * np.cos(2 * np.pi * x / 0.09)
+    if detail:
+        gray = gray + 12 * np.sin(23 * x + 31 * y) * np.sin(17 * y - 9 * x)
+    return 0.3 + 0.015 * np.cos(2 * np.pi * x / 0.09), gray
+
+
+def raster(shift_m: np.ndarray, rng: np.random.Generator, *, detail: bool = True) -> MatchedMap:
+    """Sample the yard moved by a shift, blurred as matching does, with noise."""
+    x, y = np.meshgrid(np.arange(400) * CELL_M - shift_m[0], np.arange(320) * CELL_M - shift_m[1])
+    z, gray = yard(x, y, detail=detail)
+    noise = rng.normal(0, 1, (2, *z.shape))
+    return MatchedMap(
+        (z + shift_m[2] + 0.002 * noise[0]).astype(np.float32), np.full(z.shape, 0.002, np.float32),
+        (gray + noise[1]).astype(np.float32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_find_the_shift_of_two_maps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = rng.normal(0, [0.006, 0.006, 0.01])
+    found = block_shifts(raster(true, rng), raster(np.zeros(3), rng), (0, 0), CELL_M)
+    assert len(found.place_m) == 30
+    assert np.abs(np.median(found.shift_m, axis=0) - true).max() < 0.0007
+
+
+def test_bars_alone_say_nothing_of_the_shift_along_them() -> None:
+    rng = np.random.default_rng(1)
+    pair = [raster(shift, rng, detail=False) for shift in (np.array([0.004, 0.02, 0.003]), np.zeros(3))]
+    found = block_shifts(*pair, (0, 0), CELL_M)
+    across, along = (np.median(found.information[:, k, k]) for k in (0, 1))
+    assert along < 0.1 * across
+    ties = tie_passes([prior(), prior()], {(0, 1): found})
+    moved = ties.corrections[1].unknowns - ties.corrections[0].unknowns
+    assert moved[3] == pytest.approx(0.004, abs=0.001) and moved[5] == pytest.approx(0.003, abs=0.001)
+
+
+def prior(shift_sigma_m: float = 0.005, x_m: float = 0.0) -> PassPrior:
+    sigma = np.array([2e-4, 2e-4, 2e-4, *[shift_sigma_m] * 3, 2e-4])
+    return PassPrior(np.array([x_m, 0.0, 8.0]), np.diag(sigma**2))
+
+
+def blocks(shift_m: np.ndarray, rng: np.random.Generator, wrong: int = 0) -> BlockShifts:
+    place = np.column_stack([rng.uniform(0, 6, 60), rng.uniform(-1, 1, 60), np.full(60, 0.4)])
+    shifts = shift_m + rng.normal(0, 0.002, (60, 3))
+    shifts[:wrong] += [0.02, -0.02, 0.05]
+    return BlockShifts(place, shifts, np.tile(np.eye(3) / 0.002**2, (60, 1, 1)))
+
+
+def test_an_offset_is_spread_over_both_by_their_sigmas() -> None:
+    rng = np.random.default_rng(2)
+    true = np.array([0.006, -0.004, 0.005])
+    ties = tie_passes([prior(0.002, 3.0), prior(0.006, 3.0)], {(0, 1): blocks(true, rng, wrong=12)})
+    place = np.array([[3.0, 0.0, 0.4]])
+    first, second = (one.shift_at(place)[0] for one in ties.corrections)
+    assert np.abs(second - first - true).max() < 0.0025
+    assert 3 < np.linalg.norm(second) / np.linalg.norm(first) < 12
+    assert not ties.pairs[0].contradicts
+
+
+def test_passes_further_apart_than_they_may_be_contradict() -> None:
+    far = blocks(np.array([0.0, 0.0, 0.08]), np.random.default_rng(3))
+    assert tie_passes([prior(), prior()], {(0, 1): far}).pairs[0].contradicts
+
+
+def test_what_nothing_ties_stays_with_its_encoders() -> None:
+    ties = tie_passes([prior(), prior()], {})
+    assert not ties.pairs and all((one.unknowns == 0).all() for one in ties.corrections)
+
+
+def test_ties_are_as_far_off_as_their_sigmas_say() -> None:
+    """NEES of the difference over drawn priors, 3 degrees of freedom."""
+    rng, errors = np.random.default_rng(4), []
+    for _ in range(150):
+        drawn = rng.normal(0, 0.005, (2, 3))
+        ties = tie_passes([prior(), prior()], {(0, 1): blocks(drawn[1] - drawn[0], rng)})
+        first, second = (one.unknowns[3:6] for one in ties.corrections)
+        tie = ties.pairs[0]
+        errors.append(((second - first - drawn[1] + drawn[0]) / tie.sigma_m)[:2])
+    assert 0.02 < np.mean(np.square(errors)) < 1.5  # the floor is for what blocks have wrong together
+
+
+def history() -> PlaceHistory:
+    """A yard of 6 x 8 m; the second pass sees the upper half, where a thing of 1 x 2 m is gone."""
+    one = PlaceHistory((0.0, 0.0), (160, 120), 0.05)
+    z, sigma = np.zeros((160, 120), np.float32), np.full((160, 120), 0.005, np.float32)
+    z[60:130, 40:60] = 0.3
+    one.add(0, z, sigma)
+    later = np.zeros((160, 120), np.float32)
+    later[:90] = np.nan
+    one.add(1, later, sigma)
+    return one
+
+
+def test_a_change_is_told_once_with_place_and_height() -> None:
+    (change,) = history().changes
+    assert change.pass_number == 1 and change.rise_m == pytest.approx(-0.3)
+    assert change.low_m == (2.0, 4.5) and change.high_m == (3.0, 6.5)
+    assert change.area_m2 == pytest.approx(2.0)
+
+
+def test_noise_and_edges_are_no_change() -> None:
+    rng, one = np.random.default_rng(5), PlaceHistory((0.0, 0.0), (160, 120), 0.05)
+    z = np.zeros((160, 120))
+    z[:, 40:60] = 0.3
+    shifted = z.copy()
+    shifted[:, 40] = 0.0  # an edge that one view has 50 mm further in
+    for number, seen in enumerate((z, shifted)):
+        noisy = (seen + rng.normal(0, 0.008, z.shape)).astype(np.float32)
+        one.add(number, noisy, np.full(z.shape, 0.008, np.float32))
+    assert not one.changes and (one.changed_by == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "length_m", "stale"),
+    [(2.5, 3.8, 3.0, True), (2.5, 5.5, 4.0, True), (2.5, 6.8, 1.5, False), (5.5, 4.0, 3.0, False)],
+    ids=["half-of-it-left", "its-end-where-it-was-seen-once", "all-seen-since", "far-away"],
+)
+def test_a_bundle_half_seen_beside_a_change_is_stale(
+    x_m: float, y_m: float, length_m: float, stale: bool
+) -> None:
+    assert history().is_stale(np.array([x_m, y_m, 0.1]), 0.0, length_m, 0.3, 0.5) is stale
+
+
+def test_what_was_proven_free_is_given_up_where_it_changed() -> None:
+    old, new = FreeSpace(CELL_M), FreeSpace(CELL_M)
+    old._tiles[0, 0] = np.full((2, 256, 256), 0.1, np.float32)
+    new._tiles[0, 0] = np.full((2, 256, 256), 0.4, np.float32)
+    old.join(new, 0.01, lambda x, y: np.broadcast_to(x < 1.0, (len(y), len(x))))
+    window = old.window(0, 0, 200, 10)
+    assert (window[:, :98] == np.float32(0.41)).all() and (window[:, 104:] == np.float32(0.1)).all()
+
+
+PASSES = replace(
+    TINY, length_m=3.0, frames=7, seed=710010, yard=YardSettings(max_layers=1, bar_length_m=7.5),
+    camera=CameraSettings(width_px=512, height_px=400, focal_px=500, samples_per_side=1),
+    passes=PassesSettings(trolley_y_m=(-2.0, 2.0), changes=("taken",)),
+)  # fmt: skip
+COARSE = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.02}}
+
+
+@pytest.fixture(scope="module")
+def passes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("passes") / "yard"
+    simulate_passes(folder, PASSES)
+    return folder / "pass_1", folder / "pass_2"
+
+
+@pytest.fixture(scope="module")
+def joined(passes: tuple[Path, Path]) -> bs.Yard:
+    return bs.measure(passes[::-1], at="end", **COARSE)
+
+
+def test_both_ends_are_closed_that_one_pass_leaves_open(passes: tuple[Path, Path], joined: bs.Yard) -> None:
+    alone = bs.measure(passes[1], at="end", **COARSE)
+    assert all(any(bundle.ends_open) for bundle in alone.bundles)
+    whole = [bundle for bundle in joined.bundles if abs(bundle.length_m - 7.5) < 0.15]
+    assert len(whole) >= 3 and not any(any(bundle.ends_open) for bundle in whole)
+    assert (np.diff(joined.trajectory.stamp_ns) > 0).all()
+    assert len(joined.trajectory.stamp_ns) == 14
+
+
+def test_passes_lie_together_as_well_as_their_sigmas_say(passes: tuple[Path, Path], joined: bs.Yard) -> None:
+    first, second = joined.summary["passes"]
+    (tie,) = second["ties"]
+    assert first["ties"] == [] and tie["blocks"] > 5 and not tie["contradicts"]
+    for one, path in zip((first, second), passes, strict=True):
+        assert Path(one["recording"]["path"]) == path
+        truth = np.loadtxt(
+            path / "mav0/state_groundtruth_estimate0/data.csv", delimiter=",", usecols=range(4)
+        )
+        stamps = joined.trajectory.stamp_ns
+        own = (stamps >= one["trajectory"]["first_ns"]) & (stamps <= one["trajectory"]["last_ns"])
+        shift_s = open_recording_shift(path)
+        at = (stamps[own] - truth[0, 0]) / 1e9 + shift_s
+        true = np.stack([np.interp(at, (truth[:, 0] - truth[0, 0]) / 1e9, axis) for axis in truth[:, 1:].T])
+        off = joined.trajectory.position_m[own].T - true
+        assert np.abs(np.median(off, axis=1)).max() < 0.008
+
+
+def open_recording_shift(path: Path) -> float:
+    return bs.open_recording(path).rig.timeshift_cam_imu_ns / 1e9
+
+
+def test_what_was_taken_is_told_and_the_newer_height_stands(
+    passes: tuple[Path, Path], joined: bs.Yard
+) -> None:
+    (gone,) = json.loads((passes[1] / "truth/changes.json").read_text())
+    x, _, z = gone["center"]
+    changes = joined.summary["passes"][1]["changes"]
+    here = [c for c in changes if c["low_m"][0] < x < c["high_m"][0]]
+    assert here and all(c["rise_m"] < -0.1 for c in here)
+    assert any(code == "yard-changed" for code, _ in joined.warnings)
+    with np.load(passes[1] / "truth/height.npz") as truth:
+        seen = truth["z"][np.ix_(np.abs(truth["x"] - x) < 0.08, np.abs(truth["y"]) < 0.8)]
+    heights = joined.height_map
+    there = heights.z_m[np.ix_(np.abs(heights.y_m) < 0.8, np.abs(heights.x_m - x) < 0.08)]
+    assert np.nanmedian(there) == pytest.approx(np.median(seen), abs=0.1)  # it was 0.35 m high
+    assert z > 0.15
+    left = [b for b in joined.bundles if abs(b.centre_m[0] - x) < 0.1]
+    assert all(STALE in b.cover_doubts for b in left)
+
+
+def test_a_session_of_two_passes_ends_as_the_batch(passes: tuple[Path, Path], joined: bs.Yard) -> None:
+    recordings = [bs.open_recording(path) for path in passes]
+    session = bs.Session(recordings[0].rig, imu_noise=recordings[0].imu_noise(), is_simulated=True, **COARSE)
+    for number, recording in enumerate(recordings):
+        if number:
+            session.next_pass()
+        for packet in bs.packets(recording):
+            session.push(packet)
+    yard = session.finish()
+    for name in ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply", "free.tif", "tops.tif"):
+        assert (yard.folder / name).read_bytes() == (joined.folder / name).read_bytes(), name
+
+
+def test_a_list_of_one_is_one_recording(whole: Path) -> None:
+    one, listed = (bs.measure(path, at="end", **COARSE) for path in (whole, [whole]))
+    for path in sorted(one.folder.iterdir()):
+        if path.name != "result.json":
+            assert path.read_bytes() == (listed.folder / path.name).read_bytes(), path.name
+    timed = ("measured_at", "stages", "seconds", "peak_memory_mib")
+    left, right = ({k: v for k, v in y.summary.items() if k not in timed} for y in (one, listed))
+    assert left == right and "passes" not in left
+
+
+def test_what_can_not_be_joined_is_refused(passes: tuple[Path, Path], whole: Path) -> None:
+    with pytest.raises(InputError, match="at the same time"):
+        bs.measure([passes[0], passes[0]])
+    with pytest.raises(InputError, match="differ from those"):
+        bs.measure([passes[1], whole])
+    with pytest.raises(InputError, match="encoders"):
+        bs.measure(list(passes), use=("stereo", "imu"))
+    with pytest.raises(ConfigError, match="no recording"):
+        bs.measure([])
+
+
+def test_a_changed_calibration_of_an_older_pass_forbids_the_lifts(
+    passes: tuple[Path, Path], joined: bs.Yard, tmp_path: Path
+) -> None:
+    summary = json.loads(json.dumps(joined.summary))
+    assert changed_inputs(summary) == ""
+    summary["passes"][0]["inputs"]["cam0/sensor.yaml"] = "0" * 64
+    summary["passes"][0]["inputs"].pop("mav0/cam0/sensor.yaml", None)
+    assert changed_inputs(summary).endswith("pass_1/mav0/cam0/sensor.yaml")
+
+
+def test_the_way_back_is_driven_backwards(passes: tuple[Path, Path]) -> None:
+    out, back = (
+        np.loadtxt(path / "mav0/crane0/data.csv", delimiter=",", usecols=(0, 1, 2)) for path in passes
+    )
+    assert out[-1, 1] > out[0, 1] + 3 and back[-1, 1] < back[0, 1] - 3
+    assert back[0, 0] - out[-1, 0] == pytest.approx(PASSES.passes.pause_s * 1e9, abs=1e8)
+    assert np.median(back[:, 2] - out[: len(back), 2]) == pytest.approx(4.0, abs=0.01)
