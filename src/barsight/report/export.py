@@ -15,6 +15,7 @@ import numpy as np
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
+from barsight.core.reading.geotiff import REMEDY
 from barsight.result_folder import Cloud, open_folder, read_cloud
 
 _LAS_STEP_M = 1e-4
@@ -44,7 +45,10 @@ def export(folder: Path, target: Path) -> int:
         raise ConfigError(f"{target}: can't tell the format from {kind or 'no suffix'!r}; end it in {known}")
     cloud = read_cloud(folder / "cloud.ply")
     with atomic_path(target) as path:
-        _WRITERS[kind](cloud, path)
+        try:
+            _WRITERS[kind](cloud, path)
+        except (OverflowError, ValueError) as error:
+            raise InputError(folder / "cloud.ply", f"doesn't fit a {kind} file ({error})", REMEDY) from error
     return cloud.total
 
 
