@@ -33,23 +33,25 @@ def bomb(merged: bool) -> str:
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [bomb(False), bomb(True), "a: &a [*a]", "[" * 3000, "a: 2001-99-99", f"a: {'9' * 400}", f"a: {'9' * 5000}",
-     "? [1]\n: !!int x", "a: !!python/object/apply:os.system [exit]", "".join(f"k{k}: 1\n" for k in range(30_000))],
-)  # fmt: skip
+MANY_KEYS = "".join(f"k{k}: 1\n" for k in range(30_000))
+HOSTILE_YAML = [
+    bomb(False), bomb(True), "a: &a [*a]", "[" * 3000, "a: 2001-99-99", f"a: {'9' * 400}", f"a: {'9' * 5000}",
+    "? [1]\n: !!int x", "a: !!python/object/apply:os.system [exit]", MANY_KEYS,
+]  # fmt: skip
+HOSTILE_JSON = ["[" * 3000, "9" * 400, '{"a": NaN}', '{"a": ' * 100 + "1" + "}" * 100, "\ufeff{"]
+
+
+@pytest.mark.parametrize("text", HOSTILE_YAML)
 def test_yaml_of_any_kind_is_refused_at_once(tmp_path: Path, text: str) -> None:
     path = tmp_path / "sensor.yaml"
     path.write_text(text)
     began = time.process_time()
-    with pytest.raises(CalibrationError, match="sensor.yaml") as told:
+    with pytest.raises(CalibrationError, match=r"sensor\.yaml") as told:
         read_document(path)
     assert "\n" not in str(told.value) and time.process_time() - began < 8
 
 
-@pytest.mark.parametrize(
-    "text", ["[" * 3000, "9" * 400, '{"a": NaN}', '{"a": ' * 100 + "1" + "}" * 100, "\ufeff{"]
-)
+@pytest.mark.parametrize("text", HOSTILE_JSON)
 def test_json_of_any_kind_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
@@ -61,7 +63,7 @@ def test_numbers_that_no_float_holds(tmp_path: Path) -> None:
     path = tmp_path / "magnet.toml"
     for number in ("9" * 400, "9" * 25, "1e999", "nan"):
         path.write_text(example_magnet().replace("own_mass_kg = ", f"own_mass_kg = {number} #", 1))
-        with pytest.raises((InputError, ConfigError), match="magnet.toml"):
+        with pytest.raises((InputError, ConfigError), match=r"magnet\.toml"):
             load_magnet(path)
     path.write_text("a = " + "[" * 3000)
     with pytest.raises(InputError, match="deep"):
@@ -87,7 +89,7 @@ def test_a_time_with_a_large_exponent_is_none() -> None:
 
 
 def test_a_bomb_is_refused_by_its_header() -> None:
-    data = png_bomb(40_000, 40_000)
+    data = png_bomb(9000, 9000)
     for size, says in ((None, "at most"), ((640, 480), "calibration is for")):
         with pytest.raises(TornImageError, match=says):
             decode_gray(data, size)
@@ -131,7 +133,7 @@ def killed_in(target: Path, how: str) -> None:
         f"with {how}(Path(sys.argv[1])) as path:\n"
         "    (path / 'half' if path.is_dir() else path).write_text('half'); os.kill(os.getpid(), 9)\n"
     )
-    subprocess.run([sys.executable, "-c", code, str(target)], check=False, timeout=60)
+    subprocess.run([sys.executable, "-c", code, str(target)], timeout=60)
 
 
 @pytest.mark.parametrize("write", [atomic_path, atomic_directory])
@@ -195,13 +197,11 @@ def test_a_device_is_no_output(tmp_path: Path) -> None:
 def test_a_reader_that_is_gone_and_a_full_disk(words: list[str]) -> None:
     command = [sys.executable, "-m", "barsight", *words]
     with open("/dev/full", "w") as full:  # noqa: PTH123
-        done = subprocess.run(
-            command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, check=False
-        )
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
     assert done.returncode == 1 and done.stderr.count("\n") == 1
     read, write = os.pipe()
     os.close(read)
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(write)
     assert (done.returncode, done.stderr) == (1, "")
 
@@ -211,5 +211,5 @@ def test_the_command_line_needs_no_home(tmp_path: Path) -> None:
     shutil.rmtree(recording / "mav0" / "laser0")
     env = {k: v for k, v in os.environ.items() if k != "HOME"}
     command = [sys.executable, "-m", "barsight", "info", str(recording)]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
