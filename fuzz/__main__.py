@@ -31,9 +31,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="targets whose names hold this")
     parser.add_argument("--show", action="store_true", help="print each finding with its last lines")
     given = parser.parse_args()
-    cv2.setNumThreads(1)
-    for name in COMMANDS:
-        importlib.import_module(home(name))  # once, not in every fork
+    import_commands()
     with tempfile.TemporaryDirectory() as place:
         seeds = given.seeds or Path(place) / "seeds"
         if not seeds.exists():
@@ -42,6 +40,13 @@ def main() -> int:
         runs, found = attack(chosen, seeds, Path(place), given.seed, given.minutes, given.inputs, given.show)
     print(table(runs, found, given.seed))
     return 1 if found else 0
+
+
+def import_commands() -> None:
+    """Import all commands once, not in every fork; no threads, which a fork would lose."""
+    cv2.setNumThreads(1)
+    for name in COMMANDS:
+        importlib.import_module(home(name))
 
 
 def make_seeds_apart(seeds: Path) -> None:

@@ -42,7 +42,7 @@ class Target:
         return sorted(path for path in found if not set(SKIPPED) & set(path.parts))
 
 
-def _command(*words: str) -> Call:
+def run_words(*words: str) -> Call:
     """Run a command of the command line; FOLDER/ in its words is the folder of the copies."""
     return lambda folder: run([word.replace("FOLDER", str(folder)) for word in words])
 
@@ -82,16 +82,16 @@ def _view(folder: Path) -> int:
 
 
 def _convert(name: str, to: str) -> Target:
-    call = _command("convert", f"FOLDER/{name}", "-o", "FOLDER/made", "--to", to)
+    call = run_words("convert", f"FOLDER/{name}", "-o", "FOLDER/made", "--to", to)
     return Target(f"convert {name}", (name,), (f"{name}/**/*",), call, ("made",), 1.0)
 
 
 def _info(name: str, weight: float = 1.0) -> Target:
-    return Target(f"info {name}", (name,), (f"{name}/**/*",), _command("info", f"FOLDER/{name}"), (), weight)
+    return Target(f"info {name}", (name,), (f"{name}/**/*",), run_words("info", f"FOLDER/{name}"), (), weight)
 
 
 def _rig(name: str) -> Target:
-    call = _command("calibrate", "export", f"FOLDER/{name}", "-o", "FOLDER/made.yaml", "--to", "kalibr")
+    call = run_words("calibrate", "export", f"FOLDER/{name}", "-o", "FOLDER/made.yaml", "--to", "kalibr")
     return Target(f"rig {name}", (name,), (name,), call, ("made.yaml",), 1.5)
 
 
@@ -107,48 +107,48 @@ TARGETS = (
     Target("stock json", ("stock.json",), ("stock.json",), _stock("stock.json"), (), 1.5),
     Target(
         "settings", ("settings.toml",), ("settings.toml",),
-        _command("measure", "FOLDER/none", "-o", "FOLDER/made", "--config", "FOLDER/settings.toml"),
+        run_words("measure", "FOLDER/none", "-o", "FOLDER/made", "--config", "FOLDER/settings.toml"),
         ("made",), 2,
     ),
     Target(
         "targets", ("targets.csv",), ("targets.csv",),
-        _command("calibrate", "yard", "FOLDER/targets.csv", "-o", "FOLDER/made.yaml"),
+        run_words("calibrate", "yard", "FOLDER/targets.csv", "-o", "FOLDER/made.yaml"),
         ("made.yaml", "made.html", "made.json"), 1,
     ),
     Target(
         "imu log", ("imu.csv",), ("imu.csv",),
-        _command("calibrate", "imu-noise", "FOLDER/imu.csv", "-o", "FOLDER/made.yaml"),
+        run_words("calibrate", "imu-noise", "FOLDER/imu.csv", "-o", "FOLDER/made.yaml"),
         ("made.yaml", "made.html", "made.json"), 0.5,
     ),
     *(
         Target(
             f"picture {suffix}", (f"left{suffix}", "right.png", "rig.yaml"), (f"left{suffix}",),
-            _command("disparity", f"FOLDER/left{suffix}", "FOLDER/right.png", "-o", "FOLDER/made.pfm",
+            run_words("disparity", f"FOLDER/left{suffix}", "FOLDER/right.png", "-o", "FOLDER/made.pfm",
                      "--method", "sgbm", "--rig", "FOLDER/rig.yaml"),
             ("made.pfm",), 0.6,
         ) for suffix in (".png", ".jpg", ".tif", ".bmp", ".pgm")
     ),
     Target("score", ("euroc", "out"), (*RESULT, "euroc/truth/*"),
-        _command("score", "FOLDER/euroc", "FOLDER/out")),
-    Target("report", ("out",), RESULT, _command("report", "FOLDER/out"), ("out",), 1),
+        run_words("score", "FOLDER/euroc", "FOLDER/out")),
+    Target("report", ("out",), RESULT, run_words("report", "FOLDER/out"), ("out",), 1),
     Target(
         "lifts", ("out", "magnet.toml"), RESULT,
-        _command("lifts", "FOLDER/out", "--magnet", "FOLDER/magnet.toml", "--at", "end"), ("out",), 1,
+        run_words("lifts", "FOLDER/out", "--magnet", "FOLDER/magnet.toml", "--at", "end"), ("out",), 1,
     ),
     Target(
         "events", ("out", "events.csv"), ("events.csv",),
-        _command("lifts", "FOLDER/out", "--events", "FOLDER/events.csv", "--at", "end"), ("out",), 0.5,
+        run_words("lifts", "FOLDER/out", "--events", "FOLDER/events.csv", "--at", "end"), ("out",), 0.5,
     ),
-    Target("explain", ("out",), RESULT, _command("explain", "FOLDER/out", "1"), ("out",), 1),
-    Target("compare", ("out", "old"), RESULT, _command("compare", "FOLDER/out", "FOLDER/old"), (), 1),
+    Target("explain", ("out",), RESULT, run_words("explain", "FOLDER/out", "1"), ("out",), 1),
+    Target("compare", ("out", "old"), RESULT, run_words("compare", "FOLDER/out", "FOLDER/old"), (), 1),
     Target(
-        "store", ("out",), RESULT, _command("store", "add", "sqlite:///FOLDER/yard.db", "FOLDER/out"), (), 1
+        "store", ("out",), RESULT, run_words("store", "add", "sqlite:///FOLDER/yard.db", "FOLDER/out"), (), 1
     ),
-    Target("export", ("out",), RESULT, _command("export", "FOLDER/out", "FOLDER/made.las"), ("made.las",), 1),
+    Target("export", ("out",), RESULT, run_words("export", "FOLDER/out", "FOLDER/made.las"), ("made.las",)),
     Target("view", ("out",), RESULT, _view, (), 0.6),
     Target(
         "measure", ("euroc",), ("euroc/mav0/**/*",),
-        _command(
+        run_words(
             "measure", "FOLDER/euroc", "-o", "FOLDER/made", "--stereo.method", "sgbm", "--map.cell-m", "0.05"
         ),
         ("made",), 0.15,

@@ -193,9 +193,8 @@ def test_a_device_is_no_output(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("words", [["--help"], ["info", "--help"], ["--version"]])
-def test_a_reader_that_is_gone_and_a_full_disk(words: list[str]) -> None:
-    command = [sys.executable, "-m", "barsight", *words]
+def test_a_reader_that_is_gone_and_a_full_disk() -> None:
+    command = [sys.executable, "-m", "barsight", "--help"]
     with open("/dev/full", "w") as full:  # noqa: PTH123
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
     assert done.returncode == 1 and done.stderr.count("\n") == 1
