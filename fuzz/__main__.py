@@ -45,6 +45,7 @@ def main() -> int:
 def import_commands() -> None:
     """Import all commands once, not in every fork; no threads, which a fork would lose."""
     cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # as a command does before it loads it
     for name in COMMANDS:
         importlib.import_module(home(name))
 
