@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.errors import ConfigError, InputError
+from barsight.core.errors import BarsightError, ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
 from barsight.core.reading.geotiff import REMEDY
@@ -49,6 +49,11 @@ def export(folder: Path, target: Path) -> int:
             _WRITERS[kind](cloud, path)
         except (OverflowError, ValueError) as error:
             raise InputError(folder / "cloud.ply", f"doesn't fit a {kind} file ({error})", REMEDY) from error
+        except (OSError, BarsightError):
+            raise
+        except Exception as error:  # the libraries' own, where the system refuses to write
+            reason = str(error).strip().partition("\n")[0][:200]
+            raise OutputError(f"{target}: could not be written whole ({reason}); free some space") from error
     return cloud.total
 
 
