@@ -88,8 +88,13 @@ def _write_e57(cloud: Cloud, path: Path) -> None:
     with extra("export"):
         import pye57
     x, y, z = cloud.xyz_m.T.astype(np.float64)
-    with pye57.E57(str(path), mode="w") as file:
+    file = pye57.E57(str(path), mode="w")
+    try:
         file.write_scan_raw({"cartesianX": x, "cartesianY": y, "cartesianZ": z, "intensity": cloud.intensity})
+        file.close()
+    except BaseException:
+        file.close = lambda: None  # its destructor would fail again and print it
+        raise
 
 
 def _write_csv(cloud: Cloud, path: Path) -> None:
