@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -188,7 +189,9 @@ def test_interrupted_in_the_middle(recording: Path, sent: signal.Signals) -> Non
     out = recording.parent / "out"
     before = set(recording.parent.iterdir())
     command = [sys.executable, "-m", "barsight", "measure", str(recording), "-o", str(out), *FAST]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    # nohup, which ignores SIGHUP, must not make the run ignore it too.
+    heard = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heard) as process:
         deadline = time.monotonic() + 60
         while set(recording.parent.iterdir()) == before and time.monotonic() < deadline:
             time.sleep(0.05)

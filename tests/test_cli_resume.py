@@ -16,7 +16,9 @@ from barsight.checkpoint import checkpoint_folder, checkpointed
 from barsight.cli.main import run
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
-from cli_runs import FAST, cut_short, pictures
+from barsight.yard.magnet.description import example_magnet
+from cli_runs import FAST, cut_short, edit, pictures
+from recording_samples import write_euroc
 
 SAME = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
 
@@ -143,6 +145,66 @@ def test_checkpoints_hold_only_for_what_made_them(
         matched = counting_matches(patch)
         assert run([*command, *flags]) == 0
     assert len(matched) == (0 if change is None else 4)
+    capsys.readouterr()
+
+
+def key_of(recording: Path) -> str:
+    source = open_recording(recording)
+    return map_building.checkpoint_key(source, {"stereo": {"p1": 1.0}, "lift": {"a": 1}}, source.digests())
+
+
+def edit_imu(recording: Path) -> None:
+    edit(recording / "mav0" / "imu0" / "data.csv", lambda rows: [*rows[:3], rows[3] + "1", *rows[4:]])
+
+
+def edit_crane(recording: Path) -> None:
+    path = recording / "mav0" / "crane0" / "sensor.yaml"
+    edit(path, lambda rows: [row.replace("0.35", "0.36") for row in rows])
+
+
+def edit_rig(recording: Path) -> None:
+    path = recording / "mav0" / "cam0" / "sensor.yaml"
+    edit(path, lambda rows: [row.replace("60.0", "60.5") for row in rows])
+
+
+def edit_picture(recording: Path) -> None:
+    pictures(recording, "cam1")[0].write_bytes(pictures(recording, "cam0")[0].read_bytes())
+
+
+@pytest.mark.parametrize("change", [edit_imu, edit_crane, edit_rig, edit_picture])
+def test_the_key_tells_each_input(tmp_path: Path, change: Callable[[Path], None]) -> None:
+    recording = write_euroc(tmp_path)
+    before = key_of(recording)
+    assert key_of(recording) == before
+    change(recording)
+    assert key_of(recording) != before
+
+
+def test_the_key_tells_version_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Magnet and lift settings are judged anew each time: nothing that is kept depends on them."""
+    recording = write_euroc(tmp_path)
+    source, before = open_recording(recording), key_of(recording)
+    assert map_building.checkpoint_key(source, {"stereo": {"p1": 2.0}}, source.digests()) != before
+    assert map_building.checkpoint_key(source, {"stereo": {"p1": 1.0}}, source.digests()) == before
+    monkeypatch.setattr("barsight.__version__", "0.0.9")
+    assert key_of(recording) != before
+
+
+def test_another_magnet_is_judged_from_the_same_checkpoints(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    magnet = recording.parent / "magnet.toml"
+    magnet.write_text(example_magnet())
+    command = ["measure", str(recording), "-o", str(recording.parent / "out"), *FAST, "--resume"]
+    with monkeypatch.context() as patch:
+        killed_at(patch, "SurfaceElection", 1)
+        assert run([*command, "--magnet", str(magnet)]) == 130
+    magnet.write_text(example_magnet().replace('name = "', 'name = "other ', 1))
+    with monkeypatch.context() as patch:
+        matched = counting_matches(patch)
+        assert run([*command, "--magnet", str(magnet)]) == 0
+    lifts = json.loads((recording.parent / "out" / "lifts.json").read_text())
+    assert len(matched) == 0 and lifts["magnet"]["name"].startswith("other ")
     capsys.readouterr()
 
 

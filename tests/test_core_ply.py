@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.core.ply import read_vertices
+from barsight.core.reading.ply import read_vertices
 
 FIELDS = {
     "x": "float",

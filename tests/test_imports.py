@@ -33,7 +33,7 @@ ROOMS = {
         ".", "crane", "frontend", "frame_to_frame", "linear", "problem", "batch", "fixed_lag", "rig_check",
         "settings",
     ),
-    "core": ("compiling", ".", "linalg", "settings"),
+    "core": ("compiling", ".", "reading", "linalg", "settings"),
     "mapping": (".", "surface", "passes"),
     "yard": (
         ".", "bundles.fitting", "bundles.section", "bundles", "stability", "magnet", "lifting", "inventory",

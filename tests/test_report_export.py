@@ -11,7 +11,7 @@ from pypcd4 import PointCloud
 
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, InputError
-from barsight.core.ply import read_vertices
+from barsight.core.reading.ply import read_vertices
 from barsight.report.export import export
 from result_folders import CLOUD_POINT, write_points
 

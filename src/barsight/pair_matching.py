@@ -13,9 +13,10 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import UInt8
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, MeasurementError
+from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
 from barsight.mapping.view import disparity_range
-from barsight.recording.image_decoding import TornImageError, decode_with_colour
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_with_colour
 from barsight.stereo.search_range import check_matchable
 from barsight.stereo.settings import MethodName, StereoSettings, make_method
 from barsight.stereo.vertical_offset import MAX_OFFSET_PX, vertical_offset
@@ -107,9 +108,7 @@ def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
             raise InputError("picture", "is no (H, W) array of uint8", "give gray levels, or a file")
         return path, None
     try:
-        return decode_with_colour(path.read_bytes())
-    except OSError as error:
-        raise InputError(path, f"can't be read ({error.strerror})", "check the name") from error
+        return decode_with_colour(read_bytes(path, MAX_PICTURE_BYTES, "check the name"))
     except TornImageError as error:
         raise InputError(path, str(error), "give another picture") from error
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,12 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
-from barsight.core.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
 from barsight.core.json_values import json_digest
-from barsight.core.ply import read_vertices
-from barsight.core.sealed_json import SEAL, read_sealed
+from barsight.core.reading.bounded_reading import open_regular, read_json, read_text
+from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
+from barsight.core.reading.json_schema import expect_schema, package_schema
+from barsight.core.reading.ply import read_vertices
+from barsight.core.reading.sealed_json import SEAL
 from barsight.core.stamps import parse_seconds
 from barsight.core.types import Contour, LaserProfile
 from barsight.yard.identity import ID_DIGITS, MapIdentity
@@ -63,13 +64,10 @@ def read_summary(folder: Path) -> dict[str, Any]:
         raise InputError(folder, "no such folder", remedy)
     if not path.is_file():
         raise InputError(folder, "has no result.json", remedy)
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(path, f"is not JSON ({error})", REMEDY) from error
-    if not isinstance(summary, dict):
-        raise InputError(path, "is not a JSON object", REMEDY)
-    return summary
+    summary = read_json(path, REMEDY)
+    expect_schema(summary, package_schema("barsight.yard", "result"), path, REMEDY)
+    found: dict[str, Any] = summary
+    return found
 
 
 def identify_map(summary: dict[str, Any]) -> MapIdentity:
@@ -93,7 +91,7 @@ def seal_map(summary: dict[str, Any], folder: Path) -> MapIdentity:
 
 def file_digest(path: Path) -> str:
     """Compute SHA-256 of a file."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -117,11 +115,11 @@ def open_folder(
     if identity.map_id != summary["map_id"]:
         raise InputError(path, "was changed after it was written", REMEDY)
     for name in MAP_FILES:
-        file, digest = folder / name, summary["files"].get(name)
+        file, digest = folder / name, (summary.get("files") or {}).get(name)
         if file.is_file() and (cloud or name != "cloud.ply") and file_digest(file) != digest:
             raise InputError(file, "is not the one that result.json was written with", REMEDY)
     if bundles.is_file():
-        found = read_sealed(bundles, bundle_file.SCHEMA_VERSION, REMEDY)
+        found = bundle_file.bundles_content(bundles)
         identity.expect(bundles, found, REMEDY)
         if lifts and chosen.is_file():
             content = read_lifts(chosen)
@@ -133,7 +131,7 @@ def open_folder(
 
 def bundles_digest(folder: Path) -> str:
     """Return the digest that bundles.json carries. Raises InputError."""
-    return str(read_sealed(folder / "bundles.json", bundle_file.SCHEMA_VERSION, REMEDY)[SEAL])
+    return str(bundle_file.bundles_content(folder / "bundles.json")[SEAL])
 
 
 def next_sequence(lifts: Path, identity: MapIdentity) -> int:
@@ -203,7 +201,7 @@ def read_path(folder: Path) -> CameraPath | None:
         return None
     stamps: list[int] = []
     numbers: list[list[float]] = []
-    for count, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for count, line in enumerate(read_text(path, remedy=REMEDY).splitlines(), start=1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
@@ -274,7 +272,7 @@ def _read_table(path: Path, columns: int) -> Float64:
     """Read (N, columns) from a CSV with a header; an empty field is NaN."""
     if not path.is_file():
         return np.empty((0, columns))
-    lines = path.read_text(encoding="utf-8").splitlines()[1:]
+    lines = read_text(path, remedy=REMEDY).splitlines()[1:]
     if not lines:
         return np.empty((0, columns))
     filled = (line.replace(",,", ",nan,").replace(",,", ",nan,") for line in lines)

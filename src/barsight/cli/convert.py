@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.recording.writers.convert import Target, convert
@@ -33,7 +33,7 @@ def run(arguments: Sequence[str]) -> None:
             to: The format to write.
             settings: How to read it.
         """
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         source = open_recording(recording, settings)
         with stages(console) as advance:
             done = convert(source, out, to, lambda n, total: advance("pictures", n, total))

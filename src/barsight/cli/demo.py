@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call
 from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.files import atomic_path, expect_empty
 from barsight.measure_folder import measure_into
@@ -31,7 +31,7 @@ def run(arguments: Sequence[str]) -> None:
             out: A new folder for the recording (OUT/recording), the example magnet that lifts are chosen for
                 (OUT/magnet.toml) and the results (OUT/result).
         """
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         recording, magnet, result = (out / name for name in ("recording", "magnet.toml", "result"))
         expect_empty(out)
         console.print("Simulating a small yard ...")

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, OutputError
 from barsight.core.types import Disparity
 from barsight.measurement import Preview
@@ -52,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
             preview: PNG to write with the left picture beside the disparity in colours.
             settings: The method and its settings.
         """
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         if out.suffix.lower() not in SUFFIXES:
             raise OutputError(f"{out}: disparities are written as {', '.join(SUFFIXES)}")
         if range is not None:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.report.export import export
 
 
@@ -24,6 +24,8 @@ def run(arguments: Sequence[str]) -> None:
         """
         points = export(out, file)
         told = f" ({points} points)" if points else ""
-        Console(stderr=True).print(f"written: {file}{told}", soft_wrap=True, highlight=False, markup=False)
+        SafeConsole(stderr=True).print(
+            f"written: {file}{told}", soft_wrap=True, highlight=False, markup=False
+        )
 
     call(command, "export", arguments)

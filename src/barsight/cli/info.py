@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.recording.base import RecordingSettings
 from barsight.recording.info import describe_recording
 from barsight.recording.info_tables import print_info
@@ -29,6 +29,6 @@ def run(arguments: Sequence[str]) -> None:
             recording: The recording.
             settings: How to read it.
         """
-        print_info(describe_recording(open_recording(recording, settings)), Console())
+        print_info(describe_recording(open_recording(recording, settings)), SafeConsole())
 
     call(command, "info", arguments)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.live.crane.run import measure_crane
 from barsight.live.run import replay as replay_recording
@@ -55,7 +55,7 @@ def run(arguments: Sequence[str]) -> None:
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             keyframes: keyframes.json of an earlier run: keep just the pairs that it kept.
         """
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
 
         def tell(line: str) -> None:
             console.print(line, soft_wrap=True, highlight=False, markup=False)

@@ -12,6 +12,7 @@ from types import FrameType
 
 import barsight
 from barsight.core.errors import BarsightError
+from barsight.core.printing import printable
 
 COMMANDS = {
     "demo": "Simulate a small yard, measure it and compare with truth and laser: try this first",
@@ -57,10 +58,25 @@ def main() -> None:
         signal.signal(number, _interrupt)
     if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
         signal.signal(signal.SIGHUP, _interrupt)
-    code = run(sys.argv[1:])
+    code = _run_and_print(sys.argv[1:])
     if code == INTERRUPTED:
         _leave_at_once(code)
     sys.exit(code)
+
+
+def _run_and_print(arguments: Sequence[str]) -> int:
+    """Run a command and write what standard output still holds: its reader may be gone, its disk full."""
+    try:
+        try:
+            code = run(arguments)
+        except SystemExit as leaving:  # tyro's, after its help or a refusal
+            code = leaving.code if isinstance(leaving.code, int) else 1
+        sys.stdout.flush()
+    except OSError as error:
+        # What can't be written must not be tried again at the interpreter's end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _exit_code(error)
+    return code
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -75,6 +91,8 @@ def run(arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
     _interrupts.clear()
+    # What OpenCV can't decode is told in our one line.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     try:
         importlib.import_module(home(name)).run(rest)
     except KeyboardInterrupt:
@@ -97,6 +115,8 @@ def _exit_code(error: Exception) -> int:
     if isinstance(error, OSError) and error.errno is not None:
         what = "reading or writing failed" if error.filename is None else _short(str(error.filename))
         return _refuse(f"{what}: {os.strerror(error.errno).lower()}", 1)
+    if isinstance(error, MemoryError):
+        return _refuse("the memory doesn't suffice: end other programs, or give a smaller input", 1)
     raise error
 
 
@@ -135,7 +155,7 @@ def _interrupted() -> int:
 
 
 def _refuse(line: str, code: int) -> int:
-    sys.stderr.write(f"barsight: {' '.join(line.split())}\n")
+    sys.stderr.write(f"barsight: {' '.join(printable(line).split())}\n")
     return code
 
 

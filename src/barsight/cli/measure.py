@@ -14,6 +14,7 @@ from rich.table import Table
 
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 
@@ -55,7 +56,7 @@ def run(arguments: Sequence[str]) -> None:
             overwrite: Replace the result files of an earlier run in OUT.
             verbose: Print the time that each stage took.
         """
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         with stages(console) as advance:
             measured = measure_into(
                 recordings, out, settings, advance=advance, overwrite=overwrite, resume=resume, magnet=magnet,

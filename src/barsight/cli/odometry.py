@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_directory
 from barsight.core.types import Trajectory
@@ -50,7 +50,7 @@ def run(arguments: Sequence[str]) -> None:
             reading: How to read the recording.
             settings: The estimate's settings.
         """
-        console = Console()
+        console = SafeConsole()
         source = open_recording(recording, reading)
         rectifier = Rectifier(source.rig)
         if use is not None:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.report.page import write_report
 
 
@@ -23,6 +23,6 @@ def run(arguments: Sequence[str]) -> None:
         """
         path = out / "report.html"
         write_report(out, path)
-        Console(stderr=True).print(f"report: {path}", soft_wrap=True, highlight=False, markup=False)
+        SafeConsole(stderr=True).print(f"report: {path}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "report", arguments)

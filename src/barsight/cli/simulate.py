@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import MAX_VALUE
 from barsight.simulation.passes import simulate_passes
@@ -38,7 +38,7 @@ def run(arguments: Sequence[str]) -> None:
                 stands around them, crane, light, faults of the pictures. Only length, frames, pictures and
                 laser are taken from the settings then; truth/world.json says what was drawn.
         """
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         with stages(console) as advance:
             if draw is None and settings.passes.trolley_y_m:
                 simulate_passes(out, settings, lambda done, total: advance("render", done, total))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 from barsight.core.errors import InputError, OutputError
@@ -25,18 +26,28 @@ def expect_output(target: Path, *suffixes: str) -> None:
 def atomic_path(target: Path) -> Iterator[Path]:
     """Yield a temporary path beside `target`; on success it becomes `target`, on any failure it is gone.
 
-    `OutputError` where the folder isn't there or the system refuses to write.
+    `OutputError` where the folder isn't there, `target` is a pipe or a device, or the system refuses to
+    write.
     """
     if not target.parent.exists():
         raise OutputError(f"{target}: there is no folder {target.parent}; make it or name another")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with translated_os_errors(target):
+    with translated_os_errors(target):
+        if target.exists() and not target.is_file() and not target.is_dir():
+            raise OutputError(f"{target}: is no regular file but a pipe or a device; name a file")
+        with _staging(target.absolute()) as folder:
+            temporary = folder / target.name
             yield temporary
             temporary.replace(target)
-    finally:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            temporary.unlink()
+
+
+@contextlib.contextmanager
+def atomic_paths(*targets: Path) -> Iterator[tuple[Path, ...]]:
+    """Yield temporary paths of files of one folder; on success all of them appear, on any failure none."""
+    for target in targets:
+        if target.is_dir():
+            raise OutputError(f"{target}: is a folder; name a file")
+    with contextlib.ExitStack() as stack:
+        yield tuple(stack.enter_context(atomic_path(target)) for target in targets)
 
 
 @contextlib.contextmanager
@@ -55,10 +66,8 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
             raise OutputError(f"{target}: is a file; name a folder")
         made = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{target.name[:40]}.", suffix=".part", dir=target.parent))
     try:
-        with translated_os_errors(target):
-            staging.chmod(0o777 & ~_umask())
+        with translated_os_errors(target), _staging(target) as staging:
             yield staging
             if not replace:
                 # Another run may have written there in the meantime.
@@ -72,11 +81,79 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
             else:
                 staging.replace(target)
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
         if not target.exists():
             for folder in made:
                 with contextlib.suppress(OSError):
                     folder.rmdir()
+
+
+@contextlib.contextmanager
+def changed_folder(target: Path) -> Iterator[Path]:
+    """Yield a folder that shows the files of `target`; what is written into it is moved there on success, all
+    or nothing of it.
+    """
+    with atomic_directory(target, replace=True) as staging:
+        shown = {path.name: path.absolute() for path in target.iterdir()}
+        for name, path in shown.items():
+            (staging / name).symlink_to(path)
+        try:
+            yield staging
+        except InputError as error:
+            inside = error.path.is_relative_to(staging)
+            path = target / error.path.relative_to(staging) if inside else error.path
+            raise type(error)(path, error.problem, error.remedy) from error
+        for name in shown:
+            if (staging / name).is_symlink():
+                (staging / name).unlink()
+
+
+@contextlib.contextmanager
+def _staging(target: Path) -> Iterator[Path]:
+    """Yield an empty folder beside `target` that no other run uses, and remove what is left of it.
+
+    Its name is the same each time, so that the next run finds what a killed one left and removes it. Whoever
+    works in it holds a lock on it, which ends with the process, however that ends; another run meanwhile
+    takes the next name. A folder of another user, or a link, is left alone.
+    """
+    names = (target.with_name(f".{target.name[:40]}.{turn}part") for turn in _turns())
+    staging, held = next((path, held) for path in names if (held := _taken(path)) is not None)
+    try:
+        yield staging
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        os.close(held)
+
+
+def _turns() -> Iterator[str]:
+    yield ""
+    yield from (f"{turn}." for turn in count(2))
+
+
+def _taken(staging: Path) -> int | None:
+    """Make the folder, or empty it where a killed run left it; return its locked descriptor. None where
+    another run or user has it.
+    """
+    with contextlib.suppress(FileExistsError):
+        staging.mkdir()
+    try:
+        held = os.open(staging, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None  # its run has just ended
+    except OSError:
+        if staging.parent.exists() and (staging.is_symlink() or not staging.is_dir()):
+            return None
+        raise
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        found = staging.lstat()
+        if found.st_uid == os.geteuid() and os.path.samestat(found, os.fstat(held)):
+            for path in staging.iterdir():
+                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            return held
+    except (BlockingIOError, FileNotFoundError):
+        pass
+    os.close(held)
+    return None
 
 
 @contextlib.contextmanager
@@ -146,9 +223,3 @@ def _replace(source: Path, target: Path) -> None:
     if target.is_dir() and not target.is_symlink():
         shutil.rmtree(target)
     source.replace(target)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

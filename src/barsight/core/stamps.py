@@ -34,10 +34,23 @@ def parse_seconds(text: str) -> int:
 
     Exponents are read too (`1.4e+09`, as `numpy.savetxt` writes). Raises ValueError for what is no number.
     """
+    return int(_stamp(text))
+
+
+def seconds_in_ns(text: str) -> int:
+    """Parse seconds as `parse_seconds`, rounded to the nearest nanosecond."""
+    return int(_stamp(text).to_integral_value())
+
+
+def _stamp(text: str) -> Decimal:
+    """Parse seconds to nanoseconds that 64 bits hold; a large exponent would take forever as an integer."""
     try:
-        return int(Decimal(text) * NS_PER_S)
+        stamp = Decimal(text) * NS_PER_S
+        if not -(2**63) <= stamp < 2**63:
+            raise ValueError
     except (ArithmeticError, ValueError):
-        raise ValueError(f"{text!r} is no time in seconds") from None
+        raise ValueError(f"{text[:40]!r} is no time in seconds") from None
+    return stamp
 
 
 def expect_increasing(stamps_ns: Int64, path: Path, first_line: int = 2) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
-from barsight.core.geotiff import HEIGHT_BANDS, open_geotiff
+from barsight.core.reading.bounded_reading import read_arrays, read_text
+from barsight.core.reading.geotiff import HEIGHT_BANDS, open_geotiff
 from barsight.core.types import HeightSource
 from barsight.mapping.agreement import smooth_places
 
@@ -32,23 +33,25 @@ def score_folder(recording: Path, out: Path) -> dict[str, Figures]:
     for file in (truth_file, out / "contour.csv", out / "height.tif"):
         if not file.exists():
             raise InputError(file, "no such file", "give a simulated recording and its measured folder")
-    with np.load(truth_file) as truth:
-        content = {name: truth[name] for name in truth.files}
-    return {**_score_contours(content, out), **_score_height(content, out)}
+    content = read_arrays(truth_file)
+    try:
+        return {**_score_contours(content, out), **_score_height(content, out)}
+    except (KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
+        problem = f"doesn't fit this truth ({type(error).__name__}: {error})"
+        raise InputError(out, problem, "give a simulated recording and its measured folder") from error
 
 
 def _score_contours(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
     x_true = truth["profile_x"]
     heights: dict[int, Float64] = {}
-    with (out / "contour.csv").open(encoding="ascii") as file:
-        for row in csv.DictReader(file):
-            profile = int(row["profile"])
-            if f"profile_y{profile}" not in truth:
-                continue
-            measured = heights.setdefault(profile, np.full((2, x_true.size), np.nan))
-            k = round((float(row["x_m"]) - x_true[0]) / _SPACING_M)
-            if int(row["source"]) == HeightSource.VISION and 0 <= k < x_true.size:
-                measured[:, k] = float(row["z_m"]), float(row["sigma_m"])
+    for row in csv.DictReader(read_text(out / "contour.csv").split("\n")):
+        profile = int(row["profile"])
+        if f"profile_y{profile}" not in truth:
+            continue
+        measured = heights.setdefault(profile, np.full((2, x_true.size), np.nan))
+        k = round((float(row["x_m"]) - x_true[0]) / _SPACING_M)
+        if int(row["source"]) == HeightSource.VISION and 0 <= k < x_true.size:
+            measured[:, k] = float(row["z_m"]), float(row["sigma_m"])
     errors, sigmas, smooth, covered = [], [], [], []
     for profile, (z, sigma) in heights.items():
         z_true = truth[f"profile_y{profile}"].astype(np.float64)

@@ -10,28 +10,44 @@ from __future__ import annotations
 
 import struct
 import zlib
+from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from tifffile import TiffFile
 
+from barsight.calibration.geometry.camera import MAX_PIXELS
 from barsight.core.arrays import UInt8
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_KINDS = {
+    bytes((depth, colour))
+    for colour, depths in {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}.items()
+    for depth in depths
+}
+"""Bits a sample and colour types that go together [PNG spec 11.2.2]."""
 JPEG_SIGNATURE = b"\xff\xd8\xff"
+
+
+MAX_PICTURE_BYTES = 1 << 28
+_NARROWED = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)
+"""Values of 8 bits by those of 16."""
 
 
 class TornImageError(ValueError):
     """A picture that can't be used; the text says why, without the file's name."""
 
 
-def decode_gray(data: bytes) -> UInt8:
-    """Decode the bytes of a PNG, JPEG or another file OpenCV reads to (H, W) uint8.
+def decode_gray(data: bytes, size: tuple[int, int] | None = None) -> UInt8:
+    """Decode the bytes of a PNG, JPEG, TIFF, BMP, PNM or WebP to (H, W) uint8.
 
-    Raises `TornImageError` for a picture that is cut short, damaged or of an unknown kind.
+    size: the width and height that it must have. Raises `TornImageError` for a picture that is cut short,
+    damaged, of an unknown kind, of another size or too large.
     """
-    return to_gray(_decoded(data))
+    return to_gray(_decoded(data, size))
 
 
 def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
@@ -43,18 +59,42 @@ def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
     return to_gray(image), colour if (colour != colour[:, :, :1]).any() else None
 
 
-def _decoded(data: bytes) -> NDArray[Any]:
+def expect_size(found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise `TornImageError` where a picture's width and height aren't those of its calibration."""
+    if found != size:
+        raise TornImageError(f"is {found[0]}x{found[1]}, the calibration is for {size[0]}x{size[1]}")
+
+
+def _header_size(data: bytes) -> tuple[int, int]:
+    """Read width and height without decoding. Raises `TornImageError`."""
+    if data.startswith(PNG_SIGNATURE):
+        return check_png(data)
+    if data.startswith(JPEG_SIGNATURE) and b"\xff\xd9" not in data[-64:]:
+        raise TornImageError("is a JPEG cut short (no end marker)")
+    try:
+        if data.startswith((b"II", b"MM")):
+            with TiffFile(BytesIO(data)) as file:
+                page = file.pages.first
+                return page.imagewidth, page.imagelength
+        with Image.open(BytesIO(data), formats=("JPEG", "BMP", "PPM", "WEBP")) as picture:
+            return picture.size
+    except Exception:  # Pillow and tifffile raise all kinds on a torn header
+        raise TornImageError("is no readable picture") from None
+
+
+def _decoded(data: bytes, size: tuple[int, int] | None = None) -> NDArray[Any]:
     if not data:
         raise TornImageError("is empty")
-    if data.startswith(PNG_SIGNATURE):
-        check_png(data)
-    elif data.startswith(JPEG_SIGNATURE) and b"\xff\xd9" not in data[-64:]:
-        raise TornImageError("is a JPEG cut short (no end marker)")
+    width, height = _header_size(data)
+    if size is not None:
+        expect_size((width, height), size)
+    if width * height > MAX_PIXELS:
+        raise TornImageError(f"is {width}x{height}, at most {MAX_PIXELS} pixels are read")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
-    if image is None:
+    if image is None or image.shape[:2] != (height, width):
         raise TornImageError("is no readable picture")
     return np.asarray(image)
 
@@ -84,7 +124,10 @@ def _eight_bits(image: NDArray[Any]) -> UInt8:
             raise TornImageError(
                 f"is a 16-bit picture whose brightest value is {brightest}: scale it to the full 16 bits"
             )
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        narrow = np.empty(image.shape, np.uint8)
+        for row, wide in zip(narrow, image, strict=True):
+            row[:] = _NARROWED[wide]
+        return narrow
     if image.dtype != np.uint8:
         raise TornImageError(f"has {image.dtype} pixels; 8 or 16 bits are needed")
     return np.asarray(image, dtype=np.uint8)
@@ -105,6 +148,9 @@ def check_png(data: bytes) -> tuple[int, int]:
         if zlib.crc32(view[place + 4 : end - 4]) != checksum:
             raise TornImageError(f"is a damaged PNG (wrong checksum in its {kind.decode('latin-1')} part)")
         if kind == b"IHDR":
+            kind_of_png, rest = data[place + 16 : place + 18], data[place + 18 : place + 20]
+            if length != 13 or kind_of_png not in _PNG_KINDS or any(rest) or data[place + 20] > 1:
+                raise TornImageError("is a PNG of a kind that there isn't")
             size = struct.unpack_from(">II", data, place + 8)
         elif kind == b"IDAT":
             has_pixels = True

@@ -13,7 +13,7 @@ from barsight.core.errors import InputError
 from barsight.core.stamps import Pairing, pair_stamps, seconds_to_ns
 from barsight.core.types import RefusedFrame
 from barsight.recording.base import FrameIndex
-from barsight.recording.image_decoding import TornImageError, decode_gray
+from barsight.recording.image_decoding import decode_gray
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +63,4 @@ def pair_cameras(path: Path, left_ns: Int64, right_ns: Int64, tolerance_s: float
 
 def decode_for(camera: Camera, data: bytes) -> UInt8:
     """Decode a stored picture; `TornImageError` too where it does not have the calibration's size."""
-    return expect_size(camera, decode_gray(data))
-
-
-def expect_size(camera: Camera, image: UInt8) -> UInt8:
-    """Return the image; `TornImageError` where it does not have the calibration's size."""
-    height, width = image.shape
-    if (width, height) != (camera.width, camera.height):
-        raise TornImageError(f"is {width}x{height}, the calibration is for {camera.width}x{camera.height}")
-    return image
+    return decode_gray(data, (camera.width, camera.height))

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.errors import ConfigError, InputError
+from barsight.core.errors import BarsightError, ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
+from barsight.core.reading.geotiff import REMEDY
 from barsight.result_folder import Cloud, open_folder, read_cloud
 
 _LAS_STEP_M = 1e-4
@@ -44,7 +45,15 @@ def export(folder: Path, target: Path) -> int:
         raise ConfigError(f"{target}: can't tell the format from {kind or 'no suffix'!r}; end it in {known}")
     cloud = read_cloud(folder / "cloud.ply")
     with atomic_path(target) as path:
-        _WRITERS[kind](cloud, path)
+        try:
+            _WRITERS[kind](cloud, path)
+        except (OverflowError, ValueError) as error:
+            raise InputError(folder / "cloud.ply", f"doesn't fit a {kind} file ({error})", REMEDY) from error
+        except (OSError, BarsightError):
+            raise
+        except Exception as error:  # the libraries' own, where the system refuses to write
+            reason = str(error).strip().partition("\n")[0][:200]
+            raise OutputError(f"{target}: could not be written whole ({reason}); free some space") from error
     return cloud.total
 
 
@@ -79,8 +88,13 @@ def _write_e57(cloud: Cloud, path: Path) -> None:
     with extra("export"):
         import pye57
     x, y, z = cloud.xyz_m.T.astype(np.float64)
-    with pye57.E57(str(path), mode="w") as file:
+    file = pye57.E57(str(path), mode="w")
+    try:
         file.write_scan_raw({"cartesianX": x, "cartesianY": y, "cartesianZ": z, "intensity": cloud.intensity})
+        file.close()
+    except BaseException:
+        file.close = lambda: None  # its destructor would fail again and print it
+        raise
 
 
 def _write_csv(cloud: Cloud, path: Path) -> None:

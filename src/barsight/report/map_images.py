@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError
-from barsight.core.geotiff import HEIGHT_BANDS, REMEDY, GeoTiff, open_geotiff
+from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, GeoTiff, open_geotiff
 from barsight.core.types import HeightSource
 
 LONGEST_PX = 2400

@@ -13,7 +13,7 @@ from typing import Any
 import jinja2
 from plotly.offline import get_plotlyjs
 
-from barsight.core.files import atomic_path
+from barsight.core.files import atomic_path, atomic_paths
 from barsight.core.parallel import in_background
 from barsight.report.map_images import preview_uri, read_raster
 from barsight.report.page_maps import MapFigure, map_figures
@@ -83,17 +83,16 @@ def write_summary_page(
     data: Path,
     pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write a page of key figures and plots to `html`, and its summary as JSON to `data`, each whole or not
-    at all. The template finds the plots in `plots`, by name, and the pictures in `pictures`."""
-    with atomic_path(data) as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    """Write a page of key figures and plots to `html`, and its summary as JSON to `data`, both whole or
+    neither. The template finds the plots in `plots`, by name, and the pictures in `pictures`."""
     page = environment().get_template(template).render(
         summary=summary, figures=figures, plots={plot.name: plot for plot in plots},
         plot_data=plot_json(plots), plotly_js=get_plotlyjs(), css=resource("page.css"),
         script=resource("page_script.js.jinja"), pictures=pictures,
     )  # fmt: skip
-    with atomic_path(html) as path:
-        path.write_text(page, encoding="utf-8")
+    with atomic_paths(html, data) as (page_path, data_path):
+        page_path.write_text(page, encoding="utf-8", errors="replace")
+        data_path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
 def render_page(out_dir: Path, pictures: PagePictures | None = None) -> str:

@@ -15,9 +15,11 @@ import tifffile
 from barsight.core.arrays import Float32
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_path
+from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.types import Disparity
 
 _KITTI_STEPS = 256
+_MAX_BYTES = 1 << 30
 _PFM_HEADER = re.compile(rb"^(P[fF])\s+(\d+)\s+(\d+)\s+([-+0-9.eE]+)\s")
 
 
@@ -61,17 +63,17 @@ def read_disparity(path: Path) -> Disparity:
     suffix = path.suffix.lower()
     try:
         if suffix == ".pfm":
-            values = _parse_pfm(path, path.read_bytes())
+            values = _parse_pfm(path, read_bytes(path, _MAX_BYTES, "check the name"))
         elif suffix == ".png":
-            values = _parse_kitti(path, path.read_bytes())
+            values = _parse_kitti(path, read_bytes(path, _MAX_BYTES, "check the name"))
         elif suffix in (".tif", ".tiff"):
             return _read_tiff(path)
         else:
             raise InputError(
                 path, f"is no disparity file ({suffix or 'no suffix'})", "name a .pfm, .png or .tif"
             )
-    except OSError as error:
-        raise InputError(path, f"can't be read ({error.strerror})", "check the name") from error
+    except (ValueError, OverflowError) as error:
+        raise InputError(path, f"can't be read ({error})", "write it again") from None
     return Disparity(values, np.full(values.shape, np.nan, dtype=np.float32))
 
 

@@ -34,7 +34,7 @@ from barsight.store.matching import (
 from barsight.store.opening import Store
 from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEYS
 from barsight.yard.identity import MapIdentity
-from barsight.yard.inventory.bundle_file import bundle_of, read_match
+from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle, YardMap
 
@@ -151,7 +151,7 @@ def read_survey(folder: Path) -> MeasuredSurvey:
         )
     if identity.captured_from_ns is None or identity.captured_to_ns is None:
         raise InputError(folder / "result.json", "has no captured_from_ns and captured_to_ns", REMEDY)
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = bundles_content(path)
     records = tuple({k: v for k, v in one.items() if k != "bar_axes"} for one in content["bundles"])
     match = read_match(path)
     matched = () if match is None else (one for one in match.matched if one.name not in match.moved)

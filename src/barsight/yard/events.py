@@ -13,6 +13,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
+from barsight.core.reading.bounded_reading import read_text
 from barsight.yard.types import Bundle
 
 KINDS = ("lift", "set-down", "magnet")
@@ -53,11 +54,8 @@ def read_events(path: Path) -> tuple[YardEvent, ...]:
     """Read a CSV of COLUMNS. Raises InputError where it is missing or a line is no event."""
     remedy = f"give a CSV with the columns {','.join(COLUMNS)}; a kind is one of {', '.join(KINDS)}"
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.reader(file))
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", remedy) from error
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.reader(read_text(path, remedy=remedy).split("\n")))
+    except csv.Error as error:
         raise InputError(path, f"can't be read ({error})", remedy) from error
     if not rows or tuple(rows[0]) != COLUMNS:
         raise InputError(path, "has another first line", remedy)
@@ -78,7 +76,7 @@ def _event(path: Path, number: int, row: list[str], remedy: str) -> YardEvent:
     except ValueError as error:
         raise InputError(path, f"line {number} is no event ({error})", remedy) from error
     finite = all(math.isfinite(value) for value in (x, y, yaw, length, width))
-    if kind not in KINDS or not finite or min(length, width) < 0 or event.stamp_ns < 0:
+    if kind not in KINDS or not finite or min(length, width) < 0 or not 0 <= event.stamp_ns < 2**63:
         raise InputError(path, f"line {number} is no event", remedy)
     return event
 

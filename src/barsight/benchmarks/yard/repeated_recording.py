@@ -61,7 +61,7 @@ def _repeat_pictures(source: Path, target: Path, times: int, lap_ns: int) -> Non
     (target / "data").mkdir()
     for lap in range(times):
         for stamp, name in rows:
-            (target / "data" / f"{int(stamp) + lap * lap_ns}.png").symlink_to(source / "data" / name)
+            (target / "data" / f"{int(stamp) + lap * lap_ns}.png").hardlink_to(source / "data" / name)
     stamps = (int(stamp) + lap * lap_ns for lap in range(times) for stamp, _ in rows)
     _write(target, head, ((stamp, f"{stamp}.png") for stamp in stamps))
 

@@ -5,7 +5,6 @@ Each holds `detections`, a structured array of stamp_ns, tag, corner, u, v (px) 
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from scipy.spatial import KDTree
 from barsight.calibration.boards.board import Board
 from barsight.calibration.boards.board_views import BoardView, Corners
 from barsight.core.errors import CalibrationError
+from barsight.core.reading.bounded_reading import read_arrays
 
 NAMES = ("cam0_detections.npz", "cam1_detections.npz")
 FIELDS = ("stamp_ns", "u", "v", "x", "y")
@@ -38,13 +38,9 @@ def read_rows(path: Path, fields: tuple[str, ...] = FIELDS) -> Any:
 
     Raises CalibrationError where a field is missing or not finite.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            rows = archive["detections"]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise CalibrationError(
-            path, f"is no file of detections ({error})", "take the original file"
-        ) from None
+    rows = read_arrays(path, kind=CalibrationError).get("detections")
+    if rows is None or rows.ndim != 1:
+        raise CalibrationError(path, "holds no list of detections", "take the original file")
     missing = [field for field in fields if field not in (rows.dtype.names or ())]
     if missing:
         raise CalibrationError(

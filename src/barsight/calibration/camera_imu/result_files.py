@@ -12,7 +12,6 @@ from barsight.calibration.files.kalibr import write_camchain
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.rig_formats import TOPICS
 from barsight.core.arrays import Float64
-from barsight.core.files import atomic_path
 from barsight.core.pose import skew
 
 PAIR_NAMES = tuple(
@@ -46,10 +45,8 @@ def write_camera_imu(
         "sigmas": [float(value) for value in np.sqrt(np.diag(covariance))],
         "covariance": [[float(value) for value in row] for row in covariance],
     }
-    with atomic_path(rig_path) as path:
-        write_rig_file(path, calibration.rig, section=section)
-    with atomic_path(camchain_path) as path:
-        write_camchain(path, calibration.rig, TOPICS)
+    write_rig_file(rig_path, calibration.rig, section=section)
+    write_camchain(camchain_path, calibration.rig, TOPICS)
 
 
 def mounting_covariance(calibration: CameraImuCalibration) -> tuple[tuple[str, ...], Float64]:

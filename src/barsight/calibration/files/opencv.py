@@ -7,6 +7,7 @@ R and T are cam1_from_cam0, T in metres. OpenCV's own files don't carry the pict
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
+from barsight.core.reading.bounded_reading import MAX_SETTINGS_BYTES, read_text
 
 KEYS = {
     "M1": ("M1", "K1", "cameraMatrix1", "camera_matrix_1"), "D1": ("D1", "distCoeffs1", "dist_coeffs_1"),
@@ -84,10 +86,9 @@ def write_opencv_rig(path: Path, rig: StereoRig, *, xml: bool = False) -> None:
 
 def _matrices(path: Path) -> dict[str, Float64]:
     """Read the known entries as matrices; `fisheye` is there where the lenses are."""
-    if not path.is_file():
-        raise CalibrationError(path, "no such file", "check the path")
+    text = read_text(path, MAX_SETTINGS_BYTES, ORIGINAL, CalibrationError)
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
         names = set(root.keys()) if storage.isOpened() else set()
     except (cv2.error, SystemError):
@@ -97,7 +98,7 @@ def _matrices(path: Path) -> dict[str, Float64]:
     found: dict[str, Float64] = {}
     for key, spellings in KEYS.items():
         for name in spellings:
-            matrix = storage.getNode(name).mat() if name in names else None
+            matrix = _matrix(path, storage, name) if name in names else None
             if matrix is not None and key not in found:
                 found[key] = np.asarray(matrix, dtype=np.float64)
                 if not np.isfinite(found[key]).all():
@@ -110,6 +111,13 @@ def _matrices(path: Path) -> dict[str, Float64]:
     if DISTORTION_NAMES.get(model.lower()) is Distortion.EQUIDISTANT:
         found["fisheye"] = np.ones((1, 1))
     return found
+
+
+def _matrix(path: Path, storage: cv2.FileStorage, name: str) -> Any:
+    try:
+        return storage.getNode(name).mat()
+    except (cv2.error, SystemError):
+        raise CalibrationError(path, f"{name} is no matrix", ORIGINAL) from None
 
 
 def _camera(

@@ -16,6 +16,7 @@ from barsight.calibration.files.yaml_document import read_document
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError
 from barsight.core.files import atomic_directory, atomic_path
+from barsight.core.reading.bounded_reading import MAX_SETTINGS_BYTES, read_text
 
 OPENCV_MARK = "!!opencv-matrix"
 TOPICS = ("/cam0/image_raw", "/cam1/image_raw")
@@ -89,7 +90,4 @@ def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> None:
 
 
 def _is_opencv(path: Path) -> bool:
-    try:
-        return OPENCV_MARK in path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):
-        return False
+    return OPENCV_MARK in read_text(path, MAX_SETTINGS_BYTES, f"give {KNOWN}", CalibrationError)

@@ -10,13 +10,18 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
+from barsight.core.reading.bounded_reading import MAX_DEPTH, expect_modest, read_text
 
 ROTATION_DECIMALS = 13
 TRANSLATION_DECIMALS = 12
+MAX_YAML_BYTES, MAX_YAML_NODES = 1 << 18, 20_000
+"""A calibration with its covariance has some 20 kB and 2000 values; so many take 4 s to parse."""
+REMEDY = "take the original file"
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ class Document:
         """Convert the elements to finite floats. YAML 1.1 reads `1e-5` as text, so text is tried too."""
         try:
             numbers = tuple(float(v) for v in value if not isinstance(v, bool))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             numbers = ()
         if len(numbers) != len(value):
             raise self.error(key, "holds something that is no number", "correct the entry")
@@ -98,23 +103,47 @@ class Document:
 
 def read_document(path: Path) -> Document:
     """Read a YAML mapping; a first line `%YAML:1.0` (OpenCV's, which YAML forbids) is passed over."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise CalibrationError(path, "no such file", "a calibration is needed to measure") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(path, f"can't be read ({error})", "take the original file") from None
+    text = read_text(path, MAX_YAML_BYTES, REMEDY, CalibrationError)
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
     try:
-        values = YAML(typ="safe", pure=True).load("\n".join(lines))
+        values = _load("\n".join(lines))
     except YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}: " if mark else ""
         problem = getattr(error, "problem", None) or "not readable"
-        raise CalibrationError(path, f"{where}not YAML ({problem})", "take the original file") from None
+        raise CalibrationError(path, f"{where}not YAML ({problem})", REMEDY) from None
+    except RecursionError:
+        raise CalibrationError(path, "not YAML (brackets in brackets, too deep)", REMEDY) from None
+    except Exception as error:  # of a date that isn't, a key that is a list, a binary that is none
+        raise CalibrationError(path, f"not YAML ({error})", REMEDY) from None
     if not isinstance(values, dict):
         raise CalibrationError(path, "is empty or no list of keys", "take the original file")
     return Document(path, {str(key): value for key, value in values.items()})
+
+
+def _load(text: str) -> Any:
+    """Load YAML of MAX_YAML_NODES values at most, those that its aliases stand for among them.
+
+    Raises ValueError, YAMLError and others.
+    """
+    events = YAML(typ="safe", pure=True).parse(text)
+    sizes: dict[str, int] = {}
+    open_parts: list[tuple[str | None, int]] = []
+    nodes = 0
+    for event in events:
+        if isinstance(event, CollectionStartEvent):
+            open_parts.append((event.anchor, nodes))
+        if isinstance(event, CollectionEndEvent):
+            anchor, before = open_parts.pop()
+            if anchor is not None:
+                sizes[anchor] = nodes - before
+        elif isinstance(event, NodeEvent):
+            nodes += sizes.get(event.anchor, 1) if isinstance(event, AliasEvent) else 1
+        if nodes > MAX_YAML_NODES or len(open_parts) > MAX_DEPTH:
+            raise ValueError(f"over {MAX_YAML_NODES} values or {MAX_DEPTH} brackets in brackets")
+    values = YAML(typ="safe", pure=True).load(text)
+    expect_modest(values)
+    return values
 
 
 def write_document(path: Path, values: dict[str, Any]) -> None:

@@ -10,6 +10,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 
+MAX_PIXELS = 1 << 26
+"""Of a picture; a small file may claim any number. Cameras over a yard have 2 to 25 million."""
+
 
 class Distortion(StrEnum):
     """RADTAN: k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order. EQUIDISTANT: k1..k4 [Kannala 2006]."""
@@ -48,6 +51,8 @@ class Camera:
             raise ValueError("a camera parameter is not finite")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"the image size {self.width}x{self.height} can't be")
+        if self.width * self.height > MAX_PIXELS:
+            raise ValueError(f"an image of {self.width}x{self.height} has over {MAX_PIXELS} pixels")
         if self.fx_px <= 0 or self.fy_px <= 0:
             raise ValueError(f"the focal lengths {self.fx_px}, {self.fy_px} must be positive")
         if not (-self.width < self.cx_px < 2 * self.width and -self.height < self.cy_px < 2 * self.height):

@@ -23,6 +23,7 @@ from barsight.benchmarks.yard.bundle_scores import (
     score_bundles,
 )
 from barsight.benchmarks.yard.yard_speed import time_yard
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
@@ -64,7 +65,7 @@ def bench_found_bundles(
     if yards < 1 or not 1 <= length_m <= 100:
         raise ConfigError("bench bundles: yards must be at least 1, length_m must lie between 1 and 100")
     seconds: tuple[float, ...] = ()
-    console = Console()
+    console = SafeConsole()
     if recording is not None and out is not None:
         scores = score_bundles(read_bundles(out / "bundles.json"), read_true_bundles(recording))
     elif rendered:

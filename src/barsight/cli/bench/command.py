@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.ablation import without_one_part
@@ -24,6 +23,7 @@ from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.cli.bench.live import bench_live_estimate
 from barsight.cli.bench.worlds import bench_worlds
 from barsight.cli.bench.yard import bench_yard
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.stereo.direct.pipeline import BarsightSettings
 from barsight.stereo.method import StereoMethod
@@ -55,7 +55,7 @@ def run(arguments: Sequence[str]) -> None:
     if not arguments:
         raise ConfigError(f"bench needs a benchmark: {names}")
     if arguments[0] in ("-h", "--help"):
-        Console().print(f"usage: barsight bench {names} ...", markup=False)
+        SafeConsole().print(f"usage: barsight bench {names} ...", markup=False)
         return
     if arguments[0] not in benches:
         raise ConfigError(f"there is no benchmark {arguments[0]!r}; choose {names}")
@@ -77,7 +77,7 @@ def _stereo(
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_stereo(data, _made(methods), repeats)
-    console = Console()
+    console = SafeConsole()
     console.print(scene_table(bench))
     console.print(stereo_table(bench))
     if save is not None:
@@ -103,7 +103,7 @@ def _stereo_speed(methods: tuple[MethodName, ...] = METHODS, repeats: int = 5, s
         }.items():
             made[name] = make_method(StereoSettings(barsight=settings))
     bench = bench_speed(made, repeats)
-    Console().print(speed_table(bench))
+    SafeConsole().print(speed_table(bench))
     if save is not None:
         write_json(save, bench)
 
@@ -127,7 +127,7 @@ def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = No
     """
     variants = without_one_part()
     bench = bench_stereo(data, variants, repeats=1)
-    console = Console()
+    console = SafeConsole()
     console.print(stereo_table(bench))
     console.print(subpixel_table(bench_subpixel(variants, None, scenes)))
     if save is not None:
@@ -146,7 +146,7 @@ def _subpixel(
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_subpixel(_made(methods), data, scenes)
-    Console().print(subpixel_table(bench))
+    SafeConsole().print(subpixel_table(bench))
     if save is not None:
         write_json(save, bench)
 
@@ -160,7 +160,7 @@ def _target_size(methods: tuple[MethodName, ...] = METHODS, poses: int = 10, sav
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_target_size(_made(methods), poses)
-    Console().print(target_size_table(bench))
+    SafeConsole().print(target_size_table(bench))
     if save is not None:
         write_json(save, bench)
 

@@ -11,12 +11,12 @@ from typing import Annotated
 
 import tyro
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance, provenance, write_json
 from barsight.benchmarks.yard.repeated_recording import repeat
 from barsight.cli.bench.yard import measure_apart
+from barsight.cli.safe_console import SafeConsole
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def bench_length(
     ratios = (whole.seconds / short.seconds, whole.cpu_s / short.cpu_s)
     memory = whole.peak_memory_mib / short.peak_memory_mib
     table.add_row("ratio", "", *(f"{ratio:.1f}" for ratio in ratios), f"{memory:.2f}")
-    Console().print(table)
+    SafeConsole().print(table)
     if save is not None:
         write_json(save, bench)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.benchmarks.lift_judge.magnet import read_magnet
 from barsight.benchmarks.provenance import write_json
@@ -21,6 +20,7 @@ from barsight.benchmarks.yard.judged_lifts import (
 )
 from barsight.cli.bench.seeds import parse_seeds
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
@@ -64,7 +64,7 @@ def bench_lift_targets(
         raise ConfigError(f"bench lifts: placements must be 0 or more, not {placements}")
     described, settings = load_magnet(magnet), LiftSettings()
     found: list[JudgedLift] = []
-    with tempfile.TemporaryDirectory() as scratch, stages(Console(stderr=True)) as advance:
+    with tempfile.TemporaryDirectory() as scratch, stages(SafeConsole(stderr=True)) as advance:
         described_at = magnet or Path(scratch) / "magnet.toml"
         if magnet is None:
             described_at.write_text(example_magnet(), encoding="utf-8")
@@ -80,9 +80,9 @@ def bench_lift_targets(
             if save is not None:
                 write_json(save, JudgedBench.of(done + 1, found))
     bench = JudgedBench.of(len(numbers), found)
-    Console().print(bench_table(bench))
+    SafeConsole().print(bench_table(bench))
     if bench.dangerous:
-        Console().print(dangerous_table(bench))
+        SafeConsole().print(dangerous_table(bench))
 
 
 def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, full_size: bool) -> MappedWorld:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.benchmarks.motion.fixed_lag_speed import bench_live, live_table
 from barsight.benchmarks.provenance import write_json
+from barsight.cli.safe_console import SafeConsole
 
 
 def bench_live_estimate(
@@ -25,6 +25,6 @@ def bench_live_estimate(
         save: JSON file for all figures.
     """
     bench = bench_live(keyframes, held)
-    Console().print(live_table(bench))
+    SafeConsole().print(live_table(bench))
     if save is not None:
         write_json(save, bench)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.benchmarks.motion.frontend_speed import bench_front_end, front_end_table
 from barsight.benchmarks.motion.matching import bench_features, bench_matching, feature_table, match_table
 from barsight.benchmarks.provenance import write_json
+from barsight.cli.safe_console import SafeConsole
 from barsight.features.detectors import DETECTORS, DetectorName
 
 Json = Annotated[Path | None, tyro.conf.arg(name="json")]
@@ -33,7 +33,7 @@ def features(
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_features(recordings, detectors, count, repeats)
-    Console().print(feature_table(bench))
+    SafeConsole().print(feature_table(bench))
     if save is not None:
         write_json(save, bench)
 
@@ -53,7 +53,7 @@ def matching(
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_matching(recordings, detectors, count)
-    Console().print(match_table(bench))
+    SafeConsole().print(match_table(bench))
     if save is not None:
         write_json(save, bench)
 
@@ -69,6 +69,6 @@ def front_end(
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_front_end(recordings, repeats)
-    Console().print(front_end_table(bench))
+    SafeConsole().print(front_end_table(bench))
     if save is not None:
         write_json(save, bench)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.benchmarks.provenance import provenance, write_json
 from barsight.benchmarks.yard.world_runs import run_worlds
@@ -19,6 +18,7 @@ from barsight.benchmarks.yard.world_scores import (
     world_table,
 )
 from barsight.cli.bench.seeds import parse_seeds
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
@@ -59,7 +59,7 @@ def bench_worlds(
         width_px=width_px, height_px=round(ASPECT * width_px), focal_px=FOCAL_PX * width_px / WIDTH_PX
     )
     given = SimulationSettings(length_m=length_m, frames=frames, depth_views=0, camera=camera)
-    console = Console()
+    console = SafeConsole()
 
     def tell(score: WorldScore) -> None:
         what = score.refused or f"{score.counts['found']} of {score.counts['free']} free bundles found"

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import tyro
-from rich.console import Console
 
 from barsight.benchmarks.provenance import provenance, write_json
 from barsight.benchmarks.yard.field_test import VARIANTS, YardBench, laser_error_mm, yard_row, yard_table
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
@@ -48,7 +48,7 @@ def bench_yard(
         methods: The rows.
         save: JSON file for all figures, with commit and machine.
     """
-    console = Console()
+    console = SafeConsole()
     with tempfile.TemporaryDirectory() as scratch:
         place = recording or Path(scratch) / "recording"
         if recording is None:

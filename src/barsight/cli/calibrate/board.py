@@ -8,10 +8,10 @@ from typing import Annotated
 
 import tyro
 from PIL import Image
-from rich.console import Console
 
 from barsight.calibration.boards.board import parse_board
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.files import atomic_path, expect_output
 from barsight.simulation.board import draw_board, draw_views
@@ -49,6 +49,6 @@ def run(arguments: Sequence[str]) -> None:
             Image.fromarray(drawn).save(path, format=out.suffix[1:].upper(), dpi=(dpi, dpi), resolution=dpi)
         size = " x ".join(f"{side * INCH_M / dpi:.3f} m" for side in drawn.shape[::-1])
         text = f"{out}: {'how to hold it' if views else f'{size} with its margin, at {dpi} dpi'}"
-        Console(stderr=True).print(text, soft_wrap=True, highlight=False, markup=False)
+        SafeConsole(stderr=True).print(text, soft_wrap=True, highlight=False, markup=False)
 
     call(command, "calibrate board", arguments)

@@ -27,8 +27,9 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.stereo.verdict import Verdict, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, InputError
-from barsight.core.files import expect_output
+from barsight.core.files import atomic_paths, expect_output
 from barsight.core.parallel import ordered_map
 from barsight.core.types import ImuSamples, RefusedFrame, StereoFrame
 from barsight.recording.base import RecordingSettings
@@ -73,7 +74,7 @@ def run(arguments: Sequence[str]) -> None:
             max_views: Recordings are thinned to so many pictures, evenly.
         """
         _expect(out, max_views)
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         lenses = read_rig_file(rig)
         own_file = rig.is_file() and rig.suffix in (".yaml", ".yml")
         target = read_board(rig, parse_board(board)) if own_file else parse_board(board)
@@ -94,9 +95,10 @@ def run(arguments: Sequence[str]) -> None:
         assessment = assess_camera_imu(calibration, halves)
         camchain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
         own = read_covariance(rig) if own_file else None
-        write_camera_imu(calibration, out, camchain, own)
         html = out.with_suffix(".html")
-        write_camera_imu_report(calibration, assessment, html, out.with_suffix(".json"))
+        with atomic_paths(out, camchain, html, out.with_suffix(".json")) as (path, chain, *report):
+            write_camera_imu(calibration, path, chain, own)
+            write_camera_imu_report(calibration, assessment, *report)
         _print(console, calibration, assessment, out, html)
 
     call(command, "calibrate camera-imu", arguments)

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.files import expect_output
 from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import FusionSettings
@@ -55,12 +56,12 @@ def run(arguments: Sequence[str]) -> None:
         if out is not None:
             expect_output(out, ".json")
         source = open_recording(recording, reading)
-        with stages(Console(stderr=True)) as advance:
+        with stages(SafeConsole(stderr=True)) as advance:
             count = count_frames("travel", len(source.index.stamps_ns), advance)
             check = check_rig(source, fusion, settings, count)
         if out is not None:
             write_rig_check_report(check, str(recording), out.with_suffix(".html"), out)
-        _print(check, Console())
+        _print(check, SafeConsole())
 
     call(command, "calibrate check", arguments)
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
 from barsight.calibration.files.rig_formats import RigFormat, read_rig_file, write_any_rig
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -32,7 +32,7 @@ def run(arguments: Sequence[str]) -> None:
         """
         read = read_rig_file(rig)
         write_any_rig(out, read, to)
-        Console(stderr=True).print(
+        SafeConsole(stderr=True).print(
             f"{escape(str(out))}: baseline {read.baseline_m * 1e3:.2f} mm", soft_wrap=True, highlight=False
         )
 

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
 from barsight.calibration.camera_imu.allan_deviation import fit_imu_noise
 from barsight.calibration.files.kalibr import write_imu_file
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import Failed, InputError
-from barsight.core.files import atomic_path, expect_output
+from barsight.core.files import atomic_paths, expect_output
 from barsight.recording.formats.imu_log import AccelUnit, GyroUnit, read_imu_log
 from barsight.report.calibration.imu_noise_page import write_imu_noise_report
 
@@ -42,15 +42,15 @@ def run(arguments: Sequence[str]) -> None:
             topic: The rostopic to state in the file.
         """
         expect_output(out, ".yaml", ".yml")
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         read = read_imu_log(log, gyro_unit, accel_unit)
         fit = fit_imu_noise(read.samples)
         if isinstance(fit, Failed):
             raise InputError(log, fit.reason, "log an hour or more with the IMU at rest")
-        with atomic_path(out) as path:
-            write_imu_file(path, fit.noise, topic)
         html = out.with_suffix(".html")
-        write_imu_noise_report(fit, log.name, read.notes, html, out.with_suffix(".json"))
+        with atomic_paths(out, html, out.with_suffix(".json")) as (path, page, data):
+            write_imu_file(path, fit.noise, topic)
+            write_imu_noise_report(fit, log.name, read.notes, page, data)
         for axis in fit.axes:
             console.print(
                 f"{axis.name}: density {axis.density:.3e} ± {axis.density_sigma:.0e}, walk {axis.walk:.2e} ± "

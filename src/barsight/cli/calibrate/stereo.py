@@ -19,8 +19,9 @@ from barsight.calibration.stereo.calibration import StereoCalibration, calibrate
 from barsight.calibration.stereo.verdict import Verdict, assess, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
-from barsight.core.files import atomic_path, expect_output
+from barsight.core.files import atomic_paths, expect_output
 from barsight.report.calibration.stereo_page import write_calibration_report
 
 COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.REDO: "red"}
@@ -52,7 +53,7 @@ def run(arguments: Sequence[str]) -> None:
             resolution: WIDTHxHEIGHT of the cameras, for detections, which don't carry it.
         """
         _expect(out, range_m, max_views)
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         target = parse_board(board)
         if pictures.is_dir() and has_detections(pictures):
             views, sizes, left_out = views_from_detections(pictures, target, max_views, resolution)
@@ -62,9 +63,9 @@ def run(arguments: Sequence[str]) -> None:
         calibration = calibrate_stereo(views, target, lens, sizes, pictures, left_out)
         assessment = assess(calibration, range_m)
         html, data = out.with_suffix(".html"), out.with_suffix(".json")
-        with atomic_path(out) as path:
+        with atomic_paths(out, html, data) as (path, *report):
             write_rig_file(path, calibration.rig, rig_file_section(calibration))
-        write_calibration_report(calibration, assessment, html, data)
+            write_calibration_report(calibration, assessment, *report)
         _print(console, calibration, out, html)
         colour = COLOURS[assessment.verdict]
         console.print(f"[{colour}]{assessment.verdict}[/{colour}]: {summary_sentence(assessment.lines)}")

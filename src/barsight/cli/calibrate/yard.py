@@ -15,9 +15,10 @@ from barsight.calibration.files.yaml_document import write_document
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.files import atomic_path, expect_output
+from barsight.core.files import atomic_paths, expect_output
 from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.crane_moves import MovedYard, yard_from_moves
@@ -56,17 +57,17 @@ def run(arguments: Sequence[str]) -> None:
         expect_output(out, ".yaml", ".yml")
         if not 0 < sigma_m < 10:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         hangs = None
         if source.suffix.lower() == ".csv":
             found = _from_targets(source, frame, sigma_m)
         else:
             moved = _from_moves(source, reading, console)
             found, hangs = moved.calibration, moved.yard_from_body
-        with atomic_path(out) as path:
-            write_document(path, _content(found, hangs))
         verdict = "good" if _is_good(found) else "usable with care"
-        write_yard_report(found, verdict, str(source), out.with_suffix(".html"), out.with_suffix(".json"))
+        with atomic_paths(out, out.with_suffix(".html"), out.with_suffix(".json")) as (path, html, data):
+            write_document(path, _content(found, hangs))
+            write_yard_report(found, verdict, str(source), html, data)
         _print(found, verdict, out, console)
 
     call(command, "calibrate yard", arguments)

@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.opening import DEFAULT_URL, open_store
 
@@ -39,7 +40,7 @@ def run(arguments: Sequence[str]) -> None:
         survey = read_survey(out)
         with open_store(url, create=True, migrate=migrate) as store:
             added = add_survey(store, survey, by or _user())
-        _print(added, Console())
+        _print(added, SafeConsole())
 
     words = list(arguments)
     if len(words) == 1 and not words[0].startswith("-"):

@@ -8,10 +8,10 @@ from dataclasses import asdict
 
 import tyro
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.cli.store.yard import bundle_table, write_json, yard_records
 from barsight.store.history import SurveyRow, list_surveys, present_yard, time_text
 from barsight.store.opening import DEFAULT_URL, open_store
@@ -38,7 +38,7 @@ def run(arguments: Sequence[str]) -> None:
                 {"surveys": [asdict(each) for each in surveys], "bundles": yard_records(present, now_ns)}
             )
             return
-        console = Console()
+        console = SafeConsole()
         console.print(_table(surveys))
         console.print(bundle_table("Present yard", present, now_ns))
 

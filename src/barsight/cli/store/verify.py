@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import Failed, MeasurementError
 from barsight.store.audit import verify_chain
 from barsight.store.opening import DEFAULT_URL, open_store
@@ -30,6 +30,6 @@ def run(arguments: Sequence[str]) -> None:
         if isinstance(chain, Failed):
             raise MeasurementError(f"{store.name}: {chain.reason}")
         told = f"{chain.entries} rows of the audit log hold; the last digest is {chain.digest}"
-        Console().print(told, highlight=False, soft_wrap=True)
+        SafeConsole().print(told, highlight=False, soft_wrap=True)
 
     call(command, "store verify", arguments)

@@ -10,10 +10,10 @@ from typing import Any
 
 import tyro
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S
 from barsight.store.history import PresentBundle, parse_time, present_yard, time_text
@@ -42,7 +42,7 @@ def run(arguments: Sequence[str]) -> None:
         if json:
             write_json({"at_ns": now_ns, "bundles": yard_records(present, now_ns)})
             return
-        Console().print(bundle_table(f"Yard at {time_text(now_ns)}", present, now_ns))
+        SafeConsole().print(bundle_table(f"Yard at {time_text(now_ns)}", present, now_ns))
 
     call(command, "yard", arguments)
 

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import json_value
@@ -50,7 +51,7 @@ def run(arguments: Sequence[str]) -> None:
         )  # fmt: skip
         if json is not None:
             _write(changes, json)
-        _print(changes, Console())
+        _print(changes, SafeConsole())
 
     call(command, "compare", arguments)
 

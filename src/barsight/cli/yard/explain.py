@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
 from barsight.report.explanation import Explanation, explain, format_check, write_explanation
 
 COLOUR = {"passed": "green", "failed": "red", "unknown": "red"}
@@ -36,7 +37,7 @@ def run(arguments: Sequence[str]) -> None:
         told = explain(folder, lift)
         target = out or folder / f"explain-{lift.replace(':', '-')}.html"
         write_explanation(told, target)
-        console = Console()
+        console = SafeConsole()
         _print(told, console)
         console.print(f"page: {target}", soft_wrap=True, highlight=False, markup=False)
 

@@ -16,9 +16,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from barsight.cli.arguments import call, config_path, load_settings
+from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, Failed, InputError
-from barsight.core.geotiff import REMEDY
+from barsight.core.files import changed_folder
 from barsight.core.parallel import in_background
+from barsight.core.reading.geotiff import REMEDY
 from barsight.report.page import draw_pictures, write_report
 from barsight.result_folder import (
     bundles_digest,
@@ -89,12 +91,15 @@ def run(arguments: Sequence[str]) -> None:
         if isinstance(order, Failed):
             problem = f"bundle {fetch} can't be fetched, and nothing was written: {order.reason}"
             raise InputError(out, problem, FETCH_REMEDY)
-        target, console = out / "lifts.json", Console(stderr=True)
-        digest, sequence = bundles_digest(out), next_sequence(target, folder.identity)
-        write_lifts(plan, folder.reference, folder.identity, digest, target, sequence, order)
-        if happened:
-            write_events(happened, out / "events.csv")
-        write_report(out, out / "report.html", pictures.result())
+        console = SafeConsole(stderr=True)
+        digest, sequence = bundles_digest(out), next_sequence(out / "lifts.json", folder.identity)
+        with changed_folder(out) as staging:
+            write_lifts(
+                plan, folder.reference, folder.identity, digest, staging / "lifts.json", sequence, order
+            )
+            if happened:
+                write_events(happened, staging / "events.csv")
+            write_report(staging, staging / "report.html", pictures.result())
         print_lifts(plan, console)
         if order is not None:
             print_order(order, console)

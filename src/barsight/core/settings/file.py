@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import TypeVar
 
 from barsight.core.errors import ConfigError, InputError
+from barsight.core.reading.bounded_reading import read_toml
 from barsight.core.settings.values import build_settings
 
 Settings = TypeVar("Settings")
@@ -18,12 +18,9 @@ def read_settings(path: Path, kind: type[Settings], help_at: str, argument: str)
     help_at: where the keys are explained; argument: which one named the file. Raises InputError for a file
     that can't be read and ConfigError for a key or value that can't be.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", f"check the path given as {argument}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(path, f"is no TOML file: {error}", help_at) from error
+    if not path.exists():
+        raise InputError(path, "no such file", f"check the path given as {argument}")
+    content = read_toml(path, help_at)
     try:
         return build_settings(content, kind)
     except ConfigError as error:

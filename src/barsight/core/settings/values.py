@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import sys
 import types
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
@@ -132,8 +133,8 @@ def _plain(value: Any, kind: Any, name: str) -> Any:
     }[kind]  # fmt: skip
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
         raise ConfigError(f"{name} is {value!r}; give {wanted}")
-    if kind is float and not math.isfinite(value):
-        raise ConfigError(f"{name} is {value}; give a number")
     if kind is int and abs(value) > MAX_VALUE:
-        raise ConfigError(f"{name} is {value}; the most is {MAX_VALUE}")
+        raise ConfigError(f"{name} is over the most, {MAX_VALUE}")
+    if kind is float and not abs(value) <= sys.float_info.max:
+        raise ConfigError(f"{name} is {value if isinstance(value, float) else 'too large'}; give a number")
     return kind(value)

@@ -30,7 +30,7 @@ from barsight.recording.formats.bag_laser import laser_rows
 from barsight.recording.formats.bag_setup import choose_topics, find_calibration
 from barsight.recording.formats.segments import SEGMENTS, SegmentFile
 from barsight.recording.image_decoding import TornImageError
-from barsight.recording.pairing import PairedStamps, expect_size, pair_cameras
+from barsight.recording.pairing import PairedStamps, pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
 from barsight.recording.stored_images import StoredImage
 
@@ -223,7 +223,7 @@ class BagRecording:
         images: list[UInt8] = []
         for camera, message in ((self.rig.cam0, messages[0]), (self.rig.cam1, messages[1])):
             try:
-                images.append(expect_size(camera, gray_of(message.kind, self._picture(message))))
+                images.append(gray_of(message.kind, self._picture(message), (camera.width, camera.height)))
             except TornImageError as error:
                 return RefusedFrame(stamp_ns, f"{message.topic} at {message.stamp_ns} {error}")
         return StereoFrame(stamp_ns, images[0], images[1])

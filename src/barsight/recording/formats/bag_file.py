@@ -15,8 +15,11 @@ from typing import Any
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from barsight.calibration.files.yaml_document import read_document
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import open_regular
 from barsight.core.stamps import NS_PER_S
+from barsight.recording.contained import expect_inner_name, leads_outside
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
@@ -59,6 +62,7 @@ class BagFile:
         self.path = path
         self._is_ros1 = path.is_file() and path.suffix == ".bag"
         self._files = _files(path)
+        _expect_own_files(path)
         _expect_whole_database(self._files)
         with self._opened() as reader:
             self._typestore = reader.typestore
@@ -79,8 +83,6 @@ class BagFile:
                     stamp = self._header_stamp(data)
                 except StopIteration:
                     return
-                except MemoryError:
-                    raise
                 except Exception as error:
                     raise self._torn(error) from error
                 yield RawMessage(connection.topic, connection.msgtype, stamp, data)
@@ -94,8 +96,6 @@ class BagFile:
         read = typestore.deserialize_ros1 if self._is_ros1 else typestore.deserialize_cdr
         try:
             return read(message.data, message.kind)
-        except MemoryError:
-            raise
         except Exception as error:
             raise ValueError(f"is a torn message ({_short(error)})") from error
 
@@ -113,8 +113,6 @@ class BagFile:
         try:
             reader = AnyReader(self._files, default_typestore=ros2_types())
             reader.open()
-        except MemoryError:
-            raise
         except Exception as error:
             raise self._torn(error) from error
         try:
@@ -138,6 +136,20 @@ def _files(path: Path) -> list[Path]:
     return [path]
 
 
+def _expect_own_files(path: Path) -> None:
+    """Refuse a metadata.yaml that names files outside its folder, and links that lead out of it."""
+    described = path / "metadata.yaml"
+    if not path.is_dir() or not described.exists():
+        return
+    about = read_document(described).values.get("rosbag2_bagfile_information")
+    names = about.get("relative_file_paths") if isinstance(about, dict) else None
+    for name in names if isinstance(names, list) else ():
+        expect_inner_name(str(name), described, "relative_file_paths")
+        if leads_outside(path / str(name), path):
+            raise InputError(path / str(name), "is a link out of the bag", "copy the file into the folder")
+        open_regular(path / str(name), "copy the bag again").close()
+
+
 def _expect_whole_database(paths: list[Path]) -> None:
     """Refuse a torn database: SQLite reads a file that lost its last pages without a word until a lost page
     is needed.
@@ -148,7 +160,7 @@ def _expect_whole_database(paths: list[Path]) -> None:
     for file in files:
         if file.suffix != ".db3":
             continue
-        with file.open("rb") as stream:
+        with open_regular(file) as stream:
             header = stream.read(100)
         if len(header) < 100:
             continue

@@ -15,6 +15,7 @@ from barsight.recording.image_decoding import (
     PNG_SIGNATURE,
     TornImageError,
     decode_gray,
+    expect_size,
     to_gray,
 )
 
@@ -36,10 +37,14 @@ ENCODINGS: dict[str, tuple[type[np.generic], int, int | None]] = {
 }
 
 
-def gray_of(kind: str, message: Any) -> UInt8:
-    """Decode an `Image` or `CompressedImage` to (H, W) uint8. Raises `TornImageError`."""
+def gray_of(kind: str, message: Any, size: tuple[int, int]) -> UInt8:
+    """Decode an `Image` or `CompressedImage` to (H, W) uint8. Raises `TornImageError`.
+
+    size: the calibration's width and height.
+    """
     if kind == COMPRESSED_TYPE:
-        return decode_gray(message.data.tobytes())
+        return decode_gray(message.data.tobytes(), size)
+    expect_size((int(message.width), int(message.height)), size)
     return to_gray(_pixels(message))
 
 

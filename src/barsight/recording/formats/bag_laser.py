@@ -23,13 +23,19 @@ def laser_rows(path: Path, cloud: Any) -> Float64:
     if missing or cloud.data.size < count * cloud.point_step:
         problem = f"has no field {missing[0]}" if missing else "is cut short"
         raise InputError(path, f"the laser's point cloud {problem}", "write it with `barsight convert`")
-    dtype = np.dtype(
-        {
-            "names": list(NAMES),
-            "formats": [order + KINDS[fields[name].datatype] for name in NAMES],
-            "offsets": [int(fields[name].offset) for name in NAMES],
-            "itemsize": int(cloud.point_step),
-        }
-    )
+    try:
+        dtype = np.dtype(
+            {
+                "names": list(NAMES),
+                "formats": [order + KINDS[fields[name].datatype] for name in NAMES],
+                "offsets": [int(fields[name].offset) for name in NAMES],
+                "itemsize": int(cloud.point_step),
+            }
+        )
+    except ValueError as error:
+        problem = f"has impossible fields ({error})"
+        raise InputError(
+            path, f"the laser's point cloud {problem}", "write it with `barsight convert`"
+        ) from None
     points = np.frombuffer(cloud.data.tobytes(), dtype=dtype, count=count)
     return np.stack([points[name].astype(np.float64) for name in NAMES], axis=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +11,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, open_regular
 from barsight.core.stamps import expect_increasing
+from barsight.recording.contained import expect_inner_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +86,12 @@ def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
     for number, text in _data_lines(path):
         fields = [field.strip() for field in text.split(",")]
         if len(fields) != 2 or not fields[1]:
-            raise InputError(path, f"line {number}: expected `stamp,filename`, got {text!r}", _REMEDY)
+            raise InputError(path, f"line {number}: expected `stamp,filename`, got {text[:80]!r}", _REMEDY)
         if not _is_int64(fields[0]):
             raise InputError(
-                path, f"line {number}: the stamp {fields[0]!r} is not a whole number of ns", _REMEDY
+                path, f"line {number}: the stamp {fields[0][:40]!r} is not a whole number of ns", _REMEDY
             )
+        expect_inner_name(fields[1], path, f"line {number}")
         stamps.append(int(fields[0]))
         names.append(fields[1])
         lines.append(number)
@@ -104,11 +106,8 @@ def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
 
 
 def require_file(path: Path) -> None:
-    """Raise `InputError` unless there is such a file and it may be read."""
-    if not path.is_file():
-        raise InputError(path, "no such file", "copy the recording again, with all its files")
-    if not os.access(path, os.R_OK):
-        raise InputError(path, "no permission to read it", "ask its owner or copy the recording")
+    """Raise `InputError` unless there is such a file, it may be read and is no larger than a table."""
+    open_regular(path, "copy the recording again, with all its files", max_bytes=MAX_TABLE_BYTES).close()
 
 
 _REMEDY = "take the original file or mend the line"
@@ -154,13 +153,13 @@ def _diagnosis(path: Path, columns: tuple[str, ...], extra_allowed: bool) -> Inp
             )
         if not _is_int64(fields[0]):
             return InputError(
-                path, f"line {number}: {columns[0]} {fields[0]!r} is not a whole number", _REMEDY
+                path, f"line {number}: {columns[0]} {fields[0][:40]!r} is not a whole number", _REMEDY
             )
         for name, field in zip(columns[1:], fields[1:], strict=False):
             try:
                 float(field)
             except ValueError:
-                return InputError(path, f"line {number}: {name} {field!r} is not a number", _REMEDY)
+                return InputError(path, f"line {number}: {name} {field[:40]!r} is not a number", _REMEDY)
     if empty:
         return InputError(path, "has no rows", "the sensor recorded nothing; remove its folder to go without")
     return InputError(path, "is not readable as a CSV of numbers", _REMEDY)

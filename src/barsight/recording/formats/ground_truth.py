@@ -10,7 +10,9 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
+from barsight.core.reading.bounded_reading import read_text
 from barsight.core.stamps import expect_increasing, parse_seconds
+from barsight.recording.contained import leads_outside
 from barsight.recording.formats.euroc_tables import read_table, require_file
 
 EUROC_FOLDER = "state_groundtruth_estimate0"
@@ -34,7 +36,9 @@ def find_ground_truth(recording: Path) -> Path | None:
         recording.parent / EUROC_FOLDER / "data.csv" if recording.is_file() else None,
         recording / "poses.txt",
     )
-    return next((path for path in candidates if path and path.is_file()), None)
+    found = next((path for path in candidates if path and path.is_file()), None)
+    root = recording if recording.is_dir() else recording.parent
+    return None if found is None or leads_outside(found, root) else found
 
 
 def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: str = "world") -> GroundTruth:
@@ -101,7 +105,7 @@ def _kitti(path: Path, lines: list[list[str]], stamp_ns: Int64 | None, reference
 
 def _lines(path: Path) -> list[list[str]]:
     lines: list[list[str]] = []
-    for number, text in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+    for number, text in enumerate(read_text(path).splitlines(), 1):
         fields = text.partition("#")[0].replace(",", " ").split()
         if not fields:
             continue

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.recording.contained import read_picture
 from barsight.recording.image_decoding import TornImageError
 from barsight.recording.pairing import PairedAtOpening, decode_for
 from barsight.recording.stored_images import StoredImage, merge_cameras
@@ -19,6 +20,7 @@ class PictureFiles(PairedAtOpening):
     """
 
     rig: StereoRig
+    path: Path
     _root: Path
     _left: Sequence[Path]
     _right: Sequence[Path]
@@ -31,10 +33,13 @@ class PictureFiles(PairedAtOpening):
                 yield self._read_pair(stamp, self._left[left], self._right[right])
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Yield every picture's bytes as stored, both cameras in time's order, missing files left out."""
+        """Yield the bytes as stored of every picture that can be read, both cameras in time's order."""
         for camera, stamp, path in merge_cameras(self._pairs, self._left, self._right):
-            if path.is_file():
-                yield StoredImage(camera, stamp, path.suffix.lstrip(".").lower(), path.read_bytes())
+            try:
+                data = read_picture(path, self.path)
+            except (FileNotFoundError, TornImageError):
+                continue
+            yield StoredImage(camera, stamp, path.suffix.lstrip(".").lower(), data)
 
     def _read_pair(self, stamp_ns: int, left: Path, right: Path) -> StereoFrame | RefusedFrame:
         """Read one pair; refused, with the file's name, where either picture can't be used."""
@@ -42,11 +47,9 @@ class PictureFiles(PairedAtOpening):
         for path, camera in ((left, self.rig.cam0), (right, self.rig.cam1)):
             name = path.relative_to(self._root)
             try:
-                images.append(decode_for(camera, path.read_bytes()))
+                images.append(decode_for(camera, read_picture(path, self.path)))
             except FileNotFoundError:
                 return RefusedFrame(stamp_ns, f"{name} is missing")
-            except OSError as error:
-                return RefusedFrame(stamp_ns, f"{name} can't be read ({error.strerror})")
             except TornImageError as error:
                 return RefusedFrame(stamp_ns, f"{name} {error}")
         return StereoFrame(stamp_ns, images[0], images[1])

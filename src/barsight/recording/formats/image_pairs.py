@@ -8,7 +8,8 @@ from pathlib import Path
 
 from barsight.core.arrays import UInt8
 from barsight.core.errors import InputError
-from barsight.recording.image_decoding import TornImageError, decode_gray
+from barsight.core.reading.bounded_reading import read_bytes
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_gray
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
 FOLDERS = (
@@ -69,9 +70,9 @@ def read_pair_files(pair: PicturePair) -> ReadPair:
     problems = []
     for camera, file in (("cam0", pair.left), ("cam1", pair.right)):
         try:
-            images.append(decode_gray(file.read_bytes()))
-        except (OSError, TornImageError) as error:
-            reason = f"can't be read ({error.strerror})" if isinstance(error, OSError) else str(error)
+            images.append(decode_gray(read_bytes(file, MAX_PICTURE_BYTES)))
+        except (InputError, TornImageError) as error:
+            reason = error.problem if isinstance(error, InputError) else str(error)
             problems.append((camera, f"{file.name} {reason}"))
             images.append(None)
     return ReadPair(pair.name, images[0], images[1], tuple(problems))

@@ -11,6 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import read_text
 from barsight.core.stamps import NS_PER_S, parse_seconds
 from barsight.core.types import ImuSamples
 
@@ -87,10 +88,7 @@ def _file(path: Path) -> Path:
 
 def _rows(path: Path) -> tuple[str, Int64, Float64]:
     """Read header text, stamps (N,) ns in time's order and values (N, 6)."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"can't be read as text ({error})", f"give {FORM}") from None
+    lines = read_text(path, remedy=f"give {FORM}").splitlines()
     start = next((k for k, line in enumerate(lines) if re.match(r"\s*[-+.\d]", line)), len(lines))
     rows = [(k + 1, line) for k, line in enumerate(lines[start:], start) if line.strip() and line[0] != "#"]
     stamps, values = [], []

@@ -7,7 +7,6 @@ and `times.txt`. A second layout has two bare lines of twelve numbers, `image_l`
 from __future__ import annotations
 
 import re
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,11 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import CalibrationError, InputError
-from barsight.core.stamps import NS_PER_S, expect_increasing
+from barsight.core.reading.bounded_reading import read_text
+from barsight.core.stamps import NS_PER_S, expect_increasing, seconds_in_ns
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
+from barsight.recording.contained import read_picture
 from barsight.recording.digest import file_digests
 from barsight.recording.formats.image_folders import PictureFiles
 from barsight.recording.image_decoding import TornImageError, decode_gray
@@ -34,7 +35,7 @@ FOLDERS = (
     ("image_l", "image_r", "", ""),
 )
 ASSUMED_RATE_HZ = 10
-PICTURE = re.compile(r"(\d+)\.(png|jpg|jpeg)$", re.IGNORECASE)
+PICTURE = re.compile(r"([0-9]{1,12})\.(png|jpg|jpeg)$", re.IGNORECASE)
 
 
 def is_kitti(path: Path) -> bool:
@@ -110,13 +111,13 @@ def _read_times(path: Path) -> Int64 | None:
     if not path.is_file():
         return None
     stamps = []
-    for number, text in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+    for number, text in enumerate(read_text(path).splitlines(), 1):
         if text.strip():
             try:
-                stamps.append(int((Decimal(text.strip()) * NS_PER_S).to_integral_value()))
-            except (InvalidOperation, ValueError, OverflowError):
+                stamps.append(seconds_in_ns(text.strip()))
+            except ValueError:
                 raise InputError(
-                    path, f"line {number}: {text.strip()!r} is not a time in seconds", "mend the line"
+                    path, f"line {number}: {text.strip()[:40]!r} is not a time in seconds", "mend the line"
                 ) from None
     if not stamps:
         raise InputError(path, "has no rows", "remove the file to assume 10 pictures per second")
@@ -144,7 +145,7 @@ def _read_projections(path: Path, keys: tuple[str, str]) -> tuple[Float64, Float
         raise CalibrationError(path, "no such file", "copy the sequence's calib.txt beside its pictures")
     named: dict[str, Float64] = {}
     bare: list[Float64] = []
-    for number, text in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+    for number, text in enumerate(read_text(path).splitlines(), 1):
         name, colon, rest = text.partition(":")
         name, rest = (name.strip(), rest) if colon else ("", text)
         if not rest.strip() or (name and name not in keys):
@@ -196,8 +197,8 @@ def _size(paths: list[Path]) -> tuple[int, int]:
     """Read (width, height) of the first picture that is whole: KITTI's calibration does not state it."""
     for path in paths:
         try:
-            height, width = decode_gray(path.read_bytes()).shape
-        except (OSError, TornImageError):
+            height, width = decode_gray(read_picture(path, path.parents[1])).shape
+        except (FileNotFoundError, TornImageError):
             continue
         return width, height
     raise InputError(paths[0].parent, "holds no whole picture", "copy the recording again")

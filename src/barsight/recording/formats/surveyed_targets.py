@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import read_text
 from barsight.recording.formats.euroc_tables import require_file
 
 COLUMNS = ("name", "yard_x", "yard_y", "yard_z", "x", "y", "z")
@@ -36,10 +38,10 @@ def read_targets(path: Path) -> Targets:
     Raises `InputError` naming the line.
     """
     require_file(path)
-    with path.open(encoding="utf-8-sig", newline="") as stream:
-        lines = [line.lstrip("# ") if n == 0 else line for n, line in enumerate(stream)]
+    first, *others = read_text(path, remedy=REMEDY).split("\n")
+    lines = [first.lstrip("# "), *others]
     rows = list(csv.DictReader(lines, skipinitialspace=True))
-    header = [name.strip() for name in (lines[0].split(",") if lines else [])]
+    header = [name.strip() for name in lines[0].split(",")]
     missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise InputError(path, f"has no column {missing[0]}", REMEDY)
@@ -56,7 +58,7 @@ def read_targets(path: Path) -> Targets:
             )
         numbers.append(values)
     names = [row["name"].strip() for row in rows]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InputError(path, f"target {twice} is there twice", "give each target once")
     table = np.array(numbers, np.float64).reshape(-1, 8)

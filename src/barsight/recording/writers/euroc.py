@@ -90,7 +90,7 @@ def copy_truth(recording: StoredPictures, folder: Path) -> None:
     target.mkdir(parents=True)
     if source.suffix == ".csv":
         for path in sorted(source.parent.iterdir()):
-            if path.is_file():
+            if path.is_file() and not path.is_symlink():
                 shutil.copyfile(path, target / path.name)
     else:
         (target / "data.csv").write_text(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ import numpy as np
 
 from barsight.core.errors import InputError
 from barsight.core.json_values import DIGITS, json_value
-from barsight.core.sealed_json import read_sealed, write_sealed
+from barsight.core.reading.json_schema import expect_schema, package_schema
+from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.stock_list import MatchedEntry, StockMatch
 from barsight.yard.types import Bar, Bundle, BundleSigma
@@ -36,18 +36,27 @@ def write_bundles(
     return write_sealed(content, target)
 
 
-def read_bundles(path: Path) -> tuple[Bundle, ...]:
-    """Read bundles.json. Raises InputError where it is missing, torn, changed or of another version."""
+def bundles_content(path: Path) -> dict[str, Any]:
+    """Read what bundles.json holds. Raises InputError as `read_bundles`."""
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
+    expect_schema(content, package_schema("barsight.yard", "bundles"), path, REMEDY)
+    return content
+
+
+def read_bundles(path: Path) -> tuple[Bundle, ...]:
+    """Read bundles.json. Raises InputError where it is missing, torn, changed, of another version or isn't as
+    its schema says.
+    """
+    content = bundles_content(path)
     try:
         return tuple(bundle_of(record) for record in content["bundles"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise InputError(path, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
 
 
 def read_match(path: Path) -> StockMatch | None:
     """Read how bundles.json, as `read_bundles` takes it, and the stock list fit; None without a list."""
-    stock = json.loads(path.read_text(encoding="utf-8")).get("stock")
+    stock = bundles_content(path)["stock"]
     if stock is None:
         return None
     try:

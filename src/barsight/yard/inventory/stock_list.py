@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import read_json, read_text
 from barsight.yard.types import Bundle
 
 _NEEDED = ("name", "x_m", "y_m")
@@ -80,24 +81,23 @@ def read_stock(path: Path) -> tuple[ListedBundle, ...]:
     except (ValueError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"can't be read ({error})", _REMEDY) from error
     listed = tuple(_expected(path, number, row) for number, row in enumerate(rows, start=1))
-    names = [one.name for one in listed]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    counts = Counter(one.name for one in listed)
+    twice = sorted(name for name, count in counts.items() if count > 1)
     if twice:
-        raise InputError(path, f"lists {twice[0]!r} {names.count(twice[0])} times", "give each its own name")
+        raise InputError(path, f"lists {twice[0]!r} {counts[twice[0]]} times", "give each its own name")
     return listed
 
 
 def _csv_rows(path: Path) -> list[dict[str, Any]]:
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        reader = csv.DictReader(file)
-        missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
-        if missing:
-            raise InputError(path, f"has no column {missing[0]}", _REMEDY)
-        return [dict(row) for row in reader]
+    reader = csv.DictReader(read_text(path, remedy=_REMEDY).split("\n"))
+    missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
+    if missing:
+        raise InputError(path, f"has no column {missing[0]}", _REMEDY)
+    return [dict(row) for row in reader]
 
 
 def _json_rows(path: Path) -> list[dict[str, Any]]:
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path, _REMEDY)
     rows = content.get("bundles") if isinstance(content, dict) else content
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError(path, "is no list of bundles", _REMEDY)
@@ -115,11 +115,11 @@ def _expected(path: Path, number: int, row: dict[str, Any]) -> ListedBundle:
             continue
         try:
             value = float(text)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             value = float("nan")
         positive = key in ("length_m", "width_m", "bar_diameter_m", "bars")
         if not np.isfinite(value) or (positive and value <= 0):
-            raise InputError(path, f"bundle {number}: {key} can't be {text!r}", _REMEDY)
+            raise InputError(path, f"bundle {number}: {key} can't be {str(text)[:40]!r}", _REMEDY)
         figures[key] = value
     name = str(row.get("name") or "").strip()
     if not name:

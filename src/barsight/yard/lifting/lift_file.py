@@ -11,7 +11,8 @@ from typing import Any
 import cattrs
 
 from barsight.core.json_values import DIGITS, json_value
-from barsight.core.sealed_json import read_sealed, write_sealed
+from barsight.core.reading.json_schema import expect_schema, package_schema
+from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.yard.events import YardEvent
 from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
@@ -40,8 +41,12 @@ def write_lifts(
 
 
 def read_lifts(path: Path) -> dict[str, Any]:
-    """Read lifts.json. Raises InputError where it is missing, torn, changed or of another version."""
-    return read_sealed(path, SCHEMA_VERSION, REMEDY)
+    """Read lifts.json. Raises InputError where it is missing, torn, changed, of another version or isn't as
+    its schema says.
+    """
+    content = read_sealed(path, SCHEMA_VERSION, REMEDY)
+    expect_schema(content, package_schema("barsight.yard", "lifts"), path, REMEDY)
+    return content
 
 
 def forbidden_since(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Iterator
@@ -15,14 +16,18 @@ import tifffile
 from numpy.typing import NDArray
 
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import open_regular
 
 HEIGHT_BANDS = 4
 """Bands of height.tif: z, sigma, views, source."""
 REMEDY = "measure the recording again"
+MAX_CELLS = 1 << 28
+"""Of a map: 26,000 m^2 in cells of 10 mm; a small file may claim any number."""
 _READ_BYTES = 1 << 22
 """tifffile would read ahead 256 MiB."""
 _TORN = (
     tifffile.TiffFileError, zlib.error, struct.error, OSError, ValueError, KeyError, IndexError, RuntimeError,
+    TypeError, AttributeError, AssertionError, OverflowError, ZeroDivisionError, MemoryError,
 )  # fmt: skip
 """Exceptions of tifffile on a file that is cut short or is something else."""
 
@@ -82,7 +87,7 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
     Raises InputError where it is something else, or where it proves torn while it is open.
     """
     try:
-        with tifffile.TiffFile(path) as file:
+        with open_regular(path, REMEDY) as stream, tifffile.TiffFile(stream) as file:
             page = file.pages.first
             assert isinstance(page, tifffile.TiffPage)
             planar = (
@@ -92,8 +97,14 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
                 raise InputError(
                     path, f"has the shape {page.shape}, not {bands} planar bands in tiles", REMEDY
                 )
+            if math.prod(page.shape) > MAX_CELLS * bands:
+                raise InputError(
+                    path, f"has {math.prod(page.shape) // bands} cells, at most {MAX_CELLS} are read", REMEDY
+                )
             cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
             left_m, top_m = (float(v) for v in page.tags["ModelTiepointTag"].value[3:5])
+            if not (0 < cell_m < 1e3 and abs(left_m) < 1e6 and abs(top_m) < 1e6):
+                raise InputError(path, "lies nowhere on earth: its cells or its corner can't be", REMEDY)
             yield GeoTiff(page, cell_m, left_m, top_m)
     except _TORN as error:
         raise InputError(path, f"is torn ({error})", REMEDY) from error

@@ -9,6 +9,7 @@ from typing import Any
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import json_digest
+from barsight.core.reading.bounded_reading import read_json
 
 SEAL = "content_sha256"
 
@@ -32,13 +33,10 @@ def _lines(value: Any) -> str:
 
 def read_sealed(path: Path, version: int, remedy: str) -> dict[str, Any]:
     """Read a document. Raises InputError where it is missing, torn, of another version or changed."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        found = content["schema_version"]
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", remedy) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, f"is torn ({type(error).__name__}: {error})", remedy) from error
+    content = read_json(path, remedy)
+    if not isinstance(content, dict) or "schema_version" not in content:
+        raise InputError(path, "has no schema_version", remedy)
+    found = content["schema_version"]
     if found != version:
         raise InputError(path, f"has schema version {found} instead of {version}", remedy)
     document: dict[str, Any] = content

@@ -12,6 +12,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from barsight.core.reading.bounded_reading import open_regular
+
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1",
@@ -36,7 +38,7 @@ def read_vertices(path: Path) -> NDArray[Any]:
     What follows the vertices is not read. Raises ValueError for a file that is no PLY or is cut short, and
     for lists in the vertices or before them.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         header = _read_header(file)
         dtypes = []
         for name, count, fields in header.elements:

@@ -1,0 +1,6 @@
+"""Feed Barsight with damaged and hostile input, and hold each answer against docs/threat-model.md.
+
+    python -m fuzz --minutes 5 --seed 1
+
+A checkout's tool: it is no part of the installed package.
+"""

@@ -1,0 +1,129 @@
+"""Attack for so many minutes or inputs and print a table of what was found."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import cv2
+
+from barsight.cli.main import COMMANDS, home
+from fuzz.judging import Verdict, judge
+from fuzz.mutators import mutate, reseal_folder
+from fuzz.seeds import make_seeds
+from fuzz.targets import TARGETS, Target
+
+
+def main() -> int:
+    """Parse, attack, print; 1 where something was found."""
+    parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=1.0)
+    parser.add_argument("--inputs", type=int, default=10**9, help="stop after so many")
+    parser.add_argument("--seed", type=int, default=time.time_ns() % 10**6)
+    parser.add_argument("--seeds", type=Path, help="folder that keeps the whole files between runs")
+    parser.add_argument("--only", default="", help="targets whose names hold this")
+    parser.add_argument("--show", action="store_true", help="print each finding with its last lines")
+    given = parser.parse_args()
+    import_commands()
+    with tempfile.TemporaryDirectory() as place:
+        seeds = given.seeds or Path(place) / "seeds"
+        if not seeds.exists():
+            make_seeds_apart(seeds)
+        chosen = [target for target in TARGETS if given.only in target.name]
+        runs, found = attack(chosen, seeds, Path(place), given.seed, given.minutes, given.inputs, given.show)
+    print(table(runs, found, given.seed))
+    return 1 if found else 0
+
+
+def import_commands() -> None:
+    """Import all commands once, not in every fork; no threads, which a fork would lose."""
+    cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # as a command does before it loads it
+    for name in COMMANDS:
+        importlib.import_module(home(name))
+
+
+def make_seeds_apart(seeds: Path) -> None:
+    """Make the seeds in a process of its own: this one forks, so it must not start threads."""
+    import os
+
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            make_seeds(seeds)
+            code = 0
+        finally:
+            os._exit(code)
+    if os.waitpid(pid, 0)[1]:
+        raise SystemExit("the seeds could not be made")
+
+
+def attack(
+    targets: list[Target], seeds: Path, place: Path, seed: int, minutes: float, inputs: int, show: bool
+) -> tuple[dict[str, list[Verdict]], list[tuple[int, str, str, Verdict]]]:
+    """Run inputs until time or count is up; verdicts by target, and findings: number, target, how, verdict.
+
+    Input k of a seed is the same whatever ran before it.
+    """
+    runs: dict[str, list[Verdict]] = defaultdict(list)
+    found = []
+    end = time.monotonic() + 60 * minutes
+    number = 0
+    while number < inputs and time.monotonic() < end:
+        draw = random.Random(f"{seed}:{number}")
+        target = draw.choices(targets, [each.weight for each in targets])[0]
+        how, verdict = one(target, seeds, place / "scratch", draw)
+        runs[target.name].append(verdict)
+        if verdict.fault:
+            found.append((number, target.name, how, verdict))
+            if show:
+                tail = "\n    ".join(verdict.text.strip().splitlines()[-6:])
+                print(f"{number} {target.name}: {verdict.fault} ({how})\n    {tail}", flush=True)
+        number += 1
+    return runs, found
+
+
+def one(target: Target, seeds: Path, scratch: Path, draw: random.Random) -> tuple[str, Verdict]:
+    """Copy, damage, run and judge."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    target.copy(seeds, scratch)
+    files = target.files(scratch)
+    # Folders of many pictures must not take all the turns.
+    by_folder = defaultdict(list)
+    for path in files:
+        by_folder[path.parent, path.suffix].append(path)
+    how = []
+    for _ in range(draw.choice((1, 1, 1, 2))):
+        path = draw.choice(by_folder[draw.choice(sorted(by_folder))])
+        how.append(mutate(path, draw) if path.is_file() else "")
+    if (scratch / "out").is_dir() and draw.random() < 0.7:
+        reseal_folder(scratch / "out")
+    outputs = tuple(scratch / name for name in target.outputs)
+    return "; ".join(how), judge(lambda: target.call(scratch), scratch, outputs)
+
+
+def table(runs: dict[str, list[Verdict]], found: list[tuple[int, str, str, Verdict]], seed: int) -> str:
+    """Format counts by target."""
+    kinds = Counter((name, verdict.fault.partition(":")[0]) for _, name, _, verdict in found)
+    lines = ["| target | inputs | findings | slowest s | exit codes |", "|---|---:|---|---:|---|"]
+    for name in sorted(runs):
+        told = ", ".join(f"{count} {kind}" for (of, kind), count in sorted(kinds.items()) if of == name)
+        codes = Counter(verdict.code for verdict in runs[name])
+        ends = ", ".join(f"{code}: {count}" for code, count in sorted(codes.items()))
+        slowest = max(verdict.seconds for verdict in runs[name])
+        lines.append(f"| {name} | {len(runs[name])} | {told or 0} | {slowest:.1f} | {ends} |")
+    total = sum(map(len, runs.values()))
+    return "\n".join([*lines, f"\nseed {seed}: {total} inputs, {len(found)} findings"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

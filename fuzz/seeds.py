@@ -1,0 +1,127 @@
+"""Make the whole files that the mutators damage: a tiny yard, its recording in each format, its results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from barsight.calibration.files.euroc import read_rig
+from barsight.calibration.files.rig_file import write_rig_file
+from barsight.cli.main import run
+from barsight.core.files import atomic_directory
+from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.simulate import simulate
+from barsight.yard.magnet.description import example_magnet
+from fuzz.mutators import reseal_folder
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+import result_folders
+import yard_folders
+
+TINY = SimulationSettings(
+    length_m=1.5, frames=4, seed=3, camera=CameraSettings(width_px=320, height_px=256, focal_px=312.5),
+    yard=YardSettings(max_layers=2),
+)  # fmt: skip
+BAGS = {"mcap": "ros2-mcap", "sqlite": "ros2-sqlite3", "ros1": "ros1"}
+START_NS = 1_700_000_000_000_000_000
+
+
+def make_seeds(folder: Path) -> None:
+    """Fill `folder`; it appears whole or not at all."""
+    with atomic_directory(folder) as made:
+        simulate(made / "euroc", TINY)
+        for name, kind in BAGS.items():
+            _done(["convert", str(made / "euroc"), "-o", str(made / name), "--to", kind])
+        _kitti(made / "kitti", made / "euroc")
+        _files(made)
+        for name, shift_m in (("out", 0.0), ("old", 0.1)):
+            _results(made / name, shift_m)
+            _done(["lifts", str(made / name), "--magnet", str(made / "magnet.toml"), "--at", "end"])
+
+
+def _done(command: list[str]) -> None:
+    code = run(command)
+    if code:
+        raise RuntimeError(f"barsight {' '.join(command)} ended with {code}")
+
+
+def _results(folder: Path, shift_m: float) -> None:
+    """Write what measuring leaves: a yard of two bundles, with all the files that a page shows."""
+    yard_folders.write_folder(folder, shift_m=shift_m)
+    more = folder.with_name("more")
+    result_folders.write_folder(more)
+    for name in ("cloud.ply", "contour.csv", "laser.csv", "trajectory.tum", "preview.png"):
+        shutil.copyfile(more / name, folder / name)
+    shutil.rmtree(more)
+    reseal_folder(folder)
+
+
+def _kitti(folder: Path, euroc: Path) -> None:
+    for camera in (0, 1):
+        (folder / f"image_{camera}").mkdir(parents=True)
+        pictures = sorted((euroc / "mav0" / f"cam{camera}" / "data").glob("*.png"))
+        for k, path in enumerate(pictures):
+            shutil.copyfile(path, folder / f"image_{camera}" / f"{k:06d}.png")
+    rows = ("312.5 0 159.5 0 0 312.5 127.5 0 0 0 1 0", "312.5 0 159.5 -150 0 312.5 127.5 0 0 0 1 0")
+    (folder / "calib.txt").write_text("".join(f"P{k}: {row}\n" for k, row in enumerate(rows)))
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(len(pictures))))
+
+
+def _files(made: Path) -> None:
+    rig = read_rig(made / "euroc" / "mav0")
+    write_rig_file(made / "rig.yaml", rig)
+    for name, to in (("camchain.yaml", "kalibr"), ("opencv.yaml", "opencv"), ("opencv.xml", "opencv")):
+        _done(["calibrate", "export", str(made / "rig.yaml"), "-o", str(made / name), "--to", to])
+    (made / "magnet.toml").write_text(example_magnet(), encoding="utf-8")
+    (made / "settings.toml").write_text(
+        'preset = "best"\nuse = ["stereo", "crane"]\n[map]\ncell_m = 0.05\n[stereo]\nmethod = "sgbm"\n'
+    )
+    (made / "stock.csv").write_text("name,x_m,y_m,length_m,bars\nA,0.5,0.1,2.0,12\nB,0.9,0.4,2.0,8\n")
+    stock = [{"name": "A", "x_m": 0.5, "y_m": 0.1, "bars": 12}, {"name": "B", "x_m": 0.9, "y_m": 0.4}]
+    (made / "stock.json").write_text(json.dumps({"bundles": stock}, indent=1))
+    (made / "events.csv").write_text(
+        "stamp_ns,kind,x_m,y_m,yaw_deg,length_m,width_m\n"
+        f"{START_NS},lift,0.5,0.1,0.0,2.0,0.3\n{START_NS + 5},magnet,0.9,0.4,90.0,1.0,0.5\n"
+    )
+    draw = np.random.default_rng(1)
+    places = draw.uniform(0, 10, (6, 3))
+    rows = [",".join([f"T{k}", *(f"{v:.4f}" for v in (*p, *(p + 0.5)))]) for k, p in enumerate(places)]
+    (made / "targets.csv").write_text("name,yard_x,yard_y,yard_z,x,y,z\n" + "\n".join(rows) + "\n")
+    gyro, accel = draw.normal(0, 1e-3, (4000, 3)), draw.normal((0, 0, 9.81), 1e-2, (4000, 3))
+    lines = [
+        f"{START_NS + 10_000_000 * k},{','.join(f'{v:.6f}' for v in (*w, *a))}"
+        for k, (w, a) in enumerate(zip(gyro, accel, strict=True))
+    ]
+    (made / "imu.csv").write_text("#t,wx,wy,wz,ax,ay,az\n" + "\n".join(lines) + "\n")
+    _corners(made / "corners")
+    for name, camera in (("left.png", "cam0"), ("right.png", "cam1")):
+        first = min((made / "euroc" / "mav0" / camera / "data").glob("*.png"))
+        shutil.copyfile(first, made / name)
+    for suffix in (".jpg", ".tif", ".bmp", ".pgm"):
+        picture = cv2.imread(str(made / "left.png"), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
+        cv2.imwrite(str(made / f"left{suffix}"), picture)
+
+
+def _corners(folder: Path) -> None:
+    folder.mkdir()
+    kind = [
+        ("stamp_ns", "i8"),
+        ("tag", "i4"),
+        ("corner", "i4"),
+        ("u", "f8"),
+        ("v", "f8"),
+        ("x", "f8"),
+        ("y", "f8"),
+    ]
+    rows = np.zeros(96, kind)
+    rows["stamp_ns"] = np.repeat(START_NS + 100_000_000 * np.arange(4), 24)
+    rows["tag"], rows["corner"] = np.tile(np.arange(24) // 4, 4), np.tile(np.arange(24) % 4, 4)
+    rows["u"], rows["v"] = 10.0 + 12 * rows["tag"], 20.0 + 9 * rows["corner"]
+    for camera in (0, 1):
+        np.savez(folder / f"cam{camera}_detections.npz", detections=rows)

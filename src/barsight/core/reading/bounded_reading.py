@@ -1,0 +1,192 @@
+"""Read files that others made: regular ones only, and no larger, deeper or longer than they may be.
+
+A name in a recording or a result folder may hide a pipe, a device or a file of any size; a short file may
+stand for a long one (nested brackets, numbers of 400 digits, packed zeros). Every reader of text, TOML, JSON
+and archives goes through here; YAML's own traps are in `calibration.files.yaml_document`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import stat
+import tomllib
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from barsight.core.errors import InputError
+
+MAX_TABLE_BYTES = 512 << 20
+"""Of a table of numbers: five hours of an IMU at 200 Hz take 400 MB."""
+MAX_DOCUMENT_BYTES = 256 << 20
+"""Of a result's JSON."""
+MAX_SETTINGS_BYTES = 1 << 20
+"""Of a file that people write: settings, magnets, calibrations."""
+MAX_ARCHIVE_BYTES = 1 << 30
+"""Of an archive's arrays, unpacked."""
+MAX_DEPTH, MAX_NODES = 64, 1_000_000
+"""Of lists and mappings in each other, and of all values of a settings file."""
+MAX_INTEGER = 2**64
+MAX_DIGITS = 30
+REMEDY = "take the original file"
+
+
+def open_regular(
+    path: Path, remedy: str = REMEDY, kind: type[InputError] = InputError, max_bytes: int | None = None
+) -> io.BufferedReader:
+    """Open a regular file for reading bytes.
+
+    kind: of the error for a file that is missing, may not be read, is a folder, a pipe or a device, or has
+    more than max_bytes.
+    """
+    try:
+        _expect_regular(path, path.stat(), remedy, kind, max_bytes)
+        # Another file may have taken the place meanwhile: a pipe must not block.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise kind(path, "no such file", remedy) from None
+    except PermissionError:
+        raise kind(path, "no permission to read it", "ask its owner or copy it") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise kind(path, f"can't be read ({reason})", remedy) from None
+    file = open(path, "rb", opener=lambda *_: descriptor)  # noqa: SIM115
+    try:
+        _expect_regular(path, os.fstat(descriptor), remedy, kind, max_bytes)
+    except InputError:
+        file.close()
+        raise
+    return file
+
+
+def _expect_regular(
+    path: Path, found: os.stat_result, remedy: str, kind: type[InputError], max_bytes: int | None
+) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        what = "is a folder" if stat.S_ISDIR(found.st_mode) else "is no regular file but a pipe or a device"
+        raise kind(path, what, remedy)
+    if max_bytes is not None and found.st_size > max_bytes:
+        raise kind(path, f"has {found.st_size} bytes, at most {max_bytes} are read", remedy)
+
+
+def read_bytes(
+    path: Path, max_bytes: int, remedy: str = REMEDY, kind: type[InputError] = InputError
+) -> bytes:
+    """Read a regular file of at most so many bytes. Raises `kind`."""
+    with open_regular(path, remedy, kind, max_bytes) as file:
+        try:
+            return file.read(max_bytes)
+        except OSError as error:
+            raise kind(path, f"can't be read ({error.strerror})", remedy) from None
+
+
+def read_text(
+    path: Path, max_bytes: int = MAX_TABLE_BYTES, remedy: str = REMEDY, kind: type[InputError] = InputError
+) -> str:
+    """Read UTF-8 text, with or without a BOM; lines end with newlines alone. Raises `kind`."""
+    data = read_bytes(path, max_bytes, remedy, kind)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise kind(path, f"is no UTF-8 text (byte {error.start})", remedy) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(path: Path, remedy: str = REMEDY, kind: type[InputError] = InputError) -> Any:
+    """Read a JSON document. Raises `kind` for one that is torn, too large or deep, or holds NaN."""
+    return _parsed(path, "JSON", _parse_json, MAX_DOCUMENT_BYTES, remedy, kind)
+
+
+def read_toml(path: Path, remedy: str = REMEDY, kind: type[InputError] = InputError) -> dict[str, Any]:
+    """Read a TOML file of settings. Raises `kind` as `read_json`."""
+    content: dict[str, Any] = _parsed(path, "TOML", tomllib.loads, MAX_SETTINGS_BYTES, remedy, kind)
+    try:
+        expect_modest(content)
+    except ValueError as error:
+        raise kind(path, f"is no TOML file: {error}", remedy) from None
+    return content
+
+
+def _parsed(
+    path: Path, form: str, parse: Callable[[str], Any], max_bytes: int, remedy: str, kind: type[InputError]
+) -> Any:
+    text = read_text(path, max_bytes, remedy, kind)
+    try:
+        return parse(text)
+    except RecursionError:
+        raise kind(path, f"is no {form} file: brackets in brackets over {MAX_DEPTH} deep", remedy) from None
+    except ValueError as error:
+        raise kind(path, f"is no {form} file: {error}", remedy) from None
+
+
+def _parse_json(text: str) -> Any:
+    tree = json.loads(text, parse_int=_whole, parse_constant=_constant)
+    _expect_shallow(tree)
+    return tree
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > MAX_DIGITS:
+        raise ValueError(f"a number has {len(digits)} digits")
+    return int(digits)
+
+
+def _constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number")
+
+
+def _expect_shallow(tree: Any) -> None:
+    level = [tree]
+    for _ in range(MAX_DEPTH):
+        level = [
+            item
+            for node in level if isinstance(node, (dict, list))
+            for item in (node.values() if isinstance(node, dict) else node) if isinstance(item, (dict, list))
+        ]  # fmt: skip
+        if not level:
+            return
+    raise ValueError(f"brackets in brackets over {MAX_DEPTH} deep")
+
+
+def expect_modest(tree: Any) -> None:
+    """Raise ValueError for a tree of mappings and lists that is too deep or large, or holds an integer of
+    over 64 bits. A part that stands in several places counts in each.
+    """
+    waiting, nodes = [(tree, 0)], 0
+    while waiting:
+        node, depth = waiting.pop()
+        nodes += 1
+        if depth > MAX_DEPTH:
+            raise ValueError(f"brackets in brackets over {MAX_DEPTH} deep")
+        if nodes > MAX_NODES:
+            raise ValueError(f"over {MAX_NODES} values")
+        if isinstance(node, int) and abs(node) >= MAX_INTEGER:
+            raise ValueError("an integer takes over 64 bits")
+        if isinstance(node, dict):
+            waiting += [(item, depth + 1) for item in node.values()]
+        elif isinstance(node, list):
+            waiting += [(item, depth + 1) for item in node]
+
+
+def read_arrays(
+    path: Path, remedy: str = REMEDY, kind: type[InputError] = InputError
+) -> dict[str, NDArray[Any]]:
+    """Read an npz archive's arrays. Raises `kind` for one that is torn, too large, or holds objects."""
+    data = read_bytes(path, MAX_ARCHIVE_BYTES, remedy, kind)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > MAX_ARCHIVE_BYTES:
+            raise kind(path, f"unpacks to {unpacked} bytes, at most {MAX_ARCHIVE_BYTES} are read", remedy)
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except InputError:
+        raise
+    except Exception as error:  # NumPy, zipfile and zlib raise all kinds on a torn archive
+        raise kind(path, f"is no archive of arrays ({error})", remedy) from None

@@ -1,0 +1,48 @@
+"""Keep to a recording's own files: a name in it must not lead out of it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import read_bytes
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
+
+
+def expect_inner_name(name: str, path: Path, where: str) -> None:
+    """Raise InputError about `path` for a name that is absolute, climbs out of its folder or is none.
+
+    where: the place in the file, like `line 3`.
+    """
+    parts = PurePosixPath(name)
+    if not name.isprintable() or parts.is_absolute() or ".." in parts.parts or not parts.parts:
+        raise InputError(
+            path, f"{where}: {name[:80]!r} leads out of the recording", "name files by their name alone"
+        )
+
+
+def leads_outside(path: Path, root: Path) -> bool:
+    """Check whether a file lies outside the recording `root`, by a symbolic link in its way."""
+    return not path.resolve().is_relative_to(_resolved(root))
+
+
+@lru_cache(maxsize=8)
+def _resolved(root: Path) -> Path:
+    return root.resolve()
+
+
+def read_picture(path: Path, root: Path) -> bytes:
+    """Read a picture's bytes as stored.
+
+    Raises `TornImageError` for a link out of the recording `root`, for what is no regular file, too large or
+    may not be read, and FileNotFoundError.
+    """
+    if not path.exists():
+        raise FileNotFoundError(path)
+    try:
+        if leads_outside(path, root):
+            raise TornImageError("is a link out of the recording: copy the picture into it")
+        return read_bytes(path, MAX_PICTURE_BYTES)
+    except InputError as error:
+        raise TornImageError(error.problem) from None
