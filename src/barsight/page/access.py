@@ -97,7 +97,9 @@ class Throttle:
 class Access:
     """Log-ins of one running server; they end with it. accounts: gives the store's present ones, by name."""
 
-    def __init__(self, accounts: Callable[[], dict[str, Account]], clock: Callable[[], float] = time.monotonic):
+    def __init__(
+        self, accounts: Callable[[], dict[str, Account]], clock: Callable[[], float] = time.monotonic
+    ):
         self._accounts = accounts
         self._clock = clock
         self._sessions: dict[str, _LogIn] = {}
@@ -133,7 +135,11 @@ class Access:
             scheme, _, token = authorization.partition(" ")
             found = token_digest(token.strip())
             for one in accounts.values():
-                if scheme.lower() == "bearer" and one.kind == "token" and hmac.compare_digest(one.secret, found):
+                if (
+                    scheme.lower() == "bearer"
+                    and one.kind == "token"
+                    and hmac.compare_digest(one.secret, found)
+                ):
                     return Caller(one.name, one.role, None)
             raise AccessError(401, "the token is not known")
         if not accounts:

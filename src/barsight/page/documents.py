@@ -15,7 +15,15 @@ from barsight.store.confirmation import newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
 from barsight.store.matching import has_moved
 from barsight.store.tables import (
-    ABSENCES, ALARM_STATES, ALARMS, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, STOCK_DECISIONS, SURVEY_VETOES,
+    ABSENCES,
+    ALARM_STATES,
+    ALARMS,
+    LIFT_BUNDLES,
+    LIFT_STATES,
+    LIFTS,
+    SIGHTINGS,
+    STOCK_DECISIONS,
+    SURVEY_VETOES,
     SURVEYS,
 )  # fmt: skip
 from barsight.yard.inventory.bundle_file import bundle_of, read_match
@@ -27,8 +35,8 @@ MAX_LIFTS = 500
 MAX_ALARMS = 500
 _FIGURES = (
     "axis_centre_m", "yaw_deg", "pitch_deg", "length_m", "ends_m", "ends_open", "width_m", "top_z_m",
-    "bar_diameter_m", "bars", "section_m2", "mass_kg", "layer", "on_top", "confidence", "known_share", "sigma",
-    "reasons", "cover_doubts",
+    "bar_diameter_m", "bars", "section_m2", "mass_kg", "layer", "on_top", "confidence", "known_share",
+    "sigma", "reasons", "cover_doubts",
 )  # fmt: skip
 _ALARM_ORDER = {"raised": 0, "returned": 1, "acknowledged": 2, "cleared": 3}
 
@@ -75,7 +83,9 @@ def _bundle(one: PresentBundle, vetoes: Any, offers: Any) -> dict[str, Any]:
         "stock_name": sighting.stock_name,
         "doubt": None if one.doubt is None else {"code": one.doubt.kind, "reason": one.doubt.reason},
         "vetoes": vetoes.get((sighting.survey_id, sighting.bundle_id), []),
-        "lift": None if lift is None else {"id": lift.lift_id, "rank": lift.record["rank"], "state": lift.state},
+        "lift": None
+        if lift is None
+        else {"id": lift.lift_id, "rank": lift.record["rank"], "state": lift.state},
         **{name: sighting.record[name] for name in _FIGURES},
     }
 
@@ -97,8 +107,8 @@ def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None
     ).all()
     told = [
         {
-            "map_id": row.map_id, "at_ns": row.captured_to_ns, "what": row.change, "x_m": row.x_m, "y_m": row.y_m,
-            "top_z_m": row.top_z_m, "length_m": row.length_m,
+            "map_id": row.map_id, "at_ns": row.captured_to_ns, "what": row.change, "x_m": row.x_m,
+            "y_m": row.y_m, "top_z_m": row.top_z_m, "length_m": row.length_m,
             "stock_name": row.stock_name, "sigma": json.loads(row.record)["sigma"],
         }
         for row in seen
@@ -127,7 +137,8 @@ def lift_records(connection: Connection) -> list[dict[str, Any]]:
         {
             "id": row.id, "rank": row.rank, "map_id": row.map_id, "calibration_id": row.calibration_id,
             "seen_ns": row.captured_to_ns, "bundles": [identity_name(number) for number in of[row.id]],
-            "state": steps[row.id][-1]["state"], "steps": steps[row.id], **_lift_figures(json.loads(row.record)),
+            "state": steps[row.id][-1]["state"], "steps": steps[row.id],
+            **_lift_figures(json.loads(row.record)),
         }
         for row in rows
     ]  # fmt: skip
@@ -135,8 +146,8 @@ def lift_records(connection: Connection) -> list[dict[str, Any]]:
 
 def _lift_figures(record: dict[str, Any]) -> dict[str, Any]:
     names = (
-        "target", "tolerance", "set_down", "mass_kg", "mass_sigma_kg", "pull_low_n", "pull_needed_n", "safety",
-        "count", "count_probability", "valid_from_ns", "valid_until_ns",
+        "target", "tolerance", "set_down", "mass_kg", "mass_sigma_kg", "pull_low_n", "pull_needed_n",
+        "safety", "count", "count_probability", "valid_from_ns", "valid_until_ns",
     )  # fmt: skip
     return {name: record[name] for name in names}
 
@@ -222,7 +233,11 @@ def compare_yards(connection: Connection, before_ns: int, after_ns: int) -> list
     for number in sorted({*before, *after}):
         old, new = before.get(number), after.get(number)
         kind = "went" if new is None else "came" if old is None else "moved"
-        if old is not None and new is not None and not has_moved(bundle_of(old.record), bundle_of(new.record)):
+        if (
+            old is not None
+            and new is not None
+            and not has_moved(bundle_of(old.record), bundle_of(new.record))
+        ):
             continue
         told.append(
             {
@@ -261,7 +276,9 @@ def _steps(
     connection: Connection, table: Any, owner: Any, numbers: Iterable[int]
 ) -> dict[int, list[dict[str, Any]]]:
     found: dict[int, list[dict[str, Any]]] = defaultdict(list)
-    rows = connection.execute(select(table).where(owner.in_(list(numbers))).order_by(owner, table.c.step)).all()
+    rows = connection.execute(
+        select(table).where(owner.in_(list(numbers))).order_by(owner, table.c.step)
+    ).all()
     for row in rows:
         step = {"state": row.state, "at_ns": row.at_ns, "who": row.who, "note": row.note}
         found[getattr(row, owner.name)].append(step)

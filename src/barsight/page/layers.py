@@ -51,7 +51,7 @@ def edges(heights: HeightMap) -> list[float]:
 
 
 def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[Layer, ...]:
-    """Share the yard at a time out among its surveys, the oldest first: each place to the newest that saw it."""
+    """Share the yard at a time out among its surveys, each place to the newest that saw it; the oldest first."""
     query = select(SURVEYS.c.map_id, SURVEYS.c.captured_to_ns, SURVEYS.c.folder, SURVEYS.c.heights)
     if at_ns is not None:
         query = query.where(SURVEYS.c.captured_to_ns <= at_ns)
@@ -122,7 +122,9 @@ def _shaded(heights: HeightMap) -> UInt8:
     known = np.isfinite(heights.z_m)
     low, high = np.percentile(heights.z_m[known], (1, 99)) if known.any() else (0.0, 1.0)
     level: Float32 = (heights.z_m - low) / max(float(high - low), 0.2)
-    gray = (_DARK + (_LIGHT - _DARK) * level.clip(0, 1)) * (0.8 + 0.2 * hillshade(heights.z_m, heights.cell_m))
+    gray = (_DARK + (_LIGHT - _DARK) * level.clip(0, 1)) * (
+        0.8 + 0.2 * hillshade(heights.z_m, heights.cell_m)
+    )
     return np.asarray(np.where(known, gray.clip(1, 255), 0)).astype(np.uint8)
 
 

@@ -64,7 +64,7 @@ def add_token(opened: Entry, name: str, role: str) -> str:
 
 
 def withdraw(opened: Entry, name: str) -> None:
-    """Withdraw an account. Raises ConfigError where there is none, or it is the last person that may add one."""
+    """Withdraw an account. Raises ConfigError where there is none, or it is the last engineer."""
     accounts = list_accounts(opened.connection)
     if name not in accounts:
         raise ConfigError(f"there is no account {name!r}")

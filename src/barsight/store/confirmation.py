@@ -1,4 +1,4 @@
-"""Confirm offered lifts and report what came of them; let offers and confirmations end with what they rest on."""
+"""Confirm offered lifts and report what came of them; end offers and confirmations with their map."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def confirm_lift(store: Store, lift_id: int, map_id: str, who: str) -> None:
 
 
 def take_lift(store: Store, lift_id: int, who: str) -> None:
-    """Report that a confirmed lift was executed; what was offered or confirmed beside it ends as disturbed."""
+    """Report that a confirmed lift was executed; offers and confirmations beside it end."""
 
     def step(opened: Entry, lift: OpenLift) -> None:
         step_lift(opened, lift_id, "executed")
@@ -132,7 +132,7 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
 
 
 def expire_stale(store: Store, who: str) -> int:
-    """Let offers and confirmations end whose map is no longer the newest, or too old. Returns their number."""
+    """End offers and confirmations whose map is no longer the newest, or too old. Returns their number."""
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
         if not _stale(connection, clock_ns):
@@ -144,9 +144,7 @@ def expire_stale(store: Store, who: str) -> int:
     return len(stale)
 
 
-def _change(
-    store: Store, lift_id: int, who: str, what: str, step: Callable[[Entry, OpenLift], None]
-) -> None:
+def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Entry, OpenLift], None]) -> None:
     """Step a lift in one transaction with the check that it may still be believed."""
     expire_stale(store, who)
     with store.reading() as connection:

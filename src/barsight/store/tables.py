@@ -100,7 +100,8 @@ ALARM_STATES = Table(
 )  # fmt: skip
 
 ACCOUNTS = Table(
-    "accounts", METADATA, _key(), *_texts("name", "kind", "role", "secret"), *_stamps("at_ns"), *_texts("who"),
+    "accounts", METADATA, _key(), *_texts("name", "kind", "role", "secret"), *_stamps("at_ns"),
+    *_texts("who"),
 )  # fmt: skip
 """Who may use the page: of a name the newest row counts. kind: `person` or `token`; see `accounts`."""
 
