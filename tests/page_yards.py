@@ -47,7 +47,7 @@ def survey(folder: Path, stock: list[Laid], age_s: float, *, with_lifts: bool = 
         record(one, k, ends_open=(False, k == open_end and stock is SECOND)) for k, one in enumerate(stock)
     )
     stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)
-    ways = np.array([(one.x_m, 0.0) for one in (stock[0], stock[2], stock[-1])])
+    ways = np.array([(one.x_m, 0.0) for one in (stock[0], stock[len(stock) // 2], stock[-1])])
     captured = {"captured_from_ns": int(stamps[0]), "captured_to_ns": int(stamps[-1])}
     content = summary() | {"agreement": [], "travel": sure_travel(ways, stamps).content(), **captured}
     identity = seal_map(content, folder)
@@ -64,7 +64,7 @@ def fill_store(folder: Path, *, surveys: int = 2) -> str:
     """Make a store with the first survey, an hour old, and the second, a minute old; return its URL."""
     url = f"sqlite:///{folder / 'yard.db'}"
     with open_store(url, create=True) as store:
-        add_survey(store, read_survey(survey(folder / "first", FIRST, 3600.0)), "ann")
+        add_survey(store, read_survey(survey(folder / "first", FIRST, 3600.0, with_lifts=False)), "ann")
         if surveys > 1:
             add_survey(store, read_survey(survey(folder / "second", SECOND, 60.0)), "ann")
     return url

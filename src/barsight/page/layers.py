@@ -10,7 +10,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.arrays import Bool, UInt8
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.core.geotiff import open_geotiff
@@ -51,7 +51,7 @@ def edges(heights: HeightMap) -> list[float]:
 
 
 def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[Layer, ...]:
-    """Share the yard at a time out among its surveys, each place to the newest that saw it; the oldest first."""
+    """Share the yard at a time out among its surveys, each place to the newest that saw it; oldest first."""
     query = select(SURVEYS.c.map_id, SURVEYS.c.captured_to_ns, SURVEYS.c.folder, SURVEYS.c.heights)
     if at_ns is not None:
         query = query.where(SURVEYS.c.captured_to_ns <= at_ns)
@@ -121,7 +121,7 @@ def _shaded(heights: HeightMap) -> UInt8:
     """Paint heights from dark to light, shaded from a side; 0 where unknown."""
     known = np.isfinite(heights.z_m)
     low, high = np.percentile(heights.z_m[known], (1, 99)) if known.any() else (0.0, 1.0)
-    level: Float32 = (heights.z_m - low) / max(float(high - low), 0.2)
+    level = (heights.z_m - low) / max(float(high - low), 0.2)
     gray = (_DARK + (_LIGHT - _DARK) * level.clip(0, 1)) * (
         0.8 + 0.2 * hillshade(heights.z_m, heights.cell_m)
     )

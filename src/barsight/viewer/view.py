@@ -103,7 +103,8 @@ def _own_pages_only() -> Iterator[None]:
     """Let the server that is started here refuse what other pages in the same browser ask of it: a Host or an
     Origin that isn't this machine's. viser has no setting for it, so its websockets server gets the check.
     """
-    module: Any = _infra.websockets.asyncio.server
+    library: Any = _infra
+    module = library.websockets.asyncio.server
     serve = module.serve
 
     def guarded(*places: Any, process_request: Any, **options: Any) -> Any:

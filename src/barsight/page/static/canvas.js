@@ -130,7 +130,8 @@ export class YardCanvas {
     const step = [1, 2, 5, 10, 20, 50].find((each) => each * this.view.scale > 70) || 100;
     c.font = "12px sans-serif";
     c.fillStyle = "#3c4043";
-    c.strokeStyle = "#00000018";
+    c.strokeStyle = "#00000022";
+    c.lineWidth = 1;
     c.beginPath();
     const [x0, y0] = this.at(0, this.height);
     const [x1, y1] = this.at(this.width, 0);

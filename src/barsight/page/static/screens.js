@@ -37,7 +37,7 @@ export async function liftScreen(place) {
   const open = lifts.filter((one) => ["offered", "claimed"].includes(one.state)).sort((a, b) => a.rank - b.rank);
   const closed = lifts.filter((one) => !open.includes(one));
   show(place,
-    h("section", {}, h("h1", {}, t("lifts.open")), open.length ? open.map((one) => h("div", { className: "panel", id: `lift-${one.id}` }, h("h2", {}, `${one.rank} · ${one.bundles.join(", ")}`), liftPanel(one))) : h("p", {}, t("lifts.none"))),
+    h("section", {}, h("h1", {}, t("lifts.open")), open.length ? h("div", { className: "lifts" }, open.map((one) => h("div", { className: "panel", id: `lift-${one.id}` }, h("h2", {}, `${one.rank} · ${one.bundles.join(", ")}`), liftPanel(one)))) : h("p", {}, t("lifts.none"))),
     h("section", {}, h("h1", {}, t("lifts.closed")), table([t("lift"), t("bundle"), t("state"), t("time"), t("who"), t("note"), ""], closed.map((one) => {
       const step = one.steps[one.steps.length - 1];
       return row([h("td", {}, String(one.id)), h("td", {}, one.bundles.map((name) => h("a", { href: `#bundle/${name}` }, name))), h("td", {}, t(`lift.${one.state}`)), h("td", {}, timeText(step.at_ns)), h("td", {}, step.who), h("td", {}, step.note || ""), h("td", {}, liftButtons(one))]);
