@@ -212,9 +212,8 @@ def test_other_pages_and_names_are_refused(local: httpx.Client) -> None:
     wrong = {"X-Barsight-Token": "guessed"}
     assert local.post(f"/api/lifts/{lift['id']}/confirm", json=body, headers=wrong).status_code == 403
     with socket.create_connection(("127.0.0.1", port)) as raw:
-        raw.sendall(
-            f"POST /api/session HTTP/1.1\r\nHost: localhost:{port}\r\nContent-Length: 9999999\r\n\r\n".encode()
-        )
+        head = f"Host: localhost:{port}\r\nContent-Length: 9999999\r\n\r\n"
+        raw.sendall(f"POST /api/session HTTP/1.1\r\n{head}".encode())
         assert b" 403 " in raw.recv(100)
     page = local.get("/")
     assert "default-src 'none'" in page.headers["content-security-policy"]

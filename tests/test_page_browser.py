@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from barsight.page.serve import ServeOptions, serving
-from barsight.store.opening import open_store
 from page_yards import fill_store
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -50,10 +50,31 @@ class Sheet:
         self.page.wait_for_selector(f"body[data-screen={name}] #nav-{name}[aria-current]")
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    fill_store(folder)
+    return folder
+
+
 @pytest.fixture
-def address(tmp_path: Path) -> Iterator[str]:
-    with serving(fill_store(tmp_path), ServeOptions(port=0)) as address:
+def url(made: Path, tmp_path: Path) -> str:
+    shutil.copy(made / "yard.db", tmp_path / "yard.db")
+    return f"sqlite:///{tmp_path / 'yard.db'}"
+
+
+@pytest.fixture
+def address(url: str) -> Iterator[str]:
+    with serving(url, ServeOptions(port=0)) as address:
         yield address
+
+
+def wait_for(holds: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    """The page's policy forbids Playwright to wait inside it."""
+    end_s = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
 
 
 def test_every_screen_by_mouse_and_by_keyboard(browser: object, address: str) -> None:
@@ -76,7 +97,7 @@ def test_every_screen_by_mouse_and_by_keyboard(browser: object, address: str) ->
             page.keyboard.press("Enter")
             name = reached[-1][4:]
             page.wait_for_selector(f"body[data-screen={name}] #nav-{name}[aria-current]")
-            page.wait_for_function("document.activeElement.id === 'screen'")
+            wait_for(lambda: page.evaluate("document.activeElement.id") == "screen")
             page.focus(f"#nav-{name}")
     assert [f"nav-{name}" for name in SCREENS] == [each for each in reached if each.startswith("nav-")]
     assert sheet.outside == [] and sheet.errors == []
@@ -143,20 +164,17 @@ def test_a_stale_offer_cannot_be_confirmed(browser: object, address: str) -> Non
     assert {one["state"] for one in lifts} == {"expired"}
 
 
-def test_a_server_that_ends_and_comes_back(browser: object, tmp_path: Path) -> None:
-    url = fill_store(tmp_path)
+def test_a_server_that_ends_and_comes_back(browser: object, url: str) -> None:
     with serving(url, ServeOptions(port=0)) as address:
         sheet = Sheet(browser, address)
         sheet.open("lifts")
         sheet.page.wait_for_selector("[id^=confirm-]")
     sheet.page.wait_for_selector("#server >> text=no connection")
     with serving(url, ServeOptions(port=int(address.rsplit(":", 1)[1]))):
-        sheet.page.wait_for_selector("#server >> text=/^.*connected/", timeout=15_000)
-        sheet.page.wait_for_function("!document.querySelector('#server').innerText.includes('no conn')")
+        sheet.page.wait_for_selector("#server >> text=/^connected/", timeout=15_000)
+        wait_for(lambda: "no connection" not in sheet.page.inner_text("#server"))
         confirm(sheet.page)
         sheet.page.wait_for_selector("li.at >> text=confirmed")
-    with open_store(url):
-        pass
 
 
 def test_alarms_stock_and_accounts_by_the_page(browser: object, address: str) -> None:
