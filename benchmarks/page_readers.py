@@ -1,7 +1,7 @@
-"""Time the page's API with many readers and its canvas with many bundles: `python benchmarks/page_readers.py`.
+"""Time the page's API with many readers, its canvas with many bundles: `python benchmarks/page_readers.py`.
 
-The server runs in a process of its own, `barsight serve` as a user starts it, on a store that the tests' drawn
-yard fills. Each reader asks for the six documents in turn over a connection of its own, with a pause in
+The server runs in a process of its own, `barsight serve` as a user starts it, on a store that the tests'
+drawn yard fills. Each reader asks for the six documents in turn over a connection of its own, with a pause in
 between. The canvas is timed in Chromium where Playwright is installed.
 """
 

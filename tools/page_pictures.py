@@ -1,4 +1,4 @@
-"""Take the pictures of docs/how-to/run-the-page.md, of the yard that tests draw: `python tools/page_pictures.py`."""
+"""Take the pictures of docs/how-to/run-the-page.md: `python tools/page_pictures.py`."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ def main() -> None:
     sys.path.insert(0, str(ROOT / "tests"))
     from page_yards import fill_store
 
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        with serving(fill_store(Path(folder)), ServeOptions(port=0)) as address:
-            browser = playwright.chromium.launch(
-                executable_path=shutil.which("chromium"), args=["--no-sandbox"]
-            )
-            page = browser.new_page(viewport={"width": 1400, "height": 800}, locale="en")
-            for name in SCREENS:
-                page.goto(f"{address}/#{name}")
-                page.wait_for_timeout(1500)
-                if name == "yard":
-                    page.focus("#yard")
-                    for _ in range(5):
-                        page.keyboard.press("n")
-                    page.wait_for_timeout(300)
-                page.screenshot(path=ROOT / "docs" / "pictures" / f"page_{name}.jpg", type="jpeg", quality=70)
-            browser.close()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        serving(fill_store(Path(folder)), ServeOptions(port=0)) as address,
+        sync_playwright() as playwright,
+    ):
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1400, "height": 800}, locale="en")
+        for name in SCREENS:
+            page.goto(f"{address}/#{name}")
+            page.wait_for_timeout(1500)
+            if name == "yard":
+                page.focus("#yard")
+                for _ in range(5):
+                    page.keyboard.press("n")
+                page.wait_for_timeout(300)
+            page.screenshot(path=ROOT / "docs" / "pictures" / f"page_{name}.jpg", type="jpeg", quality=70)
+        browser.close()
 
 
 if __name__ == "__main__":
