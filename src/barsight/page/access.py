@@ -46,7 +46,9 @@ class AccessError(BarsightError):
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks. csrf: token that a change must carry; None for a program's token, which no browser adds."""
+    """A person or program that asks. csrf: token that a change must carry; None for a
+    program's token, which no browser adds.
+    """
 
     name: str
     role: Role

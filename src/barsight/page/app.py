@@ -69,7 +69,7 @@ class NoteForm(BaseModel):
 
 
 class EndForm(NoteForm):
-    """How a lift ends without being taken: `expired` (declined, or taken back) or `failed`."""
+    """End of a lift that was not taken: `expired` (declined, or taken back) or `failed`."""
 
     state: str
 
@@ -89,7 +89,7 @@ class VetoForm(BaseModel):
 
 
 class DecisionForm(NoteForm):
-    """What is decided of one difference of the stock list, by its key."""
+    """Decision on one difference of the stock list, by its key."""
 
     map_id: str
     key: str = Field(max_length=200)
@@ -123,6 +123,7 @@ def build_app(watch: StoreWatch, hosts: frozenset[str], origins: frozenset[str],
     _add_page(app)
     _add_session(app, access, is_secure=is_secure)
     _add_reading(app, watch, access)
+    _add_files(app, watch, access)
     _add_lifts(app, watch, access)
     _add_alarms(app, watch, access)
     _add_accounts(app, watch, access)
@@ -199,7 +200,6 @@ def _add_session(app: FastAPI, access: Access, *, is_secure: bool) -> None:
 
 
 def _add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    painted = PaintedLayers()
     reader = _need(access, "read")
 
     def add_document(name: str) -> None:
@@ -242,6 +242,11 @@ def _add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
     def compare(before_ns: int, after_ns: int, _: Caller = reader) -> Any:
         with watch.store.reading() as connection:
             return json_value({"changes": compare_yards(connection, before_ns, after_ns)})
+
+
+def _add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
+    painted = PaintedLayers()
+    reader = _need(access, "read")
 
     @app.get("/api/layers/{map_id}.png")
     def layer(map_id: str, _: Caller = reader, kind: Kind = "photo", at_ns: int | None = None) -> Response:

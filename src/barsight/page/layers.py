@@ -30,7 +30,7 @@ _KEPT = 64
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What one survey knows best. shown: (rows, columns) of its coarse heights, from the lowest y."""
+    """Places that one survey knows best. shown: (rows, columns) of its coarse heights, from the lowest y."""
 
     map_id: str
     seen_ns: int

@@ -30,7 +30,8 @@ _DRAIN_S = 1
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """How the page is reached. public_url: what browsers call it, where that isn't this computer's loopback.
+    """Addresses at which the page is reached. public_url: what browsers call it, where that isn't this
+    computer's loopback.
     certificate, key: PEM files for TLS. live: a live run's folder.
     """
 

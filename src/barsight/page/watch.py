@@ -46,8 +46,8 @@ HEARTBEAT_S = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Published:
-    """What the page reads, as one revision of the store has it. revision: rows of the audit log. documents:
-    JSON by name.
+    """Documents that the page reads, as one revision of the store has them. revision: rows of the audit log.
+    documents: JSON by name.
     """
 
     revision: int = -1
