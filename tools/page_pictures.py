@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import sys
 import tempfile
@@ -18,7 +19,7 @@ SCREENS = ("yard", "lifts", "alarms", "timeline")
 def main() -> None:
     """Serve a store of two surveys and write a picture of each screen."""
     sys.path.insert(0, str(ROOT / "tests"))
-    from page_yards import fill_store
+    fill_store = importlib.import_module("page_yards").fill_store
 
     with (
         tempfile.TemporaryDirectory() as folder,
