@@ -67,7 +67,7 @@ APART = {
 """Rooms of which the first doesn't import the second either."""
 MAX_MODULES = 16
 ROOT = Path(barsight.__file__).parent
-OPTIONAL = {"viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1, "alembic": 3, "fastapi": 1, "uvicorn": 1}
+OPTIONAL = {"viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1, "alembic": 4, "fastapi": 1, "uvicorn": 1}
 """Optional libraries, and the number of files that import them: of rosbags one reads and one writes."""
 
 
