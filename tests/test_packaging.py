@@ -37,8 +37,17 @@ EXTRAS = {
         "store/adding.py",
         "store/lift_records.py",
         "store/migrations/env.py",
+        "store/accounts.py",
+        "store/confirmation.py",
         "store/migrations/versions/v0001_first.py",
+        "store/migrations/versions/v0002_page.py",
+        "page/conditions.py",
+        "page/documents.py",
+        "page/layers.py",
+        "page/survey_files.py",
+        "page/watch.py",
     },
+    "page": {"page/app.py", "page/serve.py"},
 }
 """Which modules may import what an extra installs."""
 

@@ -25,11 +25,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_folder(tmp_path_factory.mktemp("out"))
 
 
-def get(url: str) -> tuple[int, bytes]:
+def get(url: str, **headers: str) -> tuple[int, bytes]:
     parts = urlsplit(url)
     connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=10)
     try:
-        connection.request("GET", "/")
+        connection.request("GET", "/", headers=headers)
         answer = connection.getresponse()
         return answer.status, answer.read()
     finally:
@@ -49,6 +49,24 @@ def test_it_serves_and_stops(folder: Path, capsys: pytest.CaptureFixture[str]) -
     with pytest.raises(ConnectionRefusedError):
         get(url)
     assert capsys.readouterr().out == ""
+
+
+UPGRADE = {
+    "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": "viser-v1.1.1",
+}  # fmt: skip
+
+
+def test_other_pages_in_the_browser_are_refused(folder: Path) -> None:
+    """By Origin, and by Host: a name of another page's that was made to lead here."""
+    with serving(folder, 0) as url:
+        port = urlsplit(url).port
+        assert get(url, Origin=url)[0] == get(url, Host=f"localhost:{port}")[0] == 200
+        assert get(url, **UPGRADE, Origin=url)[0] == 101
+        for foreign in ("https://evil.example", f"http://127.0.0.1:{(port or 0) + 1}", "null"):
+            assert get(url, **UPGRADE, Origin=foreign)[0] == get(url, Origin=foreign)[0] == 403
+        for host in (f"evil.example:{port}", "127.0.0.1", "127.0.0.1:1"):
+            assert get(url, **UPGRADE, Host=host)[0] == get(url, Host=host)[0] == 403
 
 
 def test_ctrl_c_ends_it(

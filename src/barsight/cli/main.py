@@ -23,6 +23,7 @@ COMMANDS = {
     "compare": "Compare two measured yards: moved, settled, taken, added",
     "store": "Keep the yard over time: add a survey, list, verify; bundles keep their names",
     "yard": "Print the yard as the store knows it, now or at any past time",
+    "serve": "Serve the operator's page and its API on a store",
     "view": "Show a measured yard in 3D in the browser",
     "info": "Say what is in a recording: sensors, rates, gaps, calibration",
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
@@ -37,7 +38,7 @@ COMMANDS = {
 }
 GROUPS = ("bench", "calibrate", "store")
 """Commands that are packages: `command.py` in them finds the second word."""
-ROOMS = {"yard": ("lifts", "explain", "compare"), "store": ("yard",)}
+ROOMS = {"yard": ("lifts", "explain", "compare"), "store": ("yard", "serve")}
 """Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
 _interrupts: list[int] = []

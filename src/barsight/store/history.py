@@ -153,6 +153,22 @@ def present_yard(connection: Connection, at_ns: int | None = None) -> tuple[Pres
     return tuple(present)
 
 
+def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[str, Any]]:
+    """Build each bundle's record: as in bundles.json, with identity, survey, age and doubt."""
+    return [
+        {
+            "identity": each.sighting.identity,
+            "map_id": each.sighting.map_id,
+            "seen_ns": each.sighting.seen_ns,
+            "age_s": (now_ns - each.sighting.seen_ns) / NS_PER_S,
+            "stock_name": each.sighting.stock_name,
+            "doubt": None if each.doubt is None else {"code": each.doubt.kind, "reason": each.doubt.reason},
+            "bundle": each.sighting.record,
+        }
+        for each in present
+    ]
+
+
 def _sightings(
     connection: Connection, condition: ColumnElement[bool], *, is_newest: bool
 ) -> dict[int, BundleSighting]:

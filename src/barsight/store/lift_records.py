@@ -33,6 +33,10 @@ def add_lifts(
                 )  # fmt: skip
     for lift in content["lifts"] if is_newest else ():
         record = {key: value for key, value in lift.items() if key not in ("poles", "checks")}
+        record |= {
+            "beam": (content.get("magnet") or {}).get("beam"),
+            "disturbed_reach_m": content["settings"]["disturbed_reach_m"],
+        }
         lift_id = opened.add(
             LIFTS, survey_id=survey_id, rank=lift["rank"], record=json.dumps(record, sort_keys=True)
         )
@@ -57,6 +61,8 @@ def settle_lifts(opened: Entry, told: dict[int, str], seen_from_ns: int, *, is_n
             step_lift(opened, lift.lift_id, "failed", "the next survey found it where it lay")
     if not is_newest:
         return
+    for lift_id in _claimed(opened):
+        step_lift(opened, lift_id, "expired", "a newer map came")
     offers = select(LIFT_STATES.c.lift_id).distinct().where(LIFT_STATES.c.state == "offered")
     closed = select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.state != "offered")
     rows = opened.connection.execute(
@@ -66,3 +72,14 @@ def settle_lifts(opened: Entry, told: dict[int, str], seen_from_ns: int, *, is_n
     ).all()
     for lift_id in sorted({row.lift_id for row in rows if row.bundle_id in told}):
         step_lift(opened, lift_id, "expired", "a later survey saw its bundles")
+
+
+def _claimed(opened: Entry) -> list[int]:
+    """List the lifts whose last state is `claimed`."""
+    later = select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.step > 2)
+    claimed = (
+        select(LIFT_STATES.c.lift_id)
+        .where(LIFT_STATES.c.state == "claimed", LIFT_STATES.c.lift_id.not_in(later))
+        .order_by(LIFT_STATES.c.lift_id)
+    )
+    return list(opened.connection.execute(claimed).scalars())

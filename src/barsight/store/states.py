@@ -19,9 +19,11 @@ LIFT_STEPS: dict[str | None, tuple[str, ...]] = {
 """Which states may follow a lift's state; none follows `failed`, `verified` and `expired`."""
 ALARM_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("raised",),
-    "raised": ("acknowledged", "cleared"),
+    "raised": ("acknowledged", "cleared", "returned"),
     "acknowledged": ("cleared",),
+    "returned": ("cleared",),
 }
+"""`returned`: the cause is gone, and nobody has acknowledged it; acknowledging it clears it (ISA-18.2)."""
 
 
 def step_lift(opened: Entry, lift_id: int, state: str, note: str | None = None) -> None:

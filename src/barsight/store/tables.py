@@ -99,6 +99,18 @@ ALARM_STATES = Table(
     UniqueConstraint("alarm_id", "step"),
 )  # fmt: skip
 
+ACCOUNTS = Table(
+    "accounts", METADATA, _key(), *_texts("name", "kind", "role", "secret"), *_stamps("at_ns"),
+    *_texts("who"),
+)  # fmt: skip
+"""Who may use the page: of a name the newest row counts. kind: `person` or `token`; see `accounts`."""
+
+STOCK_DECISIONS = Table(
+    "stock_decisions", METADATA, _key(), _of("surveys"), *_texts("difference", "decision"),
+    *_stamps("at_ns"), *_texts("who"), Column("note", Text),
+)  # fmt: skip
+"""What was decided of a difference between a survey and its stock list; of each the newest row counts."""
+
 AUDIT = Table(
     "audit", METADATA, _key(), *_stamps("at_ns"), *_texts("who", "what", "content"),
     Column("previous", Text, nullable=False, unique=True), Column("digest", Text, nullable=False),

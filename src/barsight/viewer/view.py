@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import http
 import io
 import socket
 import threading
 import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
+from viser.infra import _infra
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import OutputError
@@ -69,7 +72,7 @@ def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[
         "everything seen": seen_layer(cloud),
     }
     _expect_free(port)
-    with _quiet():
+    with _quiet(), _own_pages_only():
         server = viser.ViserServer(host=HOST, port=port, label="barsight", verbose=False)
     try:
         if port not in (0, server.get_port()):
@@ -93,6 +96,34 @@ def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[
 def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
     """Silence viser, which announces itself in a box; the command line prints its own line."""
     return contextlib.redirect_stdout(io.StringIO())
+
+
+@contextlib.contextmanager
+def _own_pages_only() -> Iterator[None]:
+    """Let the server that is started here refuse what other pages in the same browser ask of it: a Host or an
+    Origin that isn't this machine's. viser has no setting for it, so its websockets server gets the check.
+    """
+    library: Any = _infra
+    module = library.websockets.asyncio.server
+    serve = module.serve
+
+    def guarded(*places: Any, process_request: Any, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            hosts = {f"{name}:{connection.local_address[1]}" for name in (HOST, "localhost")}
+            origins = request.headers.get_all("Origin")
+            own = {f"http://{host}" for host in hosts}
+            named = request.headers.get_all("Host")
+            if len(named) != 1 or named[0] not in hosts or not set(origins) <= own:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "another page's request is refused\n")
+            return process_request(connection, request)
+
+        return serve(*places, process_request=check, **options)
+
+    module.serve = guarded
+    try:
+        yield
+    finally:
+        module.serve = serve
 
 
 def _expect_free(port: int) -> None:

@@ -39,7 +39,7 @@ def run(arguments: Sequence[str]) -> None:
         """
         survey = read_survey(out)
         with open_store(url, create=True, migrate=migrate) as store:
-            added = add_survey(store, survey, by or _user())
+            added = add_survey(store, survey, by or user_name())
         _print(added, SafeConsole())
 
     words = list(arguments)
@@ -48,7 +48,8 @@ def run(arguments: Sequence[str]) -> None:
     call(command, "store add", words)
 
 
-def _user() -> str:
+def user_name() -> str:
+    """Name the computer's user for the audit log."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # a container's user may have no name

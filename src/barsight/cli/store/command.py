@@ -9,6 +9,7 @@ from barsight.cli.arguments import pass_on
 KINDS = {
     "add": "Add a measured folder: its bundles get names that they keep",
     "list": "List the surveys, and the bundles of the present yard",
+    "user": "Add or withdraw who may log in to the page",
     "verify": "Check the audit chain and the rows that it covers; exit code 5 where they don't hold",
 }
 

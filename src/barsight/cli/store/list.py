@@ -12,8 +12,8 @@ from rich.table import Table
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
-from barsight.cli.store.yard import bundle_table, write_json, yard_records
-from barsight.store.history import SurveyRow, list_surveys, present_yard, time_text
+from barsight.cli.store.yard import bundle_table, write_json
+from barsight.store.history import SurveyRow, list_surveys, present_yard, time_text, yard_records
 from barsight.store.opening import DEFAULT_URL, open_store
 
 

@@ -6,7 +6,6 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -16,7 +15,7 @@ from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S
-from barsight.store.history import PresentBundle, parse_time, present_yard, time_text
+from barsight.store.history import PresentBundle, parse_time, present_yard, time_text, yard_records
 from barsight.store.opening import DEFAULT_URL, open_store
 
 _UNITS = ((86400, "d"), (3600, "h"), (60, "min"), (1, "s"))
@@ -50,22 +49,6 @@ def run(arguments: Sequence[str]) -> None:
 def write_json(content: object) -> None:
     """Print a JSON document."""
     sys.stdout.write(json.dumps(json_value(content), indent=1, allow_nan=False) + "\n")
-
-
-def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[str, Any]]:
-    """Build each bundle's record: as in bundles.json, with identity, survey, age and doubt."""
-    return [
-        {
-            "identity": each.sighting.identity,
-            "map_id": each.sighting.map_id,
-            "seen_ns": each.sighting.seen_ns,
-            "age_s": (now_ns - each.sighting.seen_ns) / NS_PER_S,
-            "stock_name": each.sighting.stock_name,
-            "doubt": None if each.doubt is None else {"code": each.doubt.kind, "reason": each.doubt.reason},
-            "bundle": each.sighting.record,
-        }
-        for each in present
-    ]
 
 
 def bundle_table(title: str, present: tuple[PresentBundle, ...], now_ns: int) -> Table:

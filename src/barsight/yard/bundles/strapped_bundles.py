@@ -138,8 +138,8 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
 
 
 def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: float) -> Bundle:
-    """Keep a fitted outline that ends where the pack does. Its width is the mean of both by their sigmas; they
-    are as sure as they agree.
+    """Keep a fitted outline that ends where the pack does. Its width is the mean of both by their sigmas;
+    they are as sure as they agree.
     """
     section, section_sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m

@@ -1,0 +1,52 @@
+"""Run `barsight store user URL NAME`."""
+
+from __future__ import annotations
+
+import getpass
+import sys
+from collections.abc import Sequence
+
+import tyro
+
+from barsight.cli.arguments import call
+from barsight.cli.store.add import user_name
+from barsight.core.errors import ConfigError
+from barsight.store.accounts import Role, add_person, withdraw
+from barsight.store.audit import entry
+from barsight.store.opening import open_store
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, ask for the password and add."""
+
+    def command(
+        url: tyro.conf.Positional[str], name: tyro.conf.Positional[str], role: Role = "operator",
+        remove: bool = False,
+    ) -> None:  # fmt: skip
+        """Add a person who may log in to the page, change role and password, or withdraw the account.
+
+        The password is asked for; where the input is no terminal its first line is it.
+
+        Args:
+            url: SQLAlchemy's URL of the database.
+            name: The person's name.
+            role: viewer, operator, engineer or service.
+            remove: Withdraw the account.
+        """
+        password = "" if remove else _password()
+        with open_store(url) as store, entry(store, user_name(), f"account {name}") as opened:
+            if remove:
+                withdraw(opened, name)
+            else:
+                add_person(opened, name, role, password)
+
+    call(command, "store user", arguments)
+
+
+def _password() -> str:
+    if not sys.stdin.isatty():
+        return sys.stdin.readline().rstrip("\n")
+    password = getpass.getpass("password: ")
+    if getpass.getpass("again: ") != password:
+        raise ConfigError("the two passwords differ")
+    return password

@@ -1,0 +1,128 @@
+"""Find what needs an operator's or engineer's act, and raise, return and clear its alarms (ISA-18.2)."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import Failed, InputError
+from barsight.core.extras import extra
+from barsight.page.live import LiveHealth
+from barsight.result_folder import changed_inputs, read_summary
+from barsight.store.audit import entry, verify_chain
+from barsight.store.confirmation import newest_survey
+from barsight.store.history import executed_lifts, identity_name
+from barsight.store.opening import Store
+from barsight.store.states import alarm_state, raise_alarm, step_alarm
+from barsight.store.tables import ABSENCES, ALARM_STATES, ALARMS, LIFT_STATES, SIGHTINGS, SURVEY_VETOES
+
+with extra("store"):
+    from sqlalchemy import Connection, Row, select
+
+ALARM_CODES = {
+    "store-broken": "The audit log of the store doesn't hold: rows were changed outside Barsight.",
+    "calibration-changed": "A calibration file was changed after the newest map was measured with it.",
+    "survey-files": "The newest survey's folder is gone or lacks files.",
+    "lift-failed": "A lift was reported as done or failed, and its bundle still lies there.",
+    "bundle-gone": "A bundle is gone that no lift has taken.",
+    "bundle-moved": "A bundle lies elsewhere, and no lift has carried it.",
+    "live-stopped": "The live run writes no health any more.",
+    "live-degraded": "The live run lacks a sensor or a process that lifts need.",
+}
+"""Alarms that the page's server raises itself: code to what it means."""
+WHO = "barsight serve"
+Condition = tuple[str, str]
+"""Code and reason of an alarm."""
+
+
+def find_conditions(connection: Connection, live: LiveHealth | None) -> set[Condition]:
+    """Find what is wrong at present, the audit log aside."""
+    found: set[Condition] = set()
+    newest = newest_survey(connection)
+    if newest is not None:
+        found |= _file_conditions(newest) | _yard_conditions(connection, newest.id)
+    if live is not None and live.problem is not None:
+        found.add(live.problem)
+    return found
+
+
+def find_chain_condition(connection: Connection) -> set[Condition]:
+    """Walk the audit log."""
+    chain = verify_chain(connection)
+    return {("store-broken", chain.reason)} if isinstance(chain, Failed) else set()
+
+
+def _file_conditions(newest: Row[Any]) -> set[Condition]:
+    folder = Path(newest.folder)
+    lost = [name for name in sorted(json.loads(newest.files)) if not (folder / name).is_file()]
+    if lost:
+        return {("survey-files", f"{folder}: {', '.join(lost)} not there")}
+    try:
+        changed = changed_inputs(read_summary(folder))
+    except InputError as error:
+        return {("survey-files", str(error))}
+    return {("calibration-changed", changed)} if changed else set()
+
+
+def _yard_conditions(connection: Connection, survey_id: int) -> set[Condition]:
+    """Hold what the newest survey told against what lifts did."""
+    lifted = {lift.bundle_id for lift in executed_lifts(connection)}
+    found: set[Condition] = set()
+    gone = select(ABSENCES.c.bundle_id).where(ABSENCES.c.survey_id == survey_id, ABSENCES.c.kind == "gone")
+    moved = select(SIGHTINGS.c.bundle_id).where(
+        SIGHTINGS.c.survey_id == survey_id, SIGHTINGS.c.change == "moved"
+    )
+    for code, query in (("bundle-gone", gone), ("bundle-moved", moved)):
+        for number in connection.execute(query).scalars().all():
+            if number not in lifted:
+                found.add((code, identity_name(number)))
+    newest = newest_survey(connection)
+    failed = select(LIFT_STATES).where(LIFT_STATES.c.state == "failed")
+    for row in connection.execute(failed).all():
+        if newest is not None and row.at_ns >= newest.captured_to_ns:
+            found.add(("lift-failed", f"lift {row.lift_id}: {row.note}"))
+    return found
+
+
+def settle_alarms(store: Store, present: set[Condition], judged: set[str]) -> bool:
+    """Raise an alarm for each new condition, and let those return or clear whose condition is gone.
+
+    judged: codes that were looked for. Returns whether anything was to do.
+    """
+    with store.reading() as connection:
+        if _changes(connection, present, judged) == ([], []):
+            return False
+    with entry(store, WHO, "alarms", time.time_ns()) as opened:
+        new, ended = _changes(opened.connection, present, judged)
+        for code, reason in new:
+            raise_alarm(opened, code, reason)
+        for number in ended:
+            is_raised = alarm_state(opened.connection, number) == "raised"
+            step_alarm(opened, number, "returned" if is_raised else "cleared", "the cause is gone")
+    return True
+
+
+def _changes(
+    connection: Connection, present: set[Condition], judged: set[str]
+) -> tuple[list[Condition], list[int]]:
+    """Tell which conditions have no active alarm, and which alarms' conditions are gone."""
+    last: dict[int, str] = {}
+    for row in connection.execute(select(ALARM_STATES).order_by(ALARM_STATES.c.step)).all():
+        last[row.alarm_id] = row.state
+    active: dict[Condition, int] = {}
+    for row in connection.execute(select(ALARMS).order_by(ALARMS.c.id)).all():
+        if last.get(row.id) in ("raised", "acknowledged") and row.code in judged:
+            active[row.code, row.reason] = row.id
+    ended = [number for condition, number in active.items() if condition not in present]
+    return sorted(present - set(active)), ended
+
+
+def has_veto(connection: Connection, survey_id: int, code: str) -> bool:
+    """Check whether a map as a whole has a veto."""
+    query = select(SURVEY_VETOES.c.id).where(
+        SURVEY_VETOES.c.survey_id == survey_id, SURVEY_VETOES.c.code == code,
+        SURVEY_VETOES.c.bundle_id.is_(None),
+    )  # fmt: skip
+    return connection.execute(query).first() is not None

@@ -1,0 +1,285 @@
+"""Build the documents that the page reads from the store: the present yard, lifts, surveys, alarms, stock."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import InputError
+from barsight.core.extras import extra
+from barsight.store.confirmation import newest_survey, open_lifts, yard_clock_ns
+from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
+from barsight.store.matching import has_moved
+from barsight.store.tables import (
+    ABSENCES,
+    ALARM_STATES,
+    ALARMS,
+    LIFT_BUNDLES,
+    LIFT_STATES,
+    LIFTS,
+    SIGHTINGS,
+    STOCK_DECISIONS,
+    SURVEY_VETOES,
+    SURVEYS,
+)  # fmt: skip
+from barsight.yard.inventory.bundle_file import bundle_of, read_match
+
+with extra("store"):
+    from sqlalchemy import Connection, Row, select
+
+MAX_LIFTS = 500
+MAX_ALARMS = 500
+_FIGURES = (
+    "axis_centre_m", "yaw_deg", "pitch_deg", "length_m", "ends_m", "ends_open", "width_m", "top_z_m",
+    "bar_diameter_m", "bars", "section_m2", "mass_kg", "layer", "on_top", "confidence", "known_share",
+    "sigma", "reasons", "cover_doubts",
+)  # fmt: skip
+_ALARM_ORDER = {"raised": 0, "returned": 1, "acknowledged": 2, "cleared": 3}
+
+
+def state_document(connection: Connection) -> dict[str, Any]:
+    """Tell the header: the newest survey, the yard's clock, the numbers of what is open."""
+    newest = newest_survey(connection)
+    alarms = alarm_records(connection)
+    active = [one for one in alarms if one["state"] != "cleared"]
+    top = min(active, key=lambda one: (_ALARM_ORDER[one["state"]], -one["at_ns"]), default=None)
+    return {
+        "clock_ns": yard_clock_ns(connection),
+        "survey": None if newest is None else _survey_of(newest),
+        "map_vetoes": [] if newest is None else _map_vetoes(connection, newest.id),
+        "offered": sum(lift.state == "offered" for lift in open_lifts(connection)),
+        "claimed": sum(lift.state == "claimed" for lift in open_lifts(connection)),
+        "alarms": len(active),
+        "unacknowledged": sum(one["state"] in ("raised", "returned") for one in active),
+        "top_alarm": top,
+    }
+
+
+def bundle_records(connection: Connection, at_ns: int | None = None) -> list[dict[str, Any]]:
+    """List the yard's bundles at a time, each with its figures, doubt, vetoes and the lift that takes it."""
+    vetoes: dict[tuple[int, int], list[dict[str, str]]] = defaultdict(list)
+    for row in connection.execute(select(SURVEY_VETOES).order_by(SURVEY_VETOES.c.id)).all():
+        if row.bundle_id is not None:
+            vetoes[row.survey_id, row.bundle_id].append({"code": row.code, "reason": row.reason})
+    offers = {}
+    if at_ns is None:
+        of = _bundles_of_lifts(connection)
+        offers = {number: lift for lift in open_lifts(connection) for number in of[lift.lift_id]}
+    return [_bundle(one, vetoes, offers) for one in present_yard(connection, at_ns)]
+
+
+def _bundle(one: PresentBundle, vetoes: Any, offers: Any) -> dict[str, Any]:
+    sighting = one.sighting
+    lift = offers.get(sighting.bundle_id)
+    return {
+        "identity": sighting.identity,
+        "map_id": sighting.map_id,
+        "seen_ns": sighting.seen_ns,
+        "change": sighting.change,
+        "stock_name": sighting.stock_name,
+        "doubt": None if one.doubt is None else {"code": one.doubt.kind, "reason": one.doubt.reason},
+        "vetoes": vetoes.get((sighting.survey_id, sighting.bundle_id), []),
+        "lift": None
+        if lift is None
+        else {"id": lift.lift_id, "rank": lift.record["rank"], "state": lift.state},
+        **{name: sighting.record[name] for name in _FIGURES},
+    }
+
+
+def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None:
+    """Tell all surveys that saw a bundle or looked for it, and its lifts; None where there is no such one."""
+    seen = connection.execute(
+        select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns)
+        .join(SURVEYS)
+        .where(SIGHTINGS.c.bundle_id == number)
+        .order_by(SURVEYS.c.captured_to_ns)
+    ).all()
+    if not seen:
+        return None
+    missed = connection.execute(
+        select(ABSENCES, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns)
+        .join(SURVEYS)
+        .where(ABSENCES.c.bundle_id == number)
+    ).all()
+    told = [
+        {
+            "map_id": row.map_id, "at_ns": row.captured_to_ns, "what": row.change, "x_m": row.x_m,
+            "y_m": row.y_m, "top_z_m": row.top_z_m, "length_m": row.length_m,
+            "stock_name": row.stock_name, "sigma": json.loads(row.record)["sigma"],
+        }
+        for row in seen
+    ]  # fmt: skip
+    told += [
+        {"map_id": r.map_id, "at_ns": r.captured_to_ns, "what": r.kind, "reason": r.reason} for r in missed
+    ]
+    return {
+        "identity": identity_name(number),
+        "history": sorted(told, key=lambda each: each["at_ns"]),
+        "lifts": [one for one in lift_records(connection) if identity_name(number) in one["bundles"]],
+    }
+
+
+def lift_records(connection: Connection) -> list[dict[str, Any]]:
+    """List the newest lifts, each with its states, who brought it there, and its figures."""
+    of = _bundles_of_lifts(connection)
+    rows = connection.execute(
+        select(LIFTS, SURVEYS.c.map_id, SURVEYS.c.calibration_id, SURVEYS.c.captured_to_ns)
+        .join(SURVEYS)
+        .order_by(LIFTS.c.id.desc())
+        .limit(MAX_LIFTS)
+    ).all()
+    steps = _steps(connection, LIFT_STATES, LIFT_STATES.c.lift_id, [row.id for row in rows])
+    return [
+        {
+            "id": row.id, "rank": row.rank, "map_id": row.map_id, "calibration_id": row.calibration_id,
+            "seen_ns": row.captured_to_ns, "bundles": [identity_name(number) for number in of[row.id]],
+            "state": steps[row.id][-1]["state"], "steps": steps[row.id],
+            **_lift_figures(json.loads(row.record)),
+        }
+        for row in rows
+    ]  # fmt: skip
+
+
+def _lift_figures(record: dict[str, Any]) -> dict[str, Any]:
+    names = (
+        "target", "tolerance", "set_down", "mass_kg", "mass_sigma_kg", "pull_low_n", "pull_needed_n",
+        "safety", "count", "count_probability", "valid_from_ns", "valid_until_ns",
+    )  # fmt: skip
+    return {name: record[name] for name in names}
+
+
+def alarm_records(connection: Connection) -> list[dict[str, Any]]:
+    """List the newest alarms, the worst state first, each with its states."""
+    rows = connection.execute(select(ALARMS).order_by(ALARMS.c.id.desc()).limit(MAX_ALARMS)).all()
+    steps = _steps(connection, ALARM_STATES, ALARM_STATES.c.alarm_id, [row.id for row in rows])
+    told = [
+        {
+            "id": row.id, "code": row.code, "reason": row.reason, "state": steps[row.id][-1]["state"],
+            "at_ns": steps[row.id][0]["at_ns"], "steps": steps[row.id],
+        }
+        for row in rows
+    ]  # fmt: skip
+    return sorted(told, key=lambda one: (_ALARM_ORDER[one["state"]], -one["at_ns"]))
+
+
+def survey_records(connection: Connection) -> list[dict[str, Any]]:
+    """List the surveys, the newest first, with what each told and its files."""
+    files = {row.map_id: row for row in connection.execute(select(SURVEYS)).all()}
+    told = []
+    for one in reversed(list_surveys(connection)):
+        row = files[one.map_id]
+        present = Path(one.folder)
+        more = [name for name in ("report.html", "ortho.png") if (present / name).is_file()]
+        kept = [name for name in sorted(json.loads(row.files)) if (present / name).is_file()]
+        told.append(
+            asdict(one)
+            | {
+                "calibration_id": row.calibration_id, "software_version": row.software_version,
+                "added_ns": row.added_ns, "files": kept + more, "missing": sorted(
+                    set(json.loads(row.files)) - set(kept)
+                ),
+            }
+        )  # fmt: skip
+    return told
+
+
+def stock_record(connection: Connection) -> dict[str, Any]:
+    """Tell the differences between the newest survey and the stock list that it was measured with."""
+    newest = newest_survey(connection)
+    none: dict[str, Any] = {"map_id": None, "list": None, "differences": []}
+    if newest is None:
+        return none
+    path = Path(newest.folder) / "bundles.json"
+    try:
+        match = read_match(path) if path.is_file() else None
+    except (InputError, ValueError):
+        match = None
+    if match is None:
+        return none | {"map_id": newest.map_id, "missing_file": not path.is_file()}
+    numbers = {
+        row.number: identity_name(row.bundle_id)
+        for row in connection.execute(select(SIGHTINGS).where(SIGHTINGS.c.survey_id == newest.id)).all()
+    }
+    told: list[dict[str, Any]] = [{"kind": "missing", "name": name, "bundle": None} for name in match.missing]
+    told += [{"kind": "hidden", "name": name, "bundle": None} for name in match.hidden]
+    told += [{"kind": "extra", "name": None, "bundle": numbers.get(number)} for number in match.extra]
+    for one in match.matched:
+        entry = {"name": one.name, "bundle": numbers.get(one.bundle)}
+        if one.name in match.moved:
+            told.append({"kind": "moved", "moved_m": one.moved_m, **entry})
+        if one.disagrees:
+            told.append({"kind": "differs", "says": one.disagrees, **entry})
+    query = select(STOCK_DECISIONS).where(STOCK_DECISIONS.c.survey_id == newest.id)
+    decided = {row.difference: row for row in connection.execute(query.order_by(STOCK_DECISIONS.c.id)).all()}
+    for each in told:
+        each["key"] = f"{each['kind']} {each['name'] or each['bundle']}"
+        row = decided.get(each["key"])
+        each["decision"] = None
+        if row is not None:
+            each["decision"] = {"what": row.decision, "who": row.who, "at_ns": row.at_ns, "note": row.note}
+    agree = [one.name for one in match.matched if one.name not in match.moved and not one.disagrees]
+    return {"map_id": newest.map_id, "list": len(match.matched), "agree": agree, "differences": told}
+
+
+def compare_yards(connection: Connection, before_ns: int, after_ns: int) -> list[dict[str, Any]]:
+    """Tell what changed between two times: `came`, `went`, `moved`; what lies as it lay is left out."""
+    before = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, before_ns)}
+    after = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, after_ns)}
+    told = []
+    for number in sorted({*before, *after}):
+        old, new = before.get(number), after.get(number)
+        kind = "went" if new is None else "came" if old is None else "moved"
+        if (
+            old is not None
+            and new is not None
+            and not has_moved(bundle_of(old.record), bundle_of(new.record))
+        ):
+            continue
+        told.append(
+            {
+                "identity": identity_name(number), "what": kind,
+                "from_m": None if old is None else old.record["axis_centre_m"],
+                "to_m": None if new is None else new.record["axis_centre_m"],
+            }
+        )  # fmt: skip
+    return told
+
+
+def _survey_of(row: Row[Any]) -> dict[str, Any]:
+    names = (
+        "map_id", "captured_from_ns", "captured_to_ns", "added_ns", "calibration_id", "is_simulated",
+        "software_version",
+    )  # fmt: skip
+    return {name: getattr(row, name) for name in names}
+
+
+def _map_vetoes(connection: Connection, survey_id: int) -> list[dict[str, str]]:
+    query = select(SURVEY_VETOES).where(
+        SURVEY_VETOES.c.survey_id == survey_id, SURVEY_VETOES.c.bundle_id.is_(None)
+    )
+    rows = connection.execute(query.order_by(SURVEY_VETOES.c.id)).all()
+    return [{"code": row.code, "reason": row.reason} for row in rows]
+
+
+def _bundles_of_lifts(connection: Connection) -> dict[int, list[int]]:
+    of: dict[int, list[int]] = defaultdict(list)
+    for row in connection.execute(select(LIFT_BUNDLES).order_by(LIFT_BUNDLES.c.id)).all():
+        of[row.lift_id].append(row.bundle_id)
+    return of
+
+
+def _steps(
+    connection: Connection, table: Any, owner: Any, numbers: Iterable[int]
+) -> dict[int, list[dict[str, Any]]]:
+    found: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    rows = connection.execute(
+        select(table).where(owner.in_(list(numbers))).order_by(owner, table.c.step)
+    ).all()
+    for row in rows:
+        step = {"state": row.state, "at_ns": row.at_ns, "who": row.who, "note": row.note}
+        found[getattr(row, owner.name)].append(step)
+    return found

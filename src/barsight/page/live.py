@@ -1,0 +1,56 @@
+"""Read the health of a live run from the files that it writes."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+STOPPED_S = 10.0
+HISTORY = 720
+_FOR_LIFTS = ("full", "no-imu")
+
+
+@dataclass(frozen=True)
+class LiveHealth:
+    """A live run's last health.json (None where there is none), its age, and an alarm's code and reason."""
+
+    content: dict[str, Any] | None
+    age_s: float | None
+    problem: tuple[str, str] | None
+
+
+class LiveFolder:
+    """Looks at a live run's folder, and keeps what it saw for the trends."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.history: deque[dict[str, Any]] = deque(maxlen=HISTORY)
+
+    def look(self) -> LiveHealth:
+        """Read health.json; a new one is added to the history."""
+        path = self.folder / "health.json"
+        try:
+            changed_s = path.stat().st_mtime
+            content = json.loads(path.read_text(encoding="utf-8"))
+            mode, rates = content["mode"], dict(content["rates_hz"])
+            kept = {
+                "at_s": changed_s,
+                "mode": mode,
+                "rates_hz": rates,
+                "backlog": content["queues"]["keyframes"],
+            }
+        except (OSError, ValueError, KeyError, TypeError):
+            return LiveHealth(None, None, ("live-stopped", f"{path}: not there or torn"))
+        if not self.history or self.history[-1]["at_s"] != changed_s:
+            self.history.append(kept)
+        age_s = time.time() - changed_s
+        problem = None
+        if age_s > STOPPED_S:
+            problem = ("live-stopped", str(path))
+        elif mode not in _FOR_LIFTS:
+            problem = ("live-degraded", str(mode))
+        return LiveHealth(content, age_s, problem)

@@ -1,0 +1,351 @@
+// The yard from above on a canvas: surveys' pictures faded by age, bundles, lifts, vetoes; pan, zoom, pick.
+import { shortWhy, isForbidden } from "./why.js";
+import { t } from "./dom.js";
+
+const SELECT = "#1d4f91";
+const INK = "#26292b";
+
+export class YardCanvas {
+  // onPick: is given an identity or null.
+  constructor(canvas, onPick) {
+    this.canvas = canvas;
+    this.onPick = onPick;
+    this.view = null; // centre x, y (m), pixels a metre
+    this.data = { bundles: [], layers: [], clock_ns: 0, kind: "photo", lifts: [] };
+    this.pictures = new Map();
+    this.frames = [];
+    this.chosen = null;
+    this.listen();
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    this.media = matchMedia("print");
+    this.media.addEventListener("change", () => this.resize());
+  }
+
+  show(data, chosen) {
+    this.data = data;
+    this.chosen = chosen;
+    this.items = data.bundles.map((bundle) => this.item(bundle));
+    for (const layer of data.layers) this.load(layer);
+    if (!this.view) this.fit();
+    this.draw();
+  }
+
+  item(bundle) {
+    const [[ax, ay], [bx, by]] = bundle.ends_m;
+    const length = Math.hypot(bx - ax, by - ay) || 1;
+    const nx = (-(by - ay) / length) * bundle.width_m / 2;
+    const ny = ((bx - ax) / length) * bundle.width_m / 2;
+    return {
+      bundle, corners: [[ax + nx, ay + ny], [bx + nx, by + ny], [bx - nx, by - ny], [ax - nx, ay - ny]],
+      x: (ax + bx) / 2, y: (ay + by) / 2, reach: length / 2 + bundle.width_m, low: Math.min(ay, by), top: bundle.top_z_m,
+      forbidden: isForbidden(bundle), words: shortWhy(bundle),
+    };
+  }
+
+  load(layer) {
+    const url = `/api/layers/${layer.map_id}.png?kind=${this.data.kind}&of=${this.data.revision}${this.data.at_ns ? `&at_ns=${this.data.at_ns}` : ""}`;
+    layer.url = url;
+    if (this.pictures.has(url)) return;
+    const picture = new Image();
+    picture.onload = () => this.draw();
+    picture.src = url;
+    this.pictures.set(url, picture);
+    if (this.pictures.size > 24) this.pictures.delete(this.pictures.keys().next().value);
+  }
+
+  edges() {
+    const x = [];
+    const y = [];
+    for (const { edges_m: e } of this.data.layers) { x.push(e[0], e[2]); y.push(e[1], e[3]); }
+    for (const { ends_m: e } of this.data.bundles) { x.push(e[0][0], e[1][0]); y.push(e[0][1], e[1][1]); }
+    return x.length ? [Math.min(...x), Math.min(...y), Math.max(...x), Math.max(...y)] : [-5, -5, 5, 5];
+  }
+
+  fit() {
+    const [x0, y0, x1, y1] = this.edges();
+    const width = this.canvas.clientWidth || 800;
+    const height = this.canvas.clientHeight || 500;
+    const scale = Math.min(width / (x1 - x0 + 1), (height - 40) / (y1 - y0 + 1));
+    this.view = { x: (x0 + x1) / 2, y: (y0 + y1) / 2, scale };
+    this.draw();
+  }
+
+  resize() {
+    if (this.view) this.fit();
+  }
+
+  place(x, y) {
+    return [(x - this.view.x) * this.view.scale + this.width / 2, (this.view.y - y) * this.view.scale + this.height / 2];
+  }
+
+  at(px, py) {
+    return [(px - this.width / 2) / this.view.scale + this.view.x, this.view.y - (py - this.height / 2) / this.view.scale];
+  }
+
+  draw() {
+    if (this.waiting || !this.view) return;
+    this.waiting = true;
+    requestAnimationFrame(() => {
+      this.waiting = false;
+      const began = performance.now();
+      this.paint();
+      this.frames.push(performance.now() - began);
+      if (this.frames.length > 240) this.frames.shift();
+    });
+  }
+
+  paint() {
+    const ratio = window.devicePixelRatio || 1;
+    this.width = this.canvas.clientWidth;
+    this.height = this.canvas.clientHeight;
+    if (this.canvas.width !== Math.round(this.width * ratio)) this.canvas.width = Math.round(this.width * ratio);
+    if (this.canvas.height !== Math.round(this.height * ratio)) this.canvas.height = Math.round(this.height * ratio);
+    const c = this.canvas.getContext("2d");
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    c.fillStyle = "#c6c8ca";
+    c.fillRect(0, 0, this.width, this.height);
+    this.paintLayers(c);
+    this.paintGrid(c);
+    const seen = this.visible();
+    this.paintBundles(c, seen);
+    this.paintLifts(c);
+    this.paintWords(c, seen);
+  }
+
+  paintLayers(c) {
+    const alone = this.view.scale < 160;
+    c.imageSmoothingEnabled = alone;
+    for (const layer of this.data.layers) {
+      const picture = this.pictures.get(layer.url);
+      if (!picture || !picture.complete || !picture.naturalWidth) continue;
+      const [x0, y0, x1, y1] = layer.edges_m;
+      const [left, top] = this.place(x0, y1);
+      c.globalAlpha = fade(this.data.clock_ns - layer.seen_ns);
+      c.drawImage(picture, left, top, (x1 - x0) * this.view.scale, (y1 - y0) * this.view.scale);
+    }
+    c.globalAlpha = 1;
+  }
+
+  paintGrid(c) {
+    const step = [1, 2, 5, 10, 20, 50].find((each) => each * this.view.scale > 70) || 100;
+    c.font = "12px sans-serif";
+    c.fillStyle = "#3c4043";
+    c.strokeStyle = "#00000022";
+    c.lineWidth = 1;
+    c.beginPath();
+    const [x0, y0] = this.at(0, this.height);
+    const [x1, y1] = this.at(this.width, 0);
+    c.textAlign = "center";
+    c.textBaseline = "bottom";
+    for (let x = Math.ceil(x0 / step) * step; x < x1; x += step) {
+      const [px] = this.place(x, 0);
+      c.moveTo(px, 0); c.lineTo(px, this.height);
+      c.fillText(`X ${x}`, px, this.height - 3);
+    }
+    c.textAlign = "left";
+    c.textBaseline = "middle";
+    for (let y = Math.ceil(y0 / step) * step; y < y1; y += step) {
+      const [, py] = this.place(0, y);
+      c.moveTo(0, py); c.lineTo(this.width, py);
+      if (py < this.height - 24) c.fillText(`Y ${y}`, 4, py);
+    }
+    c.stroke();
+  }
+
+  visible() {
+    const [x0, y0] = this.at(0, this.height);
+    const [x1, y1] = this.at(this.width, 0);
+    return this.items.filter((i) => i.x + i.reach > x0 && i.x - i.reach < x1 && i.y + i.reach > y0 && i.y - i.reach < y1)
+      .sort((a, b) => a.top - b.top);
+  }
+
+  path(c, item) {
+    item.corners.forEach(([x, y], k) => (k ? c.lineTo(...this.place(x, y)) : c.moveTo(...this.place(x, y))));
+    c.closePath();
+  }
+
+  paintBundles(c, seen) {
+    const groups = { plain: [], doubt: [] };
+    for (const item of seen) groups[item.bundle.doubt ? "doubt" : "plain"].push(item);
+    c.lineWidth = 1.5;
+    c.strokeStyle = INK;
+    for (const [name, items] of Object.entries(groups)) {
+      c.setLineDash(name === "doubt" ? [6, 4] : []);
+      c.beginPath();
+      for (const item of items) this.path(c, item);
+      c.stroke();
+    }
+    c.setLineDash([]);
+    const hatched = seen.filter((item) => item.forbidden);
+    c.beginPath();
+    for (const item of hatched) this.path(c, item);
+    c.fillStyle = this.hatch(c);
+    c.fill();
+    const chosen = seen.find((item) => item.bundle.identity === this.chosen);
+    if (chosen) {
+      c.lineWidth = 2;
+      c.strokeStyle = "#fff";
+      c.beginPath(); this.path(c, chosen); c.stroke();
+      c.lineWidth = 6; c.strokeStyle = "#16191b";
+      c.beginPath(); this.path(c, chosen); c.stroke();
+      c.lineWidth = 2; c.strokeStyle = "#fff";
+      c.beginPath(); this.path(c, chosen); c.stroke();
+    }
+  }
+
+  hatch(c) {
+    if (this.pattern) return this.pattern;
+    const tile = document.createElement("canvas");
+    tile.width = tile.height = 10;
+    const pen = tile.getContext("2d");
+    pen.strokeStyle = "#16191bb0";
+    pen.beginPath();
+    for (const k of [-10, 0, 10]) { pen.moveTo(k, 10); pen.lineTo(k + 10, 0); }
+    pen.stroke();
+    this.pattern = c.createPattern(tile, "repeat");
+    return this.pattern;
+  }
+
+  paintLifts(c) {
+    const items = new Map(this.items.map((item) => [item.bundle.identity, item]));
+    for (const lift of this.data.lifts) {
+      const item = items.get(lift.bundles[0]);
+      if (!item || !["offered", "claimed"].includes(lift.state)) continue;
+      c.strokeStyle = SELECT;
+      c.lineWidth = 3.5;
+      c.beginPath(); this.path(c, item);
+      if (lift.state === "claimed") { c.fillStyle = "#1d4f9166"; c.fill(); }
+      c.stroke();
+      const [px, py] = this.place(lift.target.x_m, lift.target.y_m);
+      c.fillStyle = lift.state === "claimed" ? SELECT : "#f2f2f2";
+      c.lineWidth = 2.5;
+      c.beginPath(); c.arc(px, py, 13, 0, 7); c.fill(); c.stroke();
+      c.fillStyle = lift.state === "claimed" ? "#fff" : "#16191b";
+      c.font = "bold 14px sans-serif";
+      c.textAlign = "center"; c.textBaseline = "middle";
+      c.fillText(String(lift.rank), px, py + 1);
+    }
+  }
+
+  // Names and words where they find room: over each bundle's lower end, first come.
+  paintWords(c, seen) {
+    if (this.view.scale < 9) return;
+    const taken = [];
+    c.textBaseline = "top";
+    c.textAlign = "center";
+    const clear = (box) => taken.every((o) => box[2] < o[0] || box[0] > o[2] || box[3] < o[1] || box[1] > o[3]);
+    for (const item of [...seen].reverse()) {
+      const [px, py] = this.place(item.x, item.low);
+      const lines = [item.bundle.stock_name || item.bundle.identity];
+      const chosen = item.bundle.identity === this.chosen;
+      if (item.words && (chosen || this.view.scale > 25)) lines.push(item.words);
+      c.font = chosen ? "bold 13px sans-serif" : "13px sans-serif";
+      for (let count = lines.length; count > 0; count -= 1) {
+        const width = Math.max(...lines.slice(0, count).map((line) => c.measureText(line).width)) / 2 + 3;
+        let box = null;
+        for (let y = py + 3; y < py + 120 && !box; y += 17) {
+          const tried = [px - width, y, px + width, y + 16 * count];
+          if (clear(tried)) box = tried;
+        }
+        if (!box) continue;
+        taken.push(box);
+        c.fillStyle = "#dcdddfd8";
+        c.fillRect(box[0], box[1], box[2] - box[0], box[3] - box[1]);
+        c.fillStyle = "#16191b";
+        lines.slice(0, count).forEach((line, k) => c.fillText(line, px, box[1] + 16 * k + 1));
+        break;
+      }
+      if (taken.length > 400) break;
+    }
+  }
+
+  zoom(factor, px = this.width / 2, py = this.height / 2) {
+    const [x, y] = this.at(px, py);
+    this.view.scale = Math.min(2000, Math.max(1, this.view.scale * factor));
+    const [nx, ny] = this.at(px, py);
+    this.view.x += x - nx;
+    this.view.y += y - ny;
+    this.draw();
+  }
+
+  pan(px, py) {
+    this.view.x -= px / this.view.scale;
+    this.view.y += py / this.view.scale;
+    this.draw();
+  }
+
+  look(identity) {
+    const item = this.items.find((each) => each.bundle.identity === identity);
+    if (!item) return;
+    const [px, py] = this.place(item.x, item.y);
+    if (px < 40 || py < 40 || px > this.width - 40 || py > this.height - 40) Object.assign(this.view, { x: item.x, y: item.y });
+    this.draw();
+  }
+
+  pick(px, py) {
+    const [x, y] = this.at(px, py);
+    const under = this.items.filter((i) => inside(i.corners, x, y)).sort((a, b) => b.top - a.top);
+    this.onPick(under.length ? under[0].bundle.identity : null);
+  }
+
+  listen() {
+    let from = null;
+    let moved = false;
+    this.canvas.addEventListener("pointerdown", (e) => { from = [e.offsetX, e.offsetY]; moved = false; this.canvas.setPointerCapture(e.pointerId); });
+    this.canvas.addEventListener("pointermove", (e) => {
+      if (!from) return;
+      const [dx, dy] = [e.offsetX - from[0], e.offsetY - from[1]];
+      if (!moved && Math.hypot(dx, dy) < 4) return;
+      moved = true;
+      this.pan(dx, dy);
+      from = [e.offsetX, e.offsetY];
+    });
+    this.canvas.addEventListener("pointerup", (e) => { if (from && !moved) this.pick(e.offsetX, e.offsetY); from = null; });
+    this.canvas.addEventListener("pointercancel", () => { from = null; });
+    this.canvas.addEventListener("wheel", (e) => { e.preventDefault(); this.zoom(Math.exp(-e.deltaY / 400), e.offsetX, e.offsetY); }, { passive: false });
+    this.canvas.addEventListener("keydown", (e) => this.key(e));
+  }
+
+  key(e) {
+    const moves = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
+    if (moves[e.key]) this.pan(...moves[e.key]);
+    else if (e.key === "+" || e.key === "=") this.zoom(1.25);
+    else if (e.key === "-") this.zoom(0.8);
+    else if (e.key === "0") this.fit();
+    else if (e.key === "n" || e.key === "p") this.step(e.key === "n" ? 1 : -1);
+    else if (e.key === "Enter" && this.chosen) location.hash = `#bundle/${this.chosen}`;
+    else if (e.key === "Escape") this.onPick(null);
+    else return;
+    e.preventDefault();
+  }
+
+  // The next bundle along X.
+  step(by) {
+    const order = [...this.items].sort((a, b) => a.x - b.x || a.y - b.y).map((item) => item.bundle.identity);
+    if (!order.length) return;
+    const at = order.indexOf(this.chosen);
+    const next = order[(at + by + order.length + (at < 0 && by < 0 ? 1 : 0)) % order.length];
+    this.onPick(next);
+    this.look(next);
+  }
+
+  label() { return t("yard.canvas", this.data.bundles.length); }
+}
+
+// How strongly a place is drawn: whole up to ten minutes, a third after a day.
+export function fade(age_ns) {
+  const minutes = Math.max(age_ns / 6e10, 10);
+  return Math.max(0.33, 1 - 0.67 * (Math.log(minutes / 10) / Math.log(144)));
+}
+
+function inside(corners, x, y) {
+  let sign = 0;
+  for (let k = 0; k < 4; k += 1) {
+    const [ax, ay] = corners[k];
+    const [bx, by] = corners[(k + 1) % 4];
+    const turn = Math.sign((bx - ax) * (y - ay) - (by - ay) * (x - ax));
+    if (turn && sign && turn !== sign) return false;
+    sign = turn || sign;
+  }
+  return true;
+}

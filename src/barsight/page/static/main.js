@@ -1,0 +1,98 @@
+// The page: header, screens by the address's hash, the stream of revisions.
+import { ageText, h, languageName, LANGUAGES, loadWords, setLanguage, show, t, tell } from "./dom.js";
+import { enter, forget, listen, logIn, read, session } from "./api.js";
+import { clockNow, yardScreen } from "./yard.js";
+import { adminScreen, alarmScreen, alarmText, bundleScreen, healthScreen, liftScreen, mark, priority, stockScreen, surveyScreen } from "./screens.js";
+import { timelineScreen } from "./timeline.js";
+
+const SCREENS = { yard: yardScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, health: healthScreen, admin: adminScreen };
+const place = document.getElementById("screen");
+let isThere = true;
+let drawn = 0;
+
+const where = () => {
+  const [name, argument] = location.hash.slice(1).split("/");
+  return [name in SCREENS ? name : "yard", argument ? decodeURIComponent(argument) : null];
+};
+
+async function draw() {
+  const mine = (drawn += 1);
+  const [name, argument] = where();
+  document.body.dataset.screen = name;
+  if (!session.isKnown) return logInScreen();
+  try {
+    const state = await read("state");
+    if (mine !== drawn) return;
+    header(state, name);
+    await SCREENS[name](place, argument);
+    document.title = `${t(`nav.${name}`)} · Barsight`;
+  } catch (error) {
+    if (error.status === 401) logInScreen();
+    else if (error.status === 404) show(place, h("section", {}, error.message));
+    else tell(isThere ? error.message : t("server.away"));
+  }
+}
+
+function header(state, name) {
+  const fact = (word, value, props = {}) => h("div", { className: "fact", ...props }, h("span", {}, t(word)), h("strong", {}, value));
+  const top = state.top_alarm;
+  show(document.getElementById("header"),
+    fact("header.server", isThere ? t("server.there") : t("server.away"), { id: "server" }),
+    fact("header.age", state.survey ? ageText(clockNow(state) - state.survey.captured_to_ns) : "–", { id: "age" }),
+    fact("header.map", state.survey ? state.survey.map_id : "–"),
+    fact("header.lifts", `${state.offered} / ${state.claimed}`),
+    state.survey?.is_simulated && fact("header.kind", t("simulated")),
+    h("div", { className: "grow" }),
+    top ? h("a", { className: `alarm p${priority(top)}`, href: "#alarms", id: "top-alarm" }, mark(top), h("span", {}, `${alarmText(top)} · ${t(`alarmstate.${top.state}`)}`)) : h("span", { className: "quiet" }, t("alarms.none")),
+    h("select", { id: "language", "aria-label": t("language"), onchange: (event) => { setLanguage(event.target.value); place.replaceChildren(); draw(); } },
+      LANGUAGES.map((each) => h("option", { value: each, selected: each === languageName() }, { en: "English", de: "Deutsch", zh: "中文" }[each]))));
+  const nav = document.getElementById("nav");
+  nav.setAttribute("aria-label", t("screens"));
+  show(nav, Object.keys(SCREENS).map((each) => h("a", { href: `#${each}`, id: `nav-${each}`, "aria-current": each === name ? "page" : null }, t(`nav.${each}`), each === "alarms" && state.unacknowledged > 0 && h("span", { className: "count" }, `(${state.unacknowledged})`))));
+  document.getElementById("skip").textContent = t("skip");
+}
+
+function logInScreen() {
+  show(document.getElementById("header"), h("strong", {}, "Barsight"));
+  show(document.getElementById("nav"));
+  if (document.getElementById("log-in")) return;
+  const problem = h("p", { role: "alert" });
+  const name = h("input", { id: "name", autocomplete: "username", required: true });
+  const password = h("input", { id: "password", type: "password", autocomplete: "current-password", required: true });
+  const go = async (event) => {
+    event.preventDefault();
+    try {
+      await logIn(name.value, password.value);
+      start();
+    } catch (error) {
+      problem.textContent = error.status === 401 ? t("log.in.wrong") : error.message;
+    }
+  };
+  show(place, h("section", {}, h("h1", {}, t("log.in")), h("form", { id: "log-in", onsubmit: go }, h("label", { htmlFor: "name" }, t("name")), name, h("label", { htmlFor: "password" }, t("password")), password, h("div", { className: "buttons" }, h("button", { className: "main" }, t("log.in"))), problem)));
+  name.focus();
+}
+
+let isListening = false;
+function start() {
+  forget();
+  draw();
+  if (isListening) return;
+  isListening = true;
+  listen(() => { forget(); draw(); }, (there) => { if (there !== isThere) { isThere = there; document.body.dataset.there = there; forget(); if (there) enter().catch(() => {}).then(draw); else mark_away(); } });
+}
+
+function mark_away() {
+  const place_ = document.querySelector("#server strong");
+  if (place_) place_.textContent = t("server.away");
+}
+
+setInterval(async () => {
+  if (!session.isKnown || !isThere) return;
+  const state = await read("state").catch(() => null);
+  const age = document.querySelector("#age strong");
+  if (state?.survey && age) age.textContent = ageText(clockNow(state) - state.survey.captured_to_ns);
+  if (where()[0] === "health") draw();
+}, 5000);
+window.addEventListener("hashchange", () => draw().then(() => place.focus()));
+await loadWords();
+enter().then(start, logInScreen);

@@ -1,0 +1,163 @@
+"""Watch the store for additions, of this process or another, and keep the documents of its present state."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+
+from barsight.core.errors import BarsightError
+from barsight.core.extras import extra
+from barsight.core.json_values import json_value
+from barsight.page.conditions import (
+    ALARM_CODES,
+    WHO,
+    find_chain_condition,
+    find_conditions,
+    has_veto,
+    settle_alarms,
+)  # fmt: skip
+from barsight.page.documents import (
+    alarm_records,
+    bundle_records,
+    lift_records,
+    state_document,
+    stock_record,
+    survey_records,
+)  # fmt: skip
+from barsight.page.layers import Layer, find_layers
+from barsight.page.live import LiveFolder, LiveHealth
+from barsight.store.accounts import Account, list_accounts
+from barsight.store.confirmation import expire_stale, forbid, newest_survey
+from barsight.store.opening import Store
+from barsight.store.tables import AUDIT
+
+with extra("store"):
+    from sqlalchemy import func, select
+
+LOOK_S = 0.2
+JUDGE_S = 2.0
+VERIFY_S = 600.0
+HEARTBEAT_S = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Published:
+    """Documents that the page reads, as one revision of the store has them. revision: rows of the audit log.
+    documents: JSON by name.
+    """
+
+    revision: int = -1
+    documents: dict[str, bytes] = field(default_factory=dict)
+    accounts: dict[str, Account] = field(default_factory=dict)
+    layers: tuple[Layer, ...] = ()
+
+
+class StoreWatch:
+    """Runs in a thread of its own; requests read what it published last."""
+
+    def __init__(self, store: Store, live: LiveFolder | None = None) -> None:
+        self.store, self.live = store, live
+        self.published = Published()
+        self.health: LiveHealth | None = None
+        self.problem: str | None = None
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._changed: asyncio.Event | None = None
+        self._thread = threading.Thread(target=self._run, name="store watch", daemon=True)
+
+    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Begin to watch; who waits for events does so in this loop."""
+        self._loop, self._changed = loop, asyncio.Event()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End it, and all streams of events."""
+        self._stop.set()
+        self._thread.join(10.0)
+        if self._changed is not None:
+            self._changed.set()
+
+    def refresh(self) -> None:
+        """Publish anew where the store has more rows than were published."""
+        with self._lock:
+            with self.store.reading() as connection:
+                revision = connection.execute(select(func.coalesce(func.max(AUDIT.c.id), 0))).scalar_one()
+                if revision == self.published.revision:
+                    return
+                content = {
+                    "state": state_document(connection),
+                    "bundles": {"bundles": bundle_records(connection)},
+                    "lifts": {"lifts": lift_records(connection)},
+                    "surveys": {"surveys": survey_records(connection)},
+                    "alarms": {"alarms": alarm_records(connection)},
+                    "stock": stock_record(connection),
+                }
+                layers = find_layers(connection)
+                content["layers"] = {"layers": [one.content() for one in layers]}
+                accounts = list_accounts(connection)
+            documents = {
+                name: json.dumps(json_value({"revision": revision, **one}), allow_nan=False).encode()
+                for name, one in content.items()
+            }
+            self.published = Published(int(revision), documents, accounts, layers)
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._tell)
+
+    def judge(self, *, with_chain: bool = False) -> None:
+        """Settle alarms, and let offers end whose time is over or whose calibration was changed."""
+        self.health = None if self.live is None else self.live.look()
+        judged = {code for code in ALARM_CODES if code != "store-broken" or with_chain}
+        with self.store.reading() as connection:
+            present = find_conditions(connection, self.health)
+            if with_chain:
+                present |= find_chain_condition(connection)
+            newest = newest_survey(connection)
+            changed = [reason for code, reason in present if code == "calibration-changed"]
+            is_told = newest is not None and has_veto(connection, newest.id, "calibration-changed")
+        if changed and not is_told:
+            forbid(self.store, "calibration-changed", changed[0], WHO)
+        settle_alarms(self.store, present, judged)
+        expire_stale(self.store, WHO)
+        self.refresh()
+
+    async def events(self) -> AsyncIterator[bytes]:
+        """Stream server-sent events: the newest revision, whenever there is a newer one than was sent. A
+        reader that is slow skips those in between.
+        """
+        sent = -1
+        while not self._stop.is_set():
+            changed = self._changed
+            assert changed is not None
+            if self.published.revision != sent:
+                sent = self.published.revision
+                yield f"event: revision\nid: {sent}\ndata: {sent}\n\n".encode()
+                continue
+            try:
+                await asyncio.wait_for(changed.wait(), HEARTBEAT_S)
+            except TimeoutError:
+                yield b": still there\n\n"
+
+    def _tell(self) -> None:
+        changed, self._changed = self._changed, asyncio.Event()
+        if changed is not None:
+            changed.set()
+
+    def _run(self) -> None:
+        judged_s = verified_s = float("-inf")
+        while not self._stop.is_set():
+            try:
+                now_s = time.monotonic()
+                if now_s - judged_s >= JUDGE_S:
+                    with_chain = now_s - verified_s >= VERIFY_S
+                    self.judge(with_chain=with_chain)
+                    judged_s, verified_s = now_s, now_s if with_chain else verified_s
+                self.refresh()
+                self.problem = None
+            except BarsightError as error:  # a database that is away comes back
+                self.problem = str(error)
+            self._stop.wait(LOOK_S)

@@ -1,0 +1,198 @@
+"""Confirm offered lifts and report what came of them; end offers and confirmations with their map."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.errors import ConfigError, InputError
+from barsight.core.extras import extra
+from barsight.store.audit import Entry, entry
+from barsight.store.opening import Store
+from barsight.store.states import lift_state, step_lift
+from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, SURVEYS
+from barsight.yard.events import corners, gap_between
+from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.vetoes import VETOES
+
+with extra("store"):
+    from sqlalchemy import Connection, Row, func, select
+
+OPEN = ("offered", "claimed")
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLift:
+    """A lift that is offered or claimed. record: its JSON of lifts.json, without poles and checks."""
+
+    lift_id: int
+    survey_id: int
+    map_id: str
+    calibration_id: str
+    state: str
+    record: dict[str, Any]
+
+
+def newest_survey(connection: Connection) -> Row[Any] | None:
+    """Return the row of the survey with the newest frames, None where there is none."""
+    order = (SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
+    return connection.execute(select(SURVEYS).order_by(*order).limit(1)).first()
+
+
+def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
+    """Tell the time of the yard: this computer's; of a simulated yard its own, which went on from the newest
+    survey's last frame when that survey was added.
+    """
+    now_ns = time.time_ns() if now_ns is None else now_ns
+    newest = newest_survey(connection)
+    if newest is None or not newest.is_simulated:
+        return now_ns
+    return int(newest.captured_to_ns) + max(0, now_ns - int(newest.added_ns))
+
+
+def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
+    """List the lifts that are offered or claimed, in the order of their ids."""
+    last = select(LIFT_STATES.c.lift_id, func.max(LIFT_STATES.c.step).label("step")).group_by(
+        LIFT_STATES.c.lift_id
+    )
+    newest = last.subquery()
+    rows = connection.execute(
+        select(LIFTS, SURVEYS.c.map_id, SURVEYS.c.calibration_id, LIFT_STATES.c.state)
+        .join(SURVEYS, SURVEYS.c.id == LIFTS.c.survey_id)
+        .join(newest, newest.c.lift_id == LIFTS.c.id)
+        .join(
+            LIFT_STATES,
+            (LIFT_STATES.c.lift_id == LIFTS.c.id) & (LIFT_STATES.c.step == newest.c.step),
+        )
+        .where(LIFT_STATES.c.state.in_(OPEN))
+        .order_by(LIFTS.c.id)
+    ).all()
+    return tuple(
+        OpenLift(r.id, r.survey_id, r.map_id, r.calibration_id, r.state, json.loads(r.record)) for r in rows
+    )
+
+
+def confirm_lift(store: Store, lift_id: int, map_id: str, who: str) -> None:
+    """Confirm an offered lift on the map that the operator saw. Raises InputError where it may not be."""
+
+    def step(opened: Entry, lift: OpenLift) -> None:
+        if lift.map_id != map_id:
+            remedy = "look at the lift again before confirming it"
+            raise InputError(f"lift {lift_id}", f"was offered on map {lift.map_id}, not {map_id}", remedy)
+        note = f"map {lift.map_id}, calibration {lift.calibration_id}"
+        step_lift(opened, lift_id, "claimed", note)
+
+    _change(store, lift_id, who, "lift confirmed", step)
+
+
+def take_lift(store: Store, lift_id: int, who: str) -> None:
+    """Report that a confirmed lift was executed; offers and confirmations beside it end."""
+
+    def step(opened: Entry, lift: OpenLift) -> None:
+        step_lift(opened, lift_id, "executed")
+        moved = _outlines(opened.connection, lift, with_set_down=True)
+        for other in open_lifts(opened.connection):
+            reach_m = other.record.get("disturbed_reach_m")
+            outlines = _outlines(opened.connection, other)
+            if reach_m is None or _gap(moved, outlines) < reach_m:
+                step_lift(opened, other.lift_id, "expired", f"disturbed: lift {lift_id} came near its place")
+
+    _change(store, lift_id, who, "lift executed", step)
+
+
+def end_lift(store: Store, lift_id: int, state: str, who: str, note: str) -> None:
+    """Decline an offer, take a confirmation back (`expired`), or report that a confirmed lift `failed`."""
+    if state not in ("expired", "failed"):
+        raise ConfigError(f"a lift does not end as {state!r}")
+    if not note.strip():
+        raise ConfigError("say why, for the audit log")
+    _change(store, lift_id, who, f"lift {state}", lambda opened, _: step_lift(opened, lift_id, state, note))
+
+
+def forbid(store: Store, code: str, reason: str, who: str) -> None:
+    """Add a veto against the newest map: what is offered or confirmed on it ends. Raises ConfigError."""
+    if code not in VETOES:
+        raise ConfigError(f"{code!r} is no veto; the reference of codes lists them")
+    with store.reading() as connection:
+        clock_ns = yard_clock_ns(connection)
+    with entry(store, who, f"veto {code}", clock_ns) as opened:
+        newest = newest_survey(opened.connection)
+        if newest is None:
+            raise ConfigError("there is no survey to forbid lifts of")
+        opened.add(SURVEY_VETOES, survey_id=newest.id, code=code, reason=reason)
+        for lift in open_lifts(opened.connection):
+            step_lift(opened, lift.lift_id, "expired", f"{code}: {reason}")
+
+
+def expire_stale(store: Store, who: str) -> int:
+    """End offers and confirmations whose map is no longer the newest, or too old. Returns their number."""
+    with store.reading() as connection:
+        clock_ns = yard_clock_ns(connection)
+        if not _stale(connection, clock_ns):
+            return 0
+    with entry(store, who, "lifts expired", clock_ns) as opened:
+        stale = _stale(opened.connection, clock_ns)
+        for lift_id, reason in stale.items():
+            step_lift(opened, lift_id, "expired", reason)
+    return len(stale)
+
+
+def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Entry, OpenLift], None]) -> None:
+    """Step a lift in one transaction with the check that it may still be believed."""
+    expire_stale(store, who)
+    with store.reading() as connection:
+        clock_ns = yard_clock_ns(connection)
+    with entry(store, who, f"{what} {lift_id}", clock_ns) as opened:
+        found = {lift.lift_id: lift for lift in open_lifts(opened.connection)}
+        stale = _stale(opened.connection, clock_ns)
+        if lift_id not in found or lift_id in stale:
+            state = stale.get(lift_id) or lift_state(opened.connection, lift_id) or "unknown"
+            raise InputError(f"lift {lift_id}", f"is {state}", "look at the present offers")
+        step(opened, found[lift_id])
+
+
+def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
+    """Tell why open lifts may no longer be believed, by id."""
+    newest = newest_survey(connection)
+    told = {}
+    for lift in open_lifts(connection):
+        until_ns = lift.record["valid_until_ns"]
+        if newest is not None and lift.survey_id != newest.id:
+            told[lift.lift_id] = "expired: a newer map came"
+        elif until_ns is None or until_ns < clock_ns:
+            told[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
+    return told
+
+
+def _outlines(connection: Connection, lift: OpenLift, *, with_set_down: bool = False) -> list[Float64]:
+    """Draw the corners (4, 2) of the load and the magnet's beam; and of both where they are set down."""
+    rows = connection.execute(
+        select(SIGHTINGS.c.record)
+        .join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
+        .where(LIFT_BUNDLES.c.lift_id == lift.lift_id, SIGHTINGS.c.survey_id == lift.survey_id)
+    ).scalars()
+    bundles = [bundle_of(json.loads(row)) for row in rows]
+    places = [lift.record["target"]]
+    if with_set_down and lift.record["set_down"]:
+        places.append(lift.record["set_down"])
+    beam = lift.record.get("beam") or {"width_m": 0.0, "length_m": 0.0}
+    outlines = []
+    for place in places:
+        centre, yaw = (place["x_m"], place["y_m"]), math.radians(place["yaw_deg"])
+        outlines.append(corners(centre, yaw, beam["width_m"], beam["length_m"]))
+        moved = place is not places[0]
+        for one in bundles:
+            at = centre if moved else (float(one.centre_m[0]), float(one.centre_m[1]))
+            outlines.append(corners(at, yaw if moved else one.yaw_rad, one.width_m, one.length_m))
+    return outlines
+
+
+def _gap(first: list[Float64], second: list[Float64]) -> float:
+    return float(np.min([gap_between(one, other) for one in first for other in second], initial=math.inf))

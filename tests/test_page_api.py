@@ -1,0 +1,401 @@
+"""The page's API: who may do what, whose requests are refused, and which confirmations hold."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from barsight.cli.main import run
+from barsight.core.errors import ConfigError, InputError
+from barsight.core.stamps import NS_PER_S
+from barsight.page.access import Access, AccessError, Throttle
+from barsight.page.layers import find_layers, paint_layer
+from barsight.page.serve import ServeOptions, serving
+from barsight.store import accounts, confirmation
+from barsight.store.adding import add_survey, read_survey
+from barsight.store.audit import AuditChain, entry, verify_chain
+from barsight.store.opening import open_store
+from page_yards import FIRST, SECOND, fill_store, survey
+
+PASSWORD = "four words that nobody guesses"
+CHANGES = [
+    ("POST", "/api/lifts/{lift}/confirm", {"map_id": "{map}"}, "operate"),
+    ("POST", "/api/lifts/{lift}/taken", {}, "execute"),
+    ("POST", "/api/lifts/{lift}/end", {"state": "failed", "note": "slipped"}, "execute"),
+    ("POST", "/api/alarms/{alarm}/acknowledge", {"note": ""}, "operate"),
+    ("POST", "/api/alarms/{alarm}/clear", {"note": ""}, "report"),
+    ("POST", "/api/alarms", {"code": "rig", "reason": "loose"}, "report"),
+    ("POST", "/api/stock", {"map_id": "{map}", "key": "missing A4", "decision": "accepted"}, "operate"),
+    ("POST", "/api/accounts", {"name": "x", "kind": "token", "role": "viewer"}, "administer"),
+    ("DELETE", "/api/accounts/eve", None, "administer"),
+    ("GET", "/api/accounts", None, "administer"),
+    ("POST", "/api/vetoes", {"code": "disturbed", "reason": "a lorry"}, "report"),
+]
+MAY = {
+    "viewer": set(),
+    "operator": {"operate", "execute"},
+    "service": {"execute", "report"},
+    "engineer": {"operate", "execute", "report", "administer"},
+}
+"""Said again here, not read from the code: who may what."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    fill_store(folder)
+    return folder
+
+
+@pytest.fixture
+def url(made: Path, tmp_path: Path) -> str:
+    """A store of its own on the same folders; its lifts were offered a minute ago and hold for minutes."""
+    shutil.copy(made / "yard.db", tmp_path / "yard.db")
+    return f"sqlite:///{tmp_path / 'yard.db'}"
+
+
+@pytest.fixture
+def local(url: str) -> Iterator[httpx.Client]:
+    """A browser on this computer, before there are accounts."""
+    with serving(url, ServeOptions(port=0)) as address, httpx.Client(base_url=address) as client:
+        client.headers["X-Barsight-Token"] = client.get("/api/session").json()["token"]
+        yield client
+
+
+def offered(client: httpx.Client) -> list[dict[str, object]]:
+    lifts = client.get("/api/lifts").json()["lifts"]
+    return sorted((one for one in lifts if one["state"] == "offered"), key=lambda one: one["rank"])
+
+
+def state_of(client: httpx.Client, number: object) -> str:
+    return next(one["state"] for one in client.get("/api/lifts").json()["lifts"] if one["id"] == number)
+
+
+def test_what_the_page_reads(local: httpx.Client) -> None:
+    state = local.get("/api/state").json()
+    assert state["offered"] == 3 and state["claimed"] == 0
+    bundles = {one["identity"]: one for one in local.get("/api/bundles").json()["bundles"]}
+    assert set(bundles) == {"B1", "B2", "B3", "B5", "B6"}
+    assert bundles["B1"]["lift"]["rank"] and not bundles["B1"]["vetoes"]
+    assert {veto["code"] for veto in bundles["B6"]["vetoes"]} >= {"end-open"}
+    assert [one["code"] for one in local.get("/api/alarms").json()["alarms"]] == ["bundle-gone"]
+    stock = local.get("/api/stock").json()
+    assert stock["agree"] == ["A1", "A2", "A3"]
+    assert {one["key"] for one in stock["differences"]} == {"missing A4", "extra B5", "extra B6"}
+    history = local.get("/api/bundles/B1").json()["history"]
+    assert [one["what"] for one in history] == ["found", "same"]
+    first, second = (one["captured_to_ns"] for one in local.get("/api/surveys").json()["surveys"][::-1])
+    changes = local.get("/api/compare", params={"before_ns": first, "after_ns": second}).json()["changes"]
+    assert {(one["identity"], one["what"]) for one in changes} == {("B4", "went"), ("B6", "came")}
+    past = local.get("/api/yard", params={"at_ns": first}).json()
+    assert {one["identity"] for one in past["bundles"]} == {"B1", "B2", "B3", "B4", "B5"}
+    layer = local.get("/api/layers").json()["layers"][-1]
+    picture = local.get(f"/api/layers/{layer['map_id']}.png")
+    assert picture.content.startswith(b"\x89PNG")
+    assert local.get("/api/bundles/B99").status_code == 404
+    assert "/api/lifts/{lift_id}/confirm" in local.get("/openapi.json").json()["paths"]
+
+
+def test_a_lift_from_the_offer_to_the_next_survey(local: httpx.Client, url: str, tmp_path: Path) -> None:
+    first, second = offered(local)[:2]
+    confirm = {"map_id": first["map_id"], "name": "Ann"}
+    assert local.post(f"/api/lifts/{second['id']}/taken", json={}).status_code == 409
+    assert local.post(f"/api/lifts/{first['id']}/confirm", json=confirm).status_code == 200
+    assert local.post(f"/api/lifts/{first['id']}/confirm", json=confirm).status_code == 409
+    assert local.get("/api/state").json()["claimed"] == 1
+    assert local.post(f"/api/lifts/{first['id']}/taken", json={}).status_code == 200
+    # Its neighbour lies 1.1 m further on: what stood beside the moved bundle is disturbed.
+    assert {state_of(local, one["id"]) for one in offered(local)} <= {"offered"}
+    lift = next(one for one in local.get("/api/lifts").json()["lifts"] if one["id"] == first["id"])
+    assert [step["state"] for step in lift["steps"]] == ["offered", "claimed", "executed"]
+    assert lift["steps"][1]["who"] == "Ann (no account)"
+    lies = [one for k, one in enumerate(SECOND) if f"B{k + 1}" != lift["bundles"][0]]
+    with open_store(url) as store:
+        clock = time.time_ns() + 5 * NS_PER_S
+        folder = survey(tmp_path / "third", lies, -(clock - time.time_ns()) / NS_PER_S, with_lifts=False)
+        add_survey(store, read_survey(folder), "ann")
+    wait_for(lambda: state_of(local, first["id"]) == "verified")
+
+
+def wait_for(holds: object, timeout_s: float = 5.0) -> None:
+    assert callable(holds)
+    end_s = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_a_confirmation_ends_with_its_map(local: httpx.Client, url: str, tmp_path: Path) -> None:
+    first, second = offered(local)[:2]
+    local.post(f"/api/lifts/{first['id']}/confirm", json={"map_id": first["map_id"]}).raise_for_status()
+    with open_store(url) as store:
+        add_survey(store, read_survey(survey(tmp_path / "third", SECOND, 1.0)), "ann")
+    answer = local.post(f"/api/lifts/{first['id']}/taken", json={})
+    assert answer.status_code == 409 and "expired" in answer.json()["problem"]
+    answer = local.post(f"/api/lifts/{second['id']}/confirm", json={"map_id": second["map_id"]})
+    assert answer.status_code == 409
+    new = offered(local)[0]
+    assert new["map_id"] != first["map_id"]
+    answer = local.post(f"/api/lifts/{new['id']}/confirm", json={"map_id": first["map_id"]})
+    assert answer.status_code == 409 and "was offered on map" in answer.json()["problem"]
+    assert local.post(f"/api/lifts/{new['id']}/confirm", json={"map_id": new["map_id"]}).status_code == 200
+
+
+def test_a_confirmation_ends_with_a_veto(local: httpx.Client) -> None:
+    lift = offered(local)[0]
+    local.post(f"/api/lifts/{lift['id']}/confirm", json={"map_id": lift["map_id"]}).raise_for_status()
+    veto = {"code": "disturbed", "reason": "a lorry drove in"}
+    assert local.post("/api/vetoes", json=veto | {"code": "x"}).status_code == 422
+    local.post("/api/vetoes", json=veto).raise_for_status()
+    assert state_of(local, lift["id"]) == "expired" and offered(local) == []
+    assert local.get("/api/state").json()["map_vetoes"] == [veto]
+
+
+def test_a_confirmation_ends_with_its_calibration(
+    local: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if a calibration file of the recording, which the samples don't have, were changed."""
+    lift = offered(local)[0]
+    local.post(f"/api/lifts/{lift['id']}/confirm", json={"map_id": lift["map_id"]}).raise_for_status()
+    monkeypatch.setattr("barsight.page.conditions.changed_inputs", lambda _: "recording/cam0.yaml")
+    wait_for(lambda: state_of(local, lift["id"]) == "expired")
+    alarms = {one["code"]: one for one in local.get("/api/alarms").json()["alarms"]}
+    assert alarms["calibration-changed"]["reason"] == "recording/cam0.yaml"
+
+
+def test_an_offer_ends_with_its_time(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_store(url) as store:
+        with store.reading() as connection:
+            lift = confirmation.open_lifts(connection)[0]
+            clock_ns = confirmation.yard_clock_ns(connection)
+        assert 0 < clock_ns - lift.record["valid_from_ns"] < 300 * NS_PER_S
+        monkeypatch.setattr(confirmation, "yard_clock_ns", lambda _: lift.record["valid_until_ns"] + NS_PER_S)
+        with pytest.raises(InputError, match="expired"):
+            confirmation.confirm_lift(store, lift.lift_id, lift.map_id, "ann")
+        with store.reading() as connection:
+            assert confirmation.open_lifts(connection) == ()
+            assert isinstance(verify_chain(connection), AuditChain)
+
+
+def test_two_operators_confirm_one_lift(local: httpx.Client) -> None:
+    lift = offered(local)[0]
+    answers: list[int] = []
+
+    def confirm() -> None:
+        body = {"map_id": lift["map_id"]}
+        answers.append(local.post(f"/api/lifts/{lift['id']}/confirm", json=body).status_code)
+
+    threads = [threading.Thread(target=confirm) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(answers) == [200, 409, 409, 409]
+
+
+def test_other_pages_and_names_are_refused(local: httpx.Client) -> None:
+    port = local.base_url.port
+    assert local.get("/", headers={"Host": f"evil.example:{port}"}).status_code == 403
+    assert local.get("/api/state", headers={"Origin": "https://evil.example"}).status_code == 403
+    assert local.get("/api/state", headers={"Origin": "null"}).status_code == 403
+    assert local.get("/api/state", headers={"Origin": f"http://localhost:{port}"}).status_code == 200
+    lift = offered(local)[0]
+    body = {"map_id": lift["map_id"]}
+    wrong = {"X-Barsight-Token": "guessed"}
+    assert local.post(f"/api/lifts/{lift['id']}/confirm", json=body, headers=wrong).status_code == 403
+    with socket.create_connection(("127.0.0.1", port)) as raw:
+        head = f"Host: localhost:{port}\r\nContent-Length: 9999999\r\n\r\n"
+        raw.sendall(f"POST /api/session HTTP/1.1\r\n{head}".encode())
+        assert b" 403 " in raw.recv(100)
+    page = local.get("/")
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    assert b"http://" not in page.content and b"https://" not in page.content
+    assert state_of(local, lift["id"]) == "offered"
+
+
+def test_roles_are_enforced_by_the_api(url: str) -> None:
+    tokens = {}
+    with open_store(url) as store, entry(store, "ann", "accounts") as opened:
+        accounts.add_person(opened, "eve", "engineer", PASSWORD)
+        accounts.add_person(opened, "amy", "engineer", PASSWORD)
+        for role in MAY:
+            tokens[role] = accounts.add_token(opened, f"t-{role}", role)
+    with serving(url, ServeOptions(port=0)) as address, httpx.Client(base_url=address) as client:
+        assert client.get("/api/state").status_code == 401
+        bearer = {role: {"Authorization": f"Bearer {token}"} for role, token in tokens.items()}
+        lift = client.get("/api/lifts", headers=bearer["viewer"]).json()["lifts"][0]
+        alarm = client.get("/api/alarms", headers=bearer["viewer"]).json()["alarms"][0]
+        place = {"lift": lift["id"], "alarm": alarm["id"], "map": lift["map_id"]}
+        for role in MAY:
+            for method, path, body, right in CHANGES:
+                given = None if body is None else json.loads(json.dumps(body).replace("{map}", place["map"]))
+                answer = client.request(method, path.format(**place), json=given, headers=bearer[role])
+                assert (answer.status_code == 403) == (right not in MAY[role]), (role, path, answer.text)
+        assert client.get("/api/state", headers={"Authorization": "Bearer x"}).status_code == 401
+
+
+def test_people_log_in(url: str) -> None:
+    with open_store(url) as store:
+        with pytest.raises(ConfigError, match="first account"), entry(store, "ann", "accounts") as opened:
+            accounts.add_person(opened, "bob", "operator", PASSWORD)
+        with entry(store, "ann", "accounts") as opened:
+            accounts.add_person(opened, "eve", "engineer", PASSWORD)
+            accounts.add_person(opened, "bob", "operator", PASSWORD)
+        with pytest.raises(ConfigError, match="last engineer"), entry(store, "ann", "accounts") as opened:
+            accounts.withdraw(opened, "eve")
+    with serving(url, ServeOptions(port=0)) as address, httpx.Client(base_url=address) as client:
+        told = client.post("/api/session", json={"name": "bob", "password": PASSWORD})
+        cookie = told.headers["set-cookie"]
+        assert "HttpOnly" in cookie and "SameSite=strict" in cookie
+        lift = offered(client)[0]
+        path, body = f"/api/lifts/{lift['id']}/confirm", {"map_id": lift["map_id"], "name": "Eve"}
+        assert client.post(path, json=body).status_code == 403
+        client.headers["X-Barsight-Token"] = told.json()["token"]
+        assert client.get("/api/accounts").status_code == 403
+        assert client.post(path, json=body).status_code == 200
+        steps = client.get("/api/lifts").json()["lifts"]
+        assert "bob (operator)" in {step["who"] for one in steps for step in one["steps"]}
+        with open_store(url) as store, entry(store, "eve", "accounts") as opened:
+            accounts.withdraw(opened, "bob")
+        wait_for(lambda: client.get("/api/state").status_code == 401)
+        answers = [
+            client.post("/api/session", json={"name": "eve", "password": "wrong"}).status_code
+            for _ in range(7)
+        ]
+        assert answers[:5] == [401] * 5 and 429 in answers[5:]
+    content = Path(url.removeprefix("sqlite:///")).read_bytes()
+    assert PASSWORD.encode() not in content
+
+
+def test_failed_log_ins_wait_longer_and_longer() -> None:
+    now = [0.0]
+    throttle = Throttle(lambda: now[0])
+    waits = []
+    for _ in range(20):
+        throttle.fail("name eve")
+        try:
+            throttle.expect_free("name eve", "client a")
+            waits.append(0.0)
+        except AccessError as error:
+            waits.append(error.wait_s)
+            now[0] += error.wait_s
+    assert waits[:7] == [0, 0, 0, 0, 1, 2, 4] and max(waits) == 300.0
+    throttle.expect_free("name bob")
+
+
+def test_a_log_in_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    known = {"eve": accounts.Account("eve", "person", "engineer", "s")}
+    monkeypatch.setattr("barsight.page.access.is_password", lambda account, _: account is not None)
+    access = Access(lambda: known, lambda: now[0])
+    cookie, _ = access.log_in("eve", PASSWORD, "a")
+    assert access.caller(f"barsight_session={cookie}", "").name == "eve"
+    now[0] += 2.5 * 3600
+    with pytest.raises(AccessError, match="ended"):
+        access.caller(f"barsight_session={cookie}", "")
+    cookie, _ = access.log_in("eve", PASSWORD, "a")
+    known["eve"] = accounts.Account("eve", "person", "viewer", "another")
+    with pytest.raises(AccessError, match="log in"):
+        access.caller(f"barsight_session={cookie}", "")
+
+
+def test_files_of_a_survey_are_held_against_their_digests(local: httpx.Client, made: Path) -> None:
+    one = local.get("/api/surveys").json()["surveys"][0]
+    base = f"/api/surveys/{one['map_id']}/files"
+    report = local.get(f"{base}/report.html")
+    assert report.status_code == 200 and report.headers["content-security-policy"].startswith("sandbox")
+    assert local.get(f"{base}/height.tif").content == (made / "second" / "height.tif").read_bytes()
+    for name in ("..%2f..%2fyard.db", "yard.db", "%2fetc%2fpasswd"):
+        assert local.get(f"{base}/{name}").status_code in (404, 409)
+    path = made / "second" / "bundles.json"
+    whole = path.read_bytes()
+    path.write_bytes(whole + b" ")
+    assert local.get(f"{base}/bundles.json").status_code == 409
+    path.write_bytes(whole)
+    assert local.get(f"{base}/bundles.json").status_code == 200
+
+
+def test_an_alarm_goes_through_its_states(local: httpx.Client, made: Path, tmp_path: Path) -> None:
+    def alarms() -> dict[str, dict[str, object]]:
+        return {one["code"]: one for one in local.get("/api/alarms").json()["alarms"]}
+
+    gone = alarms()["bundle-gone"]
+    local.post(f"/api/alarms/{gone['id']}/acknowledge", json={"note": "seen"}).raise_for_status()
+    assert alarms()["bundle-gone"]["state"] == "acknowledged"
+    kept = made / "second" / "lifts.json"
+    kept.rename(tmp_path / "away")
+    wait_for(lambda: alarms().get("survey-files", {}).get("state") == "raised")
+    (tmp_path / "away").rename(kept)
+    wait_for(lambda: alarms()["survey-files"]["state"] == "returned")
+    number = alarms()["survey-files"]["id"]
+    local.post(f"/api/alarms/{number}/acknowledge", json={"note": ""}).raise_for_status()
+    assert alarms()["survey-files"]["state"] == "cleared"
+
+
+def test_places_are_shown_by_the_newest_survey_that_saw_them(url: str, tmp_path: Path) -> None:
+    """The second survey's map ends at x = 7.3 m, the first one's before it: only the second one shows."""
+    with open_store(url) as store:
+        with store.reading() as connection:
+            layers = find_layers(connection)
+        assert [one.folder.name for one in layers] == ["second"]
+        add_survey(store, read_survey(survey(tmp_path / "third", FIRST[:2], 1.0, with_lifts=False)), "ann")
+        with store.reading() as connection:
+            before, after = find_layers(connection)
+    assert (before.folder.name, after.folder.name) == ("second", "third")
+    columns = before.heights.x_m
+    assert not before.shown[:, columns < 2.8].any() and before.shown[:, columns > 3.1].any()
+    assert paint_layer(before, "photo") != paint_layer(before, "height")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--host", "0.0.0.0"], "--public-url"),
+        (["--host", "0.0.0.0", "--public-url", "http://yard"], "is not https"),
+        (["--host", "0.0.0.0", "--public-url", "https://yard"], "no accounts"),
+        (["--public-url", "https://yard"], "no accounts"),
+        (["--certificate", "no.pem"], "go together"),
+        (["--port", "99999"], "does not exist"),
+    ],
+)
+def test_it_does_not_stand_open(
+    made: Path, arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["serve", "--store", f"sqlite:///{made / 'yard.db'}", *arguments]) in (2, 3, 4)
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1
+
+
+def test_a_taken_port_is_one_line(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        assert run(["serve", "--store", f"sqlite:///{made / 'yard.db'}", "--port", port]) == 4
+    said = capsys.readouterr().err
+    assert "is taken" in said and said.count("\n") == 1
+
+
+def test_slow_readers_skip(local: httpx.Client) -> None:
+    with local.stream("GET", "/api/events") as stream:
+        lines = stream.iter_lines()
+        first = next(int(line[6:]) for line in lines if line.startswith("data: "))
+        for k in range(20):
+            body = {"code": f"rig-{k}", "reason": "loose"}
+            local.post("/api/alarms", json=body).raise_for_status()
+        newest = local.get("/api/state").json()["revision"]
+        got = []
+        for line in lines:
+            if line.startswith("data: "):
+                got.append(int(line[6:]))
+                if got[-1] == newest:
+                    break
+    assert newest == first + 20 and got == sorted(set(got))

@@ -1,0 +1,224 @@
+"""The page in a browser: screens by mouse and keyboard, two browsers, a server that ends; needs Chromium."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from barsight.page.serve import ServeOptions, serving
+from page_yards import fill_store
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (bash .ci/servers)"),
+    pytest.mark.slow,
+]
+SCREENS = ("yard", "bundle", "lifts", "stock", "alarms", "timeline", "surveys", "health", "admin")
+WORDS = Path(__file__).parents[1] / "src" / "barsight" / "page" / "static" / "words.json"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[object]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+class Sheet:
+    """A page, what it asked for from elsewhere, and its errors."""
+
+    def __init__(self, browser: object, address: str, locale: str = "en") -> None:
+        self.context = browser.new_context(locale=locale, viewport={"width": 1500, "height": 850})
+        self.page = self.context.new_page()
+        self.address = address
+        self.outside: list[str] = []
+        self.errors: list[str] = []
+        self.page.on("request", lambda r: None if r.url.startswith(address) else self.outside.append(r.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(address)
+        self.page.wait_for_selector("#yard")
+
+    def open(self, name: str) -> None:
+        self.page.click(f"#nav-{name}")
+        self.page.wait_for_selector(f"body[data-screen={name}] #nav-{name}[aria-current]")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    fill_store(folder)
+    return folder
+
+
+@pytest.fixture
+def url(made: Path, tmp_path: Path) -> str:
+    shutil.copy(made / "yard.db", tmp_path / "yard.db")
+    return f"sqlite:///{tmp_path / 'yard.db'}"
+
+
+@pytest.fixture
+def address(url: str) -> Iterator[str]:
+    with serving(url, ServeOptions(port=0)) as address:
+        yield address
+
+
+def wait_for(holds: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    """The page's policy forbids Playwright to wait inside it."""
+    end_s = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_every_screen_by_mouse_and_by_keyboard(browser: object, address: str) -> None:
+    sheet = Sheet(browser, address)
+    page = sheet.page
+    heads = {}
+    for name in SCREENS:
+        sheet.open(name)
+        page.wait_for_selector("#screen h1")
+        heads[name] = page.inner_text("#screen h1 >> nth=0")
+    assert len(set(heads.values())) >= 8
+    page.reload()
+    page.wait_for_selector("#nav-admin")
+    page.keyboard.press("Tab")
+    reached = []
+    for _ in range(15):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("document.activeElement.id"))
+        if reached[-1].startswith("nav-"):
+            page.keyboard.press("Enter")
+            name = reached[-1][4:]
+            page.wait_for_selector(f"body[data-screen={name}] #nav-{name}[aria-current]")
+            wait_for(lambda: page.evaluate("document.activeElement.id") == "screen")
+            page.focus(f"#nav-{name}")
+    assert [f"nav-{name}" for name in SCREENS] == [each for each in reached if each.startswith("nav-")]
+    assert sheet.outside == [] and sheet.errors == []
+
+
+def test_the_yard_by_keyboard_and_why_not(browser: object, address: str) -> None:
+    sheet = Sheet(browser, address)
+    page = sheet.page
+    page.focus("#yard")
+    for _ in range(5):
+        page.keyboard.press("n")
+    page.wait_for_selector("#side >> text=B6")
+    side = page.inner_text("#side")
+    assert "Move the trolley towards +Y until the end is in view" in side and "end-open" in side
+    scale = page.evaluate("barsightYard.view.scale")
+    page.keyboard.press("+")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("barsightYard.view.scale") == pytest.approx(1.25 * scale)
+    page.keyboard.press("0")
+    place = page.evaluate("barsightYard.place(0.3, 2.0)")
+    page.click("#yard", position={"x": place[0], "y": place[1]})
+    page.wait_for_selector("#side >> text=Confirm lift")
+    assert sheet.errors == []
+
+
+def confirm(page: object) -> None:
+    page.click("[id^=confirm-]:enabled >> nth=0")
+    page.fill("#ask-name", "Ann")
+    page.click("#ask-yes")
+
+
+def test_two_browsers_agree_within_a_second(browser: object, address: str) -> None:
+    one, two = Sheet(browser, address), Sheet(browser, address, "de")
+    one.open("lifts")
+    two.open("lifts")
+    one.page.wait_for_selector("[id^=confirm-]")
+    confirm(one.page)
+    two.page.wait_for_selector("li.at >> text=bestätigt", timeout=1000)
+    one.page.wait_for_selector("li.at >> text=confirmed", timeout=1000)
+    two.page.click("[id^=taken-]")
+    one.page.wait_for_selector("table >> text=taken", timeout=1000)
+    assert one.errors == two.errors == []
+
+
+def test_a_stale_offer_cannot_be_confirmed(browser: object, address: str) -> None:
+    """The dialog stands open while a veto comes: its confirmation is refused, and the page says so."""
+    sheet = Sheet(browser, address)
+    sheet.open("lifts")
+    page = sheet.page
+    page.click("[id^=confirm-] >> nth=0")
+    page.fill("#ask-name", "Ann")
+    told = page.evaluate(
+        """async () => {
+          const token = (await (await fetch("/api/session")).json()).token;
+          const headers = {"X-Barsight-Token": token, "Content-Type": "application/json"};
+          const body = JSON.stringify({code: "disturbed", reason: "a lorry"});
+          return (await fetch("/api/vetoes", {method: "POST", headers, body})).status;
+        }"""
+    )
+    assert told == 200
+    page.click("#ask-yes")
+    page.wait_for_selector("#told >> text=expired")
+    lifts = page.evaluate("fetch('/api/lifts').then((answer) => answer.json())")["lifts"]
+    assert {one["state"] for one in lifts} == {"expired"}
+
+
+def test_a_server_that_ends_and_comes_back(browser: object, url: str) -> None:
+    with serving(url, ServeOptions(port=0)) as address:
+        sheet = Sheet(browser, address)
+        sheet.open("lifts")
+        sheet.page.wait_for_selector("[id^=confirm-]")
+    sheet.page.wait_for_selector("#server >> text=no connection")
+    with serving(url, ServeOptions(port=int(address.rsplit(":", 1)[1]))):
+        sheet.page.wait_for_selector("#server >> text=/^connected/", timeout=15_000)
+        wait_for(lambda: "no connection" not in sheet.page.inner_text("#server"))
+        confirm(sheet.page)
+        sheet.page.wait_for_selector("li.at >> text=confirmed")
+
+
+def test_alarms_stock_and_accounts_by_the_page(browser: object, address: str) -> None:
+    sheet = Sheet(browser, address)
+    page = sheet.page
+    sheet.open("alarms")
+    page.click("[id^=ack-]")
+    page.wait_for_selector("text=active, acknowledged")
+    sheet.open("stock")
+    page.click("#accept-0")
+    page.click("#ask-yes")
+    page.wait_for_selector("text=accepted: the list is to be changed")
+    sheet.open("admin")
+    page.click("#add-person")
+    page.fill("#ask-name", "eve")
+    page.fill("#ask-password", "four words that nobody guesses")
+    page.click("#ask-yes")
+    page.wait_for_selector("#log-in")
+    page.fill("#name", "eve")
+    page.fill("#password", "wrong wrong wrong")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("text=Name or password is wrong")
+    page.fill("#password", "four words that nobody guesses")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#log-out")
+    assert sheet.errors == []
+
+
+def test_the_catalogue_is_whole_in_three_languages(browser: object, address: str) -> None:
+    from barsight.page.conditions import ALARM_CODES
+    from barsight.yard.vetoes import VETOES
+
+    words = json.loads(WORDS.read_text(encoding="utf-8"))
+    assert {len(texts) for texts in words.values()} == {3}
+    assert all(text.strip() for texts in words.values() for text in texts)
+    wanted = {f"{kind}.{code}" for code in VETOES for kind in ("veto", "short")}
+    wanted |= {f"help.{code}" for code in VETOES}
+    wanted |= {f"{kind}.{code}" for code in ALARM_CODES for kind in ("alarm", "cause", "action")}
+    assert wanted <= set(words)
+    for locale, word in (("de", "Platz"), ("zh-CN", "料场")):
+        sheet = Sheet(browser, address, locale)
+        assert sheet.page.inner_text("#nav-yard") == word
+        for name in SCREENS:
+            sheet.open(name)
+            sheet.page.wait_for_timeout(100)
+            shown = sheet.page.inner_text("body")
+            assert not [key for key in words if "." in key and key in shown.split()]
