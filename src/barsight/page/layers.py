@@ -13,7 +13,7 @@ import numpy as np
 from barsight.core.arrays import Bool, UInt8
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
-from barsight.core.geotiff import open_geotiff
+from barsight.core.reading.geotiff import open_geotiff
 from barsight.report.map_images import hillshade
 from barsight.store.coarse_map import unpack
 from barsight.store.tables import SURVEYS
