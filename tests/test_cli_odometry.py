@@ -48,16 +48,21 @@ def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert data["reference"] == "world" and "velocity_mps" not in data["frames"][0]
 
 
+@pytest.fixture(scope="module")
+def development_yard(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(data / "yard_dev", tmp_path_factory.mktemp("development") / "yard"))
+
+
 @pytest.fixture
-def yard(data: Path, tmp_path: Path) -> Path:
+def yard(development_yard: Path, tmp_path: Path) -> Path:
     """The development yard, its pictures linked and its tables open to change."""
-    source, copy = data / "yard_dev", tmp_path / "yard"
+    source, copy = development_yard, tmp_path / "yard"
     for folder, _, names in os.walk(source / "mav0"):
         to = copy / Path(folder).relative_to(source)
         to.mkdir(parents=True)
         for name in names:
             if name.endswith(".png"):
-                (to / name).symlink_to(Path(folder) / name)
+                os.link(Path(folder) / name, to / name)
             else:
                 shutil.copyfile(Path(folder) / name, to / name)
     return copy

@@ -104,7 +104,15 @@ def test_shown_commands_parse(
 
 
 def test_named_flags_exist(reference: ModuleType) -> None:
-    known = {"--help", "--quiet", "--editable", "--require-hashes", "--no-deps", "--no-build-isolation"}
+    known = {
+        "--help",
+        "--quiet",
+        "--editable",
+        "--require-hashes",
+        "--no-deps",
+        "--no-build-isolation",
+    }
+    known |= {"--minutes"}  # of python -m fuzz
     for kind, reached in reference.settings_uses(list(reference.commands())).items():
         fields = [field.name.replace("_", "-") for field in reference.dataclasses.fields(kind)]
         known |= {f"--{prefix}.{field}".replace("--.", "--") for _, prefix in reached for field in fields}

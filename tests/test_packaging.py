@@ -28,6 +28,7 @@ EXTRAS = {
     "export": {"report/export.py"},
     "bench": {"features/detectors.py", "simulation/worlds/settling.py"},
     "notebook": {"yard/types.py"},
+    "cameras": {"sensors/gige.py"},
     "store": {
         "store/tables.py",
         "store/opening.py",

@@ -56,7 +56,7 @@ def test_it_rests_travels_and_rests(trajectory: SimulatedTrajectory) -> None:
 
 
 def test_exact_imu_integrates_to_the_trajectory(trajectory: SimulatedTrajectory) -> None:
-    stamp_ns = stamps(trajectory.duration_s, 2000)
+    stamp_ns = stamps(trajectory, 2000)
     gyro, force = exact_imu(trajectory, stamp_ns)
     t = seconds(stamp_ns)
     truth = trajectory.at(t)

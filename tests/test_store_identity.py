@@ -18,6 +18,7 @@ from store_yards import START_NS, WHOLE, CraneYard, View
 from yard_maps import Laid
 
 HOUR_NS = 3600 * 10**9
+REACH = {"disturbed_reach_m": 1.0}
 
 
 @dataclass
@@ -75,7 +76,7 @@ def record_lift(store: Store, identity: str, to: Laid, at_ns: int) -> int:
     bundle_id = int(identity.removeprefix("B"))
     place = {"x_m": to.x_m, "y_m": to.y_m, "z_m": 0.0, "yaw_deg": to.yaw_deg}
     lift = {"rank": 1, "bundles": [0], "target": place, "set_down": place, "poles": [], "checks": []}
-    content = {"vetoes": [], "refused": [], "lifts": [lift]}
+    content = {"vetoes": [], "refused": [], "lifts": [lift], "settings": REACH}
     with entry(store, "test", "lift", at_ns) as opened:
         survey_id = newest_sightings(opened.connection, None)[bundle_id].survey_id
         add_lifts(opened, survey_id, content, {0: bundle_id}, is_newest=True)
@@ -209,7 +210,13 @@ def test_lifts_are_verified_or_failed_by_the_next_survey(store: Store, tmp_path:
     with entry(store, "test", "lift", at_ns) as opened:
         bundle_id = int(name[yard.lying[offered][0]].removeprefix("B"))
         lift = {"rank": 1, "bundles": [0], "target": {}, "set_down": None}
-        add_lifts(opened, 1, {"vetoes": [], "refused": [], "lifts": [lift]}, {0: bundle_id}, is_newest=True)
+        add_lifts(
+            opened,
+            1,
+            {"vetoes": [], "refused": [], "lifts": [lift], "settings": REACH},
+            {0: bundle_id},
+            is_newest=True,
+        )
         (waiting,) = opened.rows["lifts"]
     truth = yard.survey(tmp_path / "1", never_missed=everyone)
     added = add_survey(store, read_survey(tmp_path / "1"), "test")

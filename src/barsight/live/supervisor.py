@@ -193,9 +193,9 @@ class Supervisor:
         """Judge the mode and write it, to the log too where it changed."""
         assert self._clock is not None
         now_ns = self._clock.stamp_now_ns()
-        heard = self._heard()
         if now_ns is None or self._board["capture", "ended"]:
-            now_ns = self._last_picture_ns()
+            now_ns = self._last_picture_ns()  # before the readings, which run ahead of the pictures
+        heard = self._heard()
         down = {
             role: one.reason
             for role, one in self.state.processes.items()

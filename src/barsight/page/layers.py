@@ -29,7 +29,7 @@ _KEPT = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class SurveyLayer:
     """Places that one survey knows best. shown: (rows, columns) of its coarse heights, from the lowest y."""
 
     map_id: str
@@ -50,7 +50,7 @@ def edges(heights: HeightMap) -> list[float]:
     return [left, low, left + columns * heights.cell_m, low + rows * heights.cell_m]
 
 
-def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[Layer, ...]:
+def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[SurveyLayer, ...]:
     """Share the yard at a time out among its surveys, each place to the newest that saw it; oldest first."""
     query = select(SURVEYS.c.map_id, SURVEYS.c.captured_to_ns, SURVEYS.c.folder, SURVEYS.c.heights)
     if at_ns is not None:
@@ -64,7 +64,7 @@ def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[Layer
         for other in later:
             shown &= ~_known_at(other, heights)
         if shown.any():
-            layers.append(Layer(row.map_id, row.captured_to_ns, Path(row.folder), heights, shown))
+            layers.append(SurveyLayer(row.map_id, row.captured_to_ns, Path(row.folder), heights, shown))
             later.append(heights)
     return tuple(reversed(layers))
 
@@ -80,7 +80,7 @@ def _known_at(other: HeightMap, heights: HeightMap) -> Bool:
     return np.asarray(inside & known)
 
 
-def paint_layer(layer: Layer, kind: Kind) -> bytes:
+def paint_layer(layer: SurveyLayer, kind: Kind) -> bytes:
     """Paint a layer as PNG, gray with alpha, row 0 at the highest y. The photo is the folder's ortho.tif, the
     store's coarse heights where that isn't there any more.
     """
@@ -94,7 +94,7 @@ def paint_layer(layer: Layer, kind: Kind) -> bytes:
     return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
 
 
-def _photo(layer: Layer) -> UInt8 | None:
+def _photo(layer: SurveyLayer) -> UInt8 | None:
     path = layer.folder / "ortho.tif"
     try:
         with open_geotiff(path) as file:
@@ -134,7 +134,7 @@ class PaintedLayers:
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[str, Kind, bytes], bytes] = OrderedDict()
 
-    def paint(self, layer: Layer, kind: Kind) -> bytes:
+    def paint(self, layer: SurveyLayer, kind: Kind) -> bytes:
         """Paint a layer, or return it as painted before."""
         key = (layer.map_id, kind, np.packbits(layer.shown).tobytes())
         if key not in self._kept:

@@ -28,7 +28,7 @@ from barsight.page.documents import (
     stock_record,
     survey_records,
 )  # fmt: skip
-from barsight.page.layers import Layer, find_layers
+from barsight.page.layers import SurveyLayer, find_layers
 from barsight.page.live import LiveFolder, LiveHealth
 from barsight.store.accounts import Account, list_accounts
 from barsight.store.confirmation import expire_stale, forbid, newest_survey
@@ -53,7 +53,7 @@ class Published:
     revision: int = -1
     documents: dict[str, bytes] = field(default_factory=dict)
     accounts: dict[str, Account] = field(default_factory=dict)
-    layers: tuple[Layer, ...] = ()
+    layers: tuple[SurveyLayer, ...] = ()
 
 
 class StoreWatch:

@@ -28,6 +28,7 @@ from barsight.calibration.stereo.verdict import Verdict, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.files import atomic_paths, expect_output
 from barsight.core.parallel import ordered_map
@@ -93,15 +94,22 @@ def run(arguments: Sequence[str]) -> None:
             halves = cross_halves(calibration, views, samples, lenses, target, noise, recording)
             advance("solve", 3, 3)
         assessment = assess_camera_imu(calibration, halves)
-        camchain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
-        own = read_covariance(rig) if own_file else None
-        html = out.with_suffix(".html")
-        with atomic_paths(out, camchain, html, out.with_suffix(".json")) as (path, chain, *report):
-            write_camera_imu(calibration, path, chain, own)
-            write_camera_imu_report(calibration, assessment, *report)
-        _print(console, calibration, assessment, out, html)
+        _write(calibration, assessment, read_covariance(rig) if own_file else None, out)
+        _print(console, calibration, assessment, out)
 
     call(command, "calibrate camera-imu", arguments)
+
+
+def _write(
+    calibration: CameraImuCalibration, assessment: CameraImuAssessment,
+    lenses: tuple[tuple[str, ...], Float64] | None, out: Path,
+) -> None:  # fmt: skip
+    """Write the rig file, Kalibr's camchain and the report, or nothing."""
+    camchain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
+    with atomic_paths(out, camchain, out.with_suffix(".html"), out.with_suffix(".json")) as paths:
+        path, chain, *report = paths
+        write_camera_imu(calibration, path, chain, lenses)
+        write_camera_imu_report(calibration, assessment, *report)
 
 
 def _expect(out: Path, max_views: int) -> None:
@@ -166,7 +174,6 @@ def _print(
     calibration: CameraImuCalibration,
     assessment: CameraImuAssessment,
     out: Path,
-    html: Path,
 ) -> None:
     sigma = calibration.sigma
     for camera, mount in enumerate(calibration.solution.state.mounts):
@@ -181,7 +188,7 @@ def _print(
         )  # fmt: skip
     console.print(
         f"{escape(str(out))}: baseline {calibration.rig.baseline_m * 1e3:.2f} ± "
-        f"{calibration.baseline_sigma_m * 1e3:.2f} mm; report {escape(str(html))}",
+        f"{calibration.baseline_sigma_m * 1e3:.2f} mm; report {escape(str(out.with_suffix('.html')))}",
         soft_wrap=True, highlight=False,
     )  # fmt: skip
     colour = COLOURS[assessment.verdict]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import sys
 import types
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
@@ -135,6 +134,10 @@ def _plain(value: Any, kind: Any, name: str) -> Any:
         raise ConfigError(f"{name} is {value!r}; give {wanted}")
     if kind is int and abs(value) > MAX_VALUE:
         raise ConfigError(f"{name} is over the most, {MAX_VALUE}")
-    if kind is float and not abs(value) <= sys.float_info.max:
-        raise ConfigError(f"{name} is {value if isinstance(value, float) else 'too large'}; give a number")
-    return kind(value)
+    try:
+        made = kind(value)
+    except OverflowError:
+        raise ConfigError(f"{name} is too large; give a number") from None
+    if kind is float and not math.isfinite(made):
+        raise ConfigError(f"{name} is {made}; give a number")
+    return made

@@ -23,13 +23,13 @@ from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 from barsight.recording.base import FrameIndex, RecordingSettings
-from barsight.recording.digest import file_digests
 from barsight.recording.formats.bag_file import BagFile, RawMessage
 from barsight.recording.formats.bag_images import file_of, gray_of
 from barsight.recording.formats.bag_laser import laser_rows
 from barsight.recording.formats.bag_setup import choose_topics, find_calibration
 from barsight.recording.formats.segments import SEGMENTS, SegmentFile
 from barsight.recording.image_decoding import TornImageError
+from barsight.recording.own_files import file_digests
 from barsight.recording.pairing import PairedStamps, pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
 from barsight.recording.stored_images import StoredImage

@@ -19,7 +19,7 @@ from barsight.calibration.files.yaml_document import read_document
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import open_regular
 from barsight.core.stamps import NS_PER_S
-from barsight.recording.contained import expect_inner_name, leads_outside
+from barsight.recording.own_files import expect_inner_name, leads_outside
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"

@@ -20,8 +20,8 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, NamedPoints, RefusedFrame, StereoFrame
 from barsight.recording.base import RecordingSettings
-from barsight.recording.digest import file_digests
 from barsight.recording.formats.imu_log import read_imu_log
+from barsight.recording.own_files import file_digests
 from barsight.recording.pairing import PairedAtOpening, pair_cameras
 from barsight.recording.stored_images import StoredImage
 

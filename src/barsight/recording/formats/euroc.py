@@ -13,9 +13,9 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
-from barsight.recording.digest import file_digests
 from barsight.recording.formats.euroc_tables import Table, read_image_list, read_table
 from barsight.recording.formats.image_folders import PictureFiles
+from barsight.recording.own_files import file_digests
 from barsight.recording.pairing import pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
 

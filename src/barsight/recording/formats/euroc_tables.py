@@ -13,7 +13,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, open_regular
 from barsight.core.stamps import expect_increasing
-from barsight.recording.contained import expect_inner_name
+from barsight.recording.own_files import expect_inner_name
 
 
 @dataclass(frozen=True, eq=False)

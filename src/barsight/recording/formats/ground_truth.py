@@ -12,8 +12,8 @@ from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import read_text
 from barsight.core.stamps import expect_increasing, parse_seconds
-from barsight.recording.contained import leads_outside
 from barsight.recording.formats.euroc_tables import read_table, require_file
+from barsight.recording.own_files import leads_outside
 
 EUROC_FOLDER = "state_groundtruth_estimate0"
 EUROC_HEADER = "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"

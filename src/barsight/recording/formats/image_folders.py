@@ -7,8 +7,8 @@ from pathlib import Path
 
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.types import RefusedFrame, StereoFrame
-from barsight.recording.contained import read_picture
 from barsight.recording.image_decoding import TornImageError
+from barsight.recording.own_files import read_picture
 from barsight.recording.pairing import PairedAtOpening, decode_for
 from barsight.recording.stored_images import StoredImage, merge_cameras
 

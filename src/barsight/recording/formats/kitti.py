@@ -23,10 +23,9 @@ from barsight.core.reading.bounded_reading import read_text
 from barsight.core.stamps import NS_PER_S, expect_increasing, seconds_in_ns
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
-from barsight.recording.contained import read_picture
-from barsight.recording.digest import file_digests
 from barsight.recording.formats.image_folders import PictureFiles
 from barsight.recording.image_decoding import TornImageError, decode_gray
+from barsight.recording.own_files import file_digests, read_picture
 from barsight.recording.pairing import pair_cameras
 
 FOLDERS = (

@@ -1,12 +1,13 @@
-"""Keep to a recording's own files: a name in it must not lead out of it."""
+"""Keep to a recording's own files: names in it don't lead out of it, and a result tells their hashes."""
 
 from __future__ import annotations
 
-from functools import lru_cache
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import read_bytes
+from barsight.core.reading.bounded_reading import open_regular, read_bytes
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
 
 
@@ -24,12 +25,7 @@ def expect_inner_name(name: str, path: Path, where: str) -> None:
 
 def leads_outside(path: Path, root: Path) -> bool:
     """Check whether a file lies outside the recording `root`, by a symbolic link in its way."""
-    return not path.resolve().is_relative_to(_resolved(root))
-
-
-@lru_cache(maxsize=8)
-def _resolved(root: Path) -> Path:
-    return root.resolve()
+    return not path.resolve().is_relative_to(root.resolve())
 
 
 def read_picture(path: Path, root: Path) -> bytes:
@@ -46,3 +42,16 @@ def read_picture(path: Path, root: Path) -> bytes:
         return read_bytes(path, MAX_PICTURE_BYTES)
     except InputError as error:
         raise TornImageError(error.problem) from None
+
+
+def file_digests(root: Path, paths: Iterable[Path]) -> dict[str, str]:
+    """Compute SHA-256 by the name relative to `root` (or the bare name outside it), of those paths that
+    exist.
+    """
+    digests = {}
+    for path in paths:
+        if path.is_file():
+            name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+            with open_regular(path) as file:
+                digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digests
