@@ -84,6 +84,7 @@ def test_a_run_as_fast_as_possible_is_measure(whole: Path, tmp_path: Path) -> No
     assert not {".live", "pose.json", "live_height.tif"} & {path.name for path in out.iterdir()}
 
 
+@pytest.mark.slow
 def test_what_was_kept_replays_to_the_byte(whole: Path, tmp_path: Path) -> None:
     """At another pace, with pairs passed over and a mode that forbids lifts."""
     stamps = list(bs.open_recording(whole).index.stamps_ns)

@@ -227,6 +227,7 @@ def test_what_was_taken_is_told_and_the_newer_height_stands(
     assert all(STALE in b.cover_doubts for b in left)
 
 
+@pytest.mark.slow
 def test_a_session_of_two_passes_ends_as_the_batch(passes: tuple[Path, Path], joined: bs.Yard) -> None:
     recordings = [bs.open_recording(path) for path in passes]
     session = bs.Session(recordings[0].rig, imu_noise=recordings[0].imu_noise(), is_simulated=True, **COARSE)
