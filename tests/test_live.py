@@ -13,14 +13,14 @@ import pytest
 import barsight as bs
 from barsight.cli.main import run
 from barsight.core.types import CraneSamples, StereoFrame
-from barsight.live.counters import Counters
 from barsight.live.latency import counts, spread
-from barsight.live.logs import NumberLog, ReadingLog
 from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
 from barsight.live.pairing import PairFormer
-from barsight.live.ring import PairRing
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
+from barsight.live.shared.counters import Counters
+from barsight.live.shared.logs import NumberLog, ReadingLog
+from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.sensors.source import LivePicture, LostPicture, Readings

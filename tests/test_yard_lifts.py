@@ -35,6 +35,11 @@ from yard_folders import schema
 from yard_maps import Laid
 
 
+def test_the_schema_knows_every_veto() -> None:
+    known = schema("lifts")["$defs"]["veto"]["properties"]["code"]["enum"]
+    assert set(known) == set(VETOES) and len(known) == len(VETOES)
+
+
 def test_a_free_bundle_is_offered_with_the_figures_of_geometry() -> None:
     stock = [laid(0.3), laid(0.62)]
     bundles = tuple(record(one, k) for k, one in enumerate(stock))

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.types import ImuSamples
-from barsight.live.counters import Counters
 from barsight.live.link import Link
+from barsight.live.shared.counters import Counters
 from barsight.recording.writers.retention import Retention
 from barsight.recording.writers.segments import SegmentWriter
 
