@@ -59,8 +59,7 @@ def run(arguments: Sequence[str]) -> None:
             magnet: TOML file of the magnet that lifts are chosen for; without it nothing is offered.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             keyframes: keyframes.json of an earlier run: keep just the pairs that it kept.
-            surveys: At a crane: one survey after the other, each in a folder of OUT; it begins as the crane
-                moves and ends as it stops, or by SIGUSR1. Ctrl-C ends the last one.
+            surveys: One survey after the other, each in a folder of OUT, as the crane moves and stops.
         """
         console = SafeConsole(stderr=True)
 
@@ -77,7 +76,7 @@ def run(arguments: Sequence[str]) -> None:
             else:
                 measure = measure_surveys if surveys else measure_crane
                 measured = measure(crane, out, settings, live, **common)
-        if measured:  # surveys tell of their own
+        if measured:
             print_outcome(measured, console, verbose=False)
             tell(f"report: {out / 'report.html'}")
 
