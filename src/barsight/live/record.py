@@ -15,7 +15,7 @@ from barsight.recording.writers.segments import SegmentWriter
 
 POLL_S = 0.05
 SYNC_EVERY_S = 1.0
-LOOK_EVERY_S = 5.0
+LOOK_EVERY_S = 0.5
 DRAIN = 2
 """What `stop` says once the other processes have ended."""
 

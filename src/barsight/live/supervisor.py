@@ -17,7 +17,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.live.capture import capture
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
-from barsight.live.modes import FOR_LIFTS, FreezeWatch, HeardSensors, Mode, judge_mode
+from barsight.live.modes import FOR_LIFTS, FreezeWatch, HeardSensors, JumpWatch, Mode, judge_mode
 from barsight.live.record import DRAIN, record
 from barsight.live.shared.counters import Counters
 from barsight.live.source import ReplayClock
@@ -82,6 +82,7 @@ class Supervisor:
         self._sensors, self._shift_ns = link.sensors(recording), recording.rig.timeshift_cam_imu_ns
         crane = recording.crane() if "crane" in self._sensors else None
         self._freeze = None if crane is None else FreezeWatch(crane)
+        self._jump = None if crane is None else JumpWatch(crane.position_std_m)
         self._survey: SurveyWatch | None = None
         if link.crane is not None:
             self._survey = SurveyWatch(link.crane.survey, is_alone=not link.surveys)
@@ -235,16 +236,18 @@ class Supervisor:
             self._signs[key] = value
 
     def _heard(self) -> HeardSensors:
-        board, frozen = self._board, False
+        board, frozen, jumped_m, step_s = self._board, False, 0.0, 0.0
         # First the pictures: readings that come meanwhile must not look late beside them.
         last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
         readings: dict[str, int] = {}
         for sensor in sorted(self._sensors):
             stamps, values = self._link.readings(sensor).last(FREEZE_READINGS)
             readings[sensor] = int(stamps[-1]) - self._shift_ns if len(stamps) else 0
-            if sensor == "crane" and self._freeze is not None:
-                frozen = self._freeze.check(stamps, values)
-        return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen)
+            if sensor == "crane" and self._freeze is not None and self._jump is not None:
+                frozen, jumped_m = self._freeze.check(stamps, values), self._jump.check(stamps, values)
+        if self._link.crane is not None:
+            step_s = (time.time_ns() - time.monotonic_ns() - self._link.epoch_ns) / NS_PER_S
+        return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
 
     def _write(self, health: bool) -> None:
         write_state(self.state, self._board, self._out)
