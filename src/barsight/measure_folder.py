@@ -90,7 +90,9 @@ def write_measured(
         scratch.mkdir()
         compile_ahead(advance, "measure")
         mapped = map_yard(recordings, settings, scratch, advance, keep)
-        with in_background(lambda: write_surface(mapped.surface, mapped.free, mapped.tops, staging)):
+        with in_background(
+            lambda: write_surface(mapped.surface, mapped.free, mapped.tops, staging, mapped.history)
+        ):
             measured = find_lifts(mapped, magnet, judged_at, notices)
         content = summary(measured)
         write_results(measured, seal_map(content, staging), staging)

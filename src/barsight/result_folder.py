@@ -27,7 +27,7 @@ from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap
 
-MAP_FILES = ("height.tif", "free.tif", "tops.tif", "cloud.ply")
+MAP_FILES = ("height.tif", "free.tif", "tops.tif", "passes.tif", "cloud.ply")
 MAP_FIELDS = (
     "captured_from_ns", "captured_to_ns", "is_simulated", "reference", "hashes", "calibration_id",
     "yard_frame_id", "travel", "warnings", "map", "files",
@@ -160,18 +160,19 @@ def changed_inputs(summary: dict[str, Any]) -> str:
 
 
 def read_heights(folder: Path) -> PartedMap:
-    """height.tif, and ortho.tif, free.tif and tops.tif where there are any, read as parts of them are wanted.
+    """height.tif, and ortho.tif, free.tif, tops.tif, passes.tif where there are any, read as parts are
+    wanted.
 
     Raises InputError, then or later, where one is missing or torn.
     """
-    names = ("height.tif", "ortho.tif", "free.tif", "tops.tif")
-    path, photo, free, tops = (folder / name for name in names)
+    names = ("height.tif", "ortho.tif", "free.tif", "tops.tif", "passes.tif")
+    path, photo, free, tops, passes = (folder / name for name in names)
     if not path.is_file():
         raise InputError(folder, "has no height.tif", REMEDY)
     with open_geotiff(path, HEIGHT_BANDS) as file:
         size, cell_m = file.size, file.cell_m
         x0_m, y0_m = file.left_m + cell_m / 2, file.top_m - (size[0] - 0.5) * cell_m
-    for other, dtype in ((photo, np.uint8), (free, np.float32), (tops, np.uint8)):
+    for other, dtype in ((photo, np.uint8), (free, np.float32), (tops, np.uint8), (passes, np.uint8)):
         if other.is_file():
             with open_geotiff(other) as file:
                 if file.size != size or file.page.dtype != dtype:
@@ -187,9 +188,9 @@ def read_heights(folder: Path) -> PartedMap:
     def read(rows: slice, columns: slice) -> HeightMap:
         with open_geotiff(path, HEIGHT_BANDS) as file:
             z, sigma, views, source = file.rectangle(HEIGHT_BANDS, rows, columns)
-        gray, bounds, over = (layer(other, rows, columns) for other in (photo, free, tops))
+        layers = (layer(other, rows, columns) for other in (photo, free, tops, passes))
         x, y = x0_m + cell_m * columns.start, y0_m + cell_m * rows.start
-        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), gray, bounds, over)
+        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), *layers)
 
     return PartedMap(x0_m, y0_m, cell_m, size, read)
 

@@ -36,8 +36,10 @@ COMMANDS = {
     "export": "Write a measured cloud or map as PLY, PCD, LAS, LAZ, E57, GeoTIFF or CSV",
     "report": "Write report.html anew from a measured yard's files",
 }
-GROUPS = ("bench", "calibrate", "store")
+GROUPS = ("bench", "calibrate", "live", "store")
 """Commands that are packages: `command.py` in them finds the second word."""
+SECOND = {"live": ("check",)}
+"""Second words of commands that do something without one too."""
 ROOMS = {"yard": ("lifts", "explain", "compare"), "store": ("yard", "serve")}
 """Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
