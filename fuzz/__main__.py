@@ -60,7 +60,7 @@ def prepared(seeds: Path, place: Path) -> Path:
             if target.warm:
                 with contextlib.redirect_stderr(nothing):
                     target.call(_copied(target, seeds, place / "scratch"))
-    if len(os.listdir("/proc/self/task")) > 1:
+    if len(list(Path("/proc/self/task").iterdir())) > 1:
         raise SystemExit("a command left a thread behind, which a fork would lose")
     gc.collect()
     gc.freeze()  # a collection in a fork would copy all pages

@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,7 @@ def _child(run: Callable[[], int], scratch: Path) -> None:
             os.fdopen(number, "w", errors=errors)
             for number, errors in ((1, "strict"), (2, "backslashreplace"))
         )
+        warnings.simplefilter("ignore")  # as the console script does
         try:
             code = run()
         except SystemExit as leaving:
@@ -124,9 +126,9 @@ def _stolen(outputs: tuple[Path, ...]) -> str:
         return str(SECRET)
     for output in outputs:
         for path in output.rglob("*") if output.is_dir() else (output,):
-            if path.is_file() and not path.is_symlink() and path.stat().st_size < 1 << 26:
-                if MARK.strip() in path.read_bytes():
-                    return path.name
+            small = path.is_file() and not path.is_symlink() and path.stat().st_size < 1 << 26
+            if small and MARK.strip() in path.read_bytes():
+                return path.name
     return ""
 
 

@@ -33,7 +33,7 @@ NUMBERS = (
     "\u0661\u0662", "1e-5", "5e-324", "--5", "+", ".", "1e", "0.5", "1e4", "1e6",
 )  # fmt: skip
 TEXTS = (
-    "\x1b]0;owned\x07\x1b[31m", "\x00", "\x7f", "\ud800", "\u202e", f"../../../../../../../..{SECRET}", str(SECRET),
+    "\x1b]0;owned\x07\x1b[31m", "\x00", "\x7f", "\ud800", "\u202e", str(SECRET), "../" * 8 + str(SECRET)[1:],
     "/dev/zero", "/dev/full", ".", "..", "", "a" * 70_000, "%s%n", "[bold]x[/bold]", "[/]", "{{7*7}}",
     "<script>alert(1)</script>", "\r", "\u2028", "*a", "&a [1]", "!!python/object/apply:os.system [x]",
     "!!timestamp 2001-99-99", "!!int x", "!!binary ???", "? [1]\n: 2", "<<: 1", "~", "\ufeff",

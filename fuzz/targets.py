@@ -17,8 +17,8 @@ SKIPPED = ("state_groundtruth_estimate0", "truth")
 class Target:
     """seeds: names below the seeds' folder that are copied. damaged: glob patterns of what is damaged.
     call: what reads them, given the folder of the copies. outputs: what must not be left or changed where it
-    fails. weight: its share of the turns. warm: it leaves no thread behind, so that the parent may run it once
-    for what its forks need.
+    fails. weight: its share of the turns. warm: it leaves no thread behind, so that the parent may run it
+    once for what its forks need.
     """
 
     name: str

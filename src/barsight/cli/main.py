@@ -7,6 +7,7 @@ import importlib
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from types import FrameType
 
@@ -59,6 +60,8 @@ def main() -> None:
         signal.signal(number, _interrupt)
     if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
         signal.signal(signal.SIGHUP, _interrupt)
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # libraries' notes to programmers would stand beside our one line
     code = _run_and_print(sys.argv[1:])
     if code == INTERRUPTED:
         _leave_at_once(code)

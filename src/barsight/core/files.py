@@ -22,6 +22,11 @@ def expect_output(target: Path, *suffixes: str) -> None:
         raise OutputError(f"{target}: there is no folder {target.parent}; make it or name another")
 
 
+def lies_within(path: Path, folder: Path) -> bool:
+    """Check whether `path` is `folder` or lies in it, links followed; a link to itself is taken as it is."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
 @contextlib.contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
     """Yield a temporary path beside `target`; on success it becomes `target`, on any failure it is gone.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 from barsight.core.errors import InputError
+from barsight.core.files import lies_within
 from barsight.core.reading.bounded_reading import read_bytes
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
 
@@ -24,12 +24,7 @@ def expect_inner_name(name: str, path: Path, where: str) -> None:
 
 def leads_outside(path: Path, root: Path) -> bool:
     """Check whether a file lies outside the recording `root`, by a symbolic link in its way."""
-    return not path.resolve().is_relative_to(_resolved(root))
-
-
-@lru_cache(maxsize=8)
-def _resolved(root: Path) -> Path:
-    return root.resolve()
+    return not lies_within(path, root)
 
 
 def read_picture(path: Path, root: Path) -> bytes:
