@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -36,30 +37,33 @@ def main() -> int:
     parser.add_argument("--show", action="store_true", help="print each finding with its last lines")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
-        seeds = prepared(given.seeds or Path(place) / "seeds", Path(place))
         chosen = [target for target in TARGETS if given.only in target.name]
+        seeds = prepared(given.seeds or Path(place) / "seeds", Path(place), chosen)
         runs, found = attack(chosen, seeds, Path(place), given.seed, given.minutes, given.inputs, given.show)
     print(table(runs, found, given.seed))
     return 1 if found else 0
 
 
-def prepared(seeds: Path, place: Path) -> Path:
-    """Make the seeds where they aren't yet, and load here once what every fork needs; return the seeds."""
+def prepared(seeds: Path, place: Path, targets: Iterable[Target]) -> Path:
+    """Make the seeds where they aren't yet, and load here once what every fork for these targets needs;
+    return the seeds.
+    """
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # as a command does before it loads it
     for name in COMMANDS:
         importlib.import_module(home(name))
     if not seeds.exists():
-        _make_seeds_apart(seeds)
-    SECRET.unlink(missing_ok=True)
-    with SECRET.open("xb") as file:
-        file.write(MARK)
+        make_seeds_apart(seeds)
+    if SECRET.is_symlink() or not SECRET.is_file() or SECRET.read_bytes() != MARK:
+        SECRET.unlink(missing_ok=True)
+        with SECRET.open("xb") as file:
+            file.write(MARK)
     load_kernels("simulate", "measure")
     with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
-        for target in TARGETS:
+        for target in targets:
             if target.warm:
                 with contextlib.redirect_stderr(nothing):
-                    target.call(_copied(target, seeds, place / "scratch"))
+                    target.call(copied(target, seeds, place / "scratch"))
     if len(list(Path("/proc/self/task").iterdir())) > 1:
         raise SystemExit("a command left a thread behind, which a fork would lose")
     gc.collect()
@@ -67,7 +71,7 @@ def prepared(seeds: Path, place: Path) -> Path:
     return seeds
 
 
-def _make_seeds_apart(seeds: Path) -> None:
+def make_seeds_apart(seeds: Path) -> None:
     """Make the seeds in a process of its own: this one forks, so it must not start threads."""
     pid = os.fork()
     if pid == 0:
@@ -81,7 +85,7 @@ def _make_seeds_apart(seeds: Path) -> None:
         raise SystemExit("the seeds could not be made")
 
 
-def _copied(target: Target, seeds: Path, scratch: Path) -> Path:
+def copied(target: Target, seeds: Path, scratch: Path) -> Path:
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     target.copy(seeds, scratch)
@@ -115,7 +119,7 @@ def attack(
 
 def one(target: Target, seeds: Path, scratch: Path, draw: random.Random) -> tuple[str, Verdict]:
     """Copy, damage, run and judge."""
-    _copied(target, seeds, scratch)
+    copied(target, seeds, scratch)
     files = target.files(scratch)
     # Folders of many pictures must not take all the turns.
     by_folder = defaultdict(list)

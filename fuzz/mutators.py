@@ -230,7 +230,7 @@ def _seal(tree: dict[str, Any], path: Path) -> None:
 def _reseal(path: Path, **changes: Any) -> None:
     from barsight.core.json_values import json_digest
 
-    if path.is_file() and path.stat().st_size < 1 << 26:
+    if path.is_file() and not path.is_symlink() and path.stat().st_size < MAX_DAMAGED_BYTES:
         try:
             tree = json.loads(path.read_text()) | changes
         except (ValueError, TypeError):
@@ -244,6 +244,8 @@ def reseal_folder(folder: Path) -> None:
     from barsight.result_folder import MAP_FILES, file_digest
 
     path = folder / "result.json"
+    if not path.is_file() or path.is_symlink() or path.stat().st_size > MAX_DAMAGED_BYTES:
+        return
     try:
         tree = json.loads(path.read_text())
         for name in MAP_FILES:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from barsight.cli.main import run
+from barsight.cli.main import run_and_print
 
 Call = Callable[[Path], int]
 SKIPPED = ("state_groundtruth_estimate0", "truth")
@@ -46,7 +46,7 @@ class Target:
 
 def run_words(*words: str) -> Call:
     """Run a command of the command line; FOLDER/ in its words is the folder of the copies."""
-    return lambda folder: run([word.replace("FOLDER", str(folder)) for word in words])
+    return lambda folder: run_and_print([word.replace("FOLDER", str(folder)) for word in words])
 
 
 def _magnet(folder: Path) -> int:

@@ -91,7 +91,7 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
     try:
         with open_regular(path, REMEDY) as stream, tifffile.TiffFile(stream) as file:
             page = file.pages.first
-            assert isinstance(page, tifffile.TiffPage)
+            assert isinstance(page, tifffile.TiffPage) and page.dtype is not None
             planar = (
                 len(page.shape) == 2 if bands == 1 else page.shape[:-2] == (bands,) and page.planarconfig == 2
             )
