@@ -17,7 +17,7 @@ from typing import Any, Literal
 from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
-from barsight.core.files import atomic_path, expect_empty, translated_os_errors
+from barsight.core.files import atomic_path, expect_empty, lies_within, translated_os_errors
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
@@ -68,7 +68,7 @@ def replay(
     given = None if keyframes is None else read_keyframes(keyframes)
     described = None if magnet is None else load_magnet(magnet)
     recording = open_recording(path, settings.recording)
-    if path.resolve() in (out.resolve(), *out.resolve().parents):
+    if lies_within(out, path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
     run = LiveRun(recording, path.absolute(), out, settings, live, speed, tell)
