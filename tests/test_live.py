@@ -311,3 +311,18 @@ def test_a_jump_of_the_encoders_shows_at_once_and_stays_until_they_come_back(
         assert out[0] == pytest.approx(4.0) and seen[seen > 0][0] == pytest.approx(abs(jump_m), abs=0.02)
         assert np.diff(out).max() < 0.06
         assert out[-1] == pytest.approx(4 + back_s + 0.95 if back_s < 5 else t[-1])
+
+
+def test_encoders_that_come_back_from_a_freeze_have_not_jumped() -> None:
+    t = np.arange(0, 8, 0.05)
+    mounted = CraneSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.eye(3), 0.002)
+    place, stamps = np.zeros((t.size, 3)), (1e9 * (100 + t)).astype(np.int64)
+    place[:, 0] = np.round(np.where((t > 3) & (t < 5), 1.5, 0.5 * t), 3)
+    freeze, jump, out = FreezeWatch(mounted), JumpWatch(0.002), []
+    for k in range(2, t.size + 1, 2):
+        now = stamps[max(k - 100, 0) : k], place[max(k - 100, 0) : k]
+        frozen, jumped_m = freeze.check(*now), jump.check(*now)
+        if frozen:
+            jump.begin_anew()
+        out.append(frozen or jumped_m > 0)
+    assert any(out) and not any(out[int(5.2 / 0.1) :])
