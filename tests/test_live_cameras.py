@@ -93,6 +93,8 @@ def test_surveys_follow_each_other(crane: Plant, longer: Path, tmp_path: Path) -
     assert "the crane stopped" in (first / "live.log").read_text(), errors
     assert len(content(first / "keyframes.json")["keyframes_ns"]) >= 20
     assert phase(first) == "done" and (first / "recording").is_dir()
+    figures = content(out / "current" / "health.json")["calibration"]
+    assert abs(figures["pitch_rad"]) < 4 * figures["pitch_rad_sigma"] + 1e-4
 
 
 def phase(folder: Path) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.files import atomic_path
+from barsight.live.drift import DRIFT_FILE, drift_figures
 from barsight.live.latency import counts
 from barsight.live.modes import Mode
 from barsight.live.shared.counters import Counters
@@ -84,6 +85,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "sensors": board.row("sensors")
         | {name: board["capture", name] for name in ("skew_ns", "max_skew_ns")},
         "record": board.row("record"),
+        "calibration": drift_figures(out.parent / DRIFT_FILE),
     }
     _write_json(content, out / "health.json")
     with atomic_path(out / "health.prom") as path:
@@ -102,6 +104,7 @@ def prometheus(health: Mapping[str, Any]) -> str:
         "barsight_memory_bytes": ("gauge", "process", health["memory_bytes"]),
         "barsight_sensor": ("gauge", "sign", health["sensors"]),
         "barsight_recorder": ("gauge", "sign", health["record"]),
+        "barsight_calibration": ("gauge", "figure", health["calibration"]),
         "barsight_mode": ("gauge", "mode", {health["mode"]: 1}),
     }
     lines = []
