@@ -9,6 +9,7 @@ running; seconds, median and most.
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -99,7 +100,9 @@ class Crane:
         os.environ["PYTHONPATH"] = f"{self.folder / 'site'}:{before}"
         os.environ["BARSIGHT_CLOCK_STEP"] = str(self.step)
         command = ("-m", "barsight", "live", "--config", str(self.config), "-o", str(self.out), *FAST)
-        process = self.plant.start(0, *command, "--live.keyframe-way-m", "1.0", quiet=False)
+        process = self.plant.start(
+            0, *command, "--live.keyframe-way-m", "1.0", "--live.passed-every-s", "5", quiet=False
+        )
         os.environ["PYTHONPATH"] = before
         return process
 
@@ -305,7 +308,7 @@ def try_fault(crane: Crane, fault: Fault, found: Found) -> None:
 @contextmanager
 def small_disk(folder: Path) -> Iterator[None]:
     folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400m", "tmpfs", str(folder)], check=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1200m", "tmpfs", str(folder)], check=True)
     try:
         yield
     finally:
@@ -320,12 +323,10 @@ def run_rounds(rounds: int, seed: int, names: list[str], folder: Path) -> tuple[
         try:
             time.sleep(max(crane.begin_ns - time.time_ns(), 0) / 1e9 + 1.0)
             process = crane.run()
-            for number in range(rounds):
-                for name in rng.permutation(names).tolist():
+            with suppress(KeyboardInterrupt):  # Ctrl-C ends the rounds, not the table
+                for number, name in ((k, n) for k in range(rounds) for n in rng.permutation(names).tolist()):
                     try_fault(crane, FAULTS[name], table[name])
-                    sys.stderr.write(
-                        f"{number} {name}: {table[name].told_s[-1:]} {table[name].back_s[-1:]}\n"
-                    )
+                    sys.stderr.write(f"{number} {row(name, table[name])}\n")
             frames = crane.state()["frames"]
             process.send_signal(2)
             _, errors = process.communicate(timeout=900)
@@ -347,6 +348,7 @@ def row(name: str, found: Found) -> str:
 
 
 def main() -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background has it ignored
     words = [int(word) for word in sys.argv[1:]]
     rounds, seed = [*words, *(20, 1)[len(words) :]]
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Every fault of `fault_rounds` once: told by name, lifts revoked, all well again, and the recording readable.
+"""Every fault of `fault_rounds` once: told by name, lifts revoked, all well again, the recording readable.
 
 How soon is measured by `python tests/fault_rounds.py` on a machine without other work; here bounds are wide.
 """

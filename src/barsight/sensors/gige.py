@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -97,8 +98,9 @@ class GigeCamera:
         try:
             self._camera = vg.connect_gige(device, iface=self._settings.interface)
             # A camera whose host was killed sends on to where that was.
-            self._camera.acquisition_stop()
-            time.sleep(STOPPED_S)
+            with contextlib.suppress(vg.GenicamError):
+                self._camera.acquisition_stop()
+                time.sleep(STOPPED_S)
             self._set_up(self._camera)
         except vg.GenicamError as error:
             self.close()
