@@ -276,12 +276,14 @@ def test_counters_and_health_are_text_that_adds_up(board: Counters) -> None:
     text = prometheus(
         {
             "frames": counts(board), "restarts": {"map": 1}, "queues": {"keyframes": 3}, "mode": "full",
-            "memory_bytes": {"map": 9}, "disk_free_bytes": 7, "disk_days": 1.5,
+            "memory_bytes": {"map": 9}, "lifts_may_stand": True, "disk_free_bytes": 7, "disk_days": 1.5,
             "sensors": {"cam0_drift_ppb": -40}, "record": {"paused": 1}, "calibration": {"pitch_rad": 2e-05},
         }
     )  # fmt: skip
     assert 'barsight_frames_total{stage="captured"} 7\n' in text
     assert 'barsight_frames_dropped_total{cause="unpaired_cam1"} 2\n' in text
+    assert 'barsight_mode{mode="full"} 1\n' in text and 'barsight_mode{mode="blind"} 0\n' in text
+    assert "barsight_lifts_may_stand 1\n" in text
     assert 'barsight_calibration{figure="pitch_rad"} 2e-05\n' in text
     assert 'barsight_sensor{sign="cam0_drift_ppb"} -40\n' in text and "barsight_disk_days 1.5\n" in text
     assert all(len(line.split(" ")) in (2, 4) for line in text.splitlines())
