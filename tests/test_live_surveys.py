@@ -1,5 +1,8 @@
 """A survey begins as the crane moves and ends as it stops; folders are kept and dropped."""
 
+import os
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +12,7 @@ import pytest
 import barsight as bs
 from barsight.live.crane.run import _drop_standing, _keep
 from barsight.live.drift import DAY_NS, HEAD, NAMES, drift_figures, note_drift
+from barsight.live.run import INTERRUPTED, _stopped_by_signals
 from barsight.live.settings import SurveySettings
 from barsight.live.survey import STOOD, SurveyWatch
 from barsight.recording.writers.retention import PROTECTED
@@ -52,6 +56,25 @@ def test_a_crane_that_stands_or_never_stops_ends_it_too(is_alone: bool) -> None:
     assert going == (100.0, "a survey takes 100 s at most")
     longer = ends(0.05 * np.arange(2000), replace(SETTINGS, max_s=150.0), is_alone=is_alone)
     assert longer is not None and longer[0] == 150.0
+
+
+def test_signals_end_a_survey_or_the_run() -> None:
+    class Heard:
+        """What `_stopped_by_signals` asks of a supervisor."""
+
+        because = ""
+
+        def stop(self, because: str) -> None:
+            self.because = because
+
+    before = signal.getsignal(signal.SIGUSR1)
+    for number, told in ((signal.SIGUSR1, "told to end the survey"), (signal.SIGTERM, INTERRUPTED)):
+        heard = Heard()
+        with _stopped_by_signals(heard):  # type: ignore[arg-type]
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)
+        assert heard.because == told
+    assert signal.getsignal(signal.SIGUSR1) == before
 
 
 def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from barsight.calibration.files.rig_file import read_serials
 from barsight.core.errors import BarsightError
 from barsight.live.crane.preflight import expect_plausible, hear
 from barsight.live.settings import CraneConfig
@@ -49,6 +50,7 @@ def check_machine(crane: CraneConfig, out: Path) -> Iterator[Finding]:
         places["recordings"] = crane.recorder.folder
     for name, folder in places.items():
         yield from _disk(name, folder, crane, is_run=name == "runs")
+    yield _serials(crane)
     yield from _network(crane)
     yield from _sensors(crane)
     yield _clock()
@@ -114,6 +116,16 @@ def write_speed_mib(folder: Path) -> float:
         file.flush()
         os.fsync(file.fileno())
         return WRITTEN_MIB / (time.perf_counter() - began)
+
+
+def _serials(crane: CraneConfig) -> Finding:
+    """Check that exchanged cameras and another rig's calibration would be noticed."""
+    known = [serial or "none" for serial in read_serials(crane.calibration)]
+    remedy = (
+        f"put serial: under cam0 and cam1 of {crane.calibration.name}: else exchanged cameras aren't noticed"
+    )
+    passed = True if "none" not in known else None
+    return Finding("serial numbers in the calibration", ", ".join(known), "both", remedy, passed)
 
 
 def _network(crane: CraneConfig) -> Iterator[Finding]:
