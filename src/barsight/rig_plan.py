@@ -51,7 +51,7 @@ CAMERAS = {
 
 @dataclass(frozen=True)
 class Wish:
-    """What a rig shall do. range_m: from the cameras to the floor. width_m: of the yard, along the bars.
+    """Wishes of a yard. range_m: from the cameras to the floor. width_m: of the yard, along the bars.
 
     stack_m: height of the highest pile. bar_m: diameter of the thinnest bar. sigma_m: of a depth on the
     floor, one match. speed_mps: of the crane.
