@@ -1,6 +1,7 @@
 """Two GigE Vision cameras, an IMU and encoders in network namespaces: a live run's counterpart."""
 
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -12,6 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+import barsight as bs
+from barsight.calibration.files.kalibr import write_imu_file
+from barsight.calibration.files.rig_file import write_rig_file
 from barsight.core.types import StereoFrame
 from barsight.recording.base import Recording
 from gige_camera import library
@@ -98,9 +102,15 @@ class Plant:
         ip("-n", self.spaces[number + 1], "link", "set", "e0", state)
 
     def lose(self, number: int, percent: float) -> None:
-        """Lose a share of a camera's packets."""
-        command = ["tc", "-n", self.spaces[number + 1], "qdisc", "add", "dev", "e0", "root", "netem"]
-        subprocess.run([*command, "loss", f"{percent}%"], check=True, capture_output=True)
+        """Lose a share of what a camera sends, by nftables; none with 0."""
+        nft = ["ip", "netns", "exec", self.spaces[number + 1], "nft"]
+        lines = ["delete table inet loss"]
+        if percent:
+            lines = [
+                "add table inet loss", "add chain inet loss out { type filter hook output priority 0; }",
+                f"add rule inet loss out numgen random mod 100000 < {round(1000 * percent)} drop",
+            ]  # fmt: skip
+        subprocess.run([*nft, "; ".join(lines)], check=True, capture_output=True)
 
 
 def end(process: subprocess.Popen[str]) -> None:
@@ -139,3 +149,40 @@ def play(plant: Plant, recording: Recording, folder: Path, in_s: float) -> int:
             0, str(TESTS / "crane_sender.py"), sensor, str(PORTS[sensor]), str(folder / f"{sensor}.npz")
         )
     return begin_ns
+
+
+def describe(recording: Path, folder: Path, changes: dict[str, str] | None = None) -> Path:
+    """Write crane.toml and the calibration for a recording's rig. changes: texts in place of others."""
+    known = bs.open_recording(recording)
+    mounted, noise = known.crane(), known.imu_noise()
+    assert mounted is not None and noise is not None
+    write_rig_file(folder / "rig.yaml", known.rig)
+    lines = (folder / "rig.yaml").read_text().replace("cam0:\n", f"cam0:\n  serial: {SERIALS[0]}\n", 1)
+    (folder / "rig.yaml").write_text(lines.replace("cam1:\n", f"cam1:\n  serial: {SERIALS[1]}\n", 1))
+    write_imu_file(folder / "imu.yaml", noise, "/imu0")
+    lever, turn = mounted.crane_to_body_m.tolist(), mounted.yard_from_body_nominal.ravel().tolist()
+    text = f"""
+calibration = "rig.yaml"
+[cameras]
+serials = {json.dumps(SERIALS)}
+rate_hz = 3.0
+trigger = "Software"
+[imu]
+port = {PORTS["imu"]}
+rate_hz = 200
+noise = "imu.yaml"
+[encoders]
+port = {PORTS["crane"]}
+rate_hz = 20
+p_crane_body_m = {lever}
+R_yard_body = {turn}
+position_std_m = {mounted.position_std_m}
+[measure.recording]
+pair_tolerance_s = 0.01
+"""
+    for old, new in (changes or {}).items():
+        assert old in text, old
+        text = text.replace(old, new)
+    path = folder / "crane.toml"
+    path.write_text(text)
+    return path

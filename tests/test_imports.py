@@ -15,7 +15,7 @@ FLOORS = {
     "mapping": 4,
     "yard": 5,
     "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "simulation": 6, "board_views": 6,
-    "measure_settings": 6,
+    "measure_settings": 6, "rig_plan": 6,
     "store": 7,
     "pair_chain": 7,
     "map_building": 8, "joined_passes": 9,

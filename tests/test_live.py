@@ -277,12 +277,15 @@ def test_counters_and_health_are_text_that_adds_up(board: Counters) -> None:
     text = prometheus(
         {
             "frames": counts(board), "restarts": {"map": 1}, "queues": {"keyframes": 3}, "mode": "full",
-            "memory_bytes": {"map": 9}, "disk_free_bytes": 7, "disk_days": 1.5,
-            "sensors": {"cam0_drift_ppb": -40}, "record": {"paused": 1},
+            "memory_bytes": {"map": 9}, "lifts_may_stand": True, "disk_free_bytes": 7, "disk_days": 1.5,
+            "sensors": {"cam0_drift_ppb": -40}, "record": {"paused": 1}, "calibration": {"pitch_rad": 2e-05},
         }
     )  # fmt: skip
     assert 'barsight_frames_total{stage="captured"} 7\n' in text
     assert 'barsight_frames_dropped_total{cause="unpaired_cam1"} 2\n' in text
+    assert 'barsight_mode{mode="full"} 1\n' in text and 'barsight_mode{mode="blind"} 0\n' in text
+    assert "barsight_lifts_may_stand 1\n" in text
+    assert 'barsight_calibration{figure="pitch_rad"} 2e-05\n' in text
     assert 'barsight_sensor{sign="cam0_drift_ppb"} -40\n' in text and "barsight_disk_days 1.5\n" in text
     assert all(len(line.split(" ")) in (2, 4) for line in text.splitlines())
     assert spread([]) == {"n": 0, "p50": None, "p99": None, "max": None}
@@ -312,3 +315,18 @@ def test_a_jump_of_the_encoders_shows_at_once_and_stays_until_they_come_back(
         assert out[0] == pytest.approx(4.0) and seen[seen > 0][0] == pytest.approx(abs(jump_m), abs=0.02)
         assert np.diff(out).max() < 0.06
         assert out[-1] == pytest.approx(4 + back_s + 0.95 if back_s < 5 else t[-1])
+
+
+def test_encoders_that_come_back_from_a_freeze_have_not_jumped() -> None:
+    t = np.arange(0, 8, 0.05)
+    mounted = CraneSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.eye(3), 0.002)
+    place, stamps = np.zeros((t.size, 3)), (1e9 * (100 + t)).astype(np.int64)
+    place[:, 0] = np.round(np.where((t > 3) & (t < 5), 1.5, 0.5 * t), 3)
+    freeze, jump, out = FreezeWatch(mounted), JumpWatch(0.002), []
+    for k in range(2, t.size + 1, 2):
+        now = stamps[max(k - 100, 0) : k], place[max(k - 100, 0) : k]
+        frozen, jumped_m = freeze.check(*now), jump.check(*now)
+        if frozen:
+            jump.begin_anew()
+        out.append(frozen or jumped_m > 0)
+    assert any(out) and not any(out[int(5.2 / 0.1) :])

@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight.calibration.files.kalibr import write_imu_file
-from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run as cli
 from barsight.simulation.simulate import simulate
 from cli_runs import FAST, TINY
-from crane_network import PORTS, SERIALS, Plant, missing, plant, play
+from crane_network import SERIALS, Plant, describe, missing, plant, play
 from test_live import content
 
 WHY_NOT = missing()
@@ -36,45 +34,6 @@ def crane() -> Iterator[Plant]:
 def longer(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("longer") / "recording"
     simulate(path, replace(TINY, frames=20, length_m=3.0))
-    return path
-
-
-def describe(
-    recording: Path, folder: Path, rate_hz: float = 3.0, changes: dict[str, str] | None = None
-) -> Path:
-    """Write crane.toml and the calibration for a recording's rig. changes: texts in place of others."""
-    known = bs.open_recording(recording)
-    mounted, noise = known.crane(), known.imu_noise()
-    assert mounted is not None and noise is not None
-    write_rig_file(folder / "rig.yaml", known.rig)
-    lines = (folder / "rig.yaml").read_text().replace("cam0:\n", f"cam0:\n  serial: {SERIALS[0]}\n", 1)
-    (folder / "rig.yaml").write_text(lines.replace("cam1:\n", f"cam1:\n  serial: {SERIALS[1]}\n", 1))
-    write_imu_file(folder / "imu.yaml", noise, "/imu0")
-    lever, turn = mounted.crane_to_body_m.tolist(), mounted.yard_from_body_nominal.ravel().tolist()
-    text = f"""
-calibration = "rig.yaml"
-[cameras]
-serials = {json.dumps(SERIALS)}
-rate_hz = 3.0
-trigger = "Software"
-[imu]
-port = {PORTS["imu"]}
-rate_hz = 200
-noise = "imu.yaml"
-[encoders]
-port = {PORTS["crane"]}
-rate_hz = 20
-p_crane_body_m = {lever}
-R_yard_body = {turn}
-position_std_m = {mounted.position_std_m}
-[measure.recording]
-pair_tolerance_s = 0.01
-"""
-    for old, new in (changes or {}).items():
-        assert old in text, old
-        text = text.replace(old, new)
-    path = folder / "crane.toml"
-    path.write_text(text)
     return path
 
 
@@ -134,6 +93,8 @@ def test_surveys_follow_each_other(crane: Plant, longer: Path, tmp_path: Path) -
     assert "the crane stopped" in (first / "live.log").read_text(), errors
     assert len(content(first / "keyframes.json")["keyframes_ns"]) >= 20
     assert phase(first) == "done" and (first / "recording").is_dir()
+    figures = content(out / "current" / "health.json")["calibration"]
+    assert abs(figures["pitch_rad"]) < 4 * figures["pitch_rad_sigma"] + 1e-4
 
 
 def phase(folder: Path) -> str:

@@ -1,12 +1,18 @@
 """A survey begins as the crane moves and ends as it stops; folders are kept and dropped."""
 
+import os
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import barsight as bs
 from barsight.live.crane.run import _drop_standing, _keep
+from barsight.live.drift import DAY_NS, HEAD, NAMES, drift_figures, note_drift
+from barsight.live.run import INTERRUPTED, _stopped_by_signals
 from barsight.live.settings import SurveySettings
 from barsight.live.survey import STOOD, SurveyWatch
 from barsight.recording.writers.retention import PROTECTED
@@ -52,6 +58,25 @@ def test_a_crane_that_stands_or_never_stops_ends_it_too(is_alone: bool) -> None:
     assert longer is not None and longer[0] == 150.0
 
 
+def test_signals_end_a_survey_or_the_run() -> None:
+    class Heard:
+        """What `_stopped_by_signals` asks of a supervisor."""
+
+        because = ""
+
+        def stop(self, because: str) -> None:
+            self.because = because
+
+    before = signal.getsignal(signal.SIGUSR1)
+    for number, told in ((signal.SIGUSR1, "told to end the survey"), (signal.SIGTERM, INTERRUPTED)):
+        heard = Heard()
+        with _stopped_by_signals(heard):  # type: ignore[arg-type]
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)
+        assert heard.because == told
+    assert signal.getsignal(signal.SIGUSR1) == before
+
+
 def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:
     for day in range(1, 6):
         (tmp_path / f"2026110{day}T101010").mkdir()
@@ -73,3 +98,25 @@ def test_what_was_recorded_of_a_standing_crane_goes_unless_it_holds_an_alarm(tmp
     (recording / "alarms" / "segment_000000.mcap").unlink()
     _drop_standing(here, recording)
     assert not here.exists() and not recording.exists()
+
+
+def test_the_drift_of_surveys_has_a_trend(whole: Path, tmp_path: Path) -> None:
+    """Two surveys of one calibration; then days of which the roll grows by 2e-5 rad, one of them wrong."""
+    path = tmp_path / "drift.csv"
+    assert drift_figures(path) == {}
+    recording = bs.open_recording(whole)
+    for _ in range(2):
+        assert note_drift(recording, path) == ""
+    figures = drift_figures(path)
+    assert set(figures) == {f"{name}{end}" for name in NAMES for end in ("", "_sigma")}
+    assert all(abs(figures[name]) < 4 * figures[f"{name}_sigma"] for name in NAMES)
+    rng, lines = np.random.default_rng(2), [HEAD]
+    for day in range(30):
+        values = rng.normal(0, 1e-5, 3)
+        values[1] += 2e-5 * day + (day == 7) * 1e-2
+        both = ",".join(f"{value:.5g},1e-05" for value in values)
+        lines.append(f"{1_700_000_000_000_000_000 + day * DAY_NS},{both}\n")
+    path.write_text("".join(lines) + "17000,0.1")
+    figures = drift_figures(path)
+    assert figures["roll_rad_per_day"] == pytest.approx(2e-5, abs=1e-6)
+    assert abs(figures["pitch_rad_per_day"]) < 1e-6

@@ -14,11 +14,12 @@ import pytest
 import barsight as bs
 from barsight.cli.main import run as cli
 from barsight.live.crane.check import check_machine
+from barsight.live.crane.preflight import expect_plausible, held
 from barsight.live.pairing import PairFormer
 from barsight.live.settings import read_crane
 from barsight.recording.writers.retention import PROTECTED, Retention
 from barsight.sensors.clock import DeviceClock
-from barsight.sensors.datagrams import ReadingReceiver, pack
+from barsight.sensors.datagrams import RawReading, ReadingReceiver, pack
 from barsight.sensors.source import LivePicture
 
 SECOND = 10**9
@@ -230,3 +231,31 @@ def test_what_a_machine_lacks_is_named_with_a_remedy(described: Path, tmp_path: 
     crane = replace(read_crane(described), encoders=None)
     missing = next(one for one in check_machine(crane, tmp_path) if one.what.startswith("interface"))
     assert missing.passed is False and "nosuch0 isn't there" in missing.found and missing.remedy
+
+
+@pytest.mark.parametrize(
+    ("sensor", "value", "words"),
+    [
+        ("imu", (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "median acceleration is 1 m/s^2"),
+        ("imu", (40.0, 0.0, 0.0, 0.0, 0.0, -9.81), "give it in rad/s"),
+        ("imu", (0.0, 0.0, 0.0, 0.0, 0.0, 9.81), "R_yard_body"),
+        ("crane", (12_500.0, 300.0, 8_000.0), "give metres, not mm"),
+        ("crane", (12.5, 0.3, 8.0), ""),
+    ],
+)
+def test_readings_in_other_units_are_refused_at_the_start(
+    sensor: str, value: tuple[float, ...], words: str, described: Path
+) -> None:
+    """What a moment of readings says of its units, and of the mounting, which looks down."""
+    described.write_text(described.read_text() + "[imu]\nport = 5601\nrate_hz = 200\n")
+    crane = read_crane(described)
+    awaited = crane.described(described.parent / "recording")
+    count, rate_hz = 100, crane.sensors()[sensor].rate_hz
+    stamps = 10**18 + (np.arange(count) * SECOND / rate_hz).astype(np.int64)
+    heard = held(awaited, sensor, [RawReading(int(stamp), 0, value, 0) for stamp in stamps])
+    if not words:
+        expect_plausible(heard)
+        return
+    with pytest.raises(bs.BarsightError) as error:
+        expect_plausible(heard)
+    assert words in str(error.value) and "\n" not in str(error.value)

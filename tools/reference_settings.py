@@ -17,6 +17,9 @@ import tyro
 
 _POSITIONAL = cast(Any, tyro.conf.Positional[int]).__metadata__[0]
 _NAMES = {int: "whole number", float: "number", str: "text", bool: "yes or no", Path: "path"}
+MAGNET, CRANE = "a magnet's file", "crane.toml"
+FILES = (MAGNET, CRANE)
+"""Files that hold settings, beside flags and the files of `--config`."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +90,12 @@ def _reached_by(reached: list[tuple[str, str]]) -> str:
         by_prefix.setdefault(prefix, []).append(command)
     said = []
     for prefix, names in by_prefix.items():
-        if names == [""]:
-            said.append(f"In a magnet's file: {f'`{prefix}`' if prefix else 'the file itself'}.")
-            continue
-        flags = f"`--{prefix}.*`" if prefix else "No prefix"
-        said.append(f"{flags}: {', '.join(f'`{name}`' for name in dict.fromkeys(names))}.")
+        place = f"`{prefix}`" if prefix else "the file itself"
+        said += [f"In {file}: {place}." for file in FILES if file in names]
+        commands = [name for name in dict.fromkeys(names) if name not in FILES]
+        if commands:
+            flags = f"`--{prefix}.*`" if prefix else "No prefix"
+            said.append(f"{flags}: {', '.join(f'`{name}`' for name in commands)}.")
     return " ".join(said)
 
 

@@ -16,6 +16,7 @@ from barsight.core.errors import BarsightError
 from barsight.core.printing import printable
 
 COMMANDS = {
+    "plan": "Plan a rig: lens, baseline, light, rate and data, with the sums and a parts list",
     "demo": "Simulate a small yard, measure it and compare with truth and laser: try this first",
     "measure": "Measure a stereo recording: map, contours, trajectory, cloud, report",
     "live": "Measure while pictures and readings come, from a crane's sensors or a replayed recording",

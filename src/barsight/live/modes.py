@@ -31,6 +31,7 @@ JUMP_SIGMAS, MIN_JUMP_M, MAX_CHANGE_MPS2 = 8.0, 0.03, 1.0
 SPEED_READINGS = 6
 JUMP_HELD_S = 1.0
 """Encoders that came back from a jump are out for so long."""
+AFTER_FREEZE_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -141,13 +142,13 @@ class JumpWatch:
     def __init__(self, sigma_m: float) -> None:
         self._least_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
         self._off_m: Float64 = np.zeros(3)
-        self._last_ns = self._jump_ns = 0
+        self._last_ns = self._jump_ns = self._from_ns = 0
         self._jump_m: Float64 = np.zeros(3)
 
     def check(self, stamp_ns: Int64, position_m: Float64) -> float:
         """Look at the newest readings, (N,) and (N, 3), the last few seconds; return the jump in m, or 0."""
         for k in range(int(np.searchsorted(stamp_ns, self._last_ns, side="right")), len(stamp_ns)):
-            if k >= SPEED_READINGS:
+            if k >= SPEED_READINGS and stamp_ns[k - SPEED_READINGS] > self._from_ns:
                 self._take(stamp_ns[k - SPEED_READINGS : k + 1], position_m[k - SPEED_READINGS : k + 1])
         self._last_ns = int(stamp_ns[-1]) if len(stamp_ns) else self._last_ns
         away = float(np.linalg.norm(self._off_m))
@@ -155,6 +156,10 @@ class JumpWatch:
             return away
         held = self._jump_ns and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
         return float(np.linalg.norm(self._jump_m)) if held else 0.0
+
+    def begin_anew(self) -> None:
+        """Forget the readings so far and those of the next moment: they are frozen."""
+        self._from_ns = self._last_ns + seconds_to_ns(AFTER_FREEZE_S)
 
     def _take(self, stamp_ns: Int64, position_m: Float64) -> None:
         """Hold the last reading against the speed of those before it."""

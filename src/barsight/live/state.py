@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.files import atomic_path
+from barsight.live.drift import DRIFT_FILE, drift_figures
 from barsight.live.latency import counts
-from barsight.live.modes import Mode
+from barsight.live.modes import MODES, Mode
 from barsight.live.shared.counters import Counters
 
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
@@ -71,6 +72,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "schema_version": 1,
         "seconds": round(seconds, 3),
         "mode": state.mode.name,
+        "lifts_may_stand": state.mode.lifts,
         "rates_hz": {
             name: round(frames[name] / seconds, 3) if seconds > 0 else 0.0
             for name in ("captured", "paired", "tracked", "kept", "mapped")
@@ -84,6 +86,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "sensors": board.row("sensors")
         | {name: board["capture", name] for name in ("skew_ns", "max_skew_ns")},
         "record": board.row("record"),
+        "calibration": drift_figures(out.parent / DRIFT_FILE),
     }
     _write_json(content, out / "health.json")
     with atomic_path(out / "health.prom") as path:
@@ -102,7 +105,8 @@ def prometheus(health: Mapping[str, Any]) -> str:
         "barsight_memory_bytes": ("gauge", "process", health["memory_bytes"]),
         "barsight_sensor": ("gauge", "sign", health["sensors"]),
         "barsight_recorder": ("gauge", "sign", health["record"]),
-        "barsight_mode": ("gauge", "mode", {health["mode"]: 1}),
+        "barsight_calibration": ("gauge", "figure", health["calibration"]),
+        "barsight_mode": ("gauge", "mode", {mode: int(mode == health["mode"]) for mode in MODES}),
     }
     lines = []
     for name, (kind, label, values) in metrics.items():
@@ -111,6 +115,8 @@ def prometheus(health: Mapping[str, Any]) -> str:
     lines += [
         "# TYPE barsight_disk_free_bytes gauge",
         f"barsight_disk_free_bytes {health['disk_free_bytes']}",
+        "# TYPE barsight_lifts_may_stand gauge",
+        f"barsight_lifts_may_stand {int(health['lifts_may_stand'])}",
     ]
     if health["disk_days"] is not None:
         lines += ["# TYPE barsight_disk_days gauge", f"barsight_disk_days {health['disk_days']}"]

@@ -207,6 +207,8 @@ class Supervisor:
             if one.state not in ("running", "done") and role != "record"
         }
         mode = judge_mode(heard, now_ns, self._link.live, down)
+        if self._board["record", "paused"]:
+            mode = replace(mode, reasons=(*mode.reasons, "recording is stopped, the disk is too full"))
         self.state.now_ns = now_ns
         before = self.state.mode
         changed = (mode.name, mode.lifts) != (before.name, before.lifts)
@@ -245,6 +247,8 @@ class Supervisor:
             readings[sensor] = int(stamps[-1]) - self._shift_ns if len(stamps) else 0
             if sensor == "crane" and self._freeze is not None and self._jump is not None:
                 frozen, jumped_m = self._freeze.check(stamps, values), self._jump.check(stamps, values)
+                if frozen:
+                    self._jump.begin_anew()
         if self._link.crane is not None:
             step_s = (time.time_ns() - time.monotonic_ns() - self._link.epoch_ns) / NS_PER_S
         return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ WAIT_MS = 200
 SILENT_S = 2.0
 """A camera that gives nothing for so long and can't be controlled any more is connected anew."""
 AGAIN_S = 1.0
+STOPPED_S = 0.1
+"""A camera needs so long to end its stream."""
 WRAP = 65535
 """Cameras of GigE Vision 1 count blocks from 1 to this, then from 1 again."""
 SERIALS = ("DeviceSerialNumber", "DeviceID")
@@ -94,6 +97,10 @@ class GigeCamera:
         """Take control and set the camera. Raises InputError where it can't be or does not fit."""
         try:
             self._camera = vg.connect_gige(device, iface=self._settings.interface)
+            # A camera whose host was killed sends on to where that was.
+            with contextlib.suppress(vg.GenicamError):
+                self._camera.acquisition_stop()
+                time.sleep(STOPPED_S)
             self._set_up(self._camera)
         except vg.GenicamError as error:
             self.close()

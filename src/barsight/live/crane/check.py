@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from barsight.calibration.files.rig_file import read_serials
 from barsight.core.errors import BarsightError
 from barsight.live.crane.preflight import expect_plausible, hear
 from barsight.live.settings import CraneConfig
@@ -49,6 +50,7 @@ def check_machine(crane: CraneConfig, out: Path) -> Iterator[Finding]:
         places["recordings"] = crane.recorder.folder
     for name, folder in places.items():
         yield from _disk(name, folder, crane, is_run=name == "runs")
+    yield _serials(crane)
     yield from _network(crane)
     yield from _sensors(crane)
     yield _clock()
@@ -116,6 +118,16 @@ def write_speed_mib(folder: Path) -> float:
         return WRITTEN_MIB / (time.perf_counter() - began)
 
 
+def _serials(crane: CraneConfig) -> Finding:
+    """Check that exchanged cameras and another rig's calibration would be noticed."""
+    known = [serial or "none" for serial in read_serials(crane.calibration)]
+    remedy = (
+        f"put serial: under cam0 and cam1 of {crane.calibration.name}: else exchanged cameras aren't noticed"
+    )
+    passed = True if "none" not in known else None
+    return Finding("serial numbers in the calibration", ", ".join(known), "both", remedy, passed)
+
+
 def _network(crane: CraneConfig) -> Iterator[Finding]:
     """Check the interface to the cameras, and how much the system may hold of what comes."""
     named, camera = crane.cameras.interface, crane.rig().cam0
@@ -146,8 +158,8 @@ def _interface(name: str, crane: CraneConfig) -> Iterator[Finding]:
         "use a faster network, or lower cameras.rate_hz", speed >= rate if speed > 0 else None,
     )  # fmt: skip
     has_ptp = any((at / "device" / "ptp").glob("ptp*"))
-    remedy = "none is needed: offset and drift are estimated from the stamps"
-    yield Finding(f"PTP clock of {name}", "there" if has_ptp else "none", "none", remedy, None)
+    estimated = "none, offset and drift are estimated from the stamps"
+    yield Finding(f"PTP clock of {name}", "there" if has_ptp else "none", estimated, "", None)
 
 
 def interface_of(named: str | None) -> str | None:
@@ -196,7 +208,9 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
 
         needed = f"{sensor.rate_hz:g} readings a second at UDP port {sensor.port}"
         yield _proved(name, needed, listen)
-    yield _proved("readings", "those of a crane, in SI units", lambda: expect_plausible(awaited))
+    heard = (awaited.imu_samples, awaited.crane_samples)
+    if any(one is not None and len(one.stamp_ns) for one in heard):
+        yield _proved("readings", "those of a crane, in SI units", lambda: expect_plausible(awaited))
 
 
 def _proved(what: str, needed: str, prove: Callable[[], None]) -> Finding:

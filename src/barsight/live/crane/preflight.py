@@ -45,6 +45,12 @@ def hear(crane: CraneConfig, folder: AwaitedRecording, name: str) -> AwaitedReco
             name, f"its stamps give {rate_hz:.3g} readings a second, crane.toml says {sensor.rate_hz:g}",
             "send stamps in ns, and state the rate that is sent",
         )  # fmt: skip
+    return held(folder, name, found)
+
+
+def held(folder: AwaitedRecording, name: str, found: list[RawReading]) -> AwaitedRecording:
+    """Return the recording with these readings of `imu` or `crane`."""
+    stamps = np.array([one.device_ns for one in found], np.int64)
     values = np.array([one.values for one in found])
     if name == "imu" and folder.imu_samples is not None:
         heard = replace(

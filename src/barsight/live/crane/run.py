@@ -12,6 +12,7 @@ from typing import Any
 from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.files import expect_empty, translated_os_errors
 from barsight.live.crane.preflight import prove_sensors
+from barsight.live.drift import DRIFT_FILE, note_drift
 from barsight.live.run import INTERRUPTED, LiveRun
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import STOOD
@@ -19,6 +20,7 @@ from barsight.map_building import ProgressCallback
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.formats.segments import PATTERN
+from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions
 from barsight.recording.writers.retention import PROTECTED
 from barsight.yard.magnet.description import load_magnet
@@ -80,6 +82,8 @@ def measure_surveys(
             else:
                 _point(out / LATEST, here.name)
                 tell(f"{here.name} is measured")
+                if why := note_drift(open_recording(recording, settings.recording), out / DRIFT_FILE):
+                    tell(f"{here.name} says nothing of the calibration: {why}")
         except BarsightError as error:
             ended, proved = run.stop_because, False
             tell(f"{here.name} offers no lifts: {error}")

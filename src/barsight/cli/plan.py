@@ -1,0 +1,57 @@
+"""Run `barsight plan --range 8 --width 12`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
+from barsight.rig_plan import CAMERAS, Wish, plan_rig
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, plan and print."""
+
+    def command(
+        range: float,
+        width: float,
+        stack: float = 2.0,
+        bar_diameter: float = 0.09,
+        sigma: float = 0.01,
+        speed: float = 0.5,
+        camera: Literal["1.3MP", "1.6MP", "5MP", "12MP"] = "1.3MP",
+    ) -> None:
+        """Plan a rig: lens, baseline, exposure, rate and data with their sums, and a parts list.
+
+        All in metres and seconds. The baseline lies along the travel, the picture's short side along the
+        bars. Exit code 5 where no such rig fits, with what would help.
+
+        Args:
+            range: From the cameras to the floor.
+            width: Of the yard, along the bars; it is taken in as many lanes as needed.
+            stack: Height of the highest pile.
+            bar_diameter: Of the thinnest bar that shall be told.
+            sigma: Wanted sigma of a single depth on the floor.
+            speed: Of the crane while it measures.
+            camera: Class of camera: its size in megapixels.
+        """
+        wish = Wish(range, width, stack, bar_diameter, sigma, speed)
+        plan, console = plan_rig(wish, CAMERAS[camera]), SafeConsole()
+        sums = Table(title="Sums", box=SIMPLE_HEAD)
+        for head in ("figure", "value", "by"):
+            sums.add_column(head)
+        for row in plan.sums():
+            sums.add_row(*row)
+        parts = Table(title="Parts", box=SIMPLE_HEAD)
+        for head in ("part", "what it must do"):
+            parts.add_column(head)
+        for part in plan.parts():
+            parts.add_row(*part)
+        console.print(sums)
+        console.print(parts)
+
+    call(command, "plan", arguments)
