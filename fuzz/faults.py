@@ -267,6 +267,7 @@ def main() -> int:
                     if wrong:
                         found[target.name, fault] += 1
                         print(f"{target.name}, {fault} {turn}: {wrong}", flush=True)
+            print(f"{target.name}: done", file=sys.stderr, flush=True)
     print(table(given.faults, [writer.name for writer in writers], found, given.turns))
     print(
         f"\nseed {given.seed}: {given.turns} turns of {len(given.faults)} faults over {len(writers)} "

@@ -37,10 +37,10 @@ def make_seeds(folder: Path) -> None:
         simulate(made / "euroc", TINY)
         for name, kind in BAGS.items():
             _done(["convert", str(made / "euroc"), "-o", str(made / name), "--to", kind])
-        _kitti(made / "kitti", made / "euroc")
+        write_kitti(made / "kitti", made / "euroc")
         _files(made)
         for name, shift_m in (("out", 0.0), ("old", 0.1)):
-            _results(made / name, shift_m)
+            write_results(made / name, shift_m)
             _done(["lifts", str(made / name), "--magnet", str(made / "magnet.toml"), "--at", "end"])
 
 
@@ -50,7 +50,7 @@ def _done(command: list[str]) -> None:
         raise RuntimeError(f"barsight {' '.join(command)} ended with {code}")
 
 
-def _results(folder: Path, shift_m: float) -> None:
+def write_results(folder: Path, shift_m: float) -> None:
     """Write what measuring leaves: a yard of two bundles, with all the files that a page shows."""
     yard_folders.write_folder(folder, shift_m=shift_m)
     more = folder.with_name("more")
@@ -61,7 +61,7 @@ def _results(folder: Path, shift_m: float) -> None:
     reseal_folder(folder)
 
 
-def _kitti(folder: Path, euroc: Path) -> None:
+def write_kitti(folder: Path, euroc: Path) -> None:
     for camera in (0, 1):
         (folder / f"image_{camera}").mkdir(parents=True)
         pictures = sorted((euroc / "mav0" / f"cam{camera}" / "data").glob("*.png"))

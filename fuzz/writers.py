@@ -47,13 +47,6 @@ WRITERS = (
             run_words(*PAIR, "-o", f"FOLDER/made.{kind}"), (f"made.{kind}",),
         ) for kind in ("pfm", "png", "tif")
     ),
-    Target("measure", ("euroc",), (), run_words(*MEASURE), ("made",), warm=False),
-    Target("measure --resume", ("euroc",), (), run_words(*MEASURE, "--resume"), ("made",), warm=False),
-    Target(
-        "odometry", ("euroc",), (), run_words("odometry", "FOLDER/euroc", "-o", "FOLDER/made"), ("made",),
-        warm=False,
-    ),
-    Target("simulate", (), (), exec_words("simulate", "FOLDER/made", *TINY_YARD), ("made",), warm=False),
     Target("report", ("out",), (), run_words("report", "FOLDER/out"), ("out",)),
     Target(
         "lifts", ("out", "magnet.toml"), (),
@@ -88,4 +81,11 @@ WRITERS = (
         run_words("calibrate", "export", "FOLDER/rig.yaml", "-o", "FOLDER/made.yaml", "--to", "opencv"),
         ("made.yaml",),
     ),
+    Target("measure", ("euroc",), (), run_words(*MEASURE), ("made",), warm=False),
+    Target("measure --resume", ("euroc",), (), run_words(*MEASURE, "--resume"), ("made",), warm=False),
+    Target(
+        "odometry", ("euroc",), (), run_words("odometry", "FOLDER/euroc", "-o", "FOLDER/made"), ("made",),
+        warm=False,
+    ),
+    Target("simulate", (), (), exec_words("simulate", "FOLDER/made", *TINY_YARD), ("made",), warm=False),
 )  # fmt: skip

@@ -119,6 +119,8 @@ def test_named_flags_exist(reference: ModuleType) -> None:
         known |= {f"--{prefix}.*" for _, prefix in reached}
     made = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     known |= set(re.findall(r"--[\w.-]+", made))
+    for attack in ("__main__.py", "faults.py"):
+        known |= set(re.findall(r'"(--[a-z]+)"', (ROOT / "fuzz" / attack).read_text(encoding="utf-8")))
     unknown = {
         (name(page), flag)
         for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]

@@ -14,6 +14,10 @@ MAX_PIXELS = 1 << 26
 """Of a picture; a small file may claim any number. Cameras over a yard have 2 to 25 million."""
 
 
+MIN_FOCAL_SIDES, MAX_FOCAL_SIDES = 1e-3, 1e4
+"""Of a focal length, in sides of the picture: pictures of 180 degrees and of 20 seconds of arc."""
+
+
 class Distortion(StrEnum):
     """RADTAN: k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order. EQUIDISTANT: k1..k4 [Kannala 2006]."""
 
@@ -55,6 +59,9 @@ class Camera:
             raise ValueError(f"an image of {self.width}x{self.height} has over {MAX_PIXELS} pixels")
         if self.fx_px <= 0 or self.fy_px <= 0:
             raise ValueError(f"the focal lengths {self.fx_px}, {self.fy_px} must be positive")
+        sides = (self.fx_px / self.width, self.fy_px / self.height)
+        if not all(MIN_FOCAL_SIDES < ratio < MAX_FOCAL_SIDES for ratio in sides):
+            raise ValueError(f"the focal lengths {self.fx_px}, {self.fy_px} px can't be")
         if not (-self.width < self.cx_px < 2 * self.width and -self.height < self.cy_px < 2 * self.height):
             raise ValueError(f"the principal point ({self.cx_px}, {self.cy_px}) lies far outside the image")
         counts = COEFFICIENT_COUNTS[self.distortion]

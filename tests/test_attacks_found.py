@@ -1,0 +1,123 @@
+"""What fuzzing found, each once: a damaged file ends soon in one line that names it."""
+
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzz.mutators import png_bomb
+from fuzz.seeds import write_kitti, write_results
+
+from barsight.calibration.files.euroc import read_rig
+from barsight.calibration.files.rig_file import write_rig_file
+from barsight.cli.main import run
+from barsight.core.errors import InputError
+from barsight.recording.pairing import pair_cameras
+from barsight.yard.magnet.description import example_magnet
+
+MAX_CPU_S = 8.0
+"""Twice what the slowest takes; a digest of 8 GiB takes longer."""
+Damage = Callable[[Path], object]
+
+
+def number(of: str, value: str) -> Damage:
+    """Put a value in place of what the pattern finds first."""
+
+    def damage(path: Path) -> None:
+        text, count = re.subn(of, value, path.read_text(), count=1)
+        assert count == 1
+        path.write_text(text)
+
+    return damage
+
+
+def link_to_itself(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path.name)
+
+
+def sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(1 << 33)
+
+
+def bomb(path: Path) -> None:
+    path.write_bytes(png_bomb(9000, 9000))
+
+
+A_NUMBER = r"-?\d+\.\d+(e[-+]\d+)?"
+EXPORT = "calibrate export F/rig.xml -o F/made.yaml --to kalibr"
+FOUND: list[tuple[str, Damage, str, str]] = [
+    ("mcap/mcap.mcap", link_to_itself, "info F/mcap", "mcap.mcap: can't be read"),
+    ("kitti/calib.txt", number("-150", "1e300"), "info F/kitti", "line 2: expected 12 numbers in range"),
+    ("kitti/calib.txt", number("312.5", "5e-324"), "info F/kitti", "the focal lengths 5e-324"),
+    ("euroc/mav0/imu0/sensor.yaml", number(A_NUMBER, "-1e308"), "info F/euroc", "out of range"),
+    ("euroc/mav0/imu0/data.csv", number(f",{A_NUMBER}", ",1e300"), "info F/euroc", "line 2: a value is NaN"),
+    ("targets.csv", number(A_NUMBER, "-1e308"), "calibrate yard F/targets.csv -o F/made.yaml", "line 2: a"),
+    ("rig.xml", number(r"(?<=<data>)\s*\S+", "-1e308"), EXPORT, "range"),
+    ("out/preview.png", bomb, "report F/out", "at most"),
+    ("out/preview.png", sparse, "report F/out", "at most"),
+    ("out/ortho.png", bomb, "report F/out", "at most"),
+    ("out/trajectory.tum", number(r" \S+", " 1e999990"), "report F/out", "pose 1: its numbers are"),
+    ("out/trajectory.tum", number(r"(?m)(?<= )\S+$", "5"), "report F/out", "pose 1: its quaternion"),
+    ("out/laser.csv", number(A_NUMBER, "1e999990"), "report F/out", "out of range"),
+    ("out/height.tif", sparse, "explain F/out 1", "is torn"),
+    ("out/tops.tif", sparse, "export F/out F/made.las", "is torn"),
+    ("out/cloud.ply", sparse, "store add sqlite:///F/yard.db F/out", "cloud.ply"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def seeds(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("seeds")
+    shutil.copytree(whole, folder / "euroc")
+    assert run(["convert", str(whole), "-o", str(folder / "mcap"), "--to", "ros2-mcap"]) == 0
+    write_kitti(folder / "kitti", whole)
+    write_rig_file(folder / "rig.yaml", read_rig(whole / "mav0"))
+    command = [
+        "calibrate",
+        "export",
+        str(folder / "rig.yaml"),
+        "-o",
+        str(folder / "rig.xml"),
+        "--to",
+        "opencv",
+    ]
+    assert run(command) == 0
+    rows = [f"T{k},{k}.5,{k * k}.5,1.0,{k}.0,{k * k}.0,0.5" for k in range(4)]
+    (folder / "targets.csv").write_text("name,yard_x,yard_y,yard_z,x,y,z\n" + "\n".join(rows) + "\n")
+    write_results(folder / "out", 0.0)
+    (folder / "magnet.toml").write_text(example_magnet(), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(("name", "damage", "command", "says"), FOUND)
+def test_what_was_found_stays_mended(
+    seeds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    name: str, damage: Damage, command: str, says: str,
+) -> None:  # fmt: skip
+    folder = tmp_path / "F"
+    folder.mkdir()
+    for path in seeds.iterdir():
+        if path.is_dir() and name.startswith(f"{path.name}/"):
+            shutil.copytree(path, folder / path.name)
+        elif path.is_file():
+            shutil.copy(path, folder)
+    damage(folder / name)
+    before = sorted(folder.rglob("*"))
+    began = time.process_time()
+    assert run([word.replace("F/", f"{folder}/") for word in command.split()]) == 3
+    assert time.process_time() - began < MAX_CPU_S
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and says in told and "Traceback" not in told
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_a_camera_without_pictures_is_said() -> None:
+    some = np.arange(3, dtype=np.int64)
+    for left, right, name in ((some[:0], some, "cam0"), (some, some[:0], "cam1")):
+        with pytest.raises(InputError, match=f"holds no picture of {name}"):
+            pair_cameras(Path("bag"), left, right, 0.01)
