@@ -221,9 +221,11 @@ def test_a_beams_end_on_a_flank_holds_the_bundle_down(
 
 def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:
     (one,) = find_bundles(draw([Laid(0.0, 0.0, 0.2, 0.0)]), SETTINGS)
-    for away_m, is_free in ((one.width_m - 0.03, False), (one.width_m - 0.005, True)):
-        other = replace(one, id=1, centre_m=one.centre_m + np.array([away_m, 0.0, -0.05]))
+    for overlap_m, up_ratio, is_free in ((0.03, -0.1, False), (0.005, -0.1, True), (0.03, -0.2, True)):
+        away_m = np.array([one.width_m - overlap_m, 0.0, up_ratio * one.width_m])
+        other = replace(one, id=1, centre_m=one.centre_m + away_m)
         assert (not list_overlaps(one, [one, other])) is is_free
+        assert (not list_overlaps(other, [one, other])) is (overlap_m < 0.02)
 
 
 def test_what_has_no_flanks_is_no_bundle() -> None:

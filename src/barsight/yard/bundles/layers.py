@@ -11,6 +11,8 @@ _OVERLAP_M = 0.05
 _TOUCH_M = 0.03
 _DUNNAGE_M = 0.1
 _HIGHER_RATIO = 0.4
+_LOWER_RATIO = 0.15
+"""A middle that lies lower by this share of the mean width is the lower one, whatever the widths err by."""
 _PARALLEL = 0.08
 _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
@@ -70,7 +72,9 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
 
 
 def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[str, ...]:
-    """List other bundles whose outlines overlap this one's, not all below it: one may lie over the other."""
+    """List other bundles whose outlines overlap this one's and whose middles lie no lower: they may lie over
+    its flank. In plan view two convex sections overlap where one's widest place is above the other's.
+    """
     ids = [str(other.id) for other in bundles if other.id != bundle.id and _overlaps(other, bundle)]
     return (
         (f"its outline and that of bundle {', '.join(ids)} overlap: one may lie over the other",)
@@ -80,7 +84,8 @@ def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[str, ...]:
 
 
 def _overlaps(other: Bundle, bundle: Bundle) -> bool:
-    return other.top_z_m > _bottom(bundle) and _common_length(bundle, other, -_MEET_M) > _MEET_LENGTH_M
+    higher = other.centre_m[2] - bundle.centre_m[2] > -_LOWER_RATIO * (other.width_m + bundle.width_m) / 2
+    return bool(higher) and _common_length(bundle, other, -_MEET_M) > _MEET_LENGTH_M
 
 
 def list_neighbours(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
