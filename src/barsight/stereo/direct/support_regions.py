@@ -115,7 +115,7 @@ def biweight(gap: np.float32) -> np.float32:
 @kernel(inline=True)
 def is_along_column(axis: Float32) -> bool:
     """Check whether an axis (x, y) is so near to a column's that neighbouring rows can share their fits."""
-    return abs(axis[0]) < _COLUMN_SINE
+    return bool(abs(axis[0]) < _COLUMN_SINE)
 
 
 @kernel(inline=True)
@@ -144,7 +144,7 @@ def share_rows(frame: Float32, y: int, x0: int, height: int, alike: np.float32, 
     for i in range(TILE_COLUMNS):
         near = min(abs(up[i] - here[i]), abs(down[i] - here[i]))
         alone += np.int32(0) if near < alike else np.int32(1)
-    return alone == 0
+    return bool(alone == 0)
 
 
 @kernel()
