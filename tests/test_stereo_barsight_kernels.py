@@ -41,7 +41,11 @@ from barsight.stereo.direct.support_regions import (
     allocate_frame,
     axis_means,
     biweight,
+    blend_rows,
+    fitted_rows,
     inside,
+    is_along_column,
+    share_rows,
     tile_axes,
 )
 
@@ -163,6 +167,22 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
         value = np.linalg.solve(normal, basis.T @ np.array(values))[0]
         assert fitted[y, x] == pytest.approx(disparity[y, x] + value, abs=2e-4)
         assert information[y, x] == pytest.approx(1 / np.linalg.inv(normal)[0, 0], rel=2e-3)
+
+
+def test_a_row_goes_to_the_fitted_ones_that_are_like_it() -> None:
+    leaning = np.array([[0.1, 0.995], [0.3, 0.954]], dtype=np.float32)
+    assert [is_along_column(axis) for axis in leaning] == [True, False]
+    assert [fitted_rows(y, 11) for y in (0, 5, 9, 10)] == [(0, 4), (4, 8), (8, 10), (8, 10)]
+    image = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
+    image[8, 0], image[4, 1], image[[4, 8], 2] = 3, 3, 0.4
+    frame, shares = _frame(image), np.empty(32, dtype=np.float32)
+    assert share_rows(frame, 5, 0, HEIGHT, np.float32(0.5), shares)
+    np.testing.assert_allclose(shares[:4], [0, 1, 0.25, 0.25])
+    row = np.empty(4, dtype=np.float32)
+    blend_rows(np.full_like(row, 1), np.full_like(row, 2), shares[:4], row)
+    np.testing.assert_allclose(row, [1, 2, 1.25, 1.25])
+    image[5, 30] = 3
+    assert not share_rows(_frame(image), 5, 0, HEIGHT, np.float32(0.5), shares)
 
 
 def test_rows_between_fitted_ones_share_them_where_they_are_one_surface() -> None:

@@ -114,7 +114,7 @@ def biweight(gap: np.float32) -> np.float32:
 
 @kernel(inline=True)
 def is_along_column(axis: Float32) -> bool:
-    """Check whether an axis (x, y) is so near to a column's that neighbouring rows can share their fits."""
+    """Check whether an axis (2,) (x, y) is so near to a column's that its rows can share their fits."""
     return bool(abs(axis[0]) < _COLUMN_SINE)
 
 
