@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import gc
 import importlib
+import os
 import random
 import shutil
 import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 
 from barsight.cli.main import COMMANDS, home
+from barsight.core.compiling.ahead import load_kernels
 from fuzz.judging import Verdict, judge
-from fuzz.mutators import mutate, reseal_folder
+from fuzz.mutators import MARK, SECRET, mutate, reseal_folder
 from fuzz.seeds import make_seeds
 from fuzz.targets import TARGETS, Target
 
@@ -31,29 +36,43 @@ def main() -> int:
     parser.add_argument("--only", default="", help="targets whose names hold this")
     parser.add_argument("--show", action="store_true", help="print each finding with its last lines")
     given = parser.parse_args()
-    import_commands()
     with tempfile.TemporaryDirectory() as place:
-        seeds = given.seeds or Path(place) / "seeds"
-        if not seeds.exists():
-            make_seeds_apart(seeds)
         chosen = [target for target in TARGETS if given.only in target.name]
+        seeds = prepared(given.seeds or Path(place) / "seeds", Path(place), chosen)
         runs, found = attack(chosen, seeds, Path(place), given.seed, given.minutes, given.inputs, given.show)
     print(table(runs, found, given.seed))
     return 1 if found else 0
 
 
-def import_commands() -> None:
-    """Import all commands once, not in every fork; no threads, which a fork would lose."""
+def prepared(seeds: Path, place: Path, targets: Iterable[Target]) -> Path:
+    """Make the seeds where they aren't yet, and load here once what every fork for these targets needs;
+    return the seeds.
+    """
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # as a command does before it loads it
     for name in COMMANDS:
         importlib.import_module(home(name))
+    if not seeds.exists():
+        make_seeds_apart(seeds)
+    if SECRET.is_symlink() or not SECRET.is_file() or SECRET.read_bytes() != MARK:
+        SECRET.unlink(missing_ok=True)
+        with SECRET.open("xb") as file:
+            file.write(MARK)
+    load_kernels("simulate", "measure")
+    with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
+        for target in targets:
+            if target.warm:
+                with contextlib.redirect_stderr(nothing):
+                    target.call(copied(target, seeds, place / "scratch"))
+    if len(list(Path("/proc/self/task").iterdir())) > 1:
+        raise SystemExit("a command left a thread behind, which a fork would lose")
+    gc.collect()
+    gc.freeze()  # a collection in a fork would copy all pages
+    return seeds
 
 
 def make_seeds_apart(seeds: Path) -> None:
     """Make the seeds in a process of its own: this one forks, so it must not start threads."""
-    import os
-
     pid = os.fork()
     if pid == 0:
         code = 1
@@ -64,6 +83,13 @@ def make_seeds_apart(seeds: Path) -> None:
             os._exit(code)
     if os.waitpid(pid, 0)[1]:
         raise SystemExit("the seeds could not be made")
+
+
+def copied(target: Target, seeds: Path, scratch: Path) -> Path:
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    target.copy(seeds, scratch)
+    return scratch
 
 
 def attack(
@@ -93,9 +119,7 @@ def attack(
 
 def one(target: Target, seeds: Path, scratch: Path, draw: random.Random) -> tuple[str, Verdict]:
     """Copy, damage, run and judge."""
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir()
-    target.copy(seeds, scratch)
+    copied(target, seeds, scratch)
     files = target.files(scratch)
     # Folders of many pictures must not take all the turns.
     by_folder = defaultdict(list)
@@ -104,7 +128,7 @@ def one(target: Target, seeds: Path, scratch: Path, draw: random.Random) -> tupl
     how = []
     for _ in range(draw.choice((1, 1, 1, 2))):
         path = draw.choice(by_folder[draw.choice(sorted(by_folder))])
-        how.append(mutate(path, draw) if path.is_file() else "")
+        how.append(mutate(path, draw))
     if (scratch / "out").is_dir() and draw.random() < 0.7:
         reseal_folder(scratch / "out")
     outputs = tuple(scratch / name for name in target.outputs)

@@ -9,11 +9,13 @@ import signal
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from barsight.core.errors import BarsightError
+from fuzz.mutators import MARK, SECRET
 
 MAX_SECONDS, MAX_WALL_SECONDS = 10.0, 60.0
 """Of the processor, and by the clock: a busy machine is slow, a run that waits for ever does nothing."""
@@ -48,6 +50,8 @@ def judge(run: Callable[[], int], scratch: Path, outputs: tuple[Path, ...] = ())
         after = [_state(path) for path in outputs]
         if before != after:
             fault = "half result"
+    if not fault and (stolen := _stolen(outputs)):
+        fault = f"stolen: {stolen} holds or changed what lies elsewhere"
     left = [path.name for path in scratch.rglob(".*.part")]
     if not fault and left:
         fault = f"left {left[0]}"
@@ -66,6 +70,7 @@ def _child(run: Callable[[], int], scratch: Path) -> None:
             os.fdopen(number, "w", errors=errors)
             for number, errors in ((1, "strict"), (2, "backslashreplace"))
         )
+        warnings.simplefilter("ignore")  # as the console script does
         try:
             code = run()
         except SystemExit as leaving:
@@ -112,6 +117,18 @@ def _fault(code: int, peak: int, seconds: float, text: str) -> str:
         return f"{text.count(chr(10))} lines"
     if any((ord(sign) < 32 and sign not in "\n\t") or 127 <= ord(sign) < 160 for sign in text):
         return "control characters"
+    return ""
+
+
+def _stolen(outputs: tuple[Path, ...]) -> str:
+    """Name what holds the secret, where anything does; the secret itself where it was changed."""
+    if SECRET.read_bytes() != MARK:
+        return str(SECRET)
+    for output in outputs:
+        for path in output.rglob("*") if output.is_dir() else (output,):
+            small = path.is_file() and not path.is_symlink() and path.stat().st_size < 1 << 26
+            if small and MARK.strip() in path.read_bytes():
+                return path.name
     return ""
 
 

@@ -1,5 +1,8 @@
 """Damage files by their structure: text by its numbers, words and lines, JSON by its tree and seal, pictures
 by their header, archives and maps by their bytes, and any of them by what lies in its place.
+
+What leads out of the scratch folder leads to SECRET, never to a file of the machine, and nothing is written
+through a link: whoever runs this may be root.
 """
 
 from __future__ import annotations
@@ -10,11 +13,18 @@ import random
 import re
 import shutil
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+SECRET = Path(tempfile.gettempdir()) / "barsight_fuzz_secret.txt"
+"""Stands for what is elsewhere on the machine: never changed, never in an output."""
+MARK = b"kept from everyone: 31 41 59 26 53 58 97 93\n"
+MAX_DAMAGED_BYTES = 16 << 20
+MAX_REPEATED_SIGNS = 2_000_000
 NUMBERS = (
     "9" * 400, "-" + "9" * 400, "9" * 6000, "1e999990", "1e-999990", "1e308", "-1e308", "1e300", "1e10",
     "nan", "-inf", "inf", "-0", "0", "-1", "1", "2", "1e5", "100000", "65536", "2147483648",
@@ -23,7 +33,7 @@ NUMBERS = (
     "\u0661\u0662", "1e-5", "5e-324", "--5", "+", ".", "1e", "0.5", "1e4", "1e6",
 )  # fmt: skip
 TEXTS = (
-    "\x1b]0;owned\x07\x1b[31m", "\x00", "\x7f", "\ud800", "\u202e", "../../../etc/hostname", "/etc/passwd",
+    "\x1b]0;owned\x07\x1b[31m", "\x00", "\x7f", "\ud800", "\u202e", str(SECRET), "../" * 8 + str(SECRET)[1:],
     "/dev/zero", "/dev/full", ".", "..", "", "a" * 70_000, "%s%n", "[bold]x[/bold]", "[/]", "{{7*7}}",
     "<script>alert(1)</script>", "\r", "\u2028", "*a", "&a [1]", "!!python/object/apply:os.system [x]",
     "!!timestamp 2001-99-99", "!!int x", "!!binary ???", "? [1]\n: 2", "<<: 1", "~", "\ufeff",
@@ -33,7 +43,11 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def mutate(path: Path, draw: random.Random) -> str:
-    """Damage the file in one way that fits its kind; return how it was done."""
+    """Damage the file in one way that fits its kind; return how it was done. Links and what an earlier turn
+    made large stay as they are.
+    """
+    if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_DAMAGED_BYTES:
+        return ""
     if draw.random() < 0.08:
         return _replace(path, draw)
     kind = path.suffix.lower()
@@ -54,13 +68,16 @@ def _replace(path: Path, draw: random.Random) -> str:
     def link(to: str) -> Callable[[], None]:
         return lambda: path.symlink_to(to)
 
-    others = [other for other in path.parent.iterdir() if other.is_file() and other != path]
+    others = [
+        other for other in sorted(path.parent.iterdir())
+        if other.is_file() and not other.is_symlink() and other != path
+    ]  # fmt: skip
     kinds: dict[str, Callable[[], Any]] = {
         "gone": lambda: None,
         "empty": lambda: path.write_bytes(b""),
         "a folder": path.mkdir,
         "a FIFO": lambda: os.mkfifo(path),
-        "a link to passwd": link("/etc/passwd"),
+        "a link to elsewhere": link(str(SECRET)),
         "a link to /dev/zero": link("/dev/zero"),
         "a link to itself": link(path.name),
         "another file": lambda: shutil.copyfile(draw.choice(others), path) if others else None,
@@ -120,7 +137,7 @@ def _lines(text: str, draw: random.Random) -> tuple[str, str]:
         j = draw.randrange(len(lines))
         lines[j], lines[k] = lines[k], lines[j]
     elif how == "many":
-        lines[k:k] = [lines[k]] * 20_000
+        lines[k:k] = [lines[k]] * min(20_000, MAX_REPEATED_SIGNS // (len(lines[k]) + 1))
     elif how == "cut":
         lines = lines[:k]
     else:
@@ -183,7 +200,7 @@ def _change_node(tree: Any, draw: random.Random) -> str:
     node, key, where = draw.choice(short or places)
     values: list[Any] = [
         None, True, False, -1, 0, 1, 10**9, 10**25, 10**400, 1e308, float("nan"), float("-inf"), "", "x",
-        "\x1b[31mred", "../../etc/passwd", [], {}, [[]], [None], {"a": {}}, [1] * 50_000, "1" * 400,
+        "\x1b[31mred", str(SECRET), [], {}, [[]], [None], {"a": {}}, [1] * 50_000, "1" * 400,
     ]  # fmt: skip
     if draw.random() < 0.2:
         del node[key]
@@ -213,7 +230,7 @@ def _seal(tree: dict[str, Any], path: Path) -> None:
 def _reseal(path: Path, **changes: Any) -> None:
     from barsight.core.json_values import json_digest
 
-    if path.is_file() and path.stat().st_size < 1 << 26:
+    if path.is_file() and not path.is_symlink() and path.stat().st_size < MAX_DAMAGED_BYTES:
         try:
             tree = json.loads(path.read_text()) | changes
         except (ValueError, TypeError):
@@ -227,6 +244,8 @@ def reseal_folder(folder: Path) -> None:
     from barsight.result_folder import MAP_FILES, file_digest
 
     path = folder / "result.json"
+    if not path.is_file() or path.is_symlink() or path.stat().st_size > MAX_DAMAGED_BYTES:
+        return
     try:
         tree = json.loads(path.read_text())
         for name in MAP_FILES:
@@ -266,6 +285,7 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
+@cache
 def png_bomb(width: int, height: int) -> bytes:
     """Build a small PNG of many pixels (RGBA, 16 bits), all zero."""
     packer, row = zlib.compressobj(9), bytes(1 + 8 * width)

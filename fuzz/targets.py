@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from barsight.cli.main import run
+from barsight.cli.main import run_and_print
 
 Call = Callable[[Path], int]
 SKIPPED = ("state_groundtruth_estimate0", "truth")
@@ -17,7 +17,8 @@ SKIPPED = ("state_groundtruth_estimate0", "truth")
 class Target:
     """seeds: names below the seeds' folder that are copied. damaged: glob patterns of what is damaged.
     call: what reads them, given the folder of the copies. outputs: what must not be left or changed where it
-    fails. weight: its share of the turns.
+    fails. weight: its share of the turns. warm: it leaves no thread behind, so that the parent may run it
+    once for what its forks need.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Target:
     call: Call
     outputs: tuple[str, ...] = ()
     weight: float = 1.0
+    warm: bool = True
 
     def copy(self, seeds: Path, scratch: Path) -> None:
         """Copy the seeds into an empty folder."""
@@ -44,7 +46,7 @@ class Target:
 
 def run_words(*words: str) -> Call:
     """Run a command of the command line; FOLDER/ in its words is the folder of the copies."""
-    return lambda folder: run([word.replace("FOLDER", str(folder)) for word in words])
+    return lambda folder: run_and_print([word.replace("FOLDER", str(folder)) for word in words])
 
 
 def _magnet(folder: Path) -> int:
@@ -145,12 +147,12 @@ TARGETS = (
         "store", ("out",), RESULT, run_words("store", "add", "sqlite:///FOLDER/yard.db", "FOLDER/out"), (), 1
     ),
     Target("export", ("out",), RESULT, run_words("export", "FOLDER/out", "FOLDER/made.las"), ("made.las",)),
-    Target("view", ("out",), RESULT, _view, (), 0.6),
+    Target("view", ("out",), RESULT, _view, (), 0.6, warm=False),
     Target(
         "measure", ("euroc",), ("euroc/mav0/**/*",),
         run_words(
             "measure", "FOLDER/euroc", "-o", "FOLDER/made", "--stereo.method", "sgbm", "--map.cell-m", "0.05"
         ),
-        ("made",), 0.15,
+        ("made",), 0.15, warm=False,
     ),
 )  # fmt: skip

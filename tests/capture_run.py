@@ -9,7 +9,7 @@ import sys
 import time
 
 from barsight.live.pairing import PairFormer
-from barsight.live.ring import PairRing
+from barsight.live.shared.ring import PairRing
 from barsight.sensors.crane import CraneSource
 from barsight.sensors.gige import GigeCamera
 from barsight.sensors.settings import CamerasSettings

@@ -187,6 +187,43 @@ def test_several_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     assert not (folder / "kept").is_symlink() and (folder / "kept").read_text() == "old"
 
 
+@pytest.mark.parametrize("moves", range(4))
+def test_a_kill_while_files_are_replaced_leaves_no_mixed_folder_that_looks_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves: int
+) -> None:
+    names = ("contour.csv", "height.tif", "report.html", "result.json")
+    for name in (*names, "laser.csv", "mine.txt"):
+        (tmp_path / name).write_text("old")
+    whole, done = Path.replace, list[Path]()
+
+    def counted(source: Path, to: Path) -> Path:
+        if len(done) == moves:
+            raise KeyboardInterrupt  # as a kill would end it here
+        done.append(to)
+        return whole(source, to)
+
+    monkeypatch.setattr(Path, "replace", counted)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        atomic_directory(tmp_path, replace=True, owned=("laser.csv",)) as staging,
+    ):
+        for name in names:
+            (staging / name).write_text("new")
+    assert not (tmp_path / "result.json").exists() and not (tmp_path / "laser.csv").exists()
+    assert (tmp_path / "report.html").exists() == (moves == 3)
+    assert (tmp_path / "mine.txt").read_text() == "old"
+
+
+def test_closed_standard_streams_are_no_fault_and_take_nothing(tmp_path: Path) -> None:
+    """Without a stand-in the first file opened would become the standard output."""
+    for closed in (">&-", "<&-", "2>&-"):
+        command = f"{sys.executable} -m barsight calibrate board --board checkerboard:4x3:0.03 -o board.png"
+        done = subprocess.run(f"{command} --dpi 30 {closed}", shell=True, cwd=tmp_path, timeout=120)
+        assert done.returncode == 0
+        picture = (tmp_path / "board.png").read_bytes()
+        assert picture.startswith(b"\x89PNG") and picture[-8:-4] == b"IEND"
+
+
 def test_a_device_is_no_output(tmp_path: Path) -> None:
     (tmp_path / "x.csv").symlink_to("/dev/null")
     with pytest.raises(OutputError, match="a pipe or a device"), atomic_path(tmp_path / "x.csv"):

@@ -39,6 +39,7 @@ def test_stereo_methods_side_by_side(
     assert methods["barsight"]["scenes"][0]["scene"] == "wall"
 
 
+@pytest.mark.slow
 def test_ablation_leaves_out_one_part_at_a_time(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,6 +47,7 @@ def through(value: float) -> float:
 """
 
 
+@pytest.mark.slow
 def test_a_change_in_a_called_file_is_compiled_anew(tmp_path: Path) -> None:
     package = tmp_path / "yards"
     package.mkdir()
@@ -111,6 +112,7 @@ def only_the_last_few(monkeypatch: pytest.MonkeyPatch) -> list[Listed]:
     return few
 
 
+@pytest.mark.slow
 def test_processes_compile_into_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(SOURCE))

@@ -31,6 +31,7 @@ def test_a_cell_sees_the_sky_between_what_rises_on_either_side() -> None:
         assert opening[j, i] == pytest.approx(sum(min(side.min(initial=2.0), 2.0) for side in sides))
 
 
+@pytest.mark.slow
 def test_a_row_per_method(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,9 +41,9 @@ ROOMS = {
     "report": (".", "calibration"),
     "simulation": ("effects", ".", "worlds"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
-    "live": (".", "crane"),
+    "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
-    "cli": (".", "calibrate", "bench", "yard", "store"),
+    "cli": (".", "calibrate", "bench", "live", "yard", "store"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {

@@ -13,14 +13,14 @@ import pytest
 import barsight as bs
 from barsight.cli.main import run
 from barsight.core.types import CraneSamples, StereoFrame
-from barsight.live.counters import Counters
 from barsight.live.latency import counts, spread
-from barsight.live.logs import NumberLog, ReadingLog
-from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
+from barsight.live.modes import FreezeWatch, HeardSensors, JumpWatch, Mode, judge_mode
 from barsight.live.pairing import PairFormer
-from barsight.live.ring import PairRing
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
+from barsight.live.shared.counters import Counters
+from barsight.live.shared.logs import NumberLog, ReadingLog
+from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.sensors.source import LivePicture, LostPicture, Readings
@@ -84,6 +84,7 @@ def test_a_run_as_fast_as_possible_is_measure(whole: Path, tmp_path: Path) -> No
     assert not {".live", "pose.json", "live_height.tif"} & {path.name for path in out.iterdir()}
 
 
+@pytest.mark.slow
 def test_what_was_kept_replays_to_the_byte(whole: Path, tmp_path: Path) -> None:
     """At another pace, with pairs passed over and a mode that forbids lifts."""
     stamps = list(bs.open_recording(whole).index.stamps_ns)
@@ -208,6 +209,9 @@ HEARD = HeardSensors((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9})
         (replace(HEARD, cameras_ns=(0, 10**9)), 0.05, {}, "encoders-only", False, "cam0: no picture yet"),
         (HEARD, 1.0, {}, "blind", False, "cam0: silent"),
         (HEARD, 0, {"capture": "killed"}, "blind", False, "capture is down: killed"),
+        (replace(HEARD, jumped_m=0.5), 0, {}, "no-encoders", False, "jumped by 500 mm"),
+        (replace(HEARD, clock_step_s=-40.0), 0, {}, "full", False, "stepped by -40.0 s"),
+        (replace(HEARD, clock_step_s=0.4), 0, {}, "full", True, None),
         (HEARD, 0, {"track": "x"}, "encoders-only", False, "track is down"),
         (HEARD, 0, {"map": "x"}, "full", False, "map is down"),
     ],
@@ -283,3 +287,28 @@ def test_counters_and_health_are_text_that_adds_up(board: Counters) -> None:
     assert all(len(line.split(" ")) in (2, 4) for line in text.splitlines())
     assert spread([]) == {"n": 0, "p50": None, "p99": None, "max": None}
     assert spread([1.0, 3.0, 2.0])["p50"] == 2.0
+
+
+@pytest.mark.parametrize("back_s", [2.0, np.inf])
+@pytest.mark.parametrize("jump_m", [0.06, -0.5])
+def test_a_jump_of_the_encoders_shows_at_once_and_stays_until_they_come_back(
+    jump_m: float, back_s: float
+) -> None:
+    """0.5 m/s at 20 Hz, rounded to 1 mm, with 1.5 mm of noise; a jump at 4 s while it brakes by 0.25 m/s2."""
+    rng, t = np.random.default_rng(7), np.arange(0, 10, 0.05)
+    x = np.where(t < 3, 0.5 * t, 1.5 + 0.5 * (t - 3) - 0.125 * (t - 3) ** 2)
+    x = np.where(t > 5, 2.0, x)
+    place = np.zeros((t.size, 3))
+    for has_jumped in (False, True):
+        place[:, 0] = x + (has_jumped & (t >= 4) & (t < 4 + back_s)) * jump_m
+        noisy = np.round(place + rng.normal(0, 0.0015, place.shape), 3)
+        watch, stamps = JumpWatch(0.0015), (1e9 * (100 + t)).astype(np.int64)
+        seen = np.array([watch.check(stamps[max(k - 99, 0) : k + 1], noisy[max(k - 99, 0) : k + 1])
+                         for k in range(t.size)])  # fmt: skip
+        out = t[seen > 0]
+        if not has_jumped:
+            assert out.size == 0
+            continue
+        assert out[0] == pytest.approx(4.0) and seen[seen > 0][0] == pytest.approx(abs(jump_m), abs=0.02)
+        assert np.diff(out).max() < 0.06
+        assert out[-1] == pytest.approx(4 + back_s + 0.95 if back_s < 5 else t[-1])

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,6 +114,37 @@ def test_a_crane_is_measured_and_its_recording_gives_the_same(
     assert cli(["live", "--replay", str(out / "recording"), "-o", str(again), *FAST, *keyframes]) == 0
     assert (out / "height.tif").read_bytes() == (again / "height.tif").read_bytes()
     assert (out / "trajectory.tum").read_bytes() == (again / "trajectory.tum").read_bytes()
+
+
+@pytest.mark.slow
+def test_surveys_follow_each_other(crane: Plant, longer: Path, tmp_path: Path) -> None:
+    """The crane goes 4.2 m and stops; the survey is measured and the next one waits for it to move."""
+    wanted = bs.open_recording(longer)
+    config = describe(longer, tmp_path, changes={"[measure": "[survey]\nstop_s = 0.5\n[measure"})
+    play(crane, wanted, tmp_path, 45.0)
+    out = tmp_path / "out"
+    process = run(crane, config, out, "--surveys", "--live.camera-silence-intervals", "12")
+    until(process, lambda: (out / "latest" / "result.json").is_file(), 150.0)
+    until(process, lambda: (out / "current").resolve() != (out / "latest").resolve(), 30.0)
+    until(process, lambda: phase(out / "current") == "measuring", 60.0)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    first = (out / "latest").resolve()
+    assert "the crane stopped" in (first / "live.log").read_text(), errors
+    assert len(content(first / "keyframes.json")["keyframes_ns"]) >= 20
+    assert phase(first) == "done" and (first / "recording").is_dir()
+
+
+def phase(folder: Path) -> str:
+    return str(content(folder / "state.json")["phase"]) if (folder / "state.json").is_file() else ""
+
+
+def until(process: subprocess.Popen[str], holds: Callable[[], bool], seconds: float) -> None:
+    give_up = time.monotonic() + seconds
+    while not holds():
+        assert process.poll() is None and time.monotonic() < give_up
+        time.sleep(0.2)
 
 
 @pytest.mark.slow

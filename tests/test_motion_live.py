@@ -64,6 +64,7 @@ def test_live_agrees_with_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (np.mean(nees, axis=0) > 0.4).all()
 
 
+@pytest.mark.slow
 def test_a_crane_over_bars(data: Path) -> None:
     recording = open_recording(data / "yard_dev")
     batch, found = (
@@ -181,6 +182,7 @@ def turned(seen: tuple, angle: float) -> tuple:
     return tuple(told)
 
 
+@pytest.mark.slow
 def test_what_slides_alike_is_in_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
     """Slides of the size that ribbed bars show pass for a heading that is off: sigma counts them."""
     nees = []

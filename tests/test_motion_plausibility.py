@@ -98,6 +98,7 @@ def is_found(drawn: DrawnCrane, jumps: tuple[EncoderJump, ...], kinds: tuple[str
     return any(j.axis == drawn.axis and abs(j.stamp_ns - at) < 100_000_000 and j.kind in kinds for j in jumps)
 
 
+@pytest.mark.slow
 def test_drawn_cranes_jump_where_they_do() -> None:
     seeds = range(100, 106)
     assert [jumps_of(seed, drawn_crane(seed)) for seed in seeds] == [()] * len(seeds)

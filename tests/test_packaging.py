@@ -1,6 +1,7 @@
 """Imports, extras, locks and licences fit each other; the wheel is whole and runs without the checkout."""
 
 import ast
+import json
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ import tomllib
 import venv
 import zipfile
 from importlib.metadata import packages_distributions
+from importlib.metadata import version as installed_version
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,7 @@ from packaging.utils import canonicalize_name
 
 import barsight
 import licences
+import release_files
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "barsight"
@@ -159,3 +162,36 @@ def test_the_wheel_runs_the_demo_in_a_clean_environment(wheel: Path, tmp_path: P
 def test_the_version_is_semantic_and_the_packages_own() -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+", PROJECT["version"])
     assert barsight.__version__ == PROJECT["version"]
+
+
+@pytest.mark.slow
+def test_sdist_and_wheel_have_the_same_bytes_each_time(tmp_path: Path) -> None:
+    """Built from two copies with other times and rights of the files, in other folders."""
+    built = []
+    for name, rights, time_s in (("one", 0o600, 1_600_000_000), ("another", 0o664, 1_700_000_001)):
+        copy = tmp_path / name
+        shutil.copytree(SOURCE, copy / "src" / "barsight", ignore=shutil.ignore_patterns("__pycache__"))
+        for file in ("pyproject.toml", "README.md", "LICENSE"):
+            shutil.copy(ROOT / file, copy)
+        for path in copy.rglob("*"):
+            if path.is_file():
+                path.chmod(rights)
+            os.utime(path, (time_s, time_s))
+        built.append(release_files.build(copy, tmp_path / f"{name} dist", 1_750_000_000))
+    for first, second in zip(*built, strict=True):
+        assert first.name == second.name and first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.slow
+def test_the_bill_of_materials_names_every_package_with_version_licence_and_hash(tmp_path: Path) -> None:
+    target = tmp_path / "sbom.cdx.json"
+    subprocess.run([sys.executable, str(ROOT / "tools" / "sbom.py"), str(target)], check=True)
+    bill = json.loads(target.read_text(encoding="utf-8"))
+    assert (bill["bomFormat"], bill["specVersion"]) == ("CycloneDX", "1.6")
+    parts = {part["name"]: part for part in bill["components"]}
+    assert set(parts) == set().union(*licences.sections().values())
+    for name, part in parts.items():
+        assert part["version"] == installed_version(name) and part["licenses"]
+        assert part["externalReferences"][0]["hashes"]
+    needs = {each["ref"]: each.get("dependsOn", []) for each in bill["dependencies"]}
+    assert needs["scipy"] == ["numpy"] and set(needs["barsight"]) == set(parts)

@@ -14,7 +14,7 @@ from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
 from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts
 from barsight.registration.pass_ties import PassPrior, tie_passes
-from barsight.result_folder import changed_inputs
+from barsight.result_folder import changed_inputs, read_heights
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import CameraSettings, PassesSettings, YardSettings
 from cli_runs import TINY
@@ -227,6 +227,24 @@ def test_what_was_taken_is_told_and_the_newer_height_stands(
     assert all(STALE in b.cover_doubts for b in left)
 
 
+def test_a_lift_is_as_old_as_the_pass_that_alone_saw_a_part_of_it(joined: bs.Yard) -> None:
+    """Pass 1 goes at y = -2, pass 2 at y = 2 two minutes later; bundles reach from -3.75 to 3.75 m."""
+    first, second = joined.summary["passes"]
+    assert second["captured_from_ns"] - first["captured_to_ns"] > 60e9
+    heights = read_heights(joined.folder)
+    rows, columns = heights.shape
+    seen = heights.part(slice(0, rows), slice(0, columns)).passes
+    assert seen is not None and set(np.unique(seen)) == {0, 1, 2}
+    y_m = heights.y0_m + heights.cell_m * np.arange(rows)
+    assert (seen[y_m < -3.0] < 2).mean() > 0.9 and (seen[y_m > 2.0] != 1).all()
+    lifts = [one for one in (*joined.lifts.past, *joined.lifts.refused) if one.record["valid_from_ns"]]
+    low = {b.id: min(b.ends_m[:, 1]) for b in joined.bundles}
+    reaching = [one for one in lifts if one.bundles and min(low[k] for k in one.bundles) < -3.3]
+    assert len(reaching) >= 3
+    assert all(one.record["valid_from_ns"] <= first["captured_to_ns"] for one in reaching)
+
+
+@pytest.mark.slow
 def test_a_session_of_two_passes_ends_as_the_batch(passes: tuple[Path, Path], joined: bs.Yard) -> None:
     recordings = [bs.open_recording(path) for path in passes]
     session = bs.Session(recordings[0].rig, imu_noise=recordings[0].imu_noise(), is_simulated=True, **COARSE)
@@ -236,7 +254,15 @@ def test_a_session_of_two_passes_ends_as_the_batch(passes: tuple[Path, Path], jo
         for packet in bs.packets(recording):
             session.push(packet)
     yard = session.finish()
-    for name in ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply", "free.tif", "tops.tif"):
+    for name in (
+        "height.tif",
+        "contour.csv",
+        "trajectory.tum",
+        "cloud.ply",
+        "free.tif",
+        "tops.tif",
+        "passes.tif",
+    ):
         assert (yard.folder / name).read_bytes() == (joined.folder / name).read_bytes(), name
 
 

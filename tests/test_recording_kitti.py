@@ -80,7 +80,7 @@ def test_a_missing_and_a_torn_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "kind", "message"),
     [
-        ("calib.txt", "P0: 1 2 3\n", CalibrationError, "line 1: expected 12 finite numbers"),
+        ("calib.txt", "P0: 1 2 3\n", CalibrationError, "line 1: expected 12 numbers in range"),
         ("calib.txt", f"P0: {LEFT}\n\nP1: {RIGHT} x\n", CalibrationError, "line 3: holds something"),
         ("calib.txt", f"P0: {LEFT}\n", CalibrationError, "has no lines `P0:` and `P1:`"),
         ("calib.txt", f"P0: {LEFT}\nP1: {LEFT}\n", CalibrationError, "the baseline is zero"),

@@ -66,7 +66,7 @@ def test_a_wrong_line_is_named(tmp_path: Path, text: str, message: str) -> None:
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
 def test_values_that_are_not_finite_are_named(tmp_path: Path, value: str) -> None:
     table = read_table(written(tmp_path, GOOD.replace("0.1", value)), COLUMNS)
-    with pytest.raises(InputError, match="line 3: a value is NaN or infinite"):
+    with pytest.raises(InputError, match="line 3: a value is NaN, infinite or too large"):
         table.expect_finite("mend it")
 
 

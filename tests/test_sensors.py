@@ -1,14 +1,19 @@
 """Sensors at a crane: clocks, datagrams, pairs by trigger, retention, crane.toml."""
 
+import shutil
 import socket
 import struct
+import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import barsight as bs
+from barsight.cli.main import run as cli
+from barsight.live.crane.check import check_machine
 from barsight.live.pairing import PairFormer
 from barsight.live.settings import read_crane
 from barsight.recording.writers.retention import PROTECTED, Retention
@@ -160,3 +165,68 @@ def test_a_wrong_crane_toml_is_refused_by_name(
     with pytest.raises(bs.BarsightError) as error:
         read_crane(config).rig()
     assert words in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.fixture
+def described(whole: Path, tmp_path: Path) -> Path:
+    """crane.toml of no cameras that exist, with encoders at a free port."""
+    from barsight.calibration.files.rig_file import write_rig_file
+
+    write_rig_file(tmp_path / "rig.yaml", bs.open_recording(whole).rig)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        port = one.getsockname()[1]
+    named = GOOD.replace("rate_hz = 30\n", 'rate_hz = 30\ninterface = "127.0.0.1"\n')
+    (tmp_path / "crane.toml").write_text(named.replace("5602", str(port)))
+    return tmp_path / "crane.toml"
+
+
+def send(port: int, until: threading.Event) -> None:
+    """Send readings of a crane that stands, 20 a second."""
+    number = 0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        while not until.wait(0.05):
+            place = (1.0 + 0.001 * (number % 2), 2.0, 8.0)
+            out.sendto(pack("crane", number, time.monotonic_ns(), place), ("127.0.0.1", port))
+            number += 1
+
+
+def test_a_machine_is_checked_line_by_line(described: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    crane, ended = read_crane(described), threading.Event()
+    assert crane.encoders is not None
+    sender = threading.Thread(target=send, args=(crane.encoders.port, ended))
+    sender.start()
+    try:
+        code = cli(["live", "check", "--config", str(described), "-o", str(described.parent / "runs")])
+    finally:
+        ended.set()
+        sender.join()
+    told = capsys.readouterr()
+    lines = {line[7:].split(":")[0]: line for line in told.out.splitlines()}
+    assert code == 5 and "can't run live: " in told.err and "cameras" in told.err
+    assert lines["cameras"].startswith("FAILED cameras: ") and "; " in lines["cameras"]
+    for what in ("cores", "writing runs", "crane", "readings", "MTU of lo"):
+        assert lines[what].startswith("ok ") or what in told.err
+    assert lines["crane"].startswith("ok ") and lines["MTU of lo"].startswith("ok ")
+    assert all("needed: " in line for line in lines.values()) and "clock" in lines
+    assert not (described.parent / "runs").exists() and not list(described.parent.glob(".barsight*"))
+
+
+def test_what_a_machine_lacks_is_named_with_a_remedy(described: Path, tmp_path: Path) -> None:
+    text = described.read_text()
+    described.write_text(
+        text.replace('interface = "127.0.0.1"', 'interface = "lo"\npacket_size_bytes = 16000').replace(
+            "rate_hz = 30\n", "rate_hz = 200\n"
+        )
+        + "[live]\nring_pairs = 1000\nkeyframe_way_m = 0.0001\n"
+    )
+    crane = replace(read_crane(described), encoders=None)
+    found = {one.what.split(" (")[0]: one for one in check_machine(crane, tmp_path)}
+    ring = 2 * crane.rig().cam0.width * crane.rig().cam0.height * 1000
+    assert found["shared memory"].passed == (shutil.disk_usage("/dev/shm").free > ring)
+    assert found["disk for runs"].needed.startswith("610.4 GiB for 50 m")
+    assert found["writing runs"].needed == "250 MiB/s at 1 m/s"
+    described.write_text(text.replace("127.0.0.1", "nosuch0"))
+    crane = replace(read_crane(described), encoders=None)
+    missing = next(one for one in check_machine(crane, tmp_path) if one.what.startswith("interface"))
+    assert missing.passed is False and "nosuch0 isn't there" in missing.found and missing.remedy

@@ -90,6 +90,7 @@ def slow_trace(scene: Scene, origin: Float64, ray: Float64) -> tuple[float, int]
     return hits[nearest], nearest if np.isfinite(hits[nearest]) else -1
 
 
+@pytest.mark.slow
 def test_grid_walk_finds_what_trying_every_primitive_finds(scene: Scene) -> None:
     rng = np.random.default_rng(0)
     n = 250

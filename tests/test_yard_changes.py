@@ -37,6 +37,7 @@ def test_moved_settled_taken_and_added_are_told_apart() -> None:
     assert changes[3].sigma_kg > 0
 
 
+@pytest.mark.slow
 def test_what_errs_as_stated_is_rarely_called_a_change() -> None:
     rng = np.random.default_rng(5)
 

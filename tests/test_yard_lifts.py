@@ -35,6 +35,11 @@ from yard_folders import schema
 from yard_maps import Laid
 
 
+def test_the_schema_knows_every_veto() -> None:
+    known = schema("lifts")["$defs"]["veto"]["properties"]["code"]["enum"]
+    assert set(known) == set(VETOES) and len(known) == len(VETOES)
+
+
 def test_a_free_bundle_is_offered_with_the_figures_of_geometry() -> None:
     stock = [laid(0.3), laid(0.62)]
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
@@ -373,7 +378,7 @@ def test_a_trajectory_less_sure_than_the_magnet_needs() -> None:
 
 
 def test_a_place_is_as_old_as_the_last_frame_that_saw_it() -> None:
-    stock = [laid(0.3)]
+    stock = [laid(0.3, length_m=5.6)]
     bundles = (record(stock[0]),)
     passed = travel([(0, 0), (0, 0), (30, 0)], [900.0, 590.0, 1.0])
     (lift,) = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), passed, NOW_NS).offered
@@ -386,6 +391,48 @@ def test_a_place_is_as_old_as_the_last_frame_that_saw_it() -> None:
     ahead = travel([(0, 0), (0, 0)], [1.0, -60.0])
     plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), ahead, NOW_NS)
     assert codes(plan.refused[0]) == {"map-from-the-future"}
+
+
+def test_ends_that_no_frame_surely_saw_are_as_old_as_the_first_that_may_have() -> None:
+    """Frames surely see 3 m around, at most 5 m; the load's ends lie 3.5 m off."""
+    stock = [laid(0.3)]
+    passed = travel([(0, 0), (0, 0), (30, 0)], [400.0, 90.0, 1.0])
+    (lift,) = plan_lifts(
+        bare(map_of(stock)), (record(stock[0]),), MAGNET, SETTINGS, (), passed, NOW_NS
+    ).offered  # fmt: skip
+    assert lift.validity is not None and lift.validity.from_ns == NOW_NS - 400 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("old", "age_s"),
+    [("nothing", 91), ("an end", 500), ("beside a face", 500), ("a metre beside", 91), ("unknown", 501)],
+)
+def test_a_lift_is_as_old_as_the_oldest_part_that_it_depends_on(old: str, age_s: int) -> None:
+    """Pass 1 came 500 s ago, pass 2 90 s ago; both went over all of it, but pass 2 didn't see one part."""
+    stock = [laid(0.3)]
+    heights = bare(map_of(stock))
+    x, y = np.meshgrid(heights.x_m, heights.y_m)
+    passes = np.full(heights.shape, 2, np.uint8)
+    parts = {
+        "an end": y > 3.2,
+        "beside a face": (np.abs(x - 0.3 - MAGNET.beam.width_m / 2 - 0.02) < 0.02) & (np.abs(y) < 0.1),
+        "a metre beside": x > 1.3,
+    }
+    if old in parts:
+        passes[parts[old]] = 1
+    passes[5, 5] = 0
+    heights = replace(heights, passes=None if old == "unknown" else passes)
+    ways = [travel([(0, -1), (0, 1)], [seen_s + 1, seen_s]) for seen_s in (500.0, 90.0)]
+    joined = Travel.joined(ways)
+    (lift,) = plan_lifts(heights, (record(stock[0]),), MAGNET, SETTINGS, (), joined, NOW_NS).offered
+    assert lift.validity is not None and lift.validity.from_ns == NOW_NS - age_s * NS_PER_S
+    late = NOW_NS + 200 * NS_PER_S
+    plan = plan_lifts(heights, (record(stock[0]),), MAGNET, SETTINGS, (), joined, late)
+    assert bool(plan.offered) == (age_s < 400)
+    assert plan.offered or codes(plan.refused[0]) == {"map-too-old"}
+    assert Travel.read({"travel": ways[0].content(), "passes": [{}, {}]}) is None, "which pass isn't said"
+    again = Travel.read({"travel": joined.content(), "passes": [{}, {}]})
+    assert again is not None and again.pass_number.tolist() == [1, 1, 2, 2]
 
 
 def test_a_place_out_of_the_picture_or_not_measured_again_grows_old() -> None:

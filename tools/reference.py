@@ -61,6 +61,10 @@ def commands() -> Iterator[Command]:
         function, told = _reached(name)
         if function is not None:
             yield Command((name,), function)
+            for word in main.SECOND.get(name, ()):
+                function, _ = _reached(name, word)
+                assert function is not None
+                yield Command((name, word), function)
             continue
         for word in dict.fromkeys(re.findall(r"[a-z][a-z-]+", told)):
             function, _ = _reached(name, word)
@@ -91,7 +95,7 @@ def commands_page(all_commands: list[Command]) -> str:
     """A section for each command: what it does, its arguments, and which settings it takes."""
     rows = "".join(f"| [`{name}`](#{name}) | {about} |\n" for name, about in main.COMMANDS.items())
     lines = [HEAD, "# Commands\n\n", f"| command | what |\n|---|---|\n{rows}"]
-    headed = set()
+    headed = set(main.SECOND)
     for command in all_commands:
         if len(command.words) > 1 and command.words[0] not in headed:
             headed.add(command.words[0])

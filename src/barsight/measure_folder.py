@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, OutputError
-from barsight.core.files import atomic_directory
+from barsight.core.files import atomic_directory, lies_within
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.settings.values import expect_choice
@@ -54,7 +54,7 @@ def measure_into(
     if not chosen:
         raise ConfigError("no recording is named: give one, or several passes over one yard")
     for path in chosen:
-        if out.resolve() == path.resolve() or path.resolve() in out.resolve().parents:
+        if lies_within(out, path):
             raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
     content = write_measured(
@@ -90,7 +90,9 @@ def write_measured(
         scratch.mkdir()
         compile_ahead(advance, "measure")
         mapped = map_yard(recordings, settings, scratch, advance, keep)
-        with in_background(lambda: write_surface(mapped.surface, mapped.free, mapped.tops, staging)):
+        with in_background(
+            lambda: write_surface(mapped.surface, mapped.free, mapped.tops, staging, mapped.history)
+        ):
             measured = find_lifts(mapped, magnet, judged_at, notices)
         content = summary(measured)
         write_results(measured, seal_map(content, staging), staging)

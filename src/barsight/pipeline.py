@@ -34,6 +34,7 @@ from barsight.map_building import (
 )
 from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.free_space import FreeSpace
+from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.surface.contours import cut_contours
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
@@ -99,6 +100,11 @@ class MappedYard:
     def newest(self) -> MappedPass:
         """Return the pass that was recorded last."""
         return self.passes[-1]
+
+    @property
+    def history(self) -> PlaceHistory | None:
+        """Return which pass saw each place last, and what changed; None of one pass."""
+        return None if self.joined is None else self.joined.history
 
 
 def map_yard(
@@ -190,7 +196,7 @@ def find_lifts(
     settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
     watch, profiles, surface = mapped.watch, mapped.profiles, mapped.surface
     with watch("bundles"):
-        heights = surface_map(surface, mapped.free, mapped.tops)
+        heights = surface_map(surface, mapped.free, mapped.tops, mapped.history)
         bundles = find_bundles(heights, settings.bundles)
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)

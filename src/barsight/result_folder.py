@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
-from barsight.core.reading.bounded_reading import open_regular, read_json, read_text
+from barsight.core.reading.bounded_reading import in_range, open_regular, read_json, read_text
 from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
 from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.ply import read_vertices
@@ -27,7 +27,7 @@ from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap
 
-MAP_FILES = ("height.tif", "free.tif", "tops.tif", "cloud.ply")
+MAP_FILES = ("height.tif", "free.tif", "tops.tif", "passes.tif", "cloud.ply")
 MAP_FIELDS = (
     "captured_from_ns", "captured_to_ns", "is_simulated", "reference", "hashes", "calibration_id",
     "yard_frame_id", "travel", "warnings", "map", "files",
@@ -116,7 +116,10 @@ def open_folder(
         raise InputError(path, "was changed after it was written", REMEDY)
     for name in MAP_FILES:
         file, digest = folder / name, (summary.get("files") or {}).get(name)
-        if file.is_file() and (cloud or name != "cloud.ply") and file_digest(file) != digest:
+        if not file.is_file() or (name == "cloud.ply" and not cloud):
+            continue
+        _expect_form(file)
+        if file_digest(file) != digest:
             raise InputError(file, "is not the one that result.json was written with", REMEDY)
     if bundles.is_file():
         found = bundle_file.bundles_content(bundles)
@@ -127,6 +130,15 @@ def open_folder(
             if content["bundles_sha256"] != found[SEAL]:
                 raise InputError(chosen, "was chosen from another bundles.json", lift_file.REMEDY)
     return summary, identity
+
+
+def _expect_form(file: Path) -> None:
+    """Refuse by its header a file that would take long to digest and is no map or cloud."""
+    if file.suffix == ".tif":
+        with open_geotiff(file, HEIGHT_BANDS if file.name == "height.tif" else 1):
+            pass
+    else:
+        read_cloud(file, max_points=1)
 
 
 def bundles_digest(folder: Path) -> str:
@@ -160,18 +172,19 @@ def changed_inputs(summary: dict[str, Any]) -> str:
 
 
 def read_heights(folder: Path) -> PartedMap:
-    """height.tif, and ortho.tif, free.tif and tops.tif where there are any, read as parts of them are wanted.
+    """height.tif, and ortho.tif, free.tif, tops.tif, passes.tif where there are any, read as parts are
+    wanted.
 
     Raises InputError, then or later, where one is missing or torn.
     """
-    names = ("height.tif", "ortho.tif", "free.tif", "tops.tif")
-    path, photo, free, tops = (folder / name for name in names)
+    names = ("height.tif", "ortho.tif", "free.tif", "tops.tif", "passes.tif")
+    path, photo, free, tops, passes = (folder / name for name in names)
     if not path.is_file():
         raise InputError(folder, "has no height.tif", REMEDY)
     with open_geotiff(path, HEIGHT_BANDS) as file:
         size, cell_m = file.size, file.cell_m
         x0_m, y0_m = file.left_m + cell_m / 2, file.top_m - (size[0] - 0.5) * cell_m
-    for other, dtype in ((photo, np.uint8), (free, np.float32), (tops, np.uint8)):
+    for other, dtype in ((photo, np.uint8), (free, np.float32), (tops, np.uint8), (passes, np.uint8)):
         if other.is_file():
             with open_geotiff(other) as file:
                 if file.size != size or file.page.dtype != dtype:
@@ -187,9 +200,9 @@ def read_heights(folder: Path) -> PartedMap:
     def read(rows: slice, columns: slice) -> HeightMap:
         with open_geotiff(path, HEIGHT_BANDS) as file:
             z, sigma, views, source = file.rectangle(HEIGHT_BANDS, rows, columns)
-        gray, bounds, over = (layer(other, rows, columns) for other in (photo, free, tops))
+        layers = (layer(other, rows, columns) for other in (photo, free, tops, passes))
         x, y = x0_m + cell_m * columns.start, y0_m + cell_m * rows.start
-        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), gray, bounds, over)
+        return HeightMap(x, y, cell_m, z, sigma, views, source.astype(np.uint8), *layers)
 
     return PartedMap(x0_m, y0_m, cell_m, size, read)
 
@@ -213,6 +226,11 @@ def read_path(folder: Path) -> CameraPath | None:
         if len(numbers[-1]) != 7:
             raise InputError(path, f"line {count} has {len(fields)} numbers instead of 8", REMEDY)
     table = np.array(numbers, dtype=np.float64).reshape(-1, 7)
+    far = ~in_range(table).all(axis=1)
+    loose = ~(np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= 0.01)
+    for wrong, says in ((far, "its numbers are out of range"), (loose, "its quaternion has not length 1")):
+        if wrong.any():
+            raise InputError(path, f"pose {int(np.argmax(wrong)) + 1}: {says}", REMEDY)
     return CameraPath(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
 
 
@@ -282,4 +300,6 @@ def _read_table(path: Path, columns: int) -> Float64:
         raise InputError(path, f"is torn ({str(error).split(';')[0]})", REMEDY) from error
     if table.shape[1] != columns:
         raise InputError(path, f"has {table.shape[1]} columns instead of {columns}", REMEDY)
+    if (~in_range(table) & ~np.isnan(table)).any() or np.isnan(table[:, 0]).any():
+        raise InputError(path, "holds a number out of range", REMEDY)
     return table

@@ -7,6 +7,7 @@ import importlib
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from types import FrameType
 
@@ -36,8 +37,10 @@ COMMANDS = {
     "export": "Write a measured cloud or map as PLY, PCD, LAS, LAZ, E57, GeoTIFF or CSV",
     "report": "Write report.html anew from a measured yard's files",
 }
-GROUPS = ("bench", "calibrate", "store")
+GROUPS = ("bench", "calibrate", "live", "store")
 """Commands that are packages: `command.py` in them finds the second word."""
+SECOND = {"live": ("check",)}
+"""Second words of commands that do something without one too."""
 ROOMS = {"yard": ("lifts", "explain", "compare"), "store": ("yard", "serve")}
 """Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
@@ -55,17 +58,33 @@ def home(name: str) -> str:
 
 def main() -> None:
     """Run the console script: signals end a run as Ctrl-C does."""
+    _fill_closed_streams()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
         signal.signal(signal.SIGHUP, _interrupt)
-    code = _run_and_print(sys.argv[1:])
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # libraries' notes to programmers would stand beside our one line
+    code = run_and_print(sys.argv[1:])
     if code == INTERRUPTED:
         _leave_at_once(code)
     sys.exit(code)
 
 
-def _run_and_print(arguments: Sequence[str]) -> int:
+def _fill_closed_streams() -> None:
+    """Put the null device where a standard stream is closed: else the next file opened would take its number,
+    and what is printed would go there.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)
+            os.dup2(null, number)
+            if null != number:
+                os.close(null)
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w"))
+
+
+def run_and_print(arguments: Sequence[str]) -> int:
     """Run a command and write what standard output still holds: its reader may be gone, its disk full."""
     try:
         try:

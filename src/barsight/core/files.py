@@ -13,6 +13,9 @@ from pathlib import Path
 
 from barsight.core.errors import InputError, OutputError
 
+LAST = ("lifts.json", "odometry.json", "report.html", "result.json")
+"""Files that others rest on, or that show others: without them a folder is not taken for whole."""
+
 
 def expect_output(target: Path, *suffixes: str) -> None:
     """Raise `OutputError` early for a file that couldn't be written, or whose name ends otherwise."""
@@ -20,6 +23,11 @@ def expect_output(target: Path, *suffixes: str) -> None:
         raise OutputError(f"{target}: the name of this file ends in {suffixes[0]}")
     if not target.absolute().parent.is_dir():
         raise OutputError(f"{target}: there is no folder {target.parent}; make it or name another")
+
+
+def lies_within(path: Path, folder: Path) -> bool:
+    """Check whether `path` is `folder` or lies in it, links followed; a link to itself is taken as it is."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 @contextlib.contextmanager
@@ -56,7 +64,9 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
 
     Where `target` exists, `replace` moves the new files over its own of the same names, removes those of the
     names in `owned` that have no successor and leaves others alone; without it an existing non-empty
-    `target` is an `OutputError`.
+    `target` is an `OutputError`. Files are moved one by one: the old ones of LAST are removed before the
+    first move and the new ones come last, so that a kill in between leaves a folder that lacks them, and no
+    folder of two runs that looks whole.
     """
     target = target.absolute()
     with translated_os_errors(target):
@@ -73,11 +83,7 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
                 # Another run may have written there in the meantime.
                 expect_empty(target)
             if target.is_dir():
-                fresh = sorted(staging.iterdir())
-                for name in set(owned) - {path.name for path in fresh}:
-                    (target / name).unlink(missing_ok=True)
-                for path in fresh:
-                    _replace(path, target / path.name)
+                _move_files(staging, target, owned)
             else:
                 staging.replace(target)
     finally:
@@ -85,6 +91,20 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
             for folder in made:
                 with contextlib.suppress(OSError):
                     folder.rmdir()
+
+
+def _move_files(staging: Path, target: Path, owned: tuple[str, ...]) -> None:
+    fresh = {path.name: path for path in staging.iterdir()}
+    stale = (set(owned) - fresh.keys()) | (set(LAST) & fresh.keys())
+    for name in sorted(stale, key=_turn, reverse=True):
+        if not (target / name).is_dir():
+            (target / name).unlink(missing_ok=True)
+    for name in sorted(fresh, key=_turn):
+        _replace(fresh[name], target / name)
+
+
+def _turn(name: str) -> int:
+    return LAST.index(name) if name in LAST else -1
 
 
 @contextlib.contextmanager

@@ -35,7 +35,8 @@ class Pose:
         expect_shape("translation", translation, (3,))
         if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
             raise ValueError(f"{self.target}_from_{self.source} is not finite")
-        defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        largest = float(np.abs(rotation).max())
+        defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if largest < 10 else largest
         if defect > ORTHONORMAL_TOLERANCE:
             raise ValueError(
                 f"{self.target}_from_{self.source} is not a rotation: |R R^T - 1| = {defect:.2g}"

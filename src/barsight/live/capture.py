@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.stamps import seconds_to_ns
-from barsight.live.counters import Counters
 from barsight.live.link import Link
 from barsight.live.pairing import PairFormer
-from barsight.live.ring import PairRing
 from barsight.live.settings import CraneConfig
+from barsight.live.shared.counters import Counters
+from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.sensors.crane import CraneSource
 from barsight.sensors.datagrams import ReadingReceiver

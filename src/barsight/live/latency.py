@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from barsight.core.stamps import NS_PER_S
-from barsight.live.counters import Counters
 from barsight.live.link import Link
+from barsight.live.shared.counters import Counters
 
 LOST = (
     "unpaired_cam0", "unpaired_cam1", "torn", "capture_down", "incomplete", "missed", "backpressure", "late",

@@ -8,10 +8,10 @@ from functools import cached_property
 from pathlib import Path
 
 from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame, StereoFrame
-from barsight.live.counters import Counters
-from barsight.live.logs import NumberLog, ReadingLog
-from barsight.live.ring import PairRing
 from barsight.live.settings import CraneConfig, LiveSettings
+from barsight.live.shared.counters import Counters
+from barsight.live.shared.logs import NumberLog, ReadingLog
+from barsight.live.shared.ring import PairRing
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import FrameIndex, Recording
 from barsight.recording.open import open_recording
@@ -28,6 +28,7 @@ class Link:
     and disparities. ring, counters: names of the shared memory. keyframes: stamps of the only pairs to keep,
     None where the run chooses. crane: the sensors of crane.toml in place of a recording; then `recording` is
     the folder that the run records into. epoch_ns: what stamps are ahead of the monotonic clock there.
+    surveys: the run ends as the crane stops.
     """
 
     recording: Path
@@ -41,6 +42,7 @@ class Link:
     keyframes: tuple[int, ...] | None
     crane: CraneConfig | None = None
     epoch_ns: int = 0
+    surveys: bool = False
 
     def open_recording(self) -> Recording:
         """Open the recording that is replayed, or of a crane what is known beforehand."""

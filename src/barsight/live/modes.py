@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
+import numpy as np
+
 from barsight.core.arrays import Float64, Int64
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples
@@ -23,6 +25,12 @@ MODES: dict[ModeName, str] = {
 }
 FOR_LIFTS = ("full", "no-imu")
 MIN_CAMERA_SILENCE_S = 0.3
+MAX_CLOCK_STEP_S = 1.0
+JUMP_SIGMAS, MIN_JUMP_M, MAX_CHANGE_MPS2 = 8.0, 0.03, 1.0
+"""A reading further than this from where the crane's speed led, whatever it brakes by, has jumped."""
+SPEED_READINGS = 6
+JUMP_HELD_S = 1.0
+"""Encoders that came back from a jump are out for so long."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +39,15 @@ class HeardSensors:
 
     cameras_ns: of cam0 and cam1. interval_ns: between pictures, at most. readings_ns: of `imu` and `crane`,
     where the recording has them. frozen: whether the encoders repeat one reading that a moving crane can't.
+    jumped_m: by how much (m) they have jumped, 0 where they haven't. clock_step_s: of the system's clock.
     """
 
     cameras_ns: tuple[int, int]
     interval_ns: int
     readings_ns: dict[str, int]
     frozen: bool = False
+    jumped_m: float = 0.0
+    clock_step_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,8 @@ def judge_mode(
     crane = _silent_sensor("crane", "the encoders", heard, now_ns, settings.encoder_silence_s)
     if heard.frozen:
         crane = "the encoders are frozen: they repeat one reading while the crane must be moving"
+    elif heard.jumped_m:
+        crane = f"the encoders jumped by {1e3 * heard.jumped_m:.0f} mm"
     if "capture" in down:
         name: ModeName = "blind"
     elif silent or "track" in down:
@@ -67,7 +80,9 @@ def judge_mode(
     else:
         name = "no-imu" if imu else "full"
     reasons += [*silent, *(why for why in (imu, crane) if why)]
-    return Mode(name, tuple(reasons), name in FOR_LIFTS and not down)
+    if is_stepped := abs(heard.clock_step_s) > MAX_CLOCK_STEP_S:
+        reasons.append(f"the system's clock was stepped by {heard.clock_step_s:.1f} s: ages can't be told")
+    return Mode(name, tuple(reasons), name in FOR_LIFTS and not down and not is_stepped)
 
 
 def _silent_cameras(heard: HeardSensors, now_ns: int, settings: LiveSettings) -> list[str]:
@@ -118,3 +133,34 @@ class FreezeWatch:
     def forget(self) -> None:
         """Begin anew."""
         self._since = None
+
+
+class JumpWatch:
+    """Tells by how much the encoders have jumped, until they come back. sigma_m: of a reading."""
+
+    def __init__(self, sigma_m: float) -> None:
+        self._least_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
+        self._off_m: Float64 = np.zeros(3)
+        self._last_ns = self._jump_ns = 0
+        self._jump_m: Float64 = np.zeros(3)
+
+    def check(self, stamp_ns: Int64, position_m: Float64) -> float:
+        """Look at the newest readings, (N,) and (N, 3), the last few seconds; return the jump in m, or 0."""
+        for k in range(int(np.searchsorted(stamp_ns, self._last_ns, side="right")), len(stamp_ns)):
+            if k >= SPEED_READINGS:
+                self._take(stamp_ns[k - SPEED_READINGS : k + 1], position_m[k - SPEED_READINGS : k + 1])
+        self._last_ns = int(stamp_ns[-1]) if len(stamp_ns) else self._last_ns
+        away = float(np.linalg.norm(self._off_m))
+        if away > self._least_m:
+            return away
+        held = self._jump_ns and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
+        return float(np.linalg.norm(self._jump_m)) if held else 0.0
+
+    def _take(self, stamp_ns: Int64, position_m: Float64) -> None:
+        """Hold the last reading against the speed of those before it."""
+        t = (stamp_ns - stamp_ns[-2]) / NS_PER_S
+        place = position_m + (stamp_ns < self._jump_ns)[:, None] * self._jump_m
+        off = place[-1] - place[-2] - (place[-2] - place[0]) / -t[0] * t[-1]
+        if np.linalg.norm(off) > self._least_m + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0]):
+            self._off_m = self._off_m + off
+            self._jump_ns, self._jump_m = int(stamp_ns[-1]), off

@@ -17,18 +17,19 @@ from typing import Any, Literal
 from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
-from barsight.core.files import atomic_path, expect_empty, translated_os_errors
+from barsight.core.files import atomic_path, expect_empty, lies_within, translated_os_errors
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
-from barsight.live.counters import Counters
 from barsight.live.latency import latencies
 from barsight.live.link import GrowingRecording, KeptRecording, Link
 from barsight.live.mapper import LIVE_MAP
 from barsight.live.modes import Mode
-from barsight.live.ring import PairRing
 from barsight.live.settings import CraneConfig, LiveSettings
+from barsight.live.shared.counters import Counters
+from barsight.live.shared.ring import PairRing
 from barsight.live.state import write_state
 from barsight.live.supervisor import Supervisor
+from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback, checkpoint_key
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
@@ -39,6 +40,7 @@ from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.magnet.description import Magnet, load_magnet
 
 MAX_SPEED = 1000.0
+INTERRUPTED = "interrupted"
 LATEST = ("pose.json", LIVE_MAP)
 """Files that hold the latest value while the run lasts."""
 
@@ -66,7 +68,7 @@ def replay(
     given = None if keyframes is None else read_keyframes(keyframes)
     described = None if magnet is None else load_magnet(magnet)
     recording = open_recording(path, settings.recording)
-    if path.resolve() in (out.resolve(), *out.resolve().parents):
+    if lies_within(out, path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
     run = LiveRun(recording, path.absolute(), out, settings, live, speed, tell)
@@ -76,22 +78,26 @@ def replay(
 class LiveRun:
     """A run into `out`. recording: what is known of it beforehand; it lies, or will lie, at `path`.
 
-    crane: where it comes from a crane; epoch_ns: see `Link`.
+    crane: where it comes from a crane; epoch_ns, surveys: see `Link`. stop_because: why it ended early.
     """
 
     def __init__(
         self, recording: Recording, path: Path, out: Path, settings: MeasureSettings, live: LiveSettings,
         speed: float, tell: Callable[[str], None], crane: CraneConfig | None = None, epoch_ns: int = 0,
+        surveys: bool = False,
     ) -> None:  # fmt: skip
         self._recording, self._path, self._out, self._asked = recording, path, out, settings
         self._live, self._speed, self._tell = live, speed, tell
-        self._crane, self._epoch_ns = crane, epoch_ns
+        self._crane, self._epoch_ns, self._surveys = crane, epoch_ns, surveys
+        self.stop_because = ""
 
     def measure(
         self, given: Keyframes | None, magnet: Magnet | None, judged_at: Literal["now", "end"],
         advance: ProgressCallback,
     ) -> dict[str, Any]:  # fmt: skip
-        """Run until the recording ends or a signal comes, then measure what was kept."""
+        """Run until the recording or the survey ends or a signal comes, then measure what was kept; return
+        nothing where the crane only stood.
+        """
         compile_ahead(advance, "measure")
         folder = self._out.absolute() / ".live"
         with translated_os_errors(self._out):
@@ -103,10 +109,14 @@ class LiveRun:
                 self._path, self._asked.chosen(), self._live, self._speed, folder,
                 checkpoint_folder(folder / "checkpoints", _key(self._recording, self._asked)), ring.name,
                 board.name, None if given is None else given.stamps_ns, self._crane, self._epoch_ns,
+                self._surveys,
             )  # fmt: skip
             supervisor = Supervisor(link, board, self._tell_all)
             with _stopped_by_signals(supervisor):
                 supervisor.run()
+            self.stop_because = supervisor.stop_because
+            if self.stop_because == STOOD:
+                return {}
             if supervisor.stop_because:
                 self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
             if given is not None:
@@ -183,16 +193,21 @@ def _why_no_lifts(mode: Mode) -> str:
 
 @contextlib.contextmanager
 def _stopped_by_signals(supervisor: Supervisor) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end the run, so that what was kept is measured; a second one ends that too."""
+    """Let Ctrl-C and SIGTERM end the run, so that what was kept is measured; a second one ends that too.
+    SIGUSR1 ends the survey.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: supervisor.stop("interrupted")) for number in numbers]
+    told = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED, signal.SIGUSR1: "told to end the survey"}
+    before = {
+        number: signal.signal(number, lambda *_, because=because: supervisor.stop(because))
+        for number, because in told.items()
+    }
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
+        for number, handler in before.items():
             signal.signal(number, handler)
 
 

@@ -79,6 +79,29 @@ class RecorderSettings:
 
 
 @dataclass(frozen=True)
+class SurveySettings:
+    """Settings of when a survey begins and ends at a crane."""
+
+    way_m: float = 0.5
+    """With `--surveys` one has begun when the crane has gone so far."""
+    stop_s: float = 5.0
+    """It ends when the crane then stands for so long."""
+    rest_s: float = 600.0
+    """While the crane stands what was recorded is dropped this often, and the run begins anew."""
+    max_s: float = 3600.0
+    """A survey ends after so long whatever the crane does: disk and memory are bounded by it."""
+    keep: int = 200
+    """So many surveys' folders are kept: the oldest go, but for those with a file `PROTECTED`."""
+
+    def __post_init__(self) -> None:
+        expect_values(self, "survey.")
+        expect_ranges(
+            self, "survey.", way_m=(0.1, 100), stop_s=(0.5, 600), rest_s=(10, 86400), max_s=(10, 86400),
+            keep=(1, 100_000),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class CraneConfig:
     """A crane as crane.toml describes it."""
 
@@ -88,6 +111,7 @@ class CraneConfig:
     imu: ImuSettings | None = None
     encoders: EncodersSettings | None = None
     recorder: RecorderSettings = RecorderSettings()
+    survey: SurveySettings = SurveySettings()
     measure: MeasureSettings = field(default_factory=MeasureSettings)
     live: LiveSettings = LiveSettings()
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.files import atomic_path
-from barsight.live.counters import Counters
 from barsight.live.latency import counts
 from barsight.live.modes import Mode
+from barsight.live.shared.counters import Counters
 
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
 

@@ -15,13 +15,14 @@ from multiprocessing.process import BaseProcess
 from barsight.core.errors import BarsightError
 from barsight.core.stamps import NS_PER_S
 from barsight.live.capture import capture
-from barsight.live.counters import Counters
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
-from barsight.live.modes import FreezeWatch, HeardSensors, Mode, judge_mode
+from barsight.live.modes import FOR_LIFTS, FreezeWatch, HeardSensors, JumpWatch, Mode, judge_mode
 from barsight.live.record import DRAIN, record
+from barsight.live.shared.counters import Counters
 from barsight.live.source import ReplayClock
 from barsight.live.state import ProcessState, RunState, write_health, write_state
+from barsight.live.survey import SurveyWatch
 from barsight.live.track import track
 
 PROCESSES: dict[str, Callable[[Link], None]] = {
@@ -81,6 +82,10 @@ class Supervisor:
         self._sensors, self._shift_ns = link.sensors(recording), recording.rig.timeshift_cam_imu_ns
         crane = recording.crane() if "crane" in self._sensors else None
         self._freeze = None if crane is None else FreezeWatch(crane)
+        self._jump = None if crane is None else JumpWatch(crane.position_std_m)
+        self._survey: SurveyWatch | None = None
+        if link.crane is not None:
+            self._survey = SurveyWatch(link.crane.survey, is_alone=not link.surveys)
         self._clock: ReplayClock | None = None
         self._health_at = 0.0
         self._signs: dict[tuple[str, str], int] = {}
@@ -111,7 +116,7 @@ class Supervisor:
         if self._freeze is not None:
             self._freeze.forget()
             heard = replace(heard, frozen=self._freeze.check(*self._link.readings("crane").read()))
-        return judge_mode(heard, self._last_picture_ns(), self._link.live)
+        return judge_mode(heard, max(heard.cameras_ns), self._link.live)
 
     def _start(self, role: str) -> None:
         process = self._context.Process(
@@ -193,9 +198,9 @@ class Supervisor:
         """Judge the mode and write it, to the log too where it changed."""
         assert self._clock is not None
         now_ns = self._clock.stamp_now_ns()
-        if now_ns is None or self._board["capture", "ended"]:
-            now_ns = self._last_picture_ns()  # before the readings, which run ahead of the pictures
         heard = self._heard()
+        if now_ns is None or self._board["capture", "ended"]:
+            now_ns = max(heard.cameras_ns)
         down = {
             role: one.reason
             for role, one in self.state.processes.items()
@@ -211,8 +216,16 @@ class Supervisor:
         if changed:
             lifts = "" if mode.lifts else "; lifts are revoked"
             self._log(f"mode {mode.name}{lifts}" + "".join(f"; {reason}" for reason in mode.reasons))
+        self._watch_survey(now_ns)
         self._watch_sensors()
         self._write(health=time.monotonic() >= self._health_at)
+
+    def _watch_survey(self, now_ns: int) -> None:
+        """Stop where the survey is over; encoders that can't be trusted don't end one."""
+        if self._survey is not None:
+            _, place = self._link.readings("crane").last(1 if self.state.mode.name in FOR_LIFTS else 0)
+            if because := self._survey.judge(now_ns, place):
+                self.stop(because)
 
     def _watch_sensors(self) -> None:
         """Log what the recorder and the sensors' clocks have come to."""
@@ -223,18 +236,18 @@ class Supervisor:
             self._signs[key] = value
 
     def _heard(self) -> HeardSensors:
-        board, frozen = self._board, False
+        board, frozen, jumped_m, step_s = self._board, False, 0.0, 0.0
+        # First the pictures: readings that come meanwhile must not look late beside them.
+        last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
         readings: dict[str, int] = {}
         for sensor in sorted(self._sensors):
             stamps, values = self._link.readings(sensor).last(FREEZE_READINGS)
             readings[sensor] = int(stamps[-1]) - self._shift_ns if len(stamps) else 0
-            if sensor == "crane" and self._freeze is not None:
-                frozen = self._freeze.check(stamps, values)
-        last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
-        return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen)
-
-    def _last_picture_ns(self) -> int:
-        return max(self._board["capture", f"last_cam{camera}_ns"] for camera in (0, 1))
+            if sensor == "crane" and self._freeze is not None and self._jump is not None:
+                frozen, jumped_m = self._freeze.check(stamps, values), self._jump.check(stamps, values)
+        if self._link.crane is not None:
+            step_s = (time.time_ns() - time.monotonic_ns() - self._link.epoch_ns) / NS_PER_S
+        return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
 
     def _write(self, health: bool) -> None:
         write_state(self.state, self._board, self._out)

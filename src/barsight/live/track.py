@@ -17,9 +17,9 @@ from barsight.core.files import atomic_path
 from barsight.core.json_values import DIGITS, json_value
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
-from barsight.live.counters import Counters
 from barsight.live.link import GrowingRecording, Link
-from barsight.live.ring import CapturedPair, PairRing
+from barsight.live.shared.counters import Counters
+from barsight.live.shared.ring import CapturedPair, PairRing
 from barsight.motion.estimator import PoseEstimator
 from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs

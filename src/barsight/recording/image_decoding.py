@@ -41,13 +41,14 @@ class TornImageError(ValueError):
     """A picture that can't be used; the text says why, without the file's name."""
 
 
-def decode_gray(data: bytes, size: tuple[int, int] | None = None) -> UInt8:
+def decode_gray(data: bytes, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> UInt8:
     """Decode the bytes of a PNG, JPEG, TIFF, BMP, PNM or WebP to (H, W) uint8.
 
-    size: the width and height that it must have. Raises `TornImageError` for a picture that is cut short,
-    damaged, of an unknown kind, of another size or too large.
+    size: the width and height that it must have; max_pixels: width times height at most. Raises
+    `TornImageError` for a picture that is cut short, damaged, of an unknown kind, of another size or too
+    large.
     """
-    return to_gray(_decoded(data, size))
+    return to_gray(_decoded(data, size, max_pixels))
 
 
 def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
@@ -82,14 +83,14 @@ def _header_size(data: bytes) -> tuple[int, int]:
         raise TornImageError("is no readable picture") from None
 
 
-def _decoded(data: bytes, size: tuple[int, int] | None = None) -> NDArray[Any]:
+def _decoded(data: bytes, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> NDArray[Any]:
     if not data:
         raise TornImageError("is empty")
     width, height = _header_size(data)
     if size is not None:
         expect_size((width, height), size)
-    if width * height > MAX_PIXELS:
-        raise TornImageError(f"is {width}x{height}, at most {MAX_PIXELS} pixels are read")
+    if width * height > max_pixels:
+        raise TornImageError(f"is {width}x{height}, at most {max_pixels} pixels are read")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from barsight.core.errors import InputError
+from barsight.core.files import lies_within
 from barsight.core.reading.bounded_reading import open_regular, read_bytes
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
 
@@ -25,7 +26,7 @@ def expect_inner_name(name: str, path: Path, where: str) -> None:
 
 def leads_outside(path: Path, root: Path) -> bool:
     """Check whether a file lies outside the recording `root`, by a symbolic link in its way."""
-    return not path.resolve().is_relative_to(root.resolve())
+    return not lies_within(path, root)
 
 
 def read_picture(path: Path, root: Path) -> bytes:

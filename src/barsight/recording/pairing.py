@@ -44,6 +44,9 @@ class PairedAtOpening:
 
 def pair_cameras(path: Path, left_ns: Int64, right_ns: Int64, tolerance_s: float) -> PairedStamps:
     """Pair two cameras' stamps. Raises `InputError` about `path` where not a single pair comes together."""
+    for name, stamps_ns in (("cam0", left_ns), ("cam1", right_ns)):
+        if stamps_ns.size == 0:
+            raise InputError(path, f"holds no picture of {name}", "copy the recording again")
     pairing = pair_stamps(left_ns, right_ns, seconds_to_ns(tolerance_s))
     if pairing.left.size == 0:
         nearest = np.abs(left_ns[:, None][:1000] - right_ns[None, :1000]).min() / 1e6

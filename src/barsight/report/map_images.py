@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, GeoTiff, open_geotiff
 from barsight.core.types import HeightSource
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_with_colour
 
 LONGEST_PX = 2400
 MAX_PIXELS = 3_000_000
@@ -208,14 +210,15 @@ def data_uri(rgba: UInt8, *, lossless: bool) -> str:
 def preview_uri(path: Path) -> str:
     """Encode preview.png, packed smaller, as a data URI; empty where there is none.
 
-    InputError where it is torn.
+    InputError where it is torn or too large.
     """
     if not path.is_file():
         return ""
-    stored = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    picture = cv2.imdecode(stored, cv2.IMREAD_COLOR) if stored.size else None
-    if picture is None:
-        raise InputError(path, "is torn", REMEDY)
+    try:
+        gray, colour = decode_with_colour(read_bytes(path, MAX_PICTURE_BYTES, REMEDY))
+    except TornImageError as error:
+        raise InputError(path, str(error), REMEDY) from None
+    picture = np.dstack([gray, gray, gray]) if colour is None else colour
     opaque = np.full(picture.shape[:2], 255, np.uint8)
     return data_uri(np.dstack([picture[..., ::-1], opaque]).astype(np.uint8), lossless=False)
 

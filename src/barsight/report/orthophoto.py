@@ -14,6 +14,7 @@ import tifffile
 import barsight
 from barsight.core.arrays import UInt8
 from barsight.core.files import atomic_path
+from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.surface.surface import Surface, gray_levels
 from barsight.mapping.top_photo import TopPhoto
 
@@ -60,6 +61,15 @@ def write_top_photo(surface: Surface, tops: TopPhoto, target: Path) -> None:
     """Write the pictures' mean gray level at the height of the tops, on height.tif's grid."""
     rows, columns = surface.shape
     _write_gray(surface, tops.window(surface.columns[0], surface.rows[0], columns, rows)[::-1], target)
+
+
+def write_passes(surface: Surface, history: PlaceHistory, target: Path) -> None:
+    """Write which of several passes saw each cell last, from 1, on height.tif's grid."""
+    x_m, y_m = (
+        surface.cell_m * (first[0] + np.arange(count))
+        for first, count in ((surface.columns, surface.shape[1]), (surface.rows, surface.shape[0]))
+    )
+    _write_gray(surface, history.newest_pass(x_m, y_m)[::-1], target)
 
 
 def _write_gray(surface: Surface, picture: UInt8, target: Path) -> None:

@@ -11,6 +11,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import InputError
+from barsight.core.reading.bounded_reading import read_bytes
+from barsight.core.reading.geotiff import REMEDY
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_gray
 from barsight.report.map_images import Raster, paint_height, robust_range
 from barsight.report.page_maps import LARGE_TEXT, Drawing, Key, MapFigure, Shape, draw_map
 from barsight.yard.inventory.bundle_file import read_bundles
@@ -70,10 +73,11 @@ def yard_part(out_dir: Path, pictures: tuple[MapFigure, ...]) -> YardPart | None
 
 def _orthophoto(path: Path, raster: Raster) -> UInt8:
     """Resample the orthophoto (H, W, 4) to the raster's size, transparent where nothing was seen."""
-    gray = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    if gray is None:
-        raise InputError(path, "is torn", "measure the recording again")
     step, (rows, columns) = raster.step, raster.z_m.shape
+    try:
+        gray = decode_gray(read_bytes(path, MAX_PICTURE_BYTES, REMEDY), max_pixels=rows * columns * step**2)
+    except TornImageError as error:
+        raise InputError(path, str(error), REMEDY) from None
     whole = np.zeros((rows * step, columns * step), np.uint8)
     whole[: gray.shape[0], : gray.shape[1]] = gray[: rows * step, : columns * step]
     small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)

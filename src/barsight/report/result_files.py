@@ -20,19 +20,20 @@ from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S, format_seconds
 from barsight.core.types import Contour, LaserProfile, Trajectory
 from barsight.mapping.free_space import UNPROVEN, FreeSpace
+from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.surface.surface import Layers, Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measurement import Measurement, PassRecord, Preview
-from barsight.report.orthophoto import georeference, write_orthophoto, write_top_photo
+from barsight.report.orthophoto import georeference, write_orthophoto, write_passes, write_top_photo
 from barsight.yard.identity import ID_DIGITS, MapIdentity
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.lifting.lift_file import write_lifts
 
 SCHEMA_VERSION = 1
 RESULT_FILES = (
-    "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "contour.csv", "laser.csv",
-    "bundles.json", "lifts.json", "events.csv", "ortho.tif", "ortho.png", "preview.png", "result.json",
-    "report.html",
+    "trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "passes.tif", "contour.csv",
+    "laser.csv", "bundles.json", "lifts.json", "events.csv", "ortho.tif", "ortho.png", "preview.png",
+    "result.json", "report.html",
 )  # fmt: skip
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
@@ -42,13 +43,19 @@ _CLOUD_POINT = np.dtype(
 )
 
 
-def write_surface(surface: Surface, free: FreeSpace, tops: TopPhoto, folder: Path) -> None:
-    """Write what the map alone fills into an existing folder: cloud, heights, free space, photos."""
+def write_surface(
+    surface: Surface, free: FreeSpace, tops: TopPhoto, folder: Path, history: PlaceHistory | None = None
+) -> None:
+    """Write what the map alone fills into an existing folder: cloud, heights, free space, photos, and of
+    several passes which saw each cell last.
+    """
     write_height(surface, folder / "height.tif")
     write_free(surface, free, folder / "free.tif")
     write_orthophoto(surface, folder)
     write_top_photo(surface, tops, folder / "tops.tif")
     write_cloud(surface, folder / "cloud.ply")
+    if history is not None:
+        write_passes(surface, history, folder / "passes.tif")
 
 
 def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:

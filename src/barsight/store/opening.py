@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import ConfigError, InputError
+from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
 from barsight.store.tables import METADATA
@@ -124,9 +124,13 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if is_writer else "BEGIN")
 
 
+_UNWRITTEN = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY")
+
+
 @contextmanager
 def _told(name: str) -> Iterator[None]:
-    """Turn a database that can't be reached, read or written into an InputError of one line.
+    """Turn a database that can't be reached, read or written into an InputError of one line, an OutputError
+    where SQLite could not write.
 
     A statement that it refuses is a bug and raised as it is.
     """
@@ -136,6 +140,8 @@ def _told(name: str) -> Iterator[None]:
         if not isinstance(error, OperationalError) and type(error) is not DatabaseError:
             raise
         problem = str(error.orig).strip().splitlines()[0]
+        if getattr(error.orig, "sqlite_errorname", "").startswith(_UNWRITTEN):
+            raise OutputError(f"{name}: {problem}; free some space, or see that it may be written") from error
         raise InputError(
             name, problem, "see that the database is there, is a store and may be written"
         ) from error

@@ -10,6 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.mapping.free_space import FreeSpace
+from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.surface.surface import Surface, gray_levels
 from barsight.mapping.top_photo import TopPhoto
 from barsight.yard.types import HeightMap, YardMap
@@ -51,9 +52,12 @@ class PartedMap:
         )
 
 
-def surface_map(surface: Surface, free: FreeSpace | None = None, tops: TopPhoto | None = None) -> PartedMap:
+def surface_map(
+    surface: Surface, free: FreeSpace | None = None, tops: TopPhoto | None = None,
+    history: PlaceHistory | None = None,
+) -> PartedMap:  # fmt: skip
     """Return all that a surface knows, read from its tiles; free: what lines of sight prove free; tops: the
-    pictures at the height of the tops.
+    pictures at the height of the tops; history: which of several passes saw each place.
     """
     cell_m = surface.cell_m
 
@@ -64,9 +68,13 @@ def surface_map(surface: Surface, free: FreeSpace | None = None, tops: TopPhoto 
         size = layers.z_m.shape[1], layers.z_m.shape[0]
         bounds = None if free is None else free.window(column, row, *size)
         photo = None if tops is None else tops.window(column, row, *size)
+        x_m, y_m = (
+            cell_m * (first + np.arange(cells)) for first, cells in zip((column, row), size, strict=True)
+        )
+        newest = None if history is None else history.newest_pass(x_m, y_m)
         return HeightMap(
             column * cell_m, row * cell_m, cell_m,
-            layers.z_m, layers.sigma_m, layers.views, layers.source, gray, bounds, photo,
+            layers.z_m, layers.sigma_m, layers.views, layers.source, gray, bounds, photo, newest,
         )  # fmt: skip
 
     return PartedMap(surface.columns[0] * cell_m, surface.rows[0] * cell_m, cell_m, surface.shape, read)

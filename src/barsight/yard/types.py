@@ -24,7 +24,8 @@ class HeightMap:
     was seen; None where there is none. free_m: float32, upper bound of what may stand in the cell by lines
     of sight that passed over it, inf where none did; None where no lines of sight are known. tops: gray
     levels from 1 of the pictures at the height of the tops around (`TopPhoto`), 0 where nothing was seen;
-    None where there is no such photo.
+    None where there is no such photo. passes: number of the newest pass that saw the place, from 1, 0 where
+    none did; None where one pass made the map.
     """
 
     x0_m: float
@@ -37,6 +38,7 @@ class HeightMap:
     gray: UInt8 | None = None
     free_m: Float32 | None = None
     tops: UInt8 | None = None
+    passes: UInt8 | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -87,6 +89,7 @@ class HeightMap:
             None if self.gray is None else self.gray[cut],
             None if self.free_m is None else self.free_m[cut],
             None if self.tops is None else self.tops[cut],
+            None if self.passes is None else self.passes[cut],
         )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
-from barsight.core.reading.bounded_reading import MAX_SETTINGS_BYTES, read_text
+from barsight.core.reading.bounded_reading import MAX_SETTINGS_BYTES, in_range, read_text
 
 KEYS = {
     "M1": ("M1", "K1", "cameraMatrix1", "camera_matrix_1"), "D1": ("D1", "distCoeffs1", "dist_coeffs_1"),
@@ -101,8 +101,8 @@ def _matrices(path: Path) -> dict[str, Float64]:
             matrix = _matrix(path, storage, name) if name in names else None
             if matrix is not None and key not in found:
                 found[key] = np.asarray(matrix, dtype=np.float64)
-                if not np.isfinite(found[key]).all():
-                    raise CalibrationError(path, f"{name} is not finite", ORIGINAL)
+                if not in_range(found[key]).all():
+                    raise CalibrationError(path, f"{name} is not finite or out of range", ORIGINAL)
     for key in ("width", "height"):
         for name in (f"image_{key}", f"image{key.title()}", key):
             if name in names and storage.getNode(name).isReal() | storage.getNode(name).isInt():

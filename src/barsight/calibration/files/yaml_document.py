@@ -15,7 +15,7 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
-from barsight.core.reading.bounded_reading import MAX_DEPTH, expect_modest, read_text
+from barsight.core.reading.bounded_reading import MAX_DEPTH, expect_modest, in_range, read_text
 
 ROTATION_DECIMALS = 13
 TRANSLATION_DECIMALS = 12
@@ -66,8 +66,8 @@ class Document:
             numbers = ()
         if len(numbers) != len(value):
             raise self.error(key, "holds something that is no number", "correct the entry")
-        if not np.isfinite(numbers).all():
-            raise self.error(key, "is not finite", "replace NaN or inf by the calibrated number")
+        if not in_range(numbers).all():
+            raise self.error(key, "is not finite or out of range", "write the calibrated number")
         return numbers
 
     def matrix(self, key: str) -> Float64:

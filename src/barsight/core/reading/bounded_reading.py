@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from barsight.core.errors import InputError
 
@@ -34,7 +34,14 @@ MAX_DEPTH, MAX_NODES = 64, 1_000_000
 """Of lists and mappings in each other, and of all values of a settings file."""
 MAX_INTEGER = 2**64
 MAX_DIGITS = 30
+MAX_MAGNITUDE = 1e15
+"""Of a number in a table or a calibration: what is computed of it stays finite."""
 REMEDY = "take the original file"
+
+
+def in_range(values: ArrayLike) -> NDArray[np.bool_]:
+    """Tell for each number whether it is one and no larger than MAX_MAGNITUDE."""
+    return np.asarray(np.abs(np.asarray(values, dtype=np.float64)) <= MAX_MAGNITUDE)
 
 
 def open_regular(

@@ -23,6 +23,8 @@ HEIGHT_BANDS = 4
 REMEDY = "measure the recording again"
 MAX_CELLS = 1 << 28
 """Of a map: 26,000 m^2 in cells of 10 mm; a small file may claim any number."""
+_MAX_SLACK_BYTES = 1 << 26
+"""Of a map beside its cells: tiles that stand out over its edge, offsets, tags."""
 _READ_BYTES = 1 << 22
 """tifffile would read ahead 256 MiB."""
 _TORN = (
@@ -89,7 +91,7 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
     try:
         with open_regular(path, REMEDY) as stream, tifffile.TiffFile(stream) as file:
             page = file.pages.first
-            assert isinstance(page, tifffile.TiffPage)
+            assert isinstance(page, tifffile.TiffPage) and page.dtype is not None
             planar = (
                 len(page.shape) == 2 if bands == 1 else page.shape[:-2] == (bands,) and page.planarconfig == 2
             )
@@ -101,6 +103,10 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
                 raise InputError(
                     path, f"has {math.prod(page.shape) // bands} cells, at most {MAX_CELLS} are read", REMEDY
                 )
+            size = path.stat().st_size
+            most = 2 * math.prod(page.shape) * page.dtype.itemsize + _MAX_SLACK_BYTES
+            if size > most:
+                raise InputError(path, f"has {size} bytes, its cells take {most} at most", REMEDY)
             cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
             left_m, top_m = (float(v) for v in page.tags["ModelTiepointTag"].value[3:5])
             if not (0 < cell_m < 1e3 and abs(left_m) < 1e6 and abs(top_m) < 1e6):

@@ -24,26 +24,40 @@ def prove_sensors(crane: CraneConfig, folder: AwaitedRecording) -> None:
 
     cam0, cam1 = folder.rig.cam0, folder.rig.cam1
     prove_cameras(crane.cameras, ((cam0.width, cam0.height), (cam1.width, cam1.height)))
-    for name, sensor in crane.sensors().items():
-        found = _listen(name, sensor.port, sensor.rate_hz)
-        stamps = np.array([one.device_ns for one in found], np.int64)
-        if (np.diff(stamps) <= 0).any():
-            raise InputError(name, "its stamps do not increase", "send the time of each measurement in ns")
-        rate_hz = 1e9 / float(np.median(np.diff(stamps)))
-        if not 0.5 < rate_hz / sensor.rate_hz < 2:
-            raise InputError(
-                name, f"its stamps give {rate_hz:.3g} readings a second, crane.toml says {sensor.rate_hz:g}",
-                "send stamps in ns, and state the rate that is sent",
-            )  # fmt: skip
-        values = np.array([one.values for one in found])
-        if name == "imu" and folder.imu_samples is not None:
-            heard = replace(
-                folder.imu_samples, stamp_ns=stamps, gyro_radps=values[:, :3], accel_mps2=values[:, 3:]
-            )
-            folder = replace(folder, imu_samples=heard)
-        elif folder.crane_samples is not None:
-            heard_crane = replace(folder.crane_samples, stamp_ns=stamps, position_m=values)
-            folder = replace(folder, crane_samples=heard_crane)
+    for name in crane.sensors():
+        folder = hear(crane, folder, name)
+    expect_plausible(folder)
+
+
+def hear(crane: CraneConfig, folder: AwaitedRecording, name: str) -> AwaitedRecording:
+    """Hear `imu` or `crane` for a moment; return the recording with those readings.
+
+    Raises InputError where none come, or other ones than crane.toml says.
+    """
+    sensor = crane.sensors()[name]
+    found = _listen(name, sensor.port, sensor.rate_hz)
+    stamps = np.array([one.device_ns for one in found], np.int64)
+    if (np.diff(stamps) <= 0).any():
+        raise InputError(name, "its stamps do not increase", "send the time of each measurement in ns")
+    rate_hz = 1e9 / float(np.median(np.diff(stamps)))
+    if not 0.5 < rate_hz / sensor.rate_hz < 2:
+        raise InputError(
+            name, f"its stamps give {rate_hz:.3g} readings a second, crane.toml says {sensor.rate_hz:g}",
+            "send stamps in ns, and state the rate that is sent",
+        )  # fmt: skip
+    values = np.array([one.values for one in found])
+    if name == "imu" and folder.imu_samples is not None:
+        heard = replace(
+            folder.imu_samples, stamp_ns=stamps, gyro_radps=values[:, :3], accel_mps2=values[:, 3:]
+        )
+        return replace(folder, imu_samples=heard)
+    assert folder.crane_samples is not None
+    heard_crane = replace(folder.crane_samples, stamp_ns=stamps, position_m=values)
+    return replace(folder, crane_samples=heard_crane)
+
+
+def expect_plausible(folder: AwaitedRecording) -> None:
+    """Raise InputError where what was heard can't be a crane's: units, gravity against the mounting."""
     for notice in doubts(folder):
         raise InputError("crane.toml", notice.message)
 

@@ -1,22 +1,33 @@
-"""Run `barsight live --config crane.toml`: measure from the crane's own sensors until a signal comes."""
+"""Run `barsight live --config crane.toml`: one survey by the crane's own sensors, or one after the other."""
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.files import expect_empty, translated_os_errors
 from barsight.live.crane.preflight import prove_sensors
-from barsight.live.run import LiveRun
+from barsight.live.run import INTERRUPTED, LiveRun
 from barsight.live.settings import CraneConfig, LiveSettings
+from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
+from barsight.recording.formats.segments import PATTERN
 from barsight.recording.writers.bag import write_descriptions
+from barsight.recording.writers.retention import PROTECTED
 from barsight.yard.magnet.description import load_magnet
+
+STAMP = "%Y%m%dT%H%M%S"
+AGAIN_S = 5.0
+"""After a survey that failed the sensors are proved this often until they answer."""
+RUNNING, LATEST = "current", "latest"
+"""Links to the survey that runs, and to the last that was measured."""
 
 
 def measure_crane(
@@ -24,22 +35,102 @@ def measure_crane(
     magnet: Path | None = None, tell: Callable[[str], None] = print,
     advance: ProgressCallback = ignore_progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Measure what a crane's sensors give into `out` until Ctrl-C or SIGTERM; return what result.json says.
+    """Measure one survey into `out`, until Ctrl-C or SIGTERM; return what result.json says.
 
     All sensors are proved first; nothing is written where one of them isn't as crane.toml says.
     Raises a BarsightError.
     """
     described = None if magnet is None else load_magnet(magnet)
     expect_empty(out)
-    folder = out.absolute() / "recording"
-    if crane.recorder.folder is not None:
-        folder = crane.recorder.folder / datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+    recording = _recorded(crane, out, datetime.now(UTC).strftime(STAMP))
+    return _begin(crane, out, recording, settings, live, tell).measure(None, described, "now", advance)
+
+
+def measure_surveys(
+    crane: CraneConfig, out: Path, settings: MeasureSettings, live: LiveSettings, *,
+    magnet: Path | None = None, tell: Callable[[str], None] = print,
+    advance: ProgressCallback = ignore_progress,
+) -> dict[str, Any]:  # fmt: skip
+    """Measure survey after survey, each into a folder of its own in `out`, until Ctrl-C or SIGTERM.
+
+    A survey that fails is told, and the next begun once all sensors answer. Returns nothing of its own: each
+    folder has it. Raises a BarsightError where the sensors don't answer at the start.
+    """
+    if crane.encoders is None:
+        raise ConfigError("crane.toml has no [encoders], by which surveys begin and end")
+    described, proved, ended, is_first = None if magnet is None else load_magnet(magnet), False, "", True
+    while ended != INTERRUPTED:
+        here = out / datetime.now(UTC).strftime(STAMP)
+        recording = _recorded(crane, here, here.name)
+        try:
+            run = _begin(crane, here, recording, settings, live, tell, surveys=True, proved=proved)
+        except BarsightError as error:
+            if is_first:
+                raise
+            tell(f"no survey can begin: {error}")
+            time.sleep(AGAIN_S)
+            continue
+        is_first, proved = False, True
+        _point(out / RUNNING, here.name)
+        try:
+            run.measure(None, described, "now", advance)
+            ended = run.stop_because
+            if ended == STOOD:
+                _drop_standing(here, recording)
+            else:
+                _point(out / LATEST, here.name)
+                tell(f"{here.name} is measured")
+        except BarsightError as error:
+            ended, proved = run.stop_because, False
+            tell(f"{here.name} offers no lifts: {error}")
+        _keep(out, crane.survey.keep)
+    return {}
+
+
+def _begin(
+    crane: CraneConfig, out: Path, folder: Path, settings: MeasureSettings, live: LiveSettings,
+    tell: Callable[[str], None], *, surveys: bool = False, proved: bool = False,
+) -> LiveRun:  # fmt: skip
+    """Prove the sensors and make the folders of a run; it records into `folder`."""
     awaited = crane.described(folder)
-    prove_sensors(crane, awaited)
+    if not proved:
+        prove_sensors(crane, awaited)
     with translated_os_errors(folder):
         out.mkdir(parents=True, exist_ok=True)
         folder.mkdir(parents=True)
         write_descriptions(awaited, folder)
     epoch_ns = time.time_ns() - time.monotonic_ns()
-    run = LiveRun(crane.awaited(folder), folder, out, settings, live, 1.0, tell, crane, epoch_ns)
-    return run.measure(None, described, "now", advance)
+    return LiveRun(crane.awaited(folder), folder, out, settings, live, 1.0, tell, crane, epoch_ns, surveys)
+
+
+def _recorded(crane: CraneConfig, out: Path, name: str) -> Path:
+    """Return the folder of a run's recording."""
+    where = crane.recorder.folder
+    return out.absolute() / "recording" if where is None else where / name
+
+
+def _drop_standing(here: Path, recording: Path) -> None:
+    """Remove the folders of a run in which the crane only stood, but for pictures around alarms."""
+    if not any((recording / "alarms").glob(PATTERN)):
+        for path in (recording, here):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _point(link: Path, name: str) -> None:
+    """Make or turn a link to a folder beside it, at once."""
+    fresh = link.with_name(f".{link.name}.new")
+    with translated_os_errors(link):
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(name)
+        fresh.replace(link)
+
+
+def _keep(out: Path, count: int) -> None:
+    """Remove the oldest surveys' folders beyond so many."""
+    surveys = sorted(
+        path for path in out.iterdir()
+        if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
+    )  # fmt: skip
+    for path in surveys[:-count]:
+        if not (path / PROTECTED).exists():
+            shutil.rmtree(path, ignore_errors=True)

@@ -88,6 +88,11 @@ class PlaceHistory:
         x, y = np.meshgrid(x_m, y_m)
         return self._look_up(self.changed_by, x, y)
 
+    def newest_pass(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.uint8]:
+        """Look up which pass saw each cell of such a grid last, from 1; 0 where none did."""
+        x, y = np.meshgrid(x_m, y_m)
+        return (self._look_up(self.seen_by, x, y) + 1).astype(np.uint8)
+
     def is_stale(
         self, centre_m: Float64, yaw_rad: float, length_m: float, width_m: float, reach_m: float
     ) -> bool:

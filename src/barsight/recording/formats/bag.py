@@ -21,6 +21,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
+from barsight.core.reading.bounded_reading import in_range
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 from barsight.recording.base import FrameIndex, RecordingSettings
 from barsight.recording.formats.bag_file import BagFile, RawMessage
@@ -251,11 +252,11 @@ class BagRecording:
 
     def _finite(self, topic: str, width: int) -> Float64:
         table = self._scan[topic].table(width)
-        bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
+        bad = np.flatnonzero(~in_range(table).all(axis=1))
         if bad.size:
             raise InputError(
                 self._bag.path,
-                f"{topic}: value {int(bad[0]) + 1} is NaN or infinite ({bad.size} such values)",
+                f"{topic}: value {int(bad[0]) + 1} is NaN, infinite or too large ({bad.size} such values)",
                 "record again or take the sensor's dropouts out",
             )
         return table

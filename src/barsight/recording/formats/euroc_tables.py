@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, open_regular
+from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, in_range, open_regular
 from barsight.core.stamps import expect_increasing
 from barsight.recording.own_files import expect_inner_name
 
@@ -33,11 +33,12 @@ class Table:
 
     def expect_finite(self, remedy: str) -> None:
         """Raise `InputError` naming the first line that holds NaN or inf."""
-        bad = np.flatnonzero(~np.isfinite(self.rest).all(axis=1))
+        bad = np.flatnonzero(~in_range(self.rest).all(axis=1))
         if bad.size:
+            number = self.line(int(bad[0]))
             raise InputError(
                 self.path,
-                f"line {self.line(int(bad[0]))}: a value is NaN or infinite ({bad.size} such lines)",
+                f"line {number}: a value is NaN, infinite or too large ({bad.size} such lines)",
                 remedy,
             )
 

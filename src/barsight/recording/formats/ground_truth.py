@@ -10,7 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
-from barsight.core.reading.bounded_reading import read_text
+from barsight.core.reading.bounded_reading import in_range, read_text
 from barsight.core.stamps import expect_increasing, parse_seconds
 from barsight.recording.formats.euroc_tables import read_table, require_file
 from barsight.recording.own_files import leads_outside
@@ -110,7 +110,7 @@ def _lines(path: Path) -> list[list[str]]:
         if not fields:
             continue
         try:
-            finite = bool(np.isfinite([float(field) for field in fields]).all())
+            finite = bool(in_range([float(field) for field in fields]).all())
         except ValueError:
             finite = False
         if not finite or (lines and len(fields) != len(lines[0])):

@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import read_text
+from barsight.core.reading.bounded_reading import in_range, read_text
 from barsight.core.stamps import NS_PER_S, parse_seconds
 from barsight.core.types import ImuSamples
 
@@ -106,7 +106,7 @@ def _rows(path: Path) -> tuple[str, Int64, Float64]:
     stamp_ns = np.array(stamps, dtype=np.int64)
     if stamp_ns.size < 2:
         raise InputError(path, "holds no samples", f"give {FORM}")
-    good = np.isfinite(array).all(axis=1)
+    good = in_range(array).all(axis=1)
     stamp_ns, array = stamp_ns[good], array[good]
     back = np.flatnonzero(np.diff(stamp_ns) <= 0)
     if back.size:

@@ -19,7 +19,7 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import CalibrationError, InputError
-from barsight.core.reading.bounded_reading import read_text
+from barsight.core.reading.bounded_reading import in_range, read_text
 from barsight.core.stamps import NS_PER_S, expect_increasing, seconds_in_ns
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
@@ -34,6 +34,7 @@ FOLDERS = (
     ("image_l", "image_r", "", ""),
 )
 ASSUMED_RATE_HZ = 10
+ORIGINAL = "take the sequence's own calib.txt"
 PICTURE = re.compile(r"([0-9]{1,12})\.(png|jpg|jpeg)$", re.IGNORECASE)
 
 
@@ -155,9 +156,9 @@ def _read_projections(path: Path, keys: tuple[str, str]) -> tuple[Float64, Float
             raise CalibrationError(
                 path, f"line {number}: holds something that is no number", "mend it"
             ) from None
-        if values.size != 12 or not np.isfinite(values).all():
+        if values.size != 12 or not in_range(values).all():
             raise CalibrationError(
-                path, f"line {number}: expected 12 finite numbers, a 3x4 matrix", "mend it"
+                path, f"line {number}: expected 12 numbers in range, a 3x4 matrix", "mend it"
             )
         if name:
             named[name] = values.reshape(3, 4)
@@ -168,7 +169,7 @@ def _read_projections(path: Path, keys: tuple[str, str]) -> tuple[Float64, Float
     if len(bare) == 2:
         return bare[0], bare[1]
     wanted = f"lines `{keys[0]}:` and `{keys[1]}:`" if all(keys) else "two lines of twelve numbers"
-    raise CalibrationError(path, f"has no {wanted}", "take the sequence's own calib.txt")
+    raise CalibrationError(path, f"has no {wanted}", ORIGINAL)
 
 
 def _rig(path: Path, projections: tuple[Float64, Float64], sizes: tuple[tuple[int, int], ...]) -> StereoRig:
@@ -179,7 +180,7 @@ def _rig(path: Path, projections: tuple[Float64, Float64], sizes: tuple[tuple[in
                 Camera(width, height, float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
             )
         except ValueError as error:
-            raise CalibrationError(path, str(error), "take the sequence's own calib.txt") from None
+            raise CalibrationError(path, str(error), ORIGINAL) from None
         # P = K [I | t]: t is where the reference camera's origin lies in this camera.
         along_z = p[2, 3]
         places.append(
@@ -187,6 +188,8 @@ def _rig(path: Path, projections: tuple[Float64, Float64], sizes: tuple[tuple[in
         )
     cam1_in_cam0 = np.eye(4)
     cam1_in_cam0[:3, 3] = np.array(places[0]) - np.array(places[1])
+    if not in_range(cam1_in_cam0).all():
+        raise CalibrationError(path, "its matrices put the cameras impossibly far apart", ORIGINAL)
     left = canonical_pose("body", "cam0", np.eye(4))
     right = canonical_pose("body", "cam1", cam1_in_cam0)
     return build_rig(path, cameras[0], cameras[1], left, right, 0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import read_text
+from barsight.core.reading.bounded_reading import in_range, read_text
 from barsight.recording.formats.euroc_tables import require_file
 
 COLUMNS = ("name", "yard_x", "yard_y", "yard_z", "x", "y", "z")
@@ -52,7 +52,7 @@ def read_targets(path: Path) -> Targets:
             values += [float(row.get("sigma_m") or "nan"), float(row.get("check") or 0)]
         except (TypeError, ValueError):
             raise InputError(path, f"line {n}: a number is missing or is none", REMEDY) from None
-        if not np.isfinite(values[:6]).all() or values[6] <= 0 or values[7] not in (0, 1):
+        if not in_range(values[:6]).all() or values[6] <= 0 or values[7] not in (0, 1):
             raise InputError(
                 path, f"line {n}: a value can't be", "places finite, sigma_m positive, check 0 or 1"
             )

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from barsight.core.errors import OutputError
-from barsight.core.files import atomic_directory
+from barsight.core.files import atomic_directory, lies_within
 from barsight.recording.stored_images import StoredPictures
 from barsight.recording.writers.bag import BAG_FLAVOURS, write_bag
 from barsight.recording.writers.euroc import write_euroc
@@ -42,8 +42,7 @@ def convert(
     copied, but never read. Raises `InputError` for what can't be read, `OutputError` for what can't be
     written or an `out` that lies inside the recording.
     """
-    source = recording.path.resolve()
-    if out.resolve() == source or source in out.resolve().parents:
+    if lies_within(out, recording.path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     pairs = recording.camera_stamps
     total = pairs.left_ns.size + pairs.right_ns.size

@@ -126,7 +126,7 @@ def assess_placement(
         return _unseen_lift(place)
     held = _grip(place, yard.heights, magnet, magnet.tolerance, near, contact)
     load = tuple(near.bundles[k] for k in held.gripped)
-    valid = validity(yard.travel, place, settings) if yard.travel else None
+    valid = validity(yard.travel, place, magnet, load, yard.heights, settings) if yard.travel else None
     mass = _load_mass(load)
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
     contact = hold_load(contact, magnet, load, settings.strap_m)

@@ -5,7 +5,7 @@ lift there.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,8 @@ class Travel:
     taken off. refused_m: (R, 2) where the refused frames must have been. reach_m: how far from the body a
     frame may see. stamp_ns: (N,) of the frames, rising. measured: (N,) whether a frame's heights are in the
     map. sure_reach_m: what is nearer to the body than this is in the picture. eye_z_m: the body's median
-    height; pixel_rad: angle of a pixel; both NaN where an earlier version measured.
+    height; pixel_rad: angle of a pixel; both NaN where an earlier version measured. pass_number: (N,) of the
+    pass that each frame is of, from 1; empty where there is but one.
     """
 
     place_m: Float64
@@ -53,6 +54,7 @@ class Travel:
     sure_reach_m: float
     eye_z_m: float = float("nan")
     pixel_rad: float = float("nan")
+    pass_number: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def captured_ns(self) -> tuple[int, int] | None:
@@ -93,15 +95,16 @@ class Travel:
 
     @classmethod
     def joined(cls, parts: Sequence[Travel]) -> Travel:
-        """Join the passes of one yard, the oldest first: a place is as old as the newest frame near it."""
+        """Join the passes of one yard, the oldest first."""
         place, sigma, off, refused, stamps, measured = (
             np.concatenate([getattr(part, name) for part in parts])
             for name in ("place_m", "sigma_m", "off_m", "refused_m", "stamp_ns", "measured")
         )
         reach_m, sure_reach_m = max(part.reach_m for part in parts), min(part.sure_reach_m for part in parts)
         eye_z_m, pixel_rad = max(part.eye_z_m for part in parts), max(part.pixel_rad for part in parts)
+        numbers = np.repeat(np.arange(1, len(parts) + 1), [len(part.stamp_ns) for part in parts])
         return cls(
-            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad
+            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad, numbers
         )  # fmt: skip
 
     @classmethod
@@ -118,16 +121,18 @@ class Travel:
             measured = np.array(content["measured"], dtype=np.bool_)
             reach_m, sure_reach_m = float(content["reach_m"]), float(content["sure_reach_m"])
             eye_z_m, pixel_rad = (float(content.get(k, np.nan)) for k in ("eye_z_m", "pixel_rad"))
+            numbers = np.array(content.get("pass_number", []), dtype=np.int64)
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
         whole = (
             len({len(place), len(sigma), off.size, stamps.size, measured.size}) == 1
             and off.ndim == stamps.ndim == 1
+            and numbers.shape == (stamps.shape if summary.get("passes") else (0,))
         )
         if not whole or (np.diff(stamps) <= 0).any():
             return None
         return cls(
-            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad
+            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad, numbers
         )  # fmt: skip
 
     def content(self) -> dict[str, Any]:

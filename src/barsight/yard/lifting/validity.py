@@ -4,19 +4,26 @@ the yard since then forbids around it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from barsight.core.arrays import Float64, Int64
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.clearance import STRAY_FIELD_M
+from barsight.yard.lifting.load import axes_of
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.types import Bundle
+from barsight.yard.stability.stability import nearest_cells
+from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 
+PART_M, SQUARE_M = 0.04, 0.25
+"""Parts of a lift are no further apart than this where passes differ, else than the second."""
 MAX_CLOCK_ERROR_NS = NS_PER_S
 """Frames may be this much ahead of this computer's clock."""
 
@@ -29,14 +36,79 @@ class Validity:
     until_ns: int
 
 
-def validity(travel: Travel, place: Placement, settings: LiftSettings) -> Validity | None:
-    """Find the validity of a place: from the last frame that saw it, for `max_age_s`. None if none did."""
-    near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.sure_reach_m
-    near &= travel.measured
-    if not near.any():
+def validity(
+    travel: Travel, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], heights: HeightMap,
+    settings: LiftSettings,
+) -> Validity | None:  # fmt: skip
+    """Find the validity of a lift: from when the oldest part that it depends on was last seen, for
+    `max_age_s`. None where no frame surely saw the place itself.
+
+    It depends on the magnet's outline and the load's, both wider by the crane's tolerance and the stray
+    field's reach. A part that no pass saw has no age of its own: other checks forbid it where it matters.
+    """
+    measured = np.flatnonzero(travel.measured)
+    here = np.array([[place.x_m, place.y_m]])
+    if not (_distances(travel.place_m[measured], here) < travel.sure_reach_m).any():
         return None
-    seen_ns = int(travel.stamp_ns[near].max())
+    wider = STRAY_FIELD_M + max(magnet.tolerance.x_m, magnet.tolerance.y_m)
+    wider += math.radians(magnet.tolerance.yaw_deg) * magnet.half_span_m
+    outlines = [(here[0], place.yaw_rad, magnet.beam.width_m, 2 * magnet.half_span_m)]
+    outlines += [(b.centre_m[:2], b.yaw_rad, b.width_m, b.length_m) for b in load]
+    grid = [_places_in(centre, yaw, width + 2 * wider, length + 2 * wider)
+            for centre, yaw, width, length in outlines]  # fmt: skip
+    seen_ns = int(_last_seen(travel, measured, np.concatenate([here, *grid]), heights).min())
     return Validity(seen_ns, seen_ns + seconds_to_ns(settings.max_age_s))
+
+
+def _last_seen(travel: Travel, measured: Int64, at_m: Float64, heights: HeightMap) -> Int64:
+    """Find when each of (P, 2) places was seen last, of those that were seen: the last frame that surely
+    did, else the first that may have, of the pass whose height the map has there. The first place was seen.
+    """
+    several = len(travel.pass_number) > 0
+    numbers = travel.pass_number[measured] if several else np.ones(len(measured), np.int64)
+    newest = np.ones(len(at_m), np.int64)
+    if several and heights.passes is not None:
+        column, row, inside = nearest_cells(heights, at_m[:, 0], at_m[:, 1])
+        newest = np.where(inside, heights.passes[row, column], 0).astype(np.int64)
+        newest[0] = newest[0] or numbers.min()
+    kept = _thinned(at_m, newest)
+    at_m, newest = at_m[kept], newest[kept]
+    span_m = float(_distances(at_m[:1], at_m).max())
+    near = _distances(travel.place_m[measured], at_m[:1])[0] < travel.reach_m + span_m
+    found = []
+    for number in np.unique(newest[newest > 0]):
+        stamps = travel.stamp_ns[measured[(numbers == number) & near]]
+        if not len(stamps):
+            found.append(travel.stamp_ns[measured[numbers <= number][:1]])
+            continue
+        places = travel.place_m[measured[(numbers == number) & near]]
+        far = _distances(places, at_m[newest == number])
+        last = np.where(far < travel.sure_reach_m, stamps, -1).max(axis=1)
+        may = (far < travel.reach_m) | ~(far < travel.reach_m).any(axis=1, keepdims=True)
+        first = np.where(may, stamps, stamps.max()).min(axis=1)
+        found.append(np.where(last >= 0, last, first))
+    return np.concatenate(found)
+
+
+def _thinned(at_m: Float64, newest: Int64) -> Int64:
+    """Choose the first of each pass's places in every square of `SQUARE_M`."""
+    column, row = np.floor(at_m / SQUARE_M).astype(np.int64).T
+    key = ((row - row.min()) * (np.ptp(column) + 1) + column - column.min()) * 256 + newest
+    return np.sort(np.unique(key, return_index=True)[1])
+
+
+def _distances(frames_m: Float64, at_m: Float64) -> Float64:
+    """Compute distances (P, N) of places (P, 2) from frames' (N, 2)."""
+    x, y = (at_m[:, None, k] - frames_m[None, :, k] for k in (0, 1))
+    return np.asarray(np.hypot(x, y), np.float64)
+
+
+def _places_in(centre_m: Float64, yaw_rad: float, width_m: float, length_m: float) -> Float64:
+    """Lay places (P, 2) over a rectangle, its edges among them, no further apart than `PART_M`."""
+    v, u = (np.linspace(-size / 2, size / 2, math.ceil(size / PART_M) + 1) for size in (length_m, width_m))
+    across, along = axes_of(yaw_rad)
+    at_m = centre_m + v[:, None, None] * along + u[None, :, None] * across
+    return np.asarray(at_m, np.float64).reshape(-1, 2)
 
 
 def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> list[Check]:
@@ -54,8 +126,8 @@ def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) 
             f"the last frame is {_span(-age_ns)} ahead of this computer's clock: set the clocks",
         ),
         check_max(
-            "map-too-old", "age of the last frame that saw it", age_ns / NS_PER_S, settings.max_age_s, "s",
-            f"the last frame that saw it is {_span(age_ns)} old, {_span(max_age_ns)} are allowed",
+            "map-too-old", "age of what was seen", age_ns / NS_PER_S, settings.max_age_s, "s",
+            f"what it depends on was last seen {_span(age_ns)} ago, {_span(max_age_ns)} are allowed",
         ),
     ]  # fmt: skip
 

@@ -1,19 +1,21 @@
-"""Run `barsight live --replay RECORDING -o OUT` and `barsight live --config crane.toml -o OUT`."""
+"""Run `barsight live --replay RECORDING -o OUT`, `live --config crane.toml -o OUT`, `live check`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from barsight.cli.arguments import call, config_path, load_settings
+from barsight.cli.live import check
 from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
-from barsight.live.crane.run import measure_crane
+from barsight.live.crane.run import measure_crane, measure_surveys
 from barsight.live.run import replay as replay_recording
 from barsight.live.settings import LiveSettings, read_crane
 from barsight.measure_settings import MeasureSettings
@@ -21,6 +23,9 @@ from barsight.measure_settings import MeasureSettings
 
 def run(arguments: Sequence[str]) -> None:
     """Parse and run."""
+    if arguments[:1] == ["check"]:
+        check.run(arguments[1:])
+        return
     at_config, is_replay = config_path(arguments), any(a.split("=")[0] == "--replay" for a in arguments)
     crane = None if is_replay or at_config is None else read_crane(at_config)
     default = load_settings(at_config, MeasureSettings) if crane is None else crane.measure
@@ -36,13 +41,13 @@ def run(arguments: Sequence[str]) -> None:
         magnet: Path | None = None,
         at: Literal["now", "end"] = "now",
         keyframes: Path | None = None,
+        surveys: bool = False,
     ) -> None:
         """Measure while pictures and readings come, each at its time: poses, a growing map, lifts at the end.
 
-        Capture, tracking and mapping are processes of their own; each is started anew if it ends. OUT tells
-        at any time how the run stands (state.json, health.json, health.prom, pose.json) and has at the end
-        all that measure writes, and latency.json. Ctrl-C ends the run as the recording's end does. Pictures
-        and readings come from the sensors of crane.toml, or from a recording with --replay.
+        Capture, tracking and mapping are processes, each started anew if it ends. OUT tells at any time how
+        the run stands (state.json, health.json, health.prom, pose.json) and has at the end all that measure
+        writes, and latency.json. Ctrl-C ends the run as the recording's end does.
 
         Args:
             out: An empty or new folder.
@@ -54,27 +59,33 @@ def run(arguments: Sequence[str]) -> None:
             magnet: TOML file of the magnet that lifts are chosen for; without it nothing is offered.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             keyframes: keyframes.json of an earlier run: keep just the pairs that it kept.
+            surveys: One survey after the other, each in a folder of OUT, as the crane moves and stops.
         """
         console = SafeConsole(stderr=True)
 
-        def tell(line: str) -> None:
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
-
+        tell = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+        _expect_fitting(replay, surveys, for_replays=speed != 1 or at != "now" or keyframes is not None)
         with stages(console) as advance:
+            common: dict[str, Any] = {"magnet": magnet, "tell": tell, "advance": advance}
             if replay is not None:
                 measured = replay_recording(
-                    replay, out, settings, live, speed=speed, magnet=magnet, judged_at=at,
-                    keyframes=keyframes, tell=tell, advance=advance,
-                )  # fmt: skip
+                    replay, out, settings, live, speed=speed, judged_at=at, keyframes=keyframes, **common
+                )
             elif crane is None:
                 raise ConfigError("live needs --replay RECORDING or --config crane.toml")
-            elif speed != 1 or at != "now" or keyframes is not None:
-                raise ConfigError("--speed, --at and --keyframes are for --replay; a crane has its own pace")
             else:
-                measured = measure_crane(
-                    crane, out, settings, live, magnet=magnet, tell=tell, advance=advance
-                )  # fmt: skip
-        print_outcome(measured, console, verbose=False)
-        console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+                measure = measure_surveys if surveys else measure_crane
+                measured = measure(crane, out, settings, live, **common)
+        if measured:
+            print_outcome(measured, console, verbose=False)
+            tell(f"report: {out / 'report.html'}")
 
     call(command, "live", arguments)
+
+
+def _expect_fitting(replay: Path | None, surveys: bool, *, for_replays: bool) -> None:
+    """Raise ConfigError for flags that are another source's."""
+    if surveys and replay is not None:
+        raise ConfigError("--surveys is for --config crane.toml: a recording is one survey")
+    if replay is None and for_replays:
+        raise ConfigError("--speed, --at and --keyframes are for --replay; a crane has its own pace")

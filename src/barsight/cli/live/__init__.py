@@ -1,0 +1,1 @@
+"""Commands of a run beside the crane."""

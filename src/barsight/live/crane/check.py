@@ -1,0 +1,231 @@
+"""Check that a machine can run live at a crane: cores, memory, disk, network, cameras, readings, clocks."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from barsight.core.errors import BarsightError
+from barsight.live.crane.preflight import expect_plausible, hear
+from barsight.live.settings import CraneConfig
+
+MIN_CORES, MIN_MEMORY_GIB = 2, 2.0
+KEYFRAME_BYTES_PER_PIXEL = 16
+"""A kept pair with its disparity, on disk until it is measured: 20 MB at 1.3 megapixels."""
+SURVEY_M, TRAVEL_MPS = 50.0, 1.0
+"""The disk must take a survey so long, kept at this speed."""
+WRITTEN_MIB = 64
+HEADERS_BYTES = 28
+"""Of IPv4 and UDP, within a packet."""
+UNSYNCHRONISED = 0x40
+"""Status bit of adjtimex."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A line of the check. passed: None where the system doesn't tell, or a run can do without it."""
+
+    what: str
+    found: str
+    needed: str
+    remedy: str
+    passed: bool | None
+
+
+def check_machine(crane: CraneConfig, out: Path) -> Iterator[Finding]:
+    """Yield what was found, one thing after the other. out: where runs will write; it or a parent exists."""
+    yield _cores()
+    yield _memory()
+    yield _shared_memory(crane)
+    places = {"runs": out.absolute()}
+    if crane.recorder.folder is not None:
+        places["recordings"] = crane.recorder.folder
+    for name, folder in places.items():
+        yield from _disk(name, folder, crane, is_run=name == "runs")
+    yield from _network(crane)
+    yield from _sensors(crane)
+    yield _clock()
+
+
+def _cores() -> Finding:
+    cores = len(os.sched_getaffinity(0))
+    return Finding("cores", str(cores), f"{MIN_CORES}", "give the run more cores", cores >= MIN_CORES)
+
+
+def _memory() -> Finding:
+    """Read how much memory is available."""
+    free = 0.0
+    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            free = int(line.split()[1]) / 2**20
+    needed = f"{MIN_MEMORY_GIB:g} GiB available"
+    return Finding("memory", f"{free:.1f} GiB", needed, "end other programs", free >= MIN_MEMORY_GIB)
+
+
+def _shared_memory(crane: CraneConfig) -> Finding:
+    """Check that the ring of pairs has room."""
+    camera = crane.rig().cam0
+    needed = 2 * camera.width * camera.height * crane.live.ring_pairs
+    free = shutil.disk_usage("/dev/shm").free
+    return Finding(
+        "shared memory", f"{free / 2**20:.0f} MiB free", f"{needed / 2**20:.0f} MiB for the ring of pairs",
+        "enlarge /dev/shm (a container: --shm-size) or lower live.ring_pairs", free > needed,
+    )  # fmt: skip
+
+
+def _disk(name: str, folder: Path, crane: CraneConfig, *, is_run: bool) -> Iterator[Finding]:
+    """Check space and write speed where a run keeps its pairs, or its recording alone."""
+    there = next(path for path in (folder, *folder.parents) if path.is_dir())
+    camera = crane.rig().cam0
+    kept = camera.width * camera.height * (KEYFRAME_BYTES_PER_PIXEL if is_run else 2)
+    way_m = crane.live.keyframe_way_m
+    free, needed = shutil.disk_usage(there).free, kept * SURVEY_M / way_m
+    remedy = "free some, or name a folder on a larger disk"
+    yield Finding(
+        f"disk for {name} ({there})", f"{free / 2**30:.1f} GiB free",
+        f"{needed / 2**30:.1f} GiB for {SURVEY_M:g} m", remedy, free >= needed,
+    )  # fmt: skip
+    rate = kept * min(TRAVEL_MPS / way_m, crane.cameras.rate_hz) / 2**20
+    needed_text = f"{rate:.0f} MiB/s at {TRAVEL_MPS:g} m/s"
+    try:
+        speed = write_speed_mib(there)
+    except OSError as error:
+        yield Finding(f"writing {name}", error.strerror or str(error), needed_text, "make it writable", False)
+        return
+    yield Finding(
+        f"writing {name}", f"{speed:.0f} MiB/s", needed_text, "use a faster disk, as an SSD", speed >= rate
+    )
+
+
+def write_speed_mib(folder: Path) -> float:
+    """Measure how fast a file reaches the disk, MiB/s. Raises OSError where none can be written."""
+    block = os.urandom(1 << 20)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".barsight.") as file:
+        began = time.perf_counter()
+        for _ in range(WRITTEN_MIB):
+            file.write(block)
+        file.flush()
+        os.fsync(file.fileno())
+        return WRITTEN_MIB / (time.perf_counter() - began)
+
+
+def _network(crane: CraneConfig) -> Iterator[Finding]:
+    """Check the interface to the cameras, and how much the system may hold of what comes."""
+    named, camera = crane.cameras.interface, crane.rig().cam0
+    name = interface_of(named)
+    if name is None or not (Path("/sys/class/net") / name).is_dir():
+        told = "none is named" if named is None else f"{named} isn't there"
+        is_missing = None if named is None else False
+        yield Finding("interface to the cameras", told, "one", "name it in cameras.interface", is_missing)
+    else:
+        yield from _interface(name, crane)
+    limit, needed = _number(Path("/proc/sys/net/core/rmem_max")), 2 * camera.width * camera.height
+    yield Finding(
+        "receive buffer (net.core.rmem_max)", f"{limit} bytes", f"{needed} bytes, a pair",
+        f"sysctl -w net.core.rmem_max={max(needed, 1 << 25)}", None if limit is None else limit >= needed,
+    )  # fmt: skip
+
+
+def _interface(name: str, crane: CraneConfig) -> Iterator[Finding]:
+    """Check an interface's packets and speed, and tell whether its clock can do PTP."""
+    at, cameras, camera = Path("/sys/class/net") / name, crane.cameras, crane.rig().cam0
+    needed, mtu = cameras.packet_size_bytes + HEADERS_BYTES, _number(at / "mtu") or 0
+    remedy = f"ip link set {name} mtu 9000, here and in the switch, or lower cameras.packet_size_bytes"
+    yield Finding(f"MTU of {name}", f"{mtu} bytes", f"{needed} bytes", remedy, mtu >= needed)
+    rate = 1.1 * 2 * 8 * camera.width * camera.height * cameras.rate_hz / 1e6
+    speed = _number(at / "speed") or -1
+    yield Finding(
+        f"speed of {name}", f"{speed} Mbit/s" if speed > 0 else "not told", f"{rate:.0f} Mbit/s",
+        "use a faster network, or lower cameras.rate_hz", speed >= rate if speed > 0 else None,
+    )  # fmt: skip
+    has_ptp = any((at / "device" / "ptp").glob("ptp*"))
+    remedy = "none is needed: offset and drift are estimated from the stamps"
+    yield Finding(f"PTP clock of {name}", "there" if has_ptp else "none", "none", remedy, None)
+
+
+def interface_of(named: str | None) -> str | None:
+    """Return the name of an interface that is given by name or IPv4 address; None where neither is."""
+    if named is None or not named.replace(".", "").isdigit():
+        return named
+    import fcntl
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        for _, name in socket.if_nameindex():
+            request = name.encode()[:15].ljust(256, b"\0")
+            try:
+                answer = fcntl.ioctl(probe.fileno(), 0x8915, request)  # SIOCGIFADDR
+            except OSError:
+                continue
+            if socket.inet_ntoa(answer[20:24]) == named:
+                return name
+    return named
+
+
+def _number(path: Path) -> int | None:
+    """Read a whole number; None where the system doesn't tell."""
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
+def _sensors(crane: CraneConfig) -> Iterator[Finding]:
+    """Prove both cameras, then IMU and encoders."""
+    awaited = crane.described(Path("recording"))
+    sizes = tuple((camera.width, camera.height) for camera in (awaited.rig.cam0, awaited.rig.cam1))
+
+    def prove_both() -> None:
+        from barsight.sensors.gige import prove_cameras  # an extra, which replays do without
+
+        prove_cameras(crane.cameras, (sizes[0], sizes[1]))
+
+    told = f"{' and '.join(crane.cameras.serials)}, {sizes[0][0]}x{sizes[0][1]}, Mono8"
+    yield _proved("cameras", told, prove_both)
+    for name, sensor in crane.sensors().items():
+
+        def listen(name: str = name) -> None:
+            nonlocal awaited
+            awaited = hear(crane, awaited, name)
+
+        needed = f"{sensor.rate_hz:g} readings a second at UDP port {sensor.port}"
+        yield _proved(name, needed, listen)
+    yield _proved("readings", "those of a crane, in SI units", lambda: expect_plausible(awaited))
+
+
+def _proved(what: str, needed: str, prove: Callable[[], None]) -> Finding:
+    try:
+        prove()
+    except BarsightError as error:
+        problem, _, remedy = str(error).partition("; ")
+        return Finding(what, problem.removeprefix(f"{what}: "), needed, remedy, False)
+    return Finding(what, "as crane.toml says", needed, "", True)
+
+
+class _TimeX(ctypes.Structure):
+    """Hold what adjtimex(2) tells."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint), ("offset", ctypes.c_long), ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long), ("esterror", ctypes.c_long), ("status", ctypes.c_int),
+        ("rest", ctypes.c_byte * 256),
+    )  # fmt: skip
+
+
+def _clock() -> Finding:
+    """Ask the system whether something, as chrony or ptp4l, keeps its clock."""
+    told, needed = _TimeX(), "kept by chrony, ntpd or ptp4l"
+    remedy = "install chrony: other computers judge the age of lifts by their own clocks"
+    try:
+        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(told))
+    except (OSError, AttributeError):
+        return Finding("clock", "not told", needed, remedy, None)
+    is_kept = state >= 0 and not told.status & UNSYNCHRONISED
+    found = f"kept, within {told.maxerror / 1e3:.1f} ms" if is_kept else "free"
+    return Finding("clock", found, needed, remedy, is_kept or None)

@@ -1,0 +1,1 @@
+"""Share numbers, pairs and logs among the processes of a run."""

@@ -1,0 +1,75 @@
+"""A survey begins as the crane moves and ends as it stops; folders are kept and dropped."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.live.crane.run import _drop_standing, _keep
+from barsight.live.settings import SurveySettings
+from barsight.live.survey import STOOD, SurveyWatch
+from barsight.recording.writers.retention import PROTECTED
+
+SETTINGS = SurveySettings(way_m=0.5, stop_s=2.0, rest_s=30.0, max_s=100.0)
+
+
+def ends(
+    x_m: np.ndarray, settings: SurveySettings = SETTINGS, *, is_alone: bool = False, silent_s: float = np.inf
+) -> tuple[float, str] | None:
+    """When (s) and why a survey ends where the bridge goes so, ten readings a second; none from silent_s."""
+    watch, begin_ns = SurveyWatch(settings, is_alone=is_alone), 1_700_000_000 * 10**9
+    rng = np.random.default_rng(0)
+    for k, x in enumerate(x_m):
+        place = np.array([[x, 2.0, 8.0]]) + rng.normal(0, 0.003, (1, 3))
+        because = watch.judge(begin_ns + k * 10**8, place if k < 10 * silent_s else place[:0])
+        if because:
+            return k / 10, because
+    return None
+
+
+def test_a_survey_ends_as_the_crane_stops() -> None:
+    way = np.concatenate([np.zeros(250), 0.03 * np.arange(100), np.full(100, 3.0)])
+    found = ends(way)
+    assert found is not None and found[1] == "the crane stopped" and 36.4 < found[0] < 37.2
+    turning = np.concatenate([way[:350], way[340:250:-1], np.zeros(100)])
+    found = ends(turning)
+    assert found is not None and found[0] > 45
+    assert ends(way, is_alone=True) is None
+    assert ends(way, silent_s=36.0) is None, "encoders that are out don't end it"
+
+
+@pytest.mark.parametrize("is_alone", [False, True])
+def test_a_crane_that_stands_or_never_stops_ends_it_too(is_alone: bool) -> None:
+    stood = ends(np.full(2000, 1.0), is_alone=is_alone)
+    assert stood == ((100.0, "a survey takes 100 s at most") if is_alone else (30.0, STOOD))
+    nudged = np.full(2000, 1.0)
+    nudged[50:] = 1.3
+    assert ends(nudged, is_alone=is_alone) == stood
+    going = ends(0.05 * np.arange(2000), is_alone=is_alone)
+    assert going == (100.0, "a survey takes 100 s at most")
+    longer = ends(0.05 * np.arange(2000), replace(SETTINGS, max_s=150.0), is_alone=is_alone)
+    assert longer is not None and longer[0] == 150.0
+
+
+def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:
+    for day in range(1, 6):
+        (tmp_path / f"2026110{day}T101010").mkdir()
+    (tmp_path / "20261101T101010" / PROTECTED).touch()
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "latest").symlink_to("20261105T101010")
+    _keep(tmp_path, 2)
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["20261101T101010", "20261104T101010", "20261105T101010", "latest", "notes"]
+
+
+def test_what_was_recorded_of_a_standing_crane_goes_unless_it_holds_an_alarm(tmp_path: Path) -> None:
+    here, recording = tmp_path / "survey", tmp_path / "elsewhere"
+    for path in (here, recording / "alarms"):
+        path.mkdir(parents=True)
+    (recording / "alarms" / "segment_000000.mcap").touch()
+    _drop_standing(here, recording)
+    assert here.is_dir() and recording.is_dir()
+    (recording / "alarms" / "segment_000000.mcap").unlink()
+    _drop_standing(here, recording)
+    assert not here.exists() and not recording.exists()
