@@ -41,7 +41,11 @@ from barsight.stereo.direct.support_regions import (
     allocate_frame,
     axis_means,
     biweight,
+    blend_rows,
+    fitted_rows,
     inside,
+    is_along_column,
+    share_rows,
     tile_axes,
 )
 
@@ -127,12 +131,13 @@ def test_axis_means_are_weighted_means_along_the_axis(direction: tuple[float, fl
 
 
 def _planes(
-    disparity: np.ndarray, weight: np.ndarray, pull: np.ndarray, shape: SupportShape, same_px: float
-) -> tuple[np.ndarray, np.ndarray]:
+    disparity: np.ndarray, weight: np.ndarray, pull: np.ndarray, shape: SupportShape, same_px: float,
+    axis: tuple[float, float] = (0, 1),
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     found = np.empty_like(disparity), np.empty_like(disparity)
     frames = [_frame(image) for image in (disparity, weight, pull)]
     room = allocate_frame(disparity.shape), allocate_frame(disparity.shape)
-    fit_planes(*frames, _axes(0, 1), shape, same_px, room, *found)
+    fit_planes(*frames, _axes(*axis), shape, same_px, room, *found)
     return found
 
 
@@ -140,7 +145,7 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
     disparity, weight, pull = _noise(6, 0.2), 0.2 + np.abs(_noise(7)), _noise(8, 0.1)
     shape, same = SupportShape(4.0, 1.5), 1.0
     fitted, information = _planes(disparity, weight, pull, shape, same)
-    for y, x in ((0, 0), (11, 20), (39, 69), (25, 33)):
+    for y, x in ((0, 0), (12, 20), (39, 69), (24, 33)):
         rows, values = [], []
         for down in range(-8, 9):
             for right in range(-3, 4):
@@ -162,6 +167,41 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
         value = np.linalg.solve(normal, basis.T @ np.array(values))[0]
         assert fitted[y, x] == pytest.approx(disparity[y, x] + value, abs=2e-4)
         assert information[y, x] == pytest.approx(1 / np.linalg.inv(normal)[0, 0], rel=2e-3)
+
+
+def test_a_row_goes_to_the_fitted_ones_that_are_like_it() -> None:
+    leaning = np.array([[0.1, 0.995], [0.3, 0.954]], dtype=np.float32)
+    assert [is_along_column(axis) for axis in leaning] == [True, False]
+    assert [fitted_rows(y, 11) for y in (0, 5, 9, 10)] == [(0, 4), (4, 8), (8, 10), (8, 10)]
+    image = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
+    image[8, 0], image[4, 1], image[[4, 8], 2] = 3, 3, 0.4
+    frame, shares = _frame(image), np.empty(32, dtype=np.float32)
+    assert share_rows(frame, 5, 0, HEIGHT, np.float32(0.5), shares)
+    np.testing.assert_allclose(shares[:4], [0, 1, 0.25, 0.25])
+    row = np.empty(4, dtype=np.float32)
+    blend_rows(np.full_like(row, 1), np.full_like(row, 2), shares[:4], row)
+    np.testing.assert_allclose(row, [1, 2, 1.25, 1.25])
+    image[5, 30] = 3
+    assert not share_rows(_frame(image), 5, 0, HEIGHT, np.float32(0.5), shares)
+
+
+def test_rows_between_fitted_ones_share_them_where_they_are_one_surface() -> None:
+    disparity, weight, pull = _noise(6, 0.02), 0.2 + np.abs(_noise(7)), _noise(8, 0.1)
+    disparity[18, :34] += 5
+    disparity[21:, 40:] += 5
+    shape = SupportShape(4.0, 1.5)
+    fitted, _ = _planes(disparity, weight, pull, shape, 1.0)
+    for y, above, below in ((1, 0, 4), (6, 4, 8), (35, 32, 36), (38, 36, 39)):
+        share = (y - above) / (below - above)
+        between = (1 - share) * fitted[above] + share * fitted[below]
+        np.testing.assert_allclose(fitted[y], between, atol=1e-5)
+    # Below the step another surface goes on: each of its rows takes the nearest on its own side.
+    np.testing.assert_array_equal(fitted[22, 64:], fitted[24, 64:])
+    # What is like neither row is fitted for itself, as every row is where the axis is no column's.
+    assert np.abs(fitted[18, :32] - disparity[18, :32]).max() < 1
+    leaning, _ = _planes(disparity, weight, pull, shape, 1.0, (0.6, 0.8))
+    middle = 0.5 * (leaning[4] + leaning[8])
+    assert np.abs(leaning[6] - middle).max() > 0.01
 
 
 def test_planes_keep_a_plane_in_steps_and_stop_at_a_jump() -> None:

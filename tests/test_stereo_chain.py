@@ -135,6 +135,43 @@ def test_a_wrong_prediction_dies(wrong_px: float) -> None:
     assert np.mean(off[seen] > abs(wrong_px) / 2) < 0.02
 
 
+@pytest.mark.parametrize("shown", ["vanished", "appeared"])
+def test_a_thing_that_vanished_or_appeared_since_is_seen_as_it_is(shown: str) -> None:
+    now, truth = pair_at(True)
+    top, floor = truth > 34, truth < 33
+    predicted = truth.astype(np.float32)
+    if shown == "vanished":
+        # A box of the floor's right third was there before: 6 px nearer.
+        changed = np.zeros_like(top)
+        changed[40:300, 330:440] = True
+        changed &= floor
+        predicted[changed] += 6
+    else:
+        changed = top
+        predicted[changed] = np.median(truth[floor])
+    found = METHOD.confirm(now, RANGE, predicted)
+    off = np.abs(found.disparity_px - truth)[changed]
+    seen = np.isfinite(off)
+    assert seen.mean() > 0.6
+    assert np.median(off[seen]) < 0.1
+    assert np.mean(off[seen] > 2) < 0.02
+
+
+@pytest.mark.parametrize("bars", [-1, 1])
+def test_a_prediction_one_bar_off_dies(bars: int) -> None:
+    pitch_px, disparity_px = 9, 36
+    rows, columns = np.mgrid[:HEIGHT, : WIDTH + disparity_px].astype(float)
+    shading = 50 * np.sin(2 * np.pi * columns / pitch_px)
+    gray = quantised(110 + shading + 0.25 * (Texture(7)(columns, rows) - 110))
+    valid = np.ones((HEIGHT, WIDTH), dtype=np.bool_)
+    left, right = gray[:, :WIDTH], gray[:, disparity_px:]
+    pair = RectifiedPair(0, np.ascontiguousarray(left), np.ascontiguousarray(right), valid, valid, CAMERA)
+    predicted = np.full(valid.shape, disparity_px + bars * pitch_px, dtype=np.float32)
+    found = METHOD.confirm(pair, DisparityRange(16, 64), predicted).disparity_px
+    assert np.isfinite(found).mean() > 0.6
+    assert np.nanquantile(np.abs(found - disparity_px), 0.98) < 0.5
+
+
 @pytest.mark.parametrize("off_px", [-0.8, -0.3, 0.3, 0.8])
 def test_a_prediction_that_is_off_everywhere_does_not_confirm_itself(off_px: float) -> None:
     now, truth = pair_at(True)

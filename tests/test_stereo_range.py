@@ -7,7 +7,7 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.types import DisparityRange, RectifiedPair
-from barsight.stereo.search_range import coarse_disparity, find_disparity_range
+from barsight.stereo.search_range import coarse_disparity, find_disparity_range, follow_disparity_range
 from synthetic_scenes import camera, slanted_pair
 
 
@@ -21,6 +21,24 @@ def test_the_range_holds_the_truth(start_px: float, slope: tuple[float, float]) 
     assert found.count % 16 == 0
     assert found.count < np.ptp(truth) + 64
     assert found.lowest_px >= 0
+
+
+def test_a_followed_range_holds_what_is_predicted_and_what_is_new() -> None:
+    pair, truth = slanted_pair(480, 320, 40.0, (0.02, 0.01))
+    for known in (truth < np.quantile(truth, 0.7), np.ones(truth.shape, dtype=np.bool_)):
+        predicted = np.where(known, truth, np.nan).astype(np.float32)
+        found = follow_disparity_range(pair, predicted)
+        assert isinstance(found, DisparityRange)
+        assert found.lowest_px <= truth.min()
+        assert truth.max() < found.highest_px
+        assert found.count <= 48
+    predicted[:] = 90
+    further = follow_disparity_range(pair, predicted)
+    assert isinstance(further, DisparityRange)
+    assert further.lowest_px <= truth.min()
+    assert further.highest_px > 90
+    unknown = np.full(truth.shape, np.nan, dtype=np.float32)
+    assert follow_disparity_range(pair, unknown) == find_disparity_range(pair)
 
 
 def test_converging_cameras_have_disparities_below_zero() -> None:

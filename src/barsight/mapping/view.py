@@ -17,7 +17,7 @@ from barsight.stereo.direct.pipeline import BarsightStereo
 from barsight.stereo.masking import mask_disparity, mask_gaps, mask_unsure
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.prediction import predict_disparity
-from barsight.stereo.search_range import find_disparity_range
+from barsight.stereo.search_range import find_disparity_range, follow_disparity_range
 from barsight.stereo.settings import StereoSettings
 from barsight.stereo.triangulation import triangulate_disparity
 
@@ -74,7 +74,11 @@ class Matcher:
         return MatchedFrame(pair, self._disparity(pair, preceding))
 
     def _disparity(self, pair: RectifiedPair, preceding: Preceding | None) -> Disparity | Failed:
-        candidates = disparity_range(pair, self.stereo)
+        predicted = None
+        if preceding is not None and isinstance(self.method, BarsightStereo):
+            with self.watch("stereo"):
+                predicted = _predicted(pair, preceding)
+        candidates = disparity_range(pair, self.stereo, predicted)
         if isinstance(candidates, Failed):
             return candidates
         width = pair.camera.width
@@ -82,21 +86,13 @@ class Matcher:
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.watch("stereo", 1):
-            found = self._match(pair, candidates, preceding)
+            if predicted is not None and isinstance(self.method, BarsightStereo):
+                found = self.method.confirm(pair, candidates, predicted)
+            else:
+                found = self.method(pair, candidates)
             return mask_gaps(
                 mask_unsure(found, self.stereo.max_sigma_px), pair.left, self.stereo.gap_darkness
             )
-
-    def _match(
-        self, pair: RectifiedPair, candidates: DisparityRange, preceding: Preceding | None
-    ) -> Disparity:  # fmt: skip
-        """Match from a prediction, or from nothing where the views don't look alike."""
-        method = self.method
-        if preceding is not None and isinstance(method, BarsightStereo):
-            predicted = _predicted(pair, preceding)
-            if predicted is not None:
-                return method.confirm(pair, candidates, predicted)
-        return method(pair, candidates)
 
 
 def _predicted(pair: RectifiedPair, preceding: Preceding) -> Float32 | None:
@@ -161,11 +157,13 @@ class PointBinner:
         return PosedView(cells, pair, disparity.disparity_px)
 
 
-def disparity_range(pair: RectifiedPair, stereo: StereoSettings) -> DisparityRange | Failed:
-    """Complete the settings' disparity range, its open ends found from the images."""
+def disparity_range(
+    pair: RectifiedPair, stereo: StereoSettings, predicted: Float32 | None = None
+) -> DisparityRange | Failed:
+    """Complete the settings' disparity range, its open ends found from the images and what is predicted."""
     low, high = stereo.min_disparity_px, stereo.max_disparity_px
     if low is None or high is None:
-        found = find_disparity_range(pair)
+        found = find_disparity_range(pair) if predicted is None else follow_disparity_range(pair, predicted)
         if isinstance(found, Failed):
             return found
         low = found.lowest_px if low is None else low

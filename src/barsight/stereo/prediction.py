@@ -20,7 +20,6 @@ from barsight.core.types import Disparity, RectifiedCamera
 _MAX_SIGMA_PX = 0.5
 _SAME_SURFACE_PX = np.float32(1.0)
 _MAX_OFF_PX = np.float32(1.5)
-_ROUNDS = 1
 _BAND_ROWS = 64
 _NOWHERE = -1e6
 _NAN = np.float32(np.nan)
@@ -70,18 +69,29 @@ def _transfer(camera: RectifiedCamera, motion: Pose) -> _Transfer:
     )  # fmt: skip
 
 
-@kernel(inline=True)
-def _move(
-    u: np.float32, v: np.float32, q: np.float32, motion: _Transfer
-) -> tuple[np.float32, np.float32, np.float32]:
-    """Move a pixel (u, v) with q = disparity + doffs to the other view; q is 0 behind its camera."""
-    r, s, focal = motion.rotation, motion.shift, motion.focal
-    x, y = u - motion.cx, v - motion.cy
-    ahead = r[2, 0] * x + r[2, 1] * y + r[2, 2] * focal + s[2] * q
-    scale = focal / ahead if ahead > np.float32(0) else np.float32(0)
-    along = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * focal + s[0] * q) * scale + motion.cx
-    down = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * focal + s[1] * q) * scale + motion.cy
-    return along, down, q * scale
+@kernel()
+def _move_row(known: Float32, v: int, motion: _Transfer, moved: Float32) -> None:
+    """Move row v of a view, of disparities known (W,) px, to the other view.
+
+    Fills moved (3, W): column, row and q = disparity + doffs there, px; NaN where unknown, q 0 behind the
+    camera.
+    """
+    r, s, focal, zero = motion.rotation, motion.shift, motion.focal, np.float32(0)
+    along, down, near = moved[0], moved[1], moved[2]
+    y = np.float32(v) - motion.cy
+    r00, r10, r20 = r[0, 0], r[1, 0], r[2, 0]
+    s0, s1, s2 = s[0], s[1], s[2]
+    x0, y0, z0 = (
+        r[0, 1] * y + r[0, 2] * focal, r[1, 1] * y + r[1, 2] * focal, r[2, 1] * y + r[2, 2] * focal,
+    )  # fmt: skip
+    for u in range(len(known)):
+        x, q = np.float32(np.int32(u)) - motion.cx, known[u] + motion.doffs
+        ahead = r20 * x + z0 + s2 * q
+        scale = focal / ahead
+        scale = scale if ahead > zero else zero
+        along[u] = (r00 * x + x0 + s0 * q) * scale + motion.cx
+        down[u] = (r10 * x + y0 + s1 * q) * scale + motion.cy
+        near[u] = q * scale
 
 
 @kernel()
@@ -92,13 +102,13 @@ def _splat(known: Float32, motion: _Transfer, first: Float32) -> None:
     """
     height, width = known.shape
     half = np.float32(0.5)
+    moved = np.empty((3, width), dtype=np.float32)
+    right, below = np.float32(width) - half, np.float32(height) - half
     for v in range(height):
+        _move_row(known[v], v, motion, moved)
         for u in range(width):
-            disparity = known[v, u]
-            if not np.isfinite(disparity):
-                continue
-            along, down, q = _move(np.float32(u), np.float32(v), disparity + motion.doffs, motion)
-            if not (-half <= along < width - half and -half <= down < height - half) or q <= 0:
+            along, down, q = moved[0, u], moved[1, u], moved[2, u]
+            if not (-half <= along < right and -half <= down < below and q > np.float32(0)):
                 continue
             column, row = int(along + half), int(down + half)
             if not first[row, column] >= q - motion.doffs:
@@ -122,27 +132,32 @@ def _look_up(
     beside an edge or a hole.
     """
     height, width = known.shape
+    moved, seen = np.empty((3, width), dtype=np.float32), np.empty(width, dtype=np.float32)
+    last_column, last_row, zero = np.float32(width - 1), np.float32(height - 1), np.float32(0)
+    r20, r21, shift = there.rotation[2, 0], there.rotation[2, 1], there.shift[2]
+    straight = there.rotation[2, 2] * there.focal
     for v in range(start, end):
+        guesses, found = first[v], predicted[v]
+        _move_row(guesses, v, back, moved)
         for u in range(width):
-            guess = first[v, u]
-            predicted[v, u] = guess
-            if not np.isfinite(guess):
+            seen[u] = _NAN
+            along, down, q = moved[0, u], moved[1, u], moved[2, u]
+            if not (zero <= along < last_column and zero <= down < last_row and q > zero):
                 continue
-            for _ in range(_ROUNDS):
-                along, down, q = _move(np.float32(u), np.float32(v), guess + back.doffs, back)
-                if not (0 <= along < width - 1 and 0 <= down < height - 1) or q <= 0:
-                    break
-                column, row = int(along), int(down)
-                one, two = known[row, column], known[row, column + 1]
-                three, four = known[row + 1, column], known[row + 1, column + 1]
-                low, high = min(min(one, two), min(three, four)), max(max(one, two), max(three, four))
-                if not high - low < _SAME_SURFACE_PX:
-                    break
-                right, below = along - np.float32(column), down - np.float32(row)
-                upper, lower = one + right * (two - one), three + right * (four - three)
-                seen = upper + below * (lower - upper)
-                if not abs(seen + back.doffs - q) <= _MAX_OFF_PX:
-                    break
-                _, _, q = _move(along, down, seen + there.doffs, there)
-                guess = q - there.doffs
-                predicted[v, u] = guess
+            column, row = int(along), int(down)
+            one, two = known[row, column], known[row, column + 1]
+            three, four = known[row + 1, column], known[row + 1, column + 1]
+            low, high = min(min(one, two), min(three, four)), max(max(one, two), max(three, four))
+            if not high - low < _SAME_SURFACE_PX:
+                continue
+            right, below = along - np.float32(column), down - np.float32(row)
+            upper, lower = one + right * (two - one), three + right * (four - three)
+            value = upper + below * (lower - upper) + back.doffs
+            if abs(value - q) <= _MAX_OFF_PX:
+                seen[u] = value
+        along, down = moved[0], moved[1]
+        for u in range(width):
+            x, y = along[u] - there.cx, down[u] - there.cy
+            ahead = r20 * x + r21 * y + straight + shift * seen[u]
+            now = seen[u] * (there.focal / ahead) - there.doffs
+            found[u] = now if ahead > zero else guesses[u]

@@ -12,7 +12,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import Failed
-from barsight.core.types import DisparityRange, RectifiedPair
+from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
 
 _SCALE = 4
 _USUAL_RATIO = 0.4
@@ -21,7 +21,9 @@ _TOP_PX = 16
 _POOR = 0.6
 _MARGIN_RATIO = 0.12
 _MARGIN_PX = 6
+_FOLLOW_MARGIN_PX = 4
 _MIN_CONSISTENT = 0.03
+_SPAN_PERCENT = (0.1, 99.9)
 
 
 def find_disparity_range(pair: RectifiedPair) -> DisparityRange | Failed:
@@ -54,10 +56,29 @@ def find_disparity_range(pair: RectifiedPair) -> DisparityRange | Failed:
             )
     if share < _MIN_CONSISTENT:
         return Failed("no-texture", f"too little can be matched: {100 * share:.1f} % of the pixels")
-    low, high = np.nanpercentile(disparity, (0.1, 99.9))
-    margin = _MARGIN_PX + _MARGIN_RATIO * (high - low)
-    ceiling = int(pair.camera.width * 0.9)
-    lowest = int(np.floor(min(max(low - margin, -doffs), ceiling - 16)))
+    low, high = np.nanpercentile(disparity, _SPAN_PERCENT)
+    return _range_around(low, high, _MARGIN_PX + _MARGIN_RATIO * (high - low), pair.camera)
+
+
+def follow_disparity_range(pair: RectifiedPair, predicted: Float32) -> DisparityRange | Failed:
+    """Find the range of a pair of which most disparities are predicted, (H, W) px, NaN where not: what is
+    new is looked for in a match at an eighth of the size. As `find_disparity_range` where that says little.
+    """
+    nothing = check_matchable(pair)
+    if nothing is not None:
+        return nothing
+    coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px, shrink=2 * _SCALE)
+    known = predicted[::_SCALE, ::_SCALE]
+    if min(_finite_ratio(coarse), _finite_ratio(known)) < _POOR:
+        return find_disparity_range(pair)
+    lows, highs = np.array([np.nanpercentile(seen, _SPAN_PERCENT) for seen in (coarse, known)]).T
+    return _range_around(lows.min(), highs.max(), _FOLLOW_MARGIN_PX, pair.camera)
+
+
+def _range_around(low: float, high: float, margin: float, camera: RectifiedCamera) -> DisparityRange:
+    """Widen a span of disparities, px, by a margin to a range of a multiple of 16 candidates."""
+    ceiling = int(camera.width * 0.9)
+    lowest = int(np.floor(min(max(low - margin, -camera.doffs_px), ceiling - 16)))
     highest = int(np.ceil(min(high + margin, ceiling)))
     return DisparityRange(lowest, lowest + max(16, -(-(highest - lowest) // 16) * 16))
 
@@ -78,16 +99,16 @@ def check_matchable(pair: RectifiedPair) -> Failed | None:
 
 def coarse_disparity(
     left: UInt8, right: UInt8, doffs_px: float = 0.0, width_ratio: float = _USUAL_RATIO,
-    known: tuple[float, float] | None = None, both_ways: bool = True,
+    known: tuple[float, float] | None = None, both_ways: bool = True, shrink: int = _SCALE,
 ) -> Float32:  # fmt: skip
-    """Match at quarter size with left-right check; NaN elsewhere, also where nothing changes.
+    """Match at quarter size (`shrink`) with left-right check; NaN elsewhere, also where nothing changes.
 
     From 1 px above -doffs_px, which is infinitely far, over `width_ratio` of the width, and within that from
     the lowest to the highest disparity `known` beforehand, px. Without `both_ways` the match from right to
     left is left out, half of the time: for guesses whose places are looked for in both pictures anyhow.
     Returns (H / 4, W / 4) float32 in full-size px.
     """
-    size = (max(left.shape[1] // _SCALE, 32), max(left.shape[0] // _SCALE, 32))
+    size = (max(left.shape[1] // shrink, 32), max(left.shape[0] // shrink, 32))
     small_left = cv2.resize(left, size, interpolation=cv2.INTER_AREA)
     small_right = cv2.resize(right, size, interpolation=cv2.INTER_AREA)
     count = max(16, int(size[0] * width_ratio) // 16 * 16)

@@ -54,11 +54,12 @@ def align_views(
     Failed `not-alike` where too few places are seen by both or their gray values differ too much.
     """
     motion, tone = guess, np.array([1.0, 0.0])
+    quarters = _shrink(before, _SHRINKS[-1]), _shrink(now, _SHRINKS[-1])
     for shrink in _SHRINKS:
         if min(now.shape) < shrink * _MIN_SHRUNK_PX and shrink > _SHRINKS[-1]:
             continue
-        places = _places(before, disparity, camera, shrink)
-        image = _shrink(now, shrink)
+        old, image = (_smooth(_shrink(quarter, shrink // _SHRINKS[-1])) for quarter in quarters)
+        places = _places(old, disparity, camera, shrink)
         principal = _principal(camera, shrink)
         for _ in range(_STEPS):
             residual, rows = _residuals(places, image, motion, tone, principal)
@@ -86,16 +87,20 @@ def _principal(camera: RectifiedCamera, shrink: int) -> Float64:
     return (np.array([camera.cx_px, camera.cy_px]) - (shrink - 1) / 2) / shrink
 
 
-def _shrink(image: UInt8, shrink: int) -> Float32:
-    """Average blocks of pixels and smooth them."""
+def _shrink(image: UInt8 | Float32, shrink: int) -> Float32:
+    """Average blocks of pixels."""
     size = image.shape[1] // shrink, image.shape[0] // shrink
     whole = image[: size[1] * shrink, : size[0] * shrink].astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0))
+    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA))
 
 
-def _places(before: UInt8, disparity: Disparity, camera: RectifiedCamera, shrink: int) -> _Places:
+def _smooth(image: Float32) -> Float32:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0))
+
+
+def _places(small: Float32, disparity: Disparity, camera: RectifiedCamera, shrink: int) -> _Places:
     """Choose places on a grid of at least 16 px, in the shrunk picture, of a disparity known to 0.3 px."""
-    small, every = _shrink(before, shrink), max(_EVERY_PX // shrink, 1)
+    every = max(_EVERY_PX // shrink, 1)
     rows, columns = (np.arange(1, count - 1, every) for count in small.shape)
     v, u = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
     middle = shrink * v + shrink // 2, shrink * u + shrink // 2

@@ -25,7 +25,6 @@ _CONSISTENT_PX = 2.0
 _COST_WINDOW_PX = 7
 _EDGE_WINDOW_PX = 9
 _BAND_ROWS = 64
-_LEAST = np.float32(1e-3)
 _NAN = np.float32(np.nan)
 _FAR = -1e6
 
@@ -41,9 +40,7 @@ def confirmed_start(
     differ = np.abs(predicted - matched)
     disputed = differ >= _SAME_PX
     if disputed.any():
-        seen, others = describe_pixels(left), describe_pixels(right)
-        better = _mean_cost(seen, others, predicted, disputed) < _mean_cost(seen, others, matched, disputed)
-        disputed &= better
+        disputed &= _fits_better(describe_pixels(left), describe_pixels(right), predicted, matched, disputed)
     confirmed = (differ < _SAME_PX) | disputed
     alone = np.isfinite(predicted) & ~np.isfinite(matched)
     alone &= is_consistent(np.nan_to_num(predicted, nan=_FAR), matched_right, _CONSISTENT_PX)
@@ -58,39 +55,41 @@ def _is_edge(disparity: Float32) -> Bool:
     return edge
 
 
-def _mean_cost(
-    left: PixelDescriptors, right: PixelDescriptors, disparity: Float32, asked: Bool
-) -> Float32:  # fmt: skip
-    """Average the cost (H, W) of a disparity over the known pixels of windows of 7 px, where it is asked."""
+def _fits_better(
+    left: PixelDescriptors, right: PixelDescriptors, one: Float32, other: Float32, asked: Bool
+) -> Bool:  # fmt: skip
+    """Check (H, W), where it is asked, whether one disparity costs less than the other over the pixels of
+    windows of 7 px that have both.
+    """
     window = (_COST_WINDOW_PX, _COST_WINDOW_PX)
     near = cv2.dilate(asked.view(np.uint8), np.ones(window, dtype=np.uint8)).view(np.bool_)
-    near &= np.isfinite(disparity)
-    costs = np.zeros(disparity.shape, dtype=np.float32)
+    dearer = np.zeros(one.shape, dtype=np.float32)
 
     def work(first: int, end: int) -> None:
-        _pixel_costs(left, right, disparity, near, costs, first, end)
+        _cost_differences(left, right, (one, other), near, dearer, first, end)
 
-    parallel_bands(work, len(disparity), _BAND_ROWS)
-    known = cv2.boxFilter(near.astype(np.float32), -1, window)
-    mean: Float32 = cv2.boxFilter(costs, -1, window) / np.maximum(known, _LEAST)
-    return mean
+    parallel_bands(work, len(one), _BAND_ROWS)
+    better: Bool = cv2.boxFilter(dearer, -1, window, normalize=False) < 0
+    return better
 
 
 @kernel()
-def _pixel_costs(
-    left: PixelDescriptors, right: PixelDescriptors, disparity: Float32, asked: Bool, costs: Float32,
-    first: int, end: int,
+def _cost_differences(
+    left: PixelDescriptors, right: PixelDescriptors, disparities: tuple[Float32, Float32], asked: Bool,
+    dearer: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
-    """Compute the cost of each asked pixel's disparity (H, W) px at the nearest column, rows first...end.
+    """Compute by how much the first disparity (H, W) px of each asked pixel costs more than the other at the
+    nearest column, rows first...end.
 
-    Fills costs (H, W) where asked (H, W): UNKNOWN_COST where the disparity leaves the picture.
+    Fills dearer (H, W) where both are known: a disparity that leaves the picture costs UNKNOWN_COST.
     """
-    width = disparity.shape[1]
+    width = dearer.shape[1]
     for y in range(first, end):
         for x in range(width):
-            if not asked[y, x]:
+            if not asked[y, x] or not np.isfinite(disparities[0][y, x] + disparities[1][y, x]):
                 continue
-            costs[y, x] = UNKNOWN_COST
-            there = np.float32(x) - disparity[y, x]
-            if there > np.float32(-0.5) and there < np.float32(width) - np.float32(0.5):
-                costs[y, x] = descriptor_cost(left, right, y, x, int(there + np.float32(0.5)))
+            for k in range(2):
+                cost, there = UNKNOWN_COST, np.float32(x) - disparities[k][y, x]
+                if there > np.float32(-0.5) and there < np.float32(width) - np.float32(0.5):
+                    cost = descriptor_cost(left, right, y, x, int(there + np.float32(0.5)))
+                dearer[y, x] += np.float32(cost if k == 0 else -cost)

@@ -92,6 +92,10 @@ def _fill_rows(disparity: Float32, filled: Float32) -> bool:
         for x in range(width + 1):
             if x < width and np.isnan(disparity[y, x]):
                 continue
+            if x < width and last == x - 1:
+                filled[y, x] = disparity[y, x]
+                last = x
+                continue
             value = np.float32(np.nan)
             if last >= 0 and x < width:
                 value = min(disparity[y, last], disparity[y, x])

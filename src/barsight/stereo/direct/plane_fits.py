@@ -9,10 +9,22 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Int64, kernel
 from barsight.core.parallel import parallel_bands
-from barsight.stereo.direct.support_regions import BAND_TILES, MARGIN, TILE_COLUMNS, TILE_ROWS, biweight
+from barsight.stereo.direct.support_regions import (
+    BAND_TILES,
+    MARGIN,
+    TILE_COLUMNS,
+    TILE_ROWS,
+    biweight,
+    blend_rows,
+    fitted_rows,
+    is_along_column,
+    share_rows,
+)
 
 _REACH = 2.0
 _LANES = TILE_COLUMNS
+_SAME_PLANE = np.float32(0.5)
+"""Rows share their planes where disparities differ by less than this share of same_surface_px."""
 
 
 class Evidence(NamedTuple):
@@ -60,7 +72,9 @@ def fit_planes(
 
     Pixel i says: disparity[i] + pull[i] / weight[i], with weight[i] (0 = nothing). Its share falls with the
     distance (Gaussian) and with the difference of disparity (Tukey's biweight that ends at same_surface_px),
-    so that a support doesn't cross a depth edge. Frames in, no NaN, and two more (`room`) for use inside;
+    so that a support doesn't cross a depth edge. Supports along a column have nearly everything in
+    common: of a column's rows one in FITTED_EVERY is fitted, and those between take what the rows above and
+    below say, as far as these are the same surface. Frames in, no NaN, and two more (`room`) for use inside;
     (H, W) out.
     """
     step, unit = shape.step, np.float32(same_surface_px)
@@ -79,10 +93,12 @@ def fit_planes(
         heard = Evidence(disparity, *room)
     pairs = _pairs(shape)
 
-    def gather(first: int, end: int) -> None:
-        _gather(heard, axes, pairs, step, fitted, information, first, end)
+    for only_between in (False, True):
 
-    parallel_bands(gather, len(axes), BAND_TILES)
+        def gather(first: int, end: int, between: bool = only_between) -> None:
+            _gather(heard, axes, pairs, step, between, fitted, information, first, end)
+
+        parallel_bands(gather, len(axes), BAND_TILES)
     if unit != 1:
         fitted *= unit
 
@@ -229,11 +245,38 @@ def _sum_near(
 
 
 @kernel()
-def _gather(
-    evidence: Evidence, axes: Float32, pairs: _Pairs, step: int, fitted: Float32, information: Float32,
-    first_tile: int, end_tile: int,
+def _place_pairs(axis: Float32, pairs: _Pairs, framed_width: int, offsets: Int64) -> None:
+    """Turn the pairs' points to a tile's axis (x, y). Fills offsets (K,) in flat frames."""
+    for j in range(len(offsets)):
+        a, c = pairs.along[j], pairs.across[j]
+        offsets[j] = round(a * axis[1] + c * axis[0]) * framed_width + round(a * axis[0] - c * axis[1])
+
+
+@kernel()
+def _fit_lanes(
+    flat: Evidence, middle: int, offsets: Int64, factors: Float32, sums: Float32, row: Float32,
+    row_information: Float32,
 ) -> None:  # fmt: skip
-    """Fit each pixel's plane in tile rows first_tile...end_tile, see `fit_planes`.
+    """Fit the planes of up to TILE_COLUMNS pixels from `middle` on.
+
+    sums: (11 TILE_COLUMNS,), for use inside. Fills row and row_information, as many as they have.
+    """
+    steps, certain = sums[9 * _LANES : 10 * _LANES], sums[10 * _LANES :]
+    _sum_pairs(flat, middle, offsets, factors, sums)
+    _solve_planes(sums, steps, certain)
+    for i in range(len(row)):
+        row[i] = flat.disparity[np.uint64(middle + i)] + steps[i]
+    for i in range(len(row)):
+        row_information[i] = certain[i]
+
+
+@kernel()
+def _gather(
+    evidence: Evidence, axes: Float32, pairs: _Pairs, step: int, only_between: bool, fitted: Float32,
+    information: Float32, first_tile: int, end_tile: int,
+) -> None:  # fmt: skip
+    """Fit each pixel's plane in tile rows first_tile...end_tile, see `fit_planes`: where the axis is a
+    column's one row of FITTED_EVERY, or the rows between these.
 
     evidence: frames, disparity and pull in units of same_surface_px. axes: (tile rows, tile columns, 2).
     step: the support's, in which rows are taken too. Fills fitted (in the same units) and information, both
@@ -242,26 +285,33 @@ def _gather(
     height, width = fitted.shape
     framed_width = evidence.disparity.shape[1]
     flat = _flat(evidence)
-    sums, found = np.empty(9 * _LANES, dtype=np.float32), np.empty((2, _LANES), dtype=np.float32)
-    steps, certain = found[0], found[1]
+    sums, part = np.empty(11 * _LANES, dtype=np.float32), np.empty(_LANES, dtype=np.float32)
     offsets = np.empty(len(pairs.along), dtype=np.int64)
     for tile_x in range(axes.shape[1]):
+        x0 = tile_x * TILE_COLUMNS
+        lanes = slice(x0, min(width, x0 + TILE_COLUMNS))
         for tile_y in range(first_tile, end_tile):
-            axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
+            axis = axes[tile_y, tile_x]
+            is_column = is_along_column(axis)
+            if only_between and not is_column:
+                continue
             for j in range(len(offsets)):
                 a, c = pairs.along[j], pairs.across[j]
-                offsets[j] = round(a * axis_y + c * axis_x) * framed_width + round(a * axis_x - c * axis_y)
-            x0 = tile_x * TILE_COLUMNS
-            count = min(TILE_COLUMNS, width - x0)
+                down, right = a * axis[1] + c * axis[0], a * axis[0] - c * axis[1]
+                offsets[j] = round(down) * framed_width + round(right)
             # Rows a step apart have most of their supports' rows in common: those stay in the nearest cache.
             first_row, end_row = tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)
             for turn in range(step):
                 for y in range(first_row + turn, end_row, step):
+                    above, below = fitted_rows(y, height)
+                    is_between = is_column and above != y and below != y
+                    if only_between != is_between:
+                        continue
+                    row, row_information = fitted[y, lanes], information[y, lanes]
+                    if is_between and share_rows(evidence.disparity, y, x0, height, _SAME_PLANE, part):
+                        blend_rows(fitted[above, lanes], fitted[below, lanes], part, row)
+                        certain = information[above, lanes], information[below, lanes]
+                        blend_rows(certain[0], certain[1], part, row_information)
+                        continue
                     middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                    _sum_pairs(flat, middle, offsets, pairs.factors, sums)
-                    _solve_planes(sums, steps, certain)
-                    row, row_information = fitted[y, x0 : x0 + count], information[y, x0 : x0 + count]
-                    for i in range(count):
-                        row[i] = flat.disparity[np.uint64(middle + i)] + steps[i]
-                    for i in range(count):
-                        row_information[i] = certain[i]
+                    _fit_lanes(flat, middle, offsets, pairs.factors, sums, row, row_information)

@@ -22,6 +22,10 @@ _LINE_FLOATS = 16
 BAND_TILES = 16
 """Rows of tiles that are worked through column by column: what their supports read fits into the cache."""
 _MIN_COHERENCE = 0.35
+FITTED_EVERY = 4
+"""Where a tile's axis is a column's, supports are worked out for one row of so many, a divisor of TILE_ROWS,
+and interpolated between: they have nearly everything in common."""
+_COLUMN_SINE = np.float32(0.17)
 
 
 class AxisImages(NamedTuple):
@@ -106,6 +110,48 @@ def biweight(gap: np.float32) -> np.float32:
     rest = np.float32(1) - gap * gap
     rest = rest if rest > np.float32(0) else np.float32(0)
     return rest * rest
+
+
+@kernel(inline=True)
+def is_along_column(axis: Float32) -> bool:
+    """Check whether an axis (2,) (x, y) is so near to a column's that its rows can share their fits."""
+    return bool(abs(axis[0]) < _COLUMN_SINE)
+
+
+@kernel(inline=True)
+def fitted_rows(y: int, height: int) -> tuple[int, int]:
+    """Return the rows of one in FITTED_EVERY, and the last one, between which row y lies."""
+    above = y - y % FITTED_EVERY
+    return above, min(above + FITTED_EVERY, height - 1)
+
+
+@kernel()
+def share_rows(frame: Float32, y: int, x0: int, height: int, alike: np.float32, shares: Float32) -> bool:
+    """Share TILE_COLUMNS pixels of row y between the fitted rows above and below, by distance, where both are
+    alike there; else the one that is has all.
+
+    frame: what differs by less than `alike` is alike. Fills shares (TILE_COLUMNS,), of the row below. False
+    where a pixel is like neither.
+    """
+    above, below = fitted_rows(y, height)
+    lanes = slice(MARGIN + x0, MARGIN + x0 + TILE_COLUMNS)
+    here, up, down = frame[y + MARGIN, lanes], frame[above + MARGIN, lanes], frame[below + MARGIN, lanes]
+    part, alone = np.float32(y - above) / np.float32(below - above), np.int32(0)
+    for i in range(TILE_COLUMNS):
+        from_up, from_down = abs(up[i] - here[i]), abs(down[i] - here[i])
+        share = part if from_up < alike else np.float32(1)
+        shares[i] = share if from_down < alike else np.float32(0)
+    for i in range(TILE_COLUMNS):
+        near = min(abs(up[i] - here[i]), abs(down[i] - here[i]))
+        alone += np.int32(0) if near < alike else np.int32(1)
+    return bool(alone == 0)
+
+
+@kernel()
+def blend_rows(above: Float32, below: Float32, shares: Float32, row: Float32) -> None:
+    """Blend two rows (N,) by the shares of the one below. Fills row (N,)."""
+    for i in range(len(row)):
+        row[i] = above[i] + shares[i] * (below[i] - above[i])
 
 
 @kernel()
