@@ -332,7 +332,7 @@ def run_rounds(rounds: int, seed: int, names: list[str], folder: Path) -> tuple[
             _, errors = process.communicate(timeout=900)
             recorded = next(path for path in crane.disk.iterdir() if path.is_dir())
             pairs = len(bs.open_recording(recorded).index.stamps_ns)
-            last = errors.strip().splitlines()[-1:]
+            last = [line for line in errors.splitlines() if line.startswith("barsight:")]
             ended = f"exit code {process.returncode}; {pairs} pairs can be read again; {last}; {frames}"
         finally:
             end(crane.player)

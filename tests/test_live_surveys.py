@@ -82,10 +82,10 @@ def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:
         (tmp_path / f"2026110{day}T101010").mkdir()
     (tmp_path / "20261101T101010" / PROTECTED).touch()
     (tmp_path / "notes").mkdir()
-    (tmp_path / "latest").symlink_to("20261105T101010")
-    _keep(tmp_path, 2)
+    (tmp_path / "latest").symlink_to("20261103T101010")
+    _keep(tmp_path, 1)
     left = sorted(path.name for path in tmp_path.iterdir())
-    assert left == ["20261101T101010", "20261104T101010", "20261105T101010", "latest", "notes"]
+    assert left == ["20261101T101010", "20261103T101010", "20261105T101010", "latest", "notes"]
 
 
 def test_what_was_recorded_of_a_standing_crane_goes_unless_it_holds_an_alarm(tmp_path: Path) -> None:

@@ -32,6 +32,8 @@ SPEED_READINGS = 6
 JUMP_HELD_S = 1.0
 """Encoders that came back from a jump are out for so long."""
 AFTER_FREEZE_S = 0.3
+STAMP_SIGMA_S = 0.02
+"""A device's clock is known no better while it is estimated anew."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,7 @@ class JumpWatch:
         self._off_m: Float64 = np.zeros(3)
         self._last_ns = self._jump_ns = self._from_ns = 0
         self._jump_m: Float64 = np.zeros(3)
+        self._bound_m = 0.0
 
     def check(self, stamp_ns: Int64, position_m: Float64) -> float:
         """Look at the newest readings, (N,) and (N, 3), the last few seconds; return the jump in m, or 0."""
@@ -152,7 +155,7 @@ class JumpWatch:
                 self._take(stamp_ns[k - SPEED_READINGS : k + 1], position_m[k - SPEED_READINGS : k + 1])
         self._last_ns = int(stamp_ns[-1]) if len(stamp_ns) else self._last_ns
         away = float(np.linalg.norm(self._off_m))
-        if away > self._least_m:
+        if away > self._bound_m:
             return away
         held = self._jump_ns and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
         return float(np.linalg.norm(self._jump_m)) if held else 0.0
@@ -166,6 +169,12 @@ class JumpWatch:
         t = (stamp_ns - stamp_ns[-2]) / NS_PER_S
         place = position_m + (stamp_ns < self._jump_ns)[:, None] * self._jump_m
         off = place[-1] - place[-2] - (place[-2] - place[0]) / -t[0] * t[-1]
-        if np.linalg.norm(off) > self._least_m + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0]):
-            self._off_m = self._off_m + off
+        speed = float(np.linalg.norm(place[-2] - place[0])) / -t[0]
+        bound_m = self._least_m + STAMP_SIGMA_S * speed + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0])
+        if np.linalg.norm(off) > bound_m:
+            # Back means back within the bounds of the jump there and the jump back.
+            is_away = np.linalg.norm(self._off_m) > self._bound_m
+            self._off_m, self._bound_m = (
+                (self._off_m + off, self._bound_m + bound_m) if is_away else (off, bound_m)
+            )
             self._jump_ns, self._jump_m = int(stamp_ns[-1]), off

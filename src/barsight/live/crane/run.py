@@ -130,11 +130,12 @@ def _point(link: Path, name: str) -> None:
 
 
 def _keep(out: Path, count: int) -> None:
-    """Remove the oldest surveys' folders beyond so many."""
+    """Remove the oldest surveys' folders beyond so many, but for the last that was measured."""
     surveys = sorted(
         path for path in out.iterdir()
         if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
     )  # fmt: skip
     for path in surveys[:-count]:
-        if not (path / PROTECTED).exists():
+        is_latest = (out / LATEST).exists() and path.samefile(out / LATEST)
+        if not is_latest and not (path / PROTECTED).exists():
             shutil.rmtree(path, ignore_errors=True)
