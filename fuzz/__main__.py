@@ -32,6 +32,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--inputs", type=int, default=10**9, help="stop after so many")
     parser.add_argument("--seed", type=int, default=time.time_ns() % 10**6)
+    parser.add_argument("--first", type=int, default=0, help="number of the first input, to repeat a finding")
     parser.add_argument("--seeds", type=Path, help="folder that keeps the whole files between runs")
     parser.add_argument("--only", default="", help="targets whose names hold this")
     parser.add_argument("--show", action="store_true", help="print each finding with its last lines")
@@ -39,7 +40,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         chosen = [target for target in TARGETS if given.only in target.name]
         seeds = prepared(given.seeds or Path(place) / "seeds", Path(place), chosen)
-        runs, found = attack(chosen, seeds, Path(place), given.seed, given.minutes, given.inputs, given.show)
+        runs, found = attack(chosen, seeds, Path(place), given)
     print(table(runs, found, given.seed))
     return 1 if found else 0
 
@@ -93,7 +94,7 @@ def copied(target: Target, seeds: Path, scratch: Path) -> Path:
 
 
 def attack(
-    targets: list[Target], seeds: Path, place: Path, seed: int, minutes: float, inputs: int, show: bool
+    targets: list[Target], seeds: Path, place: Path, given: argparse.Namespace
 ) -> tuple[dict[str, list[Verdict]], list[tuple[int, str, str, Verdict]]]:
     """Run inputs until time or count is up; verdicts by target, and findings: number, target, how, verdict.
 
@@ -101,16 +102,16 @@ def attack(
     """
     runs: dict[str, list[Verdict]] = defaultdict(list)
     found = []
-    end = time.monotonic() + 60 * minutes
-    number = 0
-    while number < inputs and time.monotonic() < end:
-        draw = random.Random(f"{seed}:{number}")
+    end = time.monotonic() + 60 * given.minutes
+    number = given.first
+    while number < given.first + given.inputs and time.monotonic() < end:
+        draw = random.Random(f"{given.seed}:{number}")
         target = draw.choices(targets, [each.weight for each in targets])[0]
         how, verdict = one(target, seeds, place / "scratch", draw)
         runs[target.name].append(verdict)
         if verdict.fault:
             found.append((number, target.name, how, verdict))
-            if show:
+            if given.show:
                 tail = "\n    ".join(verdict.text.strip().splitlines()[-6:])
                 print(f"{number} {target.name}: {verdict.fault} ({how})\n    {tail}", flush=True)
         number += 1

@@ -93,8 +93,8 @@ def _wait(pid: int, began: float) -> tuple[int, int, float]:
     """
     while True:
         found, status, used = os.wait4(pid, os.WNOHANG)
-        late = time.monotonic() - began > MAX_WALL_SECONDS
-        if not found and late:
+        late = not found and time.monotonic() - began > MAX_WALL_SECONDS
+        if late:
             os.kill(pid, signal.SIGKILL)
             found, status, used = os.wait4(pid, 0)
         if found:

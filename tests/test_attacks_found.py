@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -121,3 +123,18 @@ def test_a_camera_without_pictures_is_said() -> None:
     for left, right, name in ((some[:0], some, "cam0"), (some, some[:0], "cam1")):
         with pytest.raises(InputError, match=f"holds no picture of {name}"):
             pair_cameras(Path("bag"), left, right, 0.01)
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "xml"])
+def test_a_full_disk_leaves_no_cut_opencv_file(seeds: Path, tmp_path: Path, suffix: str) -> None:
+    """OpenCV's own writer passes over what the system refuses."""
+    code = (
+        "import resource, signal, sys; from barsight.cli.main import run; "
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600)); "
+        "sys.exit(run(['calibrate', 'export', sys.argv[1], '-o', sys.argv[2], '--to', 'opencv']))"
+    )
+    command = [sys.executable, "-c", code, str(seeds / "rig.yaml"), str(tmp_path / f"made.{suffix}")]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == 4 and done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -69,9 +69,8 @@ def read_opencv_rig(path: Path) -> StereoRig:
 def write_opencv_rig(path: Path, rig: StereoRig, *, xml: bool = False) -> None:
     """Write what `read_opencv_rig` reads; where the rig sits on its body is not part of such files."""
     form = cv2.FILE_STORAGE_FORMAT_XML if xml else cv2.FILE_STORAGE_FORMAT_YAML
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE | form)
-    if not storage.isOpened():
-        raise OSError(f"{path} can't be written")
+    # Writing to a file itself, OpenCV passes over what a full disk refuses.
+    storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | form)
     pose = rig.cam0_from_cam1.inverse()
     storage.write("image_width", rig.cam0.width)
     storage.write("image_height", rig.cam0.height)
@@ -81,7 +80,7 @@ def write_opencv_rig(path: Path, rig: StereoRig, *, xml: bool = False) -> None:
         storage.write(f"D{number}", np.array([camera.coefficients or (0.0,) * 4], dtype=np.float64))
     storage.write("R", np.ascontiguousarray(pose.rotation))
     storage.write("T", np.array(pose.translation).reshape(3, 1))
-    storage.release()
+    path.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
 
 def _matrices(path: Path) -> dict[str, Float64]:
