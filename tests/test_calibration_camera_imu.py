@@ -152,6 +152,7 @@ def test_bad_corners_and_stated_noise_that_is_too_small_do_no_harm(recorded: Rec
     assert (np.abs(error) < 4 * calibration.sigma[:14]).all()
 
 
+@pytest.mark.slow
 def test_scales_of_the_gyro_are_found_or_counted() -> None:
     views, imu, truth = simulated(7, seconds=10.0, gyro_scale=1.01)
     fixed = calibrated(views, imu)

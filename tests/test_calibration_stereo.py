@@ -114,6 +114,7 @@ def test_a_bowed_stretched_board_with_small_tags_is_recovered_with_honest_sigmas
     assert 0.5 <= np.mean(np.square(shapes)) <= 1.7
 
 
+@pytest.mark.slow
 def test_halves_agree_within_their_sigmas() -> None:
     ratios = []
     for seed in range(6):

@@ -291,6 +291,7 @@ def test_bench_subpixel_runs_and_shows_sgbms_locking(tmp_path: Path) -> None:
     assert stored["methods"][1]["kinds"]["matt bar"]["peak_to_peak_px"] is None
 
 
+@pytest.mark.slow
 def test_bench_target_size_measures_a_bar(tmp_path: Path) -> None:
     bench = bench_target_size({"sgbm": Sgbm(SgbmSettings()), "nothing": _nothing}, poses=2, ranges_mm=(2500,))
     sgbm, nothing = (result.ranges[0] for result in bench.methods)

@@ -96,6 +96,7 @@ def test_ours_is_precise_and_keeps_the_true_ones(data: Path) -> None:
     assert rows["ours"].pairs > 3 * rows["homography, trend"].pairs
 
 
+@pytest.mark.slow
 def test_features_are_counted_and_timed(data: Path) -> None:
     rows = bench_features((data / "yard_dev",), ("orb",), repeats=1).features
     assert [row.detector for row in rows] == ["orb"]

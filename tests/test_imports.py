@@ -1,6 +1,7 @@
 """The house: a package imports only from floors below its own, a room only from rooms before it."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -147,13 +148,15 @@ def test_every_folder_has_its_place() -> None:
         assert found <= listed
 
 
+@cache
+def imported_packages(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {name.split(".")[0] for name in imported_modules(tree)}
+
+
 @pytest.mark.parametrize("library", OPTIONAL)
 def test_optional_libraries_are_imported_in_few_files(library: str) -> None:
-    importing = [
-        path
-        for path in SOURCES
-        if library in {n.split(".")[0] for n in imported_modules(ast.parse(path.read_text(encoding="utf-8")))}
-    ]
+    importing = [path for path in SOURCES if library in imported_packages(path)]
     assert len(importing) <= OPTIONAL[library]
 
 

@@ -65,6 +65,7 @@ def test_a_prediction_as_coarse_as_the_bars_is_refused(pitch_m: float) -> None:
         assert "can't be told from the next bar's" in refused.reason
 
 
+@pytest.mark.slow
 def test_the_motion_that_thick_bars_show_tells_thin_ones_apart() -> None:
     """The prediction is fine enough for 90 mm in the lower half only; points on 40 mm above are found too."""
     old, new = (half_and_half(0.04, 0.09, x_m, seed) for x_m, seed in ((0.0, 0), (WAY_M, 9)))
@@ -91,8 +92,17 @@ def half_and_half(above_m: float, below_m: float, x_m: float, seed: int) -> Patc
     return patch_pair(replace(above, left=left, right=right))
 
 
-@pytest.mark.parametrize("contrast", [12.0, 6.0])
-@pytest.mark.parametrize("pitch_m", [0.02, 0.04, 0.09])
+@pytest.mark.parametrize(
+    ("pitch_m", "contrast"),
+    [
+        (0.02, 6.0),
+        (0.09, 12.0),
+        *(
+            pytest.param(*bars, marks=pytest.mark.slow)
+            for bars in [(0.02, 12.0), (0.04, 12.0), (0.04, 6.0), (0.09, 6.0)]
+        ),
+    ],
+)
 def test_pictures_alone_find_the_right_bar(pitch_m: float, contrast: float) -> None:
     """Standing still, there and back, far; bars of three pixels may be refused."""
     settings = FrontEndSettings()
