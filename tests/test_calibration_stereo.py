@@ -156,6 +156,15 @@ def test_odd_corners_are_taken_out() -> None:
     assert "1 of" in calibration.removed[0].reason
 
 
+def test_a_view_with_a_few_wrong_corners_stays() -> None:
+    views = simulated(7)
+    views[4].cam0.pixels[[3, 10, 17]] += [(9.0, -3.0), (-7.0, 8.0), (4.0, 12.0)]
+    calibration = solved(views)
+    assert "04" in {view.name for view in calibration.views}
+    assert [(e.view, e.camera) for e in calibration.removed] == [("04", "cam0")]
+    assert "3 of" in calibration.removed[0].reason
+
+
 def test_blurred_picture_is_left_out() -> None:
     views = [
         replace(view, cam0=replace(view.cam0, edge_px=2.5), cam1=replace(view.cam1, edge_px=2.4))

@@ -48,6 +48,13 @@ def test_sourishgs_rig(data: Path, tmp_path: Path) -> None:
     assert abs(report["baseline_mm"] - 94.0) < 0.5
 
 
+def test_every_view_of_the_webcams_is_used(data: Path, tmp_path: Path) -> None:
+    report = calibrate(data / "checkerboard_webcams", tmp_path / "rig.yaml", "checkerboard:9x6:0.025")
+    assert {r["view"] for r in report["removed"] if r["camera"] == "both"} == set()
+    assert not [r for r in report["removed"] if "checkerboard" in r["reason"]]
+    assert abs(report["baseline_mm"] - 60.39) <= 0.003 * 60.39
+
+
 def test_a_blurred_view_and_one_of_another_board_are_left_out(data: Path, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     shutil.copytree(data / "checkerboard_bouguet", folder, copy_function=shutil.copyfile)

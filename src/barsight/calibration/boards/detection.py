@@ -31,15 +31,12 @@ def detect(board: Board, image: UInt8) -> Corners | Failed:
 
 def _detect_checkerboard(board: Board, image: UInt8) -> Corners | Failed:
     size = (board.columns, board.rows)
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, corners = cv2.findChessboardCorners(image, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
-    if not found:
-        found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-    if not found:
+    corners = _chessboard_corners(image, size)
+    if corners is None:
         return Failed(
             "no-board", f"no {size[0]}x{size[1]} checkerboard found{_told(_shown_size(board, image))}"
         )
-    grid = np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
+    grid = corners.reshape(board.rows, board.columns, 2)
     if not _is_grid(grid):
         return Failed("no-board", f"no {size[0]}x{size[1]} checkerboard found (its corners form no grid)")
     grid = _refine(image, grid)
@@ -50,6 +47,22 @@ def _detect_checkerboard(board: Board, image: UInt8) -> Corners | Failed:
     grid = _canonical(board, grid, image)
     ids = np.arange(board.rows * board.columns)
     return Corners(ids, grid.reshape(-1, 2), edge_width(image, grid))
+
+
+def _chessboard_corners(image: UInt8, size: tuple[int, int]) -> Float64 | None:
+    """Find a checkerboard's corners (N, 1, 2) by three detectors, the fastest first.
+
+    The last, sector-based and exhaustive [Duda 2018], takes about a second of 1.3 MP without a board, and
+    finds small, tilted and badly lit ones that the others miss.
+    """
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCorners(image, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
+    thorough = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    for more in (0, thorough):
+        if not found:
+            flags = cv2.CALIB_CB_NORMALIZE_IMAGE | more
+            found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
+    return np.asarray(corners, dtype=np.float64) if found else None
 
 
 def _refine(image: UInt8, grid: Float64) -> Float64:
@@ -170,13 +183,14 @@ def edge_width(image: UInt8, grid: Float64) -> float:
 
 
 def _shown_size(board: Board, image: UInt8) -> tuple[int, int] | None:
-    """Find columns and rows of the checkerboard shown; None for none or the wanted one."""
+    """Find columns and rows of another checkerboard; None for none, or for a part of the wanted one."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
     if not found or corners is None:
         return None
     columns, rows = max(meta.shape), min(meta.shape)
-    return None if {columns, rows} == {board.columns, board.rows} else (columns, rows)
+    is_part = columns <= max(board.columns, board.rows) and rows <= min(board.columns, board.rows)
+    return None if is_part else (columns, rows)
 
 
 def _told(shown: tuple[int, int] | None) -> str:

@@ -20,6 +20,8 @@ MISFIT_FACTOR, MISFIT_MARGIN_PX = 3.0, 0.3
 CORNER_SIGMAS = 4.5
 MAX_CORNERS_OUT = 0.3
 MAX_ALONE_PX = 2.0
+TRIM_RATIO = 0.1
+MIN_SCALE_OFF = 0.05
 SAME_TURN_RAD, SAME_SHIFT = 0.05, 0.15
 
 
@@ -61,11 +63,13 @@ def drop_misfits(
     cameras: tuple[Camera, Camera],
     points_m: Float64,
 ) -> tuple[list[BoardView], list[Removed]]:
-    """Drop the worst views, where their residuals are far above the others'.
+    """Drop the worst views, where most of their corners' residuals are far above the other views'.
+
+    A few corners that were wrongly found don't condemn a view: `drop_corners` takes them.
 
     start: the rig before this solve, which the bad views haven't pulled, for naming the cause.
     """
-    errors = view_rms(observed, solved.residuals_px, len(views))
+    errors = _trimmed_rms(observed, solved.residuals_px, len(views))
     usual = float(np.median(errors))
     limit = max(MISFIT_FACTOR * usual, usual + MISFIT_MARGIN_PX)
     worst = float(errors.max())
@@ -132,6 +136,18 @@ def view_rms(observed: tuple[CornerTable, ...], residuals: tuple[Float64, ...], 
     return rms
 
 
+def _trimmed_rms(observed: tuple[CornerTable, ...], residuals: tuple[Float64, ...], views: int) -> Float64:
+    """Compute the root mean square residual (V,) px of the best nine tenths of each view's corners."""
+    view = np.concatenate([seen.view for seen in observed])
+    squares = np.concatenate([(residual**2).sum(axis=1) for residual in residuals])
+    errors = np.zeros(views)
+    for number in range(views):
+        own = np.sort(squares[view == number])
+        if own.size:
+            errors[number] = np.sqrt(own[: max(int(own.size * (1 - TRIM_RATIO)), 1)].mean())
+    return errors
+
+
 def _cause(view: BoardView, state: AdjustmentState, cameras: tuple[Camera, Camera], points_m: Float64) -> str:
     """Name what is wrong with a view, as far as the rig it implies by itself tells."""
     if view.cam0 is None or view.cam1 is None:
@@ -147,7 +163,7 @@ def _cause(view: BoardView, state: AdjustmentState, cameras: tuple[Camera, Camer
         return "left and right pictures are exchanged"
     size = float(np.linalg.norm(shift))
     aligned = size > 0 and np.linalg.norm(shift / size - state.translation_m / length) < SAME_SHIFT
-    if _near(turn, state.rotation) and aligned and abs(length / size - 1) > 0.02:
+    if _near(turn, state.rotation) and aligned and abs(length / size - 1) > MIN_SCALE_OFF:
         return f"shows another board, about {length / size:.1f} times as large"
     if not _near(turn, state.rotation) or np.linalg.norm(shift - state.translation_m) > SAME_SHIFT * length:
         return "left and right don't show the same board at the same moment"
