@@ -22,6 +22,7 @@ COMMANDS = {
     "live": "Measure while pictures and readings come, from a crane's sensors or a replayed recording",
     "lifts": "Choose lift targets anew from a measured yard, for another magnet",
     "explain": "Tell why a lift is offered or refused: every check, and a picture of the place",
+    "labels": "Read the labels of a measured yard's bundles: codes in its pictures",
     "compare": "Compare two measured yards: moved, settled, taken, added",
     "store": "Keep the yard over time: add a survey, list, verify; bundles keep their names",
     "yard": "Print the yard as the store knows it, now or at any past time",
@@ -42,7 +43,7 @@ GROUPS = ("bench", "calibrate", "live", "store")
 """Commands that are packages: `command.py` in them finds the second word."""
 SECOND = {"live": ("check",)}
 """Second words of commands that do something without one too."""
-ROOMS = {"yard": ("lifts", "explain", "compare"), "store": ("yard", "serve")}
+ROOMS = {"yard": ("lifts", "explain", "labels", "compare"), "store": ("yard", "serve")}
 """Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
 _interrupts: list[int] = []

@@ -1,0 +1,68 @@
+"""Run `barsight labels RECORDING OUT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
+from barsight.labels.reading import ReadLabels, read_labels, write_labels
+from barsight.recording.base import RecordingSettings
+from barsight.recording.open import open_recording
+from barsight.yard.inventory.stock_list import read_stock
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, read and write."""
+
+    def command(
+        recording: tyro.conf.Positional[Path],
+        out: tyro.conf.Positional[Path],
+        stock_list: Path | None = None,
+        reading: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
+    ) -> None:
+        """Read the codes on bundles' labels in a recording's pictures, and attach them to the bundles of its
+        result.
+
+        OUT/labels.json lists each text with its kind, its place, in how many pictures it was read, and the
+        bundle it lies on. DataMatrix, QR, Aztec, PDF417, Code 128 and Code 93 are read, whose own check
+        holds; a label is sure where two pictures or more read it alike. A module must be about two pixels
+        wide.
+
+        Args:
+            recording: The recording that OUT was measured from.
+            out: A folder written by barsight measure; labels.json goes into it.
+            stock_list: CSV or JSON as bundles.stock_list takes it: labels that contradict it are named.
+            reading: How to read the recording.
+        """
+        listed = () if stock_list is None else read_stock(stock_list)
+        source = open_recording(recording, reading)
+        total, done = len(source.index.stamps_ns), count(1)
+        console = SafeConsole()
+        with stages(SafeConsole(stderr=True)) as advance:
+            found = read_labels(source, out, listed, lambda: advance("labels", next(done), total))
+        target = write_labels(found, out)
+        _print(found, console)
+        console.print(f"labels: {target}", soft_wrap=True, highlight=False, markup=False)
+
+    call(command, "labels", arguments)
+
+
+def _print(found: ReadLabels, console: SafeConsole) -> None:
+    table = Table("text", "kind", "x m", "y m", "pictures", "bundle", "", box=SIMPLE_HEAD)
+    for one in found.labels:
+        told = "sure" if one.is_sure else "; ".join(one.doubts)
+        bundle = "-" if one.bundle is None else str(one.bundle)
+        x, y = (f"{value:.2f}" for value in one.place_m[:2])
+        table.add_row(escape(one.text), one.kind, x, y, str(one.pictures), bundle, escape(told))
+    console.print(table if found.labels else f"no label was read in {found.pictures} pictures")
+    for text in found.contradictions:
+        console.print(f"[yellow]{escape(text)}[/yellow]", soft_wrap=True, highlight=False)

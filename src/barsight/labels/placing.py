@@ -1,0 +1,92 @@
+"""Place what a picture shows on the map: the first surface along its line of sight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from barsight.core.arrays import Float64
+from barsight.core.pose import Pose
+from barsight.core.stamps import NS_PER_S
+from barsight.core.types import RectifiedCamera
+from barsight.result_folder import CameraPath
+from barsight.yard.types import HeightMap
+
+MAX_GAP_S = 1.0
+"""A picture further from the trajectory's nearest pose has no place."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCamera:
+    """A rectified camera in the map's frame; principal_px: (cx, cy) of it, left or right."""
+
+    map_from_rect: Pose
+    focal_px: float
+    principal_px: tuple[float, float]
+
+    @classmethod
+    def of_pair(cls, map_from_rect0: Pose, camera: RectifiedCamera) -> tuple[PlacedCamera, PlacedCamera]:
+        """Place both cameras of a rectified pair."""
+        aside = Pose("rect0", "rect1", np.eye(3), np.array([camera.baseline_m, 0.0, 0.0]))
+        left = cls(map_from_rect0, camera.focal_px, (camera.cx_px, camera.cy_px))
+        principal = (camera.cx_px + camera.doffs_px, camera.cy_px)
+        return left, cls(map_from_rect0 @ aside, camera.focal_px, principal)
+
+    def sight(self, pixel: Float64) -> tuple[Float64, Float64]:
+        """Return the line of sight of a pixel (2,): its origin (3,) and its direction (3,) at depth 1."""
+        ray = np.array([*(pixel - np.array(self.principal_px)) / self.focal_px, 1.0])
+        return self.map_from_rect.translation, self.map_from_rect.rotation @ ray
+
+
+def pose_at(path: CameraPath, stamp_ns: int) -> Pose | None:
+    """Interpolate the body's pose between the poses around a stamp; None beyond `MAX_GAP_S` of them."""
+    after = int(np.searchsorted(path.stamp_ns, stamp_ns))
+    near = path.stamp_ns[max(after - 1, 0) : after + 1] - stamp_ns
+    if not near.size or np.abs(near).min() > MAX_GAP_S * NS_PER_S:
+        return None
+    if after in (0, len(path.stamp_ns)) or path.stamp_ns[after] == stamp_ns:
+        k = min(after, len(path.stamp_ns) - 1)
+        turn = Rotation.from_quat(path.quaternion_xyzw[k])
+        return Pose("map", "body", turn.as_matrix(), path.position_m[k])
+    pair = slice(after - 1, after + 1)
+    share = (stamp_ns - path.stamp_ns[after - 1]) / (path.stamp_ns[after] - path.stamp_ns[after - 1])
+    turn = Slerp([0.0, 1.0], Rotation.from_quat(path.quaternion_xyzw[pair]))(share)
+    first, second = path.position_m[pair]
+    return Pose("map", "body", turn.as_matrix(), first + share * (second - first))
+
+
+def first_surface(heights: HeightMap, origin: Float64, direction: Float64) -> Float64 | None:
+    """Intersect a line of sight that looks down with the map; (3,), None where it meets unknown cells only.
+
+    Steps of half a cell along the ground; the first place below the surface counts.
+    """
+    if direction[2] >= 0:
+        return None
+    known = heights.z_m[np.isfinite(heights.z_m)]
+    if not known.size:
+        return None
+    low, high = float(known.min()), float(known.max())
+    near, far = (high - origin[2]) / direction[2], (low - origin[2]) / direction[2]
+    drop, level = abs(direction[2]), float(np.hypot(direction[0], direction[1]))
+    step = 0.5 * heights.cell_m / max(level, drop)
+    depth = np.arange(max(near, 0.0), far + 2 * step, step)
+    places = origin + depth[:, None] * direction
+    z = _heights_at(heights, places)
+    hit = np.flatnonzero(np.isfinite(z) & (places[:, 2] <= z))
+    if not hit.size:
+        return None
+    found: Float64 = places[hit[0]]
+    return found
+
+
+def _heights_at(heights: HeightMap, places: Float64) -> Float64:
+    """Look up the height (N,) of the cell at each place (N, 3); NaN outside the map and where unknown."""
+    columns = np.round((places[:, 0] - heights.x0_m) / heights.cell_m).astype(np.int64)
+    rows = np.round((places[:, 1] - heights.y0_m) / heights.cell_m).astype(np.int64)
+    height, width = heights.z_m.shape
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    z = np.full(len(places), np.nan)
+    z[inside] = heights.z_m[rows[inside], columns[inside]]
+    return z

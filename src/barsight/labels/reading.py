@@ -1,0 +1,96 @@
+"""Read the labels of a measured yard from its recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import barsight
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.errors import InputError
+from barsight.core.files import atomic_path
+from barsight.core.types import RefusedFrame
+from barsight.labels.attachment import Label, PlacedCode, contradictions, unite
+from barsight.labels.code_reading import read_codes
+from barsight.labels.placing import PlacedCamera, first_surface, pose_at
+from barsight.recording.base import Recording
+from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.result_folder import open_folder, read_heights, read_path
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.inventory.stock_list import ListedBundle
+
+SCHEMA_VERSION = 1
+FILE = "labels.json"
+
+
+@dataclass(frozen=True, eq=False)
+class ReadLabels:
+    """The labels of a yard. pictures: that were read. contradictions: with the stock list, sentences."""
+
+    map_id: str
+    pictures: int
+    labels: tuple[Label, ...]
+    contradictions: tuple[str, ...]
+
+
+def read_labels(
+    recording: Recording, folder: Path, listed: tuple[ListedBundle, ...], count: Callable[[], None]
+) -> ReadLabels:
+    """Read the labels in a recording's pictures onto the map that `folder` holds.
+
+    count: called after each pair. Raises InputError where the folder is not of this recording or has no
+    trajectory, ConfigError without the extra `labels`.
+    """
+    said, _ = open_folder(folder)
+    own, whole = recording.digests(), said["hashes"]["inputs"]
+    if not said.get("passes") and any(own[name] != whole[name] for name in own.keys() & whole.keys()):
+        remedy = "name the recording that it was measured from"
+        raise InputError(folder, f"is not the result of {recording.path}", remedy)
+    path = read_path(folder)
+    if path is None:
+        raise InputError(folder, "has no trajectory.tum", "measure the recording again")
+    bundles, parted = read_bundles(folder / "bundles.json"), read_heights(folder)
+    heights = parted.part(slice(0, parted.shape[0]), slice(0, parted.shape[1]))
+    rectifier = Rectifier(recording.rig)
+    codes, pictures = list[PlacedCode](), 0
+    for pair in RectifiedPairs(recording, rectifier)():
+        count()
+        body = None if isinstance(pair, RefusedFrame) else pose_at(path, pair.stamp_ns)
+        if isinstance(pair, RefusedFrame) or body is None:
+            continue
+        cameras = PlacedCamera.of_pair(body @ rectifier.body_from_rect0, rectifier.camera)
+        for number, (image, camera) in enumerate(zip((pair.left, pair.right), cameras, strict=True)):
+            pictures += 1
+            for code in read_codes(image):
+                place = first_surface(heights, *camera.sight(code.middle_px))
+                if place is not None:
+                    codes.append(PlacedCode(code.text, code.kind, place, (pair.stamp_ns, number)))
+    labels = unite(codes, bundles)
+    return ReadLabels(said["map_id"], pictures, labels, contradictions(labels, bundles, listed))
+
+
+def write_labels(found: ReadLabels, folder: Path) -> Path:
+    """Write labels.json into a folder of results."""
+    content: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "software": f"barsight {barsight.__version__}",
+        "map_id": found.map_id,
+        "pictures": found.pictures,
+        "labels": [
+            {
+                "text": one.text, "kind": one.kind, "x_m": round(float(one.place_m[0]), 4),
+                "y_m": round(float(one.place_m[1]), 4), "z_m": round(float(one.place_m[2]), 4),
+                "pictures": one.pictures, "agreement_ratio": round(one.agreement_ratio, 3),
+                "is_sure": one.is_sure, "bundle": one.bundle, "doubts": list(one.doubts),
+            }
+            for one in found.labels
+        ],
+        "contradictions": list(found.contradictions),
+    }  # fmt: skip
+    target = folder / FILE
+    with atomic_path(target) as path:
+        path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return target

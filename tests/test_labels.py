@@ -1,0 +1,175 @@
+"""Labels: codes drawn into pictures are read, placed on the map, attached and held against the stock list."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.cli.main import run
+from barsight.core.pose import Pose
+from barsight.labels.attachment import PlacedCode, contradictions, unite
+from barsight.labels.code_reading import read_codes
+from barsight.labels.placing import pose_at
+from barsight.recording.open import open_recording
+from barsight.result_folder import read_heights, read_path
+from barsight.yard.inventory.stock_list import ListedBundle
+from cli_runs import FAST
+from lift_yards import laid, record
+
+zxingcpp = pytest.importorskip("zxingcpp")
+
+
+def code(text: str, kind: str = "DataMatrix") -> np.ndarray:
+    """One pixel a module, with its quiet zone, light on dark as 0 and 255."""
+    made = zxingcpp.create_barcode(text, getattr(zxingcpp.BarcodeFormat, kind))
+    return np.pad(np.array(made.to_image(scale=1)), 2, constant_values=255)
+
+
+def project(rig: StereoRig, number: int, map_from_body: Pose, points: np.ndarray) -> np.ndarray:
+    camera = (rig.cam0, rig.cam1)[number]
+    body_from_cam = (rig.body_from_cam0, rig.body_from_cam1)[number]
+    inside = (map_from_body @ body_from_cam).inverse().apply(points)
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    distortion = np.array(camera.coefficients, dtype=np.float64)
+    return cv2.projectPoints(inside, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
+
+
+def stick(image: np.ndarray, label: np.ndarray, corners_px: np.ndarray) -> np.ndarray:
+    """Draw a label over a picture by the homography of its corners; area sampling by drawing it large."""
+    large = cv2.resize(label, None, fx=8, fy=8, interpolation=cv2.INTER_NEAREST)
+    height, width = large.shape
+    source = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    wide = 4
+    turn = cv2.getPerspectiveTransform(source, (wide * corners_px).astype(np.float32))
+    size = (wide * image.shape[1], wide * image.shape[0])
+    drawn = cv2.warpPerspective(large, turn, size, flags=cv2.INTER_AREA)
+    inside = cv2.warpPerspective(np.full_like(large, 255), turn, size)
+    small = cv2.resize(drawn, image.shape[::-1], interpolation=cv2.INTER_AREA)
+    share = cv2.resize(inside, image.shape[::-1], interpolation=cv2.INTER_AREA) / 255.0
+    return np.where(share > 0, (1 - share) * image + 0.75 * small + 20 * share, image).astype(np.uint8)
+
+
+def labelled(recording: Path, out: Path, text: str, size_m: float) -> np.ndarray:
+    """Stick a label over the middle of the map in all pictures, by the measured poses; its place."""
+    parted, rig, path = read_heights(out), open_recording(recording).rig, read_path(out)
+    heights = parted.part(slice(0, parted.shape[0]), slice(0, parted.shape[1]))
+    assert path is not None
+    x, y = path.position_m[:, 0].mean(), float(np.mean(heights.y_m))
+    column, row = np.abs(heights.x_m - x).argmin(), np.abs(heights.y_m - y).argmin()
+    around = heights.z_m[row - 2 : row + 3, column - 2 : column + 3]
+    middle = np.array([x, y, np.nanmedian(around)])
+    half = size_m / 2
+    corners = middle + half * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    for number in (0, 1):
+        for file in sorted((recording / "mav0" / f"cam{number}" / "data").glob("*.png")):
+            body = pose_at(path, int(file.stem))
+            assert body is not None
+            image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            cv2.imwrite(str(file), stick(image, code(text), project(rig, number, body, corners)))
+    return middle
+
+
+def test_labels_are_read_placed_and_held_against_the_stock(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(["measure", str(recording), "-o", str(out), *FAST]) == 0
+    middle = labelled(recording, out, "B-17", 1.2)
+    stock = tmp_path / "stock.csv"
+    stock.write_text("name,x_m,y_m\nB-16,1.0,2.0\n")
+    assert run(["labels", str(recording), str(out), "--stock-list", str(stock)]) == 0
+    content = json.loads((out / "labels.json").read_text())
+    assert [(one["text"], one["bundle"], one["is_sure"]) for one in content["labels"]] == [
+        ("B-17", None, True)
+    ]
+    label = content["labels"][0]
+    assert np.linalg.norm([label["x_m"] - middle[0], label["y_m"] - middle[1]]) < 0.1
+    assert label["pictures"] >= 4
+    assert content["contradictions"] == ["label 'B-17' is not in the list"]
+    assert "not in the list" in capsys.readouterr().out
+
+
+def worn(image: np.ndarray, module_px: float, rng: np.random.Generator) -> np.ndarray:
+    """A label as a camera sees it: small, turned, blurred, noisy, with a highlight across it."""
+    size = int(np.ceil(1.6 * module_px * max(image.shape)))
+    angle, scale = rng.uniform(0, 360), 8 * module_px
+    turn = cv2.getRotationMatrix2D((image.shape[1] / 2, image.shape[0] / 2), angle, scale)
+    turn[:, 2] += 4 * size - np.array([image.shape[1], image.shape[0]]) / 2
+    large = cv2.warpAffine(image, turn, (8 * size, 8 * size), flags=cv2.INTER_NEAREST, borderValue=110.0)
+    small = cv2.resize(large, (size, size), interpolation=cv2.INTER_AREA).astype(np.float64)
+    small = cv2.GaussianBlur(small, (0, 0), rng.uniform(0.3, 0.9))
+    bright = rng.uniform(0, 90) * np.exp(
+        -(((np.arange(size) - rng.uniform(0, size)) / rng.uniform(2, 9)) ** 2)
+    )
+    seen = (
+        rng.uniform(0.25, 0.8) * small
+        + rng.uniform(0, 40)
+        + bright
+        + rng.normal(0, rng.uniform(1, 6), small.shape)
+    )
+    return np.clip(seen, 0, 255).astype(np.uint8)
+
+
+def read_share(count: int, module_px: float, seed: int) -> tuple[dict[str, float], int]:
+    """Share of labels of each kind that one picture reads, and how many were read wrongly."""
+    rng = np.random.default_rng(seed)
+    right, wrong = dict.fromkeys(("DataMatrix", "QRCode", "Code128"), 0), 0
+    for number in range(count):
+        kind = list(right)[number % 3]
+        text = f"{rng.integers(10**8, 10**9)}"
+        found = {one.text for one in read_codes(worn(code(text, kind), module_px, rng))}
+        right[kind] += text in found
+        wrong += bool(found - {text})
+    return {kind: 3 * number / count for kind, number in right.items()}, wrong
+
+
+def test_worn_labels_are_read_right_or_not_at_all() -> None:
+    share, wrong = read_share(150, 3.0, 41)
+    assert min(share["DataMatrix"], share["QRCode"]) > 0.85 and share["Code128"] > 0.3 and wrong == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module_px", [1.5, 2.0, 2.5, 3.0, 4.0])
+def test_ten_thousand_labels(module_px: float) -> None:
+    share, wrong = read_share(2000, module_px, 7000 + int(10 * module_px))
+    told = ", ".join(f"{kind} {100 * part:.1f} %" for kind, part in share.items())
+    print(f"{module_px} px a module: {told} read, {wrong} of 2000 wrong")
+    assert wrong == 0
+
+
+def test_other_texts_at_the_place_and_single_pictures_are_doubted() -> None:
+    place = np.array([1.0, 2.0, 0.5])
+    codes = [PlacedCode("A", "QRCode", place + 0.01 * k, (k, 0)) for k in range(3)]
+    codes += [PlacedCode("B", "QRCode", place, (9, 1)), PlacedCode("C", "QRCode", place + 3, (1, 0))]
+    labels = {one.text: one for one in unite(codes, ())}
+    assert not labels["A"].is_sure and labels["A"].agreement_ratio == 0.75
+    assert "1 picture" in labels["C"].doubts[0]
+
+
+def test_another_recording_is_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(["measure", str(recording), "-o", str(out), *FAST]) == 0
+    rig = recording / "mav0" / "cam0" / "sensor.yaml"
+    rig.write_text(rig.read_text() + "\n# another\n")
+    capsys.readouterr()
+    assert run(["labels", str(recording), str(out)]) != 0
+    assert "is not the result of" in capsys.readouterr().err
+    assert not (out / "labels.json").exists()
+
+
+def test_a_label_lies_on_the_highest_bundle_there_and_the_list_may_contradict() -> None:
+    low, high = record(laid(1.0), 4), record(laid(1.05, z=0.3), 7)
+    at = np.array([1.06, 0.5, high.top_z_m])
+    codes = [PlacedCode("N7", "QRCode", at, (k, 0)) for k in range(2)]
+    codes += [PlacedCode("N9", "QRCode", at + np.array([5.0, 0, 0]), (k, 0)) for k in range(2)]
+    labels = unite(codes, (low, high))
+    assert [(one.text, one.bundle) for one in labels] == [("N7", 7), ("N9", None)]
+    listed = (ListedBundle("N7", 1.1, 0.2), ListedBundle("N9", 6.0, 0.0))
+    assert contradictions(labels, (low, high), listed) == ()
+    (told,) = contradictions(labels, (low, high), (ListedBundle("N7", 3.0, 0.2), listed[1]))
+    assert told.startswith("N7 is listed at x 3.00 m")
