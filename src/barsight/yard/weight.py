@@ -14,6 +14,8 @@ from barsight.yard.types import Bundle
 STEEL_KG_PER_M3 = 7850.0
 COUNT_SIGMA_RATIO = 0.08
 """What the outline of counted bars leaves open of their section."""
+UNKNOWN_LENGTH_SIGMA_M = 0.05
+"""Of a length whose sigma isn't known: as the load's outline and its overhang take it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ def bundle_mass(bundle: Bundle) -> Mass:
     if not (section > 0 and bundle.length_m > 0):
         return Mass(math.nan, math.nan)
     kg = section * bundle.length_m * STEEL_KG_PER_M3
-    longer = bundle.sigma.length_m / bundle.length_m if math.isfinite(bundle.sigma.length_m) else 0.0
+    known = math.isfinite(bundle.sigma.length_m)
+    longer = (bundle.sigma.length_m if known else UNKNOWN_LENGTH_SIGMA_M) / bundle.length_m
     return Mass(kg, kg * math.hypot(sigma / section, longer))
 
 
