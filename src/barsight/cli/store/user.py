@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import tyro
 
 from barsight.cli.arguments import call
-from barsight.cli.store.add import user_name
+from barsight.cli.user import user_name
 from barsight.core.errors import ConfigError
 from barsight.store.accounts import Role, add_person, withdraw
 from barsight.store.audit import entry
