@@ -11,7 +11,7 @@ from barsight.core.errors import InputError
 from barsight.fleet.cluster import run_all
 from barsight.fleet.ledger import parked_keys, published_keys, running_keys
 from barsight.fleet.objects import Objects
-from barsight.fleet.records import noted_keys, note_results
+from barsight.fleet.records import note_results, noted_keys
 from barsight.fleet.scratch import sweep
 from barsight.fleet.task import TaskSettings, run_task
 from barsight.fleet.versions import FleetTask

@@ -10,9 +10,9 @@ import tyro
 from barsight.cli.arguments import call, load_settings
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.cli.user import user_name
 from barsight.core.extras import extra
 from barsight.measure_settings import MeasureSettings
+from barsight.store.audit import user_name
 from barsight.store.opening import DEFAULT_URL, open_store
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.cli.user import user_name
 from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
+from barsight.store.audit import user_name
 from barsight.store.opening import DEFAULT_URL, open_store
 
 

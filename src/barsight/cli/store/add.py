@@ -11,8 +11,8 @@ from rich.console import Console
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
-from barsight.cli.user import user_name
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
+from barsight.store.audit import user_name
 from barsight.store.opening import DEFAULT_URL, open_store
 
 
