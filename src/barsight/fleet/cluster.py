@@ -63,7 +63,7 @@ def run_all(
     one that was lost. may_go_on: asked before each; where it refuses, what runs is waited for.
     """
     waiting = iter(tasks)
-    running = as_completed()
+    running = as_completed(loop=client.loop)
     count = 0
 
     def submit_more() -> int:
