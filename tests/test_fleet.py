@@ -157,7 +157,7 @@ def test_folders_of_the_dead_are_swept_and_no_others() -> None:
 
 def test_the_night_passes_midnight() -> None:
     night = Window(("22:00", "06:00"))
-    at = [night.is_open(datetime(2026, 1, 1, hour)) for hour in (21, 22, 3, 6)]  # noqa: DTZ001
+    at = [night.is_open(datetime(2026, 1, 1, hour)) for hour in (21, 22, 3, 6)]
     assert at == [False, True, True, False]
     assert not Window(idle=True).is_open(busy_ratio=1.0) and Window(idle=True).is_open(busy_ratio=0.0)
 

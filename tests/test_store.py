@@ -214,7 +214,7 @@ import sqlalchemy as sa
 from alembic import op
 
 revision = "0003"
-down_revision = "0002"
+down_revision = "0003"
 
 
 def upgrade():
@@ -248,7 +248,7 @@ def test_an_earlier_schema_is_brought_up_to_date_after_a_backup(
     assert run(["store", "verify", store_url]) == 3
     assert "newer version" in capsys.readouterr().err
     if store_url.startswith("sqlite"):
-        backup = tmp_path / "yard.db.schema-0002.backup"
+        backup = tmp_path / "yard.db.schema-0003.backup"
         with open_store(f"sqlite:///{backup}") as store:
             assert checked(store) == before
 

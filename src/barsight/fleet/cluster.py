@@ -43,7 +43,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Any]:
             return
         with (
             LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                 host="127.0.0.1", memory_limit=0,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
