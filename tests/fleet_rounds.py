@@ -1,4 +1,4 @@
-"""Stand-ins for the fleet's tests: an archive of small files, a measurement that only copies, an S3 server."""
+"""Stand-ins for the fleet's tests: small files, a measurement that only digests, an S3 server."""
 
 from __future__ import annotations
 

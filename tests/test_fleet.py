@@ -1,4 +1,4 @@
-"""The fleet: keys, claims, limits, S3, restarts, comparison and promotion, against stand-ins that do nothing."""
+"""The fleet: keys, claims, limits, S3, restarts, comparison and promotion, against stand-ins."""
 
 from __future__ import annotations
 
@@ -86,7 +86,8 @@ def test_a_claim_has_one_owner_until_its_lease_runs_out(tmp_path: Path) -> None:
     ("code", "wanted"),
     [
         ("import sys; sys.exit('it is torn')", "refused: exit code 1: it is torn"),
-        ("x = bytearray(300 << 20); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(9)", "over-memory"),
+        ("x = bytearray(300 << 20); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(9)",
+         "over-memory"),
         ("import time; time.sleep(9)", "timeout: did not end in 0.8 s"),
     ],
 )  # fmt: skip
@@ -200,7 +201,8 @@ def test_a_promoted_version_hides_the_other_survey_of_its_recording(tmp_path: Pa
             for name, at_ns in (("live1", 10), ("new1", 10), ("live2", 20)):
                 opened.add(
                     SURVEYS, map_id=name, captured_from_ns=at_ns, captured_to_ns=at_ns + 1, added_ns=0,
-                    calibration_id="", is_simulated=True, software_version="", folder="", files="", heights=b"",
+                    calibration_id="", is_simulated=True, software_version="", folder="", files="",
+                    heights=b"",
                 )  # fmt: skip
             opened.add(FLEET_SURVEYS, version="v", map_id="new1", is_own=True)
         assert seen() == ["live1", "live2"]

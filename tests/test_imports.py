@@ -65,7 +65,8 @@ APART = {
     ("benchmarks.motion", "benchmarks.stereo"), ("cli.bench", "cli.calibrate"),
     ("cli.yard", "cli.calibrate"), ("cli.yard", "cli.bench"),
     ("cli.store", "cli.calibrate"), ("cli.store", "cli.bench"), ("cli.store", "cli.yard"),
-    ("cli.fleet", "cli.calibrate"), ("cli.fleet", "cli.bench"), ("cli.fleet", "cli.yard"), ("cli.fleet", "cli.store"),
+    ("cli.fleet", "cli.calibrate"), ("cli.fleet", "cli.bench"), ("cli.fleet", "cli.yard"),
+    ("cli.fleet", "cli.store"),
 }  # fmt: skip
 """Rooms of which the first doesn't import the second either."""
 MAX_MODULES = 16

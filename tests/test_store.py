@@ -213,7 +213,7 @@ NEXT = """
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0003"
+revision = "0004"
 down_revision = "0003"
 
 
@@ -226,7 +226,7 @@ def upgrade():
 def next_version(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "pass") -> None:
     """As if a later version of the package with one more migration were installed."""
     shutil.copytree(opening.MIGRATIONS, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (folder / "versions" / "v0003_next.py").write_text(NEXT.format(more=more), encoding="utf-8")
+    (folder / "versions" / "v0004_next.py").write_text(NEXT.format(more=more), encoding="utf-8")
     monkeypatch.setattr(opening, "MIGRATIONS", folder)
 
 

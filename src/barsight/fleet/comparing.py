@@ -65,7 +65,11 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
     return RecordingComparison(
         name, changes, tuple(sorted(bundles[0].keys() - pairs.keys())),
         tuple(sorted(bundles[1].keys() - set(pairs.values()))),
-        (*(f"+{code}" for code in sorted(vetoes[1] - vetoes[0])), *(f"-{code}" for code in sorted(vetoes[0] - vetoes[1]))),
+        tuple(
+            sign + code
+            for sign, codes in (("+", vetoes[1] - vetoes[0]), ("-", vetoes[0] - vetoes[1]))
+            for code in sorted(codes)
+        ),
         {figure: _half_widths(figure, *bundles) for figure in FIGURES} if all(bundles) else {},
         (notes[0]["measured_s"], notes[1]["measured_s"]),
         (f"{results.url}/{folders[0]}/preview.png", f"{results.url}/{folders[1]}/preview.png"),

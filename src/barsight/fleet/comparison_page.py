@@ -20,8 +20,8 @@ def comparison_page(findings: Findings) -> str:
     pictures = {one.recording: one.pictures for one in findings.recordings}
     parts = [
         f"<h1>Version {escape(findings.before)} and version {escape(findings.after)}</h1>",
-        f"<p>{len(findings.recordings)} recordings, {findings.tests} figures of bundles compared. Told is what "
-        f"Holm's rule leaves at {100 * LEVEL:g} % for any false one among all; sigma of a difference is that of "
+        f"<p>{len(findings.recordings)} recordings, {findings.tests} figures of bundles compared. Told is "
+        f"what Holm's rule leaves at {100 * LEVEL:g} % for any false one among all; sigma is that of "
         "two independent measurements, which is more than two looks at the same pictures differ by.</p>",
         "<h2>Shifts of the whole archive</h2>",
         _table(
@@ -82,7 +82,8 @@ def _table(heads: tuple[str, ...], rows: list[tuple[object, ...]] | list[tuple[s
         return "<p>None.</p>"
     head = "".join(f"<th>{escape(name)}</th>" for name in heads)
     lines = "".join(
-        f"<tr{' class=found' if row[-1] == 'found' else ''}>{''.join(f'<td>{_cell(cell)}</td>' for cell in row)}</tr>"
+        f"<tr{' class=found' if row[-1] == 'found' else ''}>"
+        f"{''.join(f'<td>{_cell(cell)}</td>' for cell in row)}</tr>"
         for row in rows
     )
     return f"<table><tr>{head}</tr>{lines}</table>"

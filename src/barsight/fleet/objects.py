@@ -129,7 +129,7 @@ def _is_plain(endpoint: str) -> bool:
     return endpoint.startswith("http://")
 
 
-class _told:
+class _told:  # noqa: N801
     """Turn what a server or disk refuses into an InputError of one line."""
 
     def __init__(self, name: str) -> None:

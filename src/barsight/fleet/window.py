@@ -28,7 +28,7 @@ class Window:
                 _clock(text)
 
     def is_open(self, now: datetime | None = None, busy_ratio: float | None = None) -> bool:
-        """Check the clock and the machine's load. busy_ratio: share of the cores at work; measured if None."""
+        """Check the clock and the machine's load. busy_ratio: share of the cores at work, or None."""
         if self.between is not None:
             start, end = map(_clock, self.between)
             at = (now or datetime.now().astimezone()).time()

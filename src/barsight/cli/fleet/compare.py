@@ -29,8 +29,8 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         store: str = DEFAULT_URL,
     ) -> None:
-        """Compare two versions over the archive: bundles moved beyond sigma, vetoes that appeared or vanished,
-        intervals, times. Writes comparison.json and comparison.html.
+        """Compare two versions over the archive: bundles moved beyond sigma, vetoes that appeared or
+        vanished, intervals, times. Writes comparison.json and comparison.html.
 
         Many figures are looked at together: told is what Holm's rule leaves at 5 % for any false one.
 
@@ -69,8 +69,8 @@ def run(arguments: Sequence[str]) -> None:
         shifts = ", ".join(f"{s.figure} {s.shift:+.4f}" for s in findings.shifts if s.is_found) or "none"
         console = SafeConsole()
         console.print(
-            f"{len(compared)} recordings: {len(findings.beyond)} figures of bundles beyond sigma, shifts of the "
-            f"archive: {shifts}, {sum(bool(one.vetoes) for one in compared)} with other vetoes",
+            f"{len(compared)} recordings: {len(findings.beyond)} figures of bundles beyond sigma, shifts of "
+            f"the archive: {shifts}, {sum(bool(one.vetoes) for one in compared)} with other vetoes",
             highlight=False, soft_wrap=True,
         )  # fmt: skip
         console.print(f"page: {out / 'comparison.html'}", highlight=False, soft_wrap=True, markup=False)

@@ -20,8 +20,8 @@ def run(arguments: Sequence[str]) -> None:
     """Parse, plan and print."""
 
     def command(
-        archive: tyro.conf.Positional[str], results: str, store: str = DEFAULT_URL, config: Path | None = None,
-        rig: Path | None = None, magnet: Path | None = None, limit: int | None = None, workers: int = 1,
+        archive: tyro.conf.Positional[str], results: str, store: str = DEFAULT_URL,
+        config: Path | None = None, rig: Path | None = None, magnet: Path | None = None, limit: int | None = None, workers: int = 1,
         by: str | None = None,
     ) -> None:  # fmt: skip
         """Find an archive's recordings and plan their measurement; says what is new, done and parked, and
@@ -62,13 +62,14 @@ def run(arguments: Sequence[str]) -> None:
         counts = {"done": done, "parked": parked}
         words = ", ".join(f"{sum(t.key in keys for t in tasks)} {name}" for name, keys in counts.items())
         console.print(
-            f"version {version.name}: {len(tasks)} recordings, {new} new in the plan, {words}, {len(left)} to do",
+            f"version {version.name}: {len(tasks)} recordings, {new} new in the plan, {words}, "
+            f"{len(left)} to do",
             highlight=False, soft_wrap=True,
         )  # fmt: skip
         basis = f"by {told.known} measured" if told.known else "roughly: none was measured yet"
         console.print(
-            f"about {told.seconds / 3600 / workers:.2f} h with {workers} workers, {told.fetched_bytes / 1e9:.2f} GB "
-            f"to fetch, {told.written_bytes / 1e9:.2f} GB to write ({basis})",
+            f"about {told.seconds / 3600 / workers:.2f} h with {workers} workers, "
+            f"{told.fetched_bytes / 1e9:.2f} GB to fetch, {told.written_bytes / 1e9:.2f} GB to write ({basis})",
             highlight=False, soft_wrap=True,
         )  # fmt: skip
 

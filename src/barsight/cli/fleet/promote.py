@@ -20,8 +20,8 @@ def run(arguments: Sequence[str]) -> None:
     """Parse and switch."""
 
     def command(
-        version: tyro.conf.Positional[str | None] = None, results: str | None = None, into: Path | None = None,
-        store: str = DEFAULT_URL, revert: bool = False, by: str | None = None,
+        version: tyro.conf.Positional[str | None] = None, results: str | None = None,
+        into: Path | None = None, store: str = DEFAULT_URL, revert: bool = False, by: str | None = None,
     ) -> None:  # fmt: skip
         """Switch what the page and the plant see to a version, all its recordings at once; or take that back.
 

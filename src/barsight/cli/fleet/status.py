@@ -15,7 +15,7 @@ def run(arguments: Sequence[str]) -> None:
     """Parse, count and print."""
 
     def command(results: str, store: str = DEFAULT_URL, version: str | None = None) -> None:
-        """Count what is published, under way, left and parked, of each version; parked ones with their reason.
+        """Count what is published, under way, left and parked, of each version; parked ones with reasons.
 
         Args:
             results: Folder or URL for what is measured.

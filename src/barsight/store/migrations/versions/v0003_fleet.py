@@ -41,7 +41,8 @@ def upgrade() -> None:
         *_stamps("peak_bytes", "result_bytes", "at_ns"),
     )  # fmt: skip
     op.create_table(
-        "fleet_surveys", _key(), *_texts("version", "map_id"), sa.Column("is_own", sa.Boolean, nullable=False),
+        "fleet_surveys", _key(), *_texts("version", "map_id"),
+        sa.Column("is_own", sa.Boolean, nullable=False),
         sa.UniqueConstraint("version", "map_id"),
     )  # fmt: skip
     op.create_table("promotions", _key(), *_texts("version", "who"), *_stamps("at_ns"))
