@@ -24,7 +24,8 @@ FLOORS = {
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
     "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11, "labels": 11,
     "api": 12, "session": 12, "live": 12,
-    "cli": 13,
+    "fleet": 13,
+    "cli": 14,
 }  # fmt: skip
 ROOMS = {
     "calibration": ("geometry", "boards", "files", "stereo", "camera_imu"),
@@ -44,7 +45,7 @@ ROOMS = {
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
-    "cli": (".", "calibrate", "bench", "live", "yard", "store"),
+    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {
@@ -65,13 +66,15 @@ APART = {
     ("benchmarks.motion", "benchmarks.stereo"), ("cli.bench", "cli.calibrate"),
     ("cli.yard", "cli.calibrate"), ("cli.yard", "cli.bench"),
     ("cli.store", "cli.calibrate"), ("cli.store", "cli.bench"), ("cli.store", "cli.yard"),
+    ("cli.fleet", "cli.calibrate"), ("cli.fleet", "cli.bench"), ("cli.fleet", "cli.yard"),
+    ("cli.fleet", "cli.store"),
 }  # fmt: skip
 """Rooms of which the first doesn't import the second either."""
 MAX_MODULES = 16
 ROOT = Path(barsight.__file__).parent
 OPTIONAL = {
     "viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1, "alembic": 4, "viva_genicam": 1, "fastapi": 1,
-    "uvicorn": 1, "zxingcpp": 1,
+    "uvicorn": 1, "zxingcpp": 1, "obstore": 1, "distributed": 1, "dask": 1,
 }  # fmt: skip
 """Optional libraries, and the number of files that import them: of rosbags one reads and one writes."""
 

@@ -14,6 +14,7 @@ from barsight.core.extras import extra
 from barsight.store.confirmation import newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
 from barsight.store.matching import has_moved
+from barsight.store.promotion import counts
 from barsight.store.tables import (
     ABSENCES,
     ALARM_STATES,
@@ -129,6 +130,7 @@ def lift_records(connection: Connection) -> list[dict[str, Any]]:
     rows = connection.execute(
         select(LIFTS, SURVEYS.c.map_id, SURVEYS.c.calibration_id, SURVEYS.c.captured_to_ns)
         .join(SURVEYS)
+        .where(counts())
         .order_by(LIFTS.c.id.desc())
         .limit(MAX_LIFTS)
     ).all()

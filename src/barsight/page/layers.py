@@ -16,6 +16,7 @@ from barsight.core.extras import extra
 from barsight.core.reading.geotiff import open_geotiff
 from barsight.report.map_images import hillshade
 from barsight.store.coarse_map import unpack
+from barsight.store.promotion import counts
 from barsight.store.tables import SURVEYS
 from barsight.yard.types import HeightMap
 
@@ -52,7 +53,9 @@ def edges(heights: HeightMap) -> list[float]:
 
 def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[SurveyLayer, ...]:
     """Share the yard at a time out among its surveys, each place to the newest that saw it; oldest first."""
-    query = select(SURVEYS.c.map_id, SURVEYS.c.captured_to_ns, SURVEYS.c.folder, SURVEYS.c.heights)
+    query = select(SURVEYS.c.map_id, SURVEYS.c.captured_to_ns, SURVEYS.c.folder, SURVEYS.c.heights).where(
+        counts()
+    )
     if at_ns is not None:
         query = query.where(SURVEYS.c.captured_to_ns <= at_ns)
     rows = connection.execute(query.order_by(SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())).all()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import getpass
 import hashlib
 import json
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -142,3 +144,11 @@ def _digest(row: dict[str, Any]) -> str:
 def _canonical(value: Any) -> str:
     """Write JSON with sorted keys and without spaces, so that the same value is the same text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def user_name() -> str:
+    """Name the computer's user for the audit log."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container's user may have no name
+        return f"uid {os.getuid()}"

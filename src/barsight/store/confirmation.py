@@ -16,6 +16,7 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry
 from barsight.store.opening import Store
+from barsight.store.promotion import counts
 from barsight.store.states import lift_state, step_lift
 from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, SURVEYS
 from barsight.yard.events import corners, gap_between
@@ -43,7 +44,7 @@ class OpenLift:
 def newest_survey(connection: Connection) -> Row[Any] | None:
     """Return the row of the survey with the newest frames, None where there is none."""
     order = (SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
-    return connection.execute(select(SURVEYS).order_by(*order).limit(1)).first()
+    return connection.execute(select(SURVEYS).where(counts()).order_by(*order).limit(1)).first()
 
 
 def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
@@ -71,7 +72,7 @@ def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
             LIFT_STATES,
             (LIFT_STATES.c.lift_id == LIFTS.c.id) & (LIFT_STATES.c.step == newest.c.step),
         )
-        .where(LIFT_STATES.c.state.in_(OPEN))
+        .where(LIFT_STATES.c.state.in_(OPEN), counts())
         .order_by(LIFTS.c.id)
     ).all()
     return tuple(

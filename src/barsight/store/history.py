@@ -15,6 +15,7 @@ import numpy as np
 from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
+from barsight.store.promotion import counts
 from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.types import Bundle
@@ -131,7 +132,7 @@ def next_sightings(connection: Connection, after_ns: int) -> dict[int, BundleSig
 def newest_absences(connection: Connection, until_ns: int | None) -> dict[int, Absence]:
     """Find the newest survey up to a time that looked for a bundle and did not see it, by bundle."""
     condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
-    chosen = select(ABSENCES, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition)
+    chosen = select(ABSENCES, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition, counts())
     rows = _first_of_each(connection, chosen, ABSENCES.c.bundle_id, is_newest=True)
     return {r.bundle_id: Absence(r.bundle_id, r.captured_to_ns, r.kind, r.reason) for r in rows}
 
@@ -172,7 +173,9 @@ def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[s
 def _sightings(
     connection: Connection, condition: ColumnElement[bool], *, is_newest: bool
 ) -> dict[int, BundleSighting]:
-    chosen = select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition)
+    chosen = (
+        select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition, counts())
+    )
     rows = _first_of_each(connection, chosen, SIGHTINGS.c.bundle_id, is_newest=is_newest)
     return {
         r.bundle_id: BundleSighting(

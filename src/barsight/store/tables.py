@@ -116,3 +116,30 @@ AUDIT = Table(
     Column("previous", Text, nullable=False, unique=True), Column("digest", Text, nullable=False),
 )  # fmt: skip
 """The chain of what was added; see `audit`."""
+
+FLEET_VERSIONS = Table(
+    "fleet_versions", METADATA, _key(), Column("name", Text, nullable=False, unique=True),
+    *_texts("configuration", "calibration", "magnet", "software", "rig"), *_stamps("at_ns"),
+)  # fmt: skip
+"""Ways to measure an archive; digests, see `fleet.versions`."""
+
+FLEET_TASKS = Table(
+    "fleet_tasks", METADATA, _key(), Column("key", Text, nullable=False, unique=True),
+    *_texts("version", "archive", "recording", "passes"), *_stamps("bytes", "pairs", "at_ns"),
+)  # fmt: skip
+"""Recordings planned under a version. key: of `fleet.versions.Version.key`; passes: JSON."""
+
+FLEET_RESULTS = Table(
+    "fleet_results", METADATA, _key(), Column("key", Text, nullable=False, unique=True),
+    *_figures("measured_s", "whole_s"), *_stamps("peak_bytes", "result_bytes", "at_ns"),
+)  # fmt: skip
+"""Tasks that are done; the results' own objects are the truth."""
+
+FLEET_SURVEYS = Table(
+    "fleet_surveys", METADATA, _key(), *_texts("version", "map_id"),
+    Column("is_own", Boolean, nullable=False), UniqueConstraint("version", "map_id"),
+)  # fmt: skip
+"""Surveys of a version. is_own: the store has it for the version's sake only."""
+
+PROMOTIONS = Table("promotions", METADATA, _key(), *_texts("version", "who"), *_stamps("at_ns"))
+"""Versions that page and plant were switched to; the newest row counts, an empty version is none."""

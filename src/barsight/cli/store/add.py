@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +12,7 @@ from rich.console import Console
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
+from barsight.store.audit import user_name
 from barsight.store.opening import DEFAULT_URL, open_store
 
 
@@ -46,14 +45,6 @@ def run(arguments: Sequence[str]) -> None:
     if len(words) == 1 and not words[0].startswith("-"):
         words.insert(0, DEFAULT_URL)
     call(command, "store add", words)
-
-
-def user_name() -> str:
-    """Name the computer's user for the audit log."""
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a container's user may have no name
-        return f"uid {os.getuid()}"
 
 
 def _print(added: AddedSurvey, console: Console) -> None:

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 import tyro
 
 from barsight.cli.arguments import call
-from barsight.cli.store.add import user_name
 from barsight.core.errors import ConfigError
 from barsight.store.accounts import Role, add_person, withdraw
-from barsight.store.audit import entry
+from barsight.store.audit import entry, user_name
 from barsight.store.opening import open_store
 
 

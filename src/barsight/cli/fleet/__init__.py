@@ -1,0 +1,1 @@
+"""Commands of the fleet: an archive measured anew, compared, promoted."""

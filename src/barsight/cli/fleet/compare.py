@@ -1,0 +1,78 @@
+"""Run `barsight fleet compare BEFORE AFTER -o OUT`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.extras import extra
+from barsight.core.files import atomic_directory
+from barsight.core.json_values import json_value
+from barsight.store.opening import DEFAULT_URL, open_store
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, compare and write."""
+
+    def command(
+        before: tyro.conf.Positional[str],
+        after: tyro.conf.Positional[str],
+        results: str,
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        store: str = DEFAULT_URL,
+    ) -> None:
+        """Compare two versions over the archive: bundles moved beyond sigma, vetoes that appeared or
+        vanished, intervals, times. Writes comparison.json and comparison.html.
+
+        Many figures are looked at together: told is what Holm's rule leaves at 5 % for any false one.
+
+        Args:
+            before: Version, by the beginning of its name.
+            after: The other version.
+            results: Folder or URL of what was measured.
+            out: Folder for the comparison; it must be new or empty.
+            store: SQLAlchemy's URL of the database.
+        """
+        with extra("fleet"):
+            from barsight.fleet.comparing import compare_recording
+            from barsight.fleet.comparison_page import comparison_page
+            from barsight.fleet.findings import judge
+            from barsight.fleet.objects import open_objects
+            from barsight.fleet.records import find_version, read_tasks
+        target = open_objects(results)
+        with open_store(store) as opened, opened.reading() as connection:
+            versions = [find_version(connection, name) for name in (before, after)]
+            keys = [{t.name: t.key for t in read_tasks(connection, one)} for one in versions]
+        compared, untold = [], sorted(keys[0].keys() ^ keys[1].keys())
+        both = sorted(keys[0].keys() & keys[1].keys())
+        with stages(SafeConsole(stderr=True)) as advance:
+            for number, name in enumerate(both):
+                one = compare_recording(target, name, keys[0][name], keys[1][name])
+                if one is None:
+                    untold.append(name)
+                else:
+                    compared.append(one)
+                advance("compare", number + 1, len(both))
+        findings = judge(versions[0].name, versions[1].name, compared, untold)
+        with atomic_directory(out) as staging:
+            text = json.dumps(json_value(asdict(findings)), indent=1, allow_nan=False)
+            (staging / "comparison.json").write_text(text + "\n", encoding="utf-8")
+            (staging / "comparison.html").write_text(comparison_page(findings), encoding="utf-8")
+        shifts = ", ".join(f"{s.figure} {s.shift:+.4f}" for s in findings.shifts if s.is_found) or "none"
+        console = SafeConsole()
+        console.print(
+            f"{len(compared)} recordings: {len(findings.beyond)} figures of bundles beyond sigma, shifts of "
+            f"the archive: {shifts}, {sum(bool(one.vetoes) for one in compared)} with other vetoes",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
+        console.print(f"page: {out / 'comparison.html'}", highlight=False, soft_wrap=True, markup=False)
+
+    call(command, "fleet compare", arguments)

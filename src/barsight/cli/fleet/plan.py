@@ -1,0 +1,76 @@
+"""Run `barsight fleet plan ARCHIVE --store URL --results URL`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from barsight.cli.arguments import call, load_settings
+from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.extras import extra
+from barsight.measure_settings import MeasureSettings
+from barsight.store.audit import user_name
+from barsight.store.opening import DEFAULT_URL, open_store
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, plan and print."""
+
+    def command(
+        archive: tyro.conf.Positional[str], results: str, store: str = DEFAULT_URL,
+        config: Path | None = None, rig: Path | None = None, magnet: Path | None = None, limit: int | None = None, workers: int = 1,
+        by: str | None = None,
+    ) -> None:  # fmt: skip
+        """Find an archive's recordings and plan their measurement; says what is new, done and parked, and
+        estimates hours and gigabytes. Nothing is measured.
+
+        A folder with survey.json, {"passes": ["first", "second"]}, is one survey of several passes.
+
+        Args:
+            archive: Folder or s3://, az://, gs:// URL above the recordings.
+            results: Folder or URL for what is measured.
+            store: SQLAlchemy's URL of the database.
+            config: TOML file of settings, as for barsight measure.
+            rig: Calibration to use instead of the recordings' own.
+            magnet: TOML file of the magnet that lifts are chosen for.
+            limit: Most recordings to plan, in the order of their names.
+            workers: Workers that the hours are estimated for.
+            by: Who plans, for the audit log; the name of the user if not given.
+        """
+        with extra("fleet"):
+            from barsight.fleet.ledger import parked_keys, published_keys
+            from barsight.fleet.objects import open_objects
+            from barsight.fleet.planning import estimate, plan_tasks
+            from barsight.fleet.records import note_plan, seconds_by_size
+            from barsight.fleet.versions import publish_version
+        settings = load_settings(config, MeasureSettings)
+        source, target = open_objects(archive), open_objects(results, create=True)
+        version = publish_version(target, settings, config, rig, magnet)
+        console = SafeConsole()
+        with stages(SafeConsole(stderr=True)) as advance:
+            tasks = plan_tasks(source, target, version, limit, lambda n, all_: advance("read", n, all_))
+        with open_store(store, create=True) as opened:
+            new = note_plan(opened, tasks, source.url, by or user_name())
+            with opened.reading() as connection:
+                measured = seconds_by_size(connection)
+        done, parked = published_keys(target), parked_keys(target)
+        left = [task for task in tasks if task.key not in done | parked]
+        told = estimate(left, measured)
+        counts = {"done": done, "parked": parked}
+        words = ", ".join(f"{sum(t.key in keys for t in tasks)} {name}" for name, keys in counts.items())
+        console.print(
+            f"version {version.name}: {len(tasks)} recordings, {new} new in the plan, {words}, "
+            f"{len(left)} to do",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
+        basis = f"by {told.known} measured" if told.known else "roughly: none was measured yet"
+        console.print(
+            f"about {told.seconds / 3600 / workers:.2f} h with {workers} workers, "
+            f"{told.fetched_bytes / 1e9:.2f} GB to fetch, {told.written_bytes / 1e9:.2f} GB to write ({basis})",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
+
+    call(command, "fleet plan", arguments)

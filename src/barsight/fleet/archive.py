@@ -1,0 +1,152 @@
+"""Find the recordings of an archive, and the manifest of each: paths, sizes, digests of what is in them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from barsight.core.errors import InputError
+from barsight.core.json_values import json_digest
+from barsight.fleet.objects import Objects, StoredObject
+
+SURVEY = "survey.json"
+"""File that makes one survey of the recordings in its folder: the passes, in its list `passes`."""
+_BAGS = (".bag", ".mcap", ".db3")
+_INSIDE = {"mav0", "cam0", "cam1", "image_0", "image_1"}
+_PICTURES = (".png", ".jpg", ".pgm", ".tif")
+_UNREAD = {"truth"}
+"""Folders of a recording that a measurement doesn't read."""
+
+
+@dataclass(frozen=True)
+class ArchivedRecording:
+    """A recording, or a survey of several passes, as an archive holds it.
+
+    name: its path in the archive. passes: paths of its recordings, relative to `name`; "." for itself.
+    """
+
+    name: str
+    passes: tuple[str, ...]
+    files: tuple[StoredObject, ...]
+
+    @property
+    def size(self) -> int:
+        """Add up its bytes."""
+        return sum(file.size for file in self.files)
+
+    @property
+    def pairs(self) -> int:
+        """Count its pictures by two; 0 for a bag, whose pictures the listing doesn't show."""
+        return sum(file.path.lower().endswith(_PICTURES) for file in self.files) // 2
+
+    def relative(self, file: StoredObject) -> str:
+        """Return a file's path in the recording; its name where the recording is one file."""
+        if file.path == self.name:
+            return PurePosixPath(file.path).name
+        return file.path.removeprefix(f"{self.name}/") if self.name else file.path
+
+
+def find_recordings(archive: Objects) -> tuple[ArchivedRecording, ...]:
+    """Find recordings and surveys by the archive's listing, in the order of their names.
+
+    Raises InputError where there is none.
+    """
+    files = {one.path: one for one in archive.list()}
+    roots = {root for path in files if (root := _root(path)) is not None}
+    surveys = {
+        str(PurePosixPath(path).parent): _passes(archive, path)
+        for path in files
+        if PurePosixPath(path).name == SURVEY and path != SURVEY
+    }
+    roots = {r for r in roots if not any(r == s or r.startswith(f"{s}/") for s in surveys)} | surveys.keys()
+    held: dict[str, list[StoredObject]] = {root: [] for root in roots}
+    for path, file in files.items():
+        for owner in (path, *map(str, PurePosixPath(path).parents)):
+            owner = "" if owner == "." else owner
+            if owner in held:
+                inner = PurePosixPath(path.removeprefix(owner).lstrip("/")).parts
+                if not _UNREAD & set(inner[:-1]):
+                    held[owner].append(file)
+                break
+    if not held:
+        raise InputError(archive.url, "holds no recording", "name the folder above the recordings")
+    return tuple(
+        ArchivedRecording(root, surveys.get(root, (".",)), tuple(sorted(held[root], key=lambda f: f.path)))
+        for root in sorted(held)
+    )
+
+
+def _root(path: str) -> str | None:
+    """Return the path of the recording that a file belongs to; None for any other file."""
+    parts = PurePosixPath(path).parts
+    for place, part in enumerate(parts[:-1]):
+        if part in _INSIDE:
+            return "/".join(parts[:place])
+    name = PurePosixPath(path)
+    if name.suffix in _BAGS:
+        return path
+    return None
+
+
+def _passes(archive: Objects, path: str) -> tuple[str, ...]:
+    content = archive.read_json(path)
+    listed = content.get("passes") if isinstance(content, dict) else None
+    sound = isinstance(listed, list) and listed and all(
+        isinstance(one, str) and one and ".." not in PurePosixPath(one).parts and not one.startswith("/")
+        for one in listed
+    )  # fmt: skip
+    if not sound:
+        raise InputError(
+            f"{archive.url}/{path}", "has no list of passes", 'write {"passes": ["first", "second"]}'
+        )
+    assert isinstance(listed, list)
+    return tuple(listed)
+
+
+def manifest_digest(
+    archive: Objects, results: Objects, recording: ArchivedRecording, read: Callable[[int], None]
+) -> str:
+    """Compute SHA-256 over paths, sizes and content of a recording's files; its place in the archive is no
+    part of it.
+
+    read: told of the bytes that were read. A recording whose listing is unchanged is not read again: the
+    digest is kept in the results under `manifests/`.
+    """
+    listed = json_digest([archive.url, recording.name, [[f.path, f.size, f.mark] for f in recording.files]])
+    kept = f"manifests/{listed}.json"
+    known = results.read_json(kept)
+    if known is None:
+        rows = []
+        for file in recording.files:
+            rows.append([recording.relative(file), file.size, _digest(archive, file)])
+            read(file.size)
+        known = {"manifest": json_digest([list(recording.passes), rows]), "files": rows}
+        results.write(kept, json.dumps(known).encode())
+    return str(known["manifest"])
+
+
+def _digest(archive: Objects, file: StoredObject) -> str:
+    found = hashlib.sha256()
+    for part in archive.chunks(file.path):
+        found.update(part)
+    return found.hexdigest()
+
+
+def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path) -> Iterator[Path]:
+    """Copy a recording's files into a folder, and yield the path of each pass."""
+    recording = ArchivedRecording(name, passes, ())
+    is_file = PurePosixPath(name).suffix in _BAGS
+    listed = [StoredObject(name, 0, "")] if is_file else archive.list(name)
+    for file in listed:
+        inner = PurePosixPath(recording.relative(file))
+        if _UNREAD & set(inner.parts[:-1]) or ".." in inner.parts:
+            continue
+        target = folder / inner
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("wb") as stream:
+            for part in archive.chunks(file.path):
+                stream.write(part)
+    yield from (folder / PurePosixPath(name).name if is_file else folder / one for one in passes)

@@ -1,0 +1,100 @@
+"""Write the comparison of two versions as a page that needs no other file but the pictures it links."""
+
+from __future__ import annotations
+
+from html import escape
+
+from barsight.fleet.findings import LEVEL, Findings
+
+MOST = 100
+"""Bundles and recordings that the page lists; the JSON has all."""
+_STYLE = (
+    "body{font:15px/1.45 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color:#1c2733}"
+    "table{border-collapse:collapse;margin:1rem 0}td,th{padding:.25rem .8rem;border-bottom:1px solid #d5dce3;"
+    "text-align:right}td:first-child,th:first-child{text-align:left}.found{background:#fde8d8}"
+)
+
+
+def comparison_page(findings: Findings) -> str:
+    """Format the page: shifts of the archive, bundles beyond sigma, vetoes, bundles of one version, times."""
+    pictures = {one.recording: one.pictures for one in findings.recordings}
+    parts = [
+        f"<h1>Version {escape(findings.before)} and version {escape(findings.after)}</h1>",
+        f"<p>{len(findings.recordings)} recordings, {findings.tests} figures of bundles compared. Told is "
+        f"what Holm's rule leaves at {100 * LEVEL:g} % for any false one among all; sigma is that of "
+        "two independent measurements, which is more than two looks at the same pictures differ by.</p>",
+        "<h2>Shifts of the whole archive</h2>",
+        _table(
+            ("figure", "recordings", "mean shift", "chance", ""),
+            [
+                (s.figure, str(s.recordings), f"{s.shift:+.5f}", f"{s.p:.2g}", "found" if s.is_found else "")
+                for s in findings.shifts
+            ],
+        ),
+        f"<h2>Bundles beyond sigma: {len(findings.beyond)}</h2>",
+        _table(
+            ("recording", "bundle", "figure", "before", "after", "sigma", "chance", "pictures"),
+            [
+                (c.recording, str(c.bundle), c.figure, f"{c.before:.4f}", f"{c.after:.4f}", f"{c.sigma:.4f}",
+                 f"{c.p:.2g}", pictures[c.recording])
+                for c in findings.beyond[:MOST]
+            ],
+        ),
+        "<h2>Vetoes and bundles of one version only</h2>",
+        _table(
+            ("recording", "vetoes", "bundles gone", "bundles new", "pictures"),
+            [
+                (one.recording, " ".join(one.vetoes), _numbers(one.only_before), _numbers(one.only_after),
+                 one.pictures)
+                for one in findings.recordings
+                if one.vetoes or one.only_before or one.only_after
+            ][:MOST],
+        ),
+        "<h2>Half widths of the 95 % intervals, mean over the recordings</h2>",
+        _table(("figure", "before", "after"), _intervals(findings)),
+        f"<h2>Times</h2><p>Median seconds: {findings.seconds[0]:.2f} and {findings.seconds[1]:.2f}.</p>",
+    ]  # fmt: skip
+    if findings.untold:
+        parts.append(f"<p>Not compared: {escape(', '.join(findings.untold[:MOST]))}</p>")
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Two versions</title>'
+        f"<style>{_STYLE}</style>{''.join(parts)}</html>\n"
+    )
+
+
+def _intervals(findings: Findings) -> list[tuple[str, ...]]:
+    told = [one.intervals for one in findings.recordings if one.intervals]
+    if not told:
+        return []
+    rows = []
+    for figure in told[0]:
+        before, after = (sum(one[figure][side] for one in told) / len(told) for side in (0, 1))
+        rows.append((figure, f"{before:.4f}", f"{after:.4f}"))
+    return rows
+
+
+def _numbers(numbers: tuple[int, ...]) -> str:
+    return " ".join(map(str, numbers))
+
+
+def _table(heads: tuple[str, ...], rows: list[tuple[object, ...]] | list[tuple[str, ...]]) -> str:
+    if not rows:
+        return "<p>None.</p>"
+    head = "".join(f"<th>{escape(name)}</th>" for name in heads)
+    lines = "".join(
+        f"<tr{' class=found' if row[-1] == 'found' else ''}>"
+        f"{''.join(f'<td>{_cell(cell)}</td>' for cell in row)}</tr>"
+        for row in rows
+    )
+    return f"<table><tr>{head}</tr>{lines}</table>"
+
+
+def _cell(cell: object) -> str:
+    if isinstance(cell, tuple):
+        links = zip(("before", "after"), cell, strict=True)
+        return " ".join(f'<a href="{escape(_link(str(url)))}">{word}</a>' for word, url in links)
+    return escape(str(cell))
+
+
+def _link(url: str) -> str:
+    return url if "://" in url else f"file://{url}"

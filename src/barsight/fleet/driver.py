@@ -1,0 +1,108 @@
+"""Drive a version's tasks to their end: submit what is left, ask the results what is done, begin again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from barsight.core.errors import InputError
+from barsight.fleet.cluster import run_all
+from barsight.fleet.ledger import parked_keys, published_keys, running_keys
+from barsight.fleet.objects import Objects
+from barsight.fleet.records import note_results, noted_keys
+from barsight.fleet.scratch import sweep
+from barsight.fleet.task import TaskSettings, run_task
+from barsight.fleet.versions import FleetTask
+from barsight.fleet.window import Window
+from barsight.store.opening import Store
+
+POLL_S = 2.0
+_ROWS = 200
+"""Rows that are written in one transaction."""
+
+
+@dataclass(frozen=True)
+class FleetCounts:
+    """Keys by state."""
+
+    published: int
+    parked: int
+    running: int
+    left: int
+
+
+def count_states(results: Objects, tasks: list[FleetTask]) -> FleetCounts:
+    """Count the tasks that are published, parked, worked on now, and left."""
+    keys = {task.key for task in tasks}
+    published, parked = published_keys(results) & keys, parked_keys(results) & keys
+    open_keys = keys - published - parked
+    running = running_keys(results, open_keys)
+    return FleetCounts(len(published), len(parked - published), len(running), len(open_keys - running))
+
+
+def drive(
+    client: Any,
+    tasks: list[FleetTask],
+    settings: TaskSettings,
+    store: Store,
+    results: Objects,
+    window: Window,
+    advance: Callable[[int, int], None],
+    run: Callable[[Any, Any], str] = run_task,
+) -> None:
+    """Run all tasks that the results don't have until each is published or parked.
+
+    advance: told of the tasks that are done and of all. Rows that workers could not write are written at
+    the end of each round. What another driver's workers have claimed is waited for.
+    """
+    sweep()
+    wanted = {task.key for task in tasks}
+    while True:
+        ended = (published_keys(results) | parked_keys(results)) & wanted
+        note_missing(store, results, settings.by, wanted)
+        advance(len(ended), len(tasks))
+        left = [task for task in tasks if task.key not in ended]
+        if not left:
+            return
+        if not window.is_open():
+            time.sleep(POLL_S)
+            continue
+        busy = running_keys(results, {task.key for task in left})
+        free = [task for task in left if task.key not in busy]
+        done = len(ended)
+        for key in run_all(client, run, free, settings, window.is_open):
+            if key is not None:
+                done += 1
+                advance(min(done, len(tasks)), len(tasks))
+        if not free:
+            time.sleep(POLL_S)
+
+
+def note_missing(store: Store, results: Objects, by: str, wanted: set[str]) -> int:
+    """Write the rows of published tasks that the store lacks; return their number."""
+    with store.reading() as connection:
+        known = noted_keys(connection)
+    missing = sorted((published_keys(results) & wanted) - known)
+    for first in range(0, len(missing), _ROWS):
+        contents = {
+            key: results.read_json(f"results/{key}/result.json") for key in missing[first : first + _ROWS]
+        }
+        note_results(store, contents, by)
+    return len(missing)
+
+
+def parked_reasons(results: Objects, tasks: list[FleetTask]) -> list[tuple[FleetTask, str]]:
+    """List the parked tasks, each with its reason."""
+    keys = parked_keys(results)
+    told = []
+    for task in tasks:
+        if task.key in keys:
+            note = results.read_json(f"parked/{task.key}.json")
+            if note is None:
+                raise InputError(
+                    f"{results.url}/parked/{task.key}.json", "is gone", "ask for the status again"
+                )
+            told.append((task, str(note["reason"])))
+    return told

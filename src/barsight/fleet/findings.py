@@ -1,0 +1,101 @@
+"""Judge all comparisons of an archive together: what is beyond chance, with many looked at at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mean, median
+
+import numpy as np
+from scipy.stats import ttest_1samp
+
+from barsight.fleet.comparing import FIGURES, FigureChange, RecordingComparison
+
+LEVEL = 0.05
+"""Chance that anything at all is told of two versions that measure alike: of the bundles, and once more of
+the shifts of the whole archive."""
+MIN_RECORDINGS = 5
+"""Fewer don't tell a shift of the archive from chance."""
+
+
+@dataclass(frozen=True)
+class ArchiveShift:
+    """A shift that the recordings share. shift: mean over the recordings of each one's median difference;
+    p: of Student's t over the recordings. is_found: by Holm's rule over the figures.
+    """
+
+    figure: str
+    recordings: int
+    shift: float
+    p: float
+    is_found: bool
+
+
+@dataclass(frozen=True)
+class Findings:
+    """All that is told of two versions. beyond: bundles beyond sigma, the least likely first. tests: how
+    many figures were looked at. untold: recordings that one of the versions lacks.
+    """
+
+    before: str
+    after: str
+    tests: int
+    beyond: tuple[FigureChange, ...]
+    shifts: tuple[ArchiveShift, ...]
+    recordings: tuple[RecordingComparison, ...]
+    untold: tuple[str, ...]
+
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """Return the median seconds of a measurement, before and after."""
+        if not self.recordings:
+            return 0.0, 0.0
+        return (
+            median(one.seconds[0] for one in self.recordings),
+            median(one.seconds[1] for one in self.recordings),
+        )
+
+
+def judge(
+    before: str, after: str, recordings: Sequence[RecordingComparison], untold: Sequence[str]
+) -> Findings:
+    """Find the bundles beyond sigma and the shifts of the archive, each by Holm's rule at LEVEL."""
+    changes = [change for one in recordings for change in one.changes]
+    found = holm([change.p for change in changes])
+    beyond = sorted((c for c, is_found in zip(changes, found, strict=True) if is_found), key=lambda c: c.p)
+    return Findings(
+        before, after, len(changes), tuple(beyond), _shifts(recordings), tuple(recordings), tuple(untold)
+    )
+
+
+def holm(chances: Sequence[float]) -> list[bool]:
+    """Tell which chances are too small for chance, with at most LEVEL for any false one among all (Holm,
+    "A simple sequentially rejective multiple test procedure", 1979).
+    """
+    found = [False] * len(chances)
+    for rank, place in enumerate(sorted(range(len(chances)), key=lambda i: chances[i])):
+        if chances[place] > LEVEL / (len(chances) - rank):
+            break
+        found[place] = True
+    return found
+
+
+def _shifts(recordings: Sequence[RecordingComparison]) -> tuple[ArchiveShift, ...]:
+    rows = []
+    for figure in FIGURES:
+        medians = [
+            median(differences)
+            for one in recordings
+            if (differences := [c.after - c.before for c in one.changes if c.figure == figure])
+        ]
+        rows.append((figure, len(medians), mean(medians) if medians else 0.0, _chance(medians)))
+    found = holm([row[3] for row in rows])
+    return tuple(ArchiveShift(*row, is_found) for row, is_found in zip(rows, found, strict=True))
+
+
+def _chance(medians: list[float]) -> float:
+    if len(medians) < MIN_RECORDINGS or not any(medians):
+        return 1.0
+    if np.ptp(medians) == 0:
+        return 0.0
+    return float(ttest_1samp(medians, 0.0).pvalue)

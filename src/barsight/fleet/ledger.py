@@ -1,0 +1,138 @@
+"""Keep in the results who works on a key, how often it failed, and that it is done: the truth of a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any, Literal
+
+from barsight.fleet.objects import Objects
+
+TRIES = 3
+"""Failures after which a recording is parked,"""
+MOST_LOST = 12
+"""and claims whose worker died without a word, which others' faults cause too."""
+Held = Literal["published", "parked", "claimed"]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A key that is ours for a while. token: of this try. number: counts the claims of the key from 1."""
+
+    key: str
+    number: int
+    token: str
+
+
+def claim(results: Objects, key: str, lease_s: float) -> Claim | Held:
+    """Take a key by put-if-absent, or tell who has it. One whose lease has run out is taken over.
+
+    Clocks of the machines must agree to a small part of the lease.
+    """
+    if results.read(f"results/{key}/result.json") is not None:
+        return "published"
+    if results.read(f"parked/{key}.json") is not None:
+        return "parked"
+    number = 0
+    for one in results.list(f"claims/{key}/"):
+        number = max(number, int(PurePosixPath(one.path).stem))
+    if number:
+        last = results.read_json(f"claims/{key}/{number:04d}.json")
+        if last is not None and last["expires"] > time.time():
+            return "claimed"
+    if number >= MOST_LOST:
+        park(results, key, f"its worker ended {number} times without a word", number)
+        return "parked"
+    mine = Claim(key, number + 1, secrets.token_hex(8))
+    return mine if results.write_new(_path(mine), _claim_text(mine, lease_s)) else "claimed"
+
+
+@contextmanager
+def held(results: Objects, mine: Claim, lease_s: float) -> Iterator[None]:
+    """Renew a claim from a thread of its own while the block runs, and let it run out at once after it."""
+    ended = threading.Event()
+
+    def renew() -> None:
+        while not ended.wait(lease_s / 4):
+            try:
+                results.write(_path(mine), _claim_text(mine, lease_s))
+            except Exception:  # the next one may go through; if none does another worker takes over
+                continue
+
+    thread = threading.Thread(target=renew, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        results.write(_path(mine), _claim_text(mine, 0.0))
+
+
+def publish(results: Objects, mine: Claim, content: dict[str, Any]) -> bool:
+    """Write the key's result.json, its last object, where there is none; tell whether it is ours."""
+    text = json.dumps({"key": mine.key, "token": mine.token, **content}, indent=1)
+    return results.write_new(f"results/{mine.key}/result.json", text.encode())
+
+
+def fail(results: Objects, mine: Claim, reason: str) -> bool:
+    """Note a failure; tell whether the recording is parked by it."""
+    note = {"token": mine.token, "reason": reason, "host": socket.gethostname(), "at": time.time()}
+    results.write_new(f"failures/{mine.key}/{mine.number:04d}.json", json.dumps(note).encode())
+    count = sum(1 for _ in results.list(f"failures/{mine.key}/"))
+    if count >= TRIES:
+        park(results, mine.key, reason, count)
+    return count >= TRIES
+
+
+def park(results: Objects, key: str, reason: str, tries: int) -> None:
+    """Park a key with its reason."""
+    results.write_new(f"parked/{key}.json", json.dumps({"reason": reason, "tries": tries}).encode())
+
+
+def forgive(results: Objects, key: str) -> None:
+    """Forget a key's failures, so that it is tried again."""
+    for prefix in (f"failures/{key}/", f"claims/{key}/"):
+        for one in list(results.list(prefix)):
+            results.remove(one.path)
+    results.remove(f"parked/{key}.json")
+
+
+def published_keys(results: Objects) -> set[str]:
+    """List the keys that are done."""
+    return {PurePosixPath(one.path).parent.name for one in results.list("results/")}
+
+
+def parked_keys(results: Objects) -> set[str]:
+    """List the keys that are parked."""
+    return {PurePosixPath(one.path).stem for one in results.list("parked/")}
+
+
+def running_keys(results: Objects, among: set[str]) -> set[str]:
+    """List the keys of `among` that someone works on now."""
+    newest: dict[str, str] = {}
+    for one in results.list("claims/"):
+        key = PurePosixPath(one.path).parent.name
+        if key in among:
+            newest[key] = max(newest.get(key, ""), one.path)
+    now = time.time()
+    return {
+        key for key, path in newest.items() if (results.read_json(path) or {"expires": 0})["expires"] > now
+    }
+
+
+def _path(mine: Claim) -> str:
+    return f"claims/{mine.key}/{mine.number:04d}.json"
+
+
+def _claim_text(mine: Claim, lease_s: float) -> bytes:
+    owner = {"host": socket.gethostname(), "pid": os.getpid(), "token": mine.token}
+    return json.dumps({**owner, "at": time.time(), "expires": time.time() + lease_s}).encode()

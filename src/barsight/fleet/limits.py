@@ -1,0 +1,89 @@
+"""Run a command under limits of memory and time, and tell in one line why it did not end well."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from barsight.core.errors import Failed
+from barsight.core.extras import extra
+
+with extra("fleet"):
+    import psutil
+
+_LOOK_S = 0.1
+GIB = 1 << 30
+
+
+@dataclass(frozen=True)
+class LimitedRun:
+    """A command that ended well. peak_bytes: resident memory of it and its children together."""
+
+    seconds: float
+    peak_bytes: int
+
+
+def run_limited(
+    command: Sequence[str], folder: Path, environment: Mapping[str, str], memory_gib: float, timeout_s: float
+) -> LimitedRun | Failed:
+    """Run a command in `folder`; it and its children are killed once they pass a limit, or we die.
+
+    Fails with `over-memory`, `timeout`, or `refused` and the last line that it wrote.
+    """
+    started = time.monotonic()
+    peak = 0
+    with (folder / "measure.log").open("wb") as log:
+        process = subprocess.Popen(
+            command, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            start_new_session=True, preexec_fn=_die_with_parent if sys.platform == "linux" else None,
+        )  # fmt: skip
+        try:
+            while process.poll() is None:
+                peak = max(peak, _resident(process.pid))
+                if peak > memory_gib * GIB:
+                    told = f"took {peak / GIB:.2f} GiB of memory, {memory_gib:g} GiB are allowed"
+                    return Failed("over-memory", told)
+                if time.monotonic() - started > timeout_s:
+                    return Failed("timeout", f"did not end in {timeout_s:g} s")
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_LOOK_S)
+        finally:
+            _kill(process)
+    if process.returncode == 0:
+        return LimitedRun(time.monotonic() - started, peak)
+    lines = (folder / "measure.log").read_bytes()[-4000:].decode(errors="replace").strip().splitlines()
+    line = (lines or ["no word"])[-1]
+    return Failed("refused", f"exit code {process.returncode}: {line[:300]}")
+
+
+def _die_with_parent() -> None:
+    """Ask the kernel to kill this process when its parent dies (PR_SET_PDEATHSIG)."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
+def _resident(pid: int) -> int:
+    total = 0
+    with contextlib.suppress(psutil.Error):
+        first = psutil.Process(pid)
+        for one in (first, *first.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):
+                total += one.memory_info().rss
+    return total
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is not None:
+        return
+    with contextlib.suppress(psutil.Error):
+        for one in psutil.Process(process.pid).children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                one.kill()
+    process.kill()
+    process.wait()

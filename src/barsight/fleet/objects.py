@@ -1,0 +1,152 @@
+"""Read and write objects of a folder, S3, Azure or Google storage; nothing else here knows of obstore."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import ConfigError, InputError
+from barsight.core.extras import extra
+
+with extra("fleet"):
+    import obstore
+    from obstore.exceptions import AlreadyExistsError, BaseError
+    from obstore.store import LocalStore, ObjectStore, from_url
+
+RETRY_S = 180
+"""Time for which a request that a server refuses or loses is tried again."""
+_LARGE = 8 << 20
+
+
+@dataclass(frozen=True)
+class StoredObject:
+    """An object of a listing. mark: changes when its content does."""
+
+    path: str
+    size: int
+    mark: str
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Objects under one URL. url: of a folder, s3://, az:// or gs://; without its keys, which come from the
+    environment.
+    """
+
+    url: str
+    store: ObjectStore
+
+    def list(self, prefix: str = "") -> Iterator[StoredObject]:
+        """List what lies under a prefix, which ends at a slash."""
+        with _told(self.url):
+            for part in obstore.list(self.store, prefix.rstrip("/") or None):
+                for one in part:
+                    mark = one["e_tag"] or one["last_modified"].isoformat()
+                    yield StoredObject(one["path"], one["size"], mark)
+
+    def read(self, path: str) -> bytes | None:
+        """Read an object; None where there is none."""
+        with _told(f"{self.url}/{path}"):
+            try:
+                return bytes(obstore.get(self.store, path).bytes())
+            except FileNotFoundError:
+                return None
+
+    def read_json(self, path: str) -> Any:
+        """Read a JSON object; None where there is none."""
+        data = self.read(path)
+        return None if data is None else json.loads(data)
+
+    def write(self, path: str, data: bytes) -> None:
+        """Write an object over what is there."""
+        with _told(f"{self.url}/{path}"):
+            obstore.put(self.store, path, data)
+
+    def write_new(self, path: str, data: bytes) -> bool:
+        """Write an object only where there is none; tell whether it is ours.
+
+        data: tells its writer apart. A put whose answer was lost is tried again and finds itself.
+        """
+        with _told(f"{self.url}/{path}"):
+            try:
+                obstore.put(self.store, path, data, mode="create")
+            except AlreadyExistsError:
+                return self.read(path) == data
+        return True
+
+    def remove(self, path: str) -> None:
+        """Remove an object; one that is gone is fine."""
+        with _told(f"{self.url}/{path}"):
+            try:
+                obstore.delete(self.store, path)
+            except FileNotFoundError:
+                return
+
+    def chunks(self, path: str) -> Iterator[bytes]:
+        """Read a large object in parts. Raises InputError where there is none."""
+        with _told(f"{self.url}/{path}"):
+            try:
+                found = obstore.get(self.store, path)
+            except FileNotFoundError:
+                raise InputError(f"{self.url}/{path}", "is gone", "plan the archive again") from None
+            for part in found.stream(min_chunk_size=_LARGE):
+                yield bytes(part)
+
+    def upload(self, file: Path, path: str) -> None:
+        """Write a file as an object."""
+        with _told(f"{self.url}/{path}"):
+            obstore.put(self.store, path, file)
+
+
+def open_objects(url: str, *, create: bool = False) -> Objects:
+    """Open a folder or a bucket. create: make the folder where there is none.
+
+    Raises ConfigError for a URL that is none, InputError for a folder that isn't there.
+    """
+    if "://" in url and not url.startswith("file://"):
+        options = {"allow_http": True} if _is_plain(os.environ.get("AWS_ENDPOINT_URL", "")) else None
+        waits = {"init_backoff": timedelta(seconds=0.2), "max_backoff": timedelta(seconds=5), "base": 2}
+        retry = {"max_retries": 1000, "retry_timeout": timedelta(seconds=RETRY_S), "backoff": waits}
+        try:
+            return Objects(url.rstrip("/"), from_url(url, client_options=options, retry_config=retry))  # type: ignore[call-overload]
+        except (BaseError, ValueError) as error:
+            raise ConfigError(f"{url}: can't be opened ({_first_line(error)})") from error
+    folder = Path(url.removeprefix("file://")).absolute()
+    if not folder.is_dir():
+        if not create:
+            raise InputError(folder, "there is no such folder", "name the folder, or s3://BUCKET/PATH")
+        folder.mkdir(parents=True, exist_ok=True)
+    return Objects(str(folder), LocalStore(folder))
+
+
+def _is_plain(endpoint: str) -> bool:
+    return endpoint.startswith("http://")
+
+
+class _told:  # noqa: N801
+    """Turn what a server or disk refuses into an InputError of one line."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __enter__(self) -> None:
+        """Begin."""
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        """Translate."""
+        if isinstance(error, BaseError) or (isinstance(error, OSError) and error.errno is None):
+            problem = _first_line(error)
+            raise InputError(
+                self.name, f"can't be reached ({problem})", "see that it is there and its keys are set"
+            ) from error
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return re.sub(r"\s+", " ", lines[0])[:300]

@@ -1,0 +1,80 @@
+"""Plan an archive: a task for each recording, and an estimate of the hours and gigabytes that are left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import median
+
+from barsight.fleet.archive import find_recordings, manifest_digest
+from barsight.fleet.objects import Objects
+from barsight.fleet.versions import FleetTask, Version
+
+FIRST_S, PER_PAIR_S, PER_BYTE_S, RESULT_BYTES = 8.0, 1.5, 1e-6, 15_000_000
+"""Rough figures of two cores, for an archive of which nothing was measured yet."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Work that is left: seconds of one worker, bytes to fetch and to write. known: tasks it rests on."""
+
+    seconds: float
+    fetched_bytes: int
+    written_bytes: int
+    known: int
+
+
+def plan_tasks(
+    archive: Objects,
+    results: Objects,
+    version: Version,
+    limit: int | None,
+    advance: Callable[[int, int], None],
+) -> list[FleetTask]:
+    """Make the tasks of an archive's recordings, in the order of their names; recordings with the same
+    content under two names are one task. advance: told of bytes read and of all.
+    """
+    recordings = find_recordings(archive)[:limit]
+    total, done = sum(one.size for one in recordings), 0
+    tasks: dict[str, FleetTask] = {}
+    for recording in recordings:
+
+        def read(size: int) -> None:
+            nonlocal done
+            done += size
+            advance(done, total)
+
+        key = version.key(manifest_digest(archive, results, recording, read))
+        tasks.setdefault(
+            key,
+            FleetTask(key, recording.name, recording.passes, version, recording.size, recording.pairs),
+        )
+    return list(tasks.values())
+
+
+def estimate(tasks: list[FleetTask], measured: list[tuple[int, int, float, int]]) -> Estimate:
+    """Estimate the work of tasks by what others took: by their pairs, or by bytes where these aren't known.
+
+    measured: bytes, pairs, seconds and bytes of result of tasks that are done.
+    """
+    per_pair = [seconds / pairs for _, pairs, seconds, _ in measured if pairs]
+    per_byte = [seconds / size for size, _, seconds, _ in measured if size]
+    written = [result for *_, result in measured]
+    seconds = 0.0
+    for task in tasks:
+        if task.pairs:
+            seconds += median(per_pair) * task.pairs if per_pair else FIRST_S + PER_PAIR_S * task.pairs
+        else:
+            seconds += median(per_byte) * task.size if per_byte else FIRST_S + PER_BYTE_S * task.size
+    each = median(written) if written else RESULT_BYTES
+    return Estimate(seconds, sum(t.size for t in tasks), round(each * len(tasks)), len(measured))
+
+
+def in_order(tasks: list[FleetTask], priorities: tuple[str, ...]) -> list[FleetTask]:
+    """Put first the recordings whose names begin with the first priority, and so on; then all others."""
+
+    def rank(task: FleetTask) -> int:
+        hits = (place for place, start in enumerate(priorities) if task.name.startswith(start))
+        return next(hits, len(priorities))
+
+    return sorted(tasks, key=rank)

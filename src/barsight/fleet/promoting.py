@@ -1,0 +1,103 @@
+"""Switch what the page and the plant see to a version's results, and take it back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.extras import extra
+from barsight.core.files import atomic_directory
+from barsight.fleet.ledger import published_keys
+from barsight.fleet.objects import Objects
+from barsight.fleet.versions import FleetTask, Version
+from barsight.store.adding import add_survey, read_survey
+from barsight.store.audit import entry
+from barsight.store.opening import Store
+from barsight.store.promotion import promoted_version
+from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
+
+with extra("store"):
+    from sqlalchemy import select
+
+
+def promote(
+    store: Store,
+    results: Objects,
+    version: Version,
+    tasks: list[FleetTask],
+    folder: Path,
+    by: str,
+    advance: Callable[[int, int], None],
+) -> int:
+    """Copy a version's results into `folder`, add them to the store as surveys, and switch to them at once.
+
+    Until the switch nobody sees them; killed before it, it is done again. Raises MeasurementError while a
+    recording of the version is neither published nor parked. Returns the number of surveys.
+    """  # fmt: skip
+    done = published_keys(results)
+    open_ones = [t for t in tasks if t.key not in done and results.read(f"parked/{t.key}.json") is None]
+    if open_ones or not done & {task.key for task in tasks}:
+        raise MeasurementError(
+            f"version {version.name}: {len(open_ones)} recordings are not measured; run it to its end first"
+        )
+    chosen = [task for task in tasks if task.key in done]
+    surveys = []
+    for number, task in enumerate(chosen):
+        out = folder / task.key[:32]
+        if not out.is_dir():
+            _fetch(results, task.key, out)
+        surveys.append(read_survey(out))
+        advance(number + 1, len(chosen))
+    for survey in sorted(surveys, key=lambda one: one.to_ns):
+        map_id = survey.identity.map_id
+        with entry(store, by, f"fleet survey {map_id} of version {version.name}") as opened:
+            read = opened.connection
+            mine = (FLEET_SURVEYS.c.version == version.name) & (FLEET_SURVEYS.c.map_id == map_id)
+            if read.execute(select(FLEET_SURVEYS.c.id).where(mine)).first() is None:
+                is_there = read.execute(select(SURVEYS.c.id).where(SURVEYS.c.map_id == map_id)).first()
+                is_others = read.execute(
+                    select(FLEET_SURVEYS.c.is_own).where(FLEET_SURVEYS.c.map_id == map_id)
+                ).first()
+                is_own = bool(is_others.is_own) if is_others else is_there is None
+                opened.add(FLEET_SURVEYS, version=version.name, map_id=map_id, is_own=is_own)
+        add_survey(store, survey, by)
+    _switch(store, version.name, by, f"promote fleet version {version.name}")
+    return len(surveys)
+
+
+def take_back(store: Store, by: str) -> str:
+    """Switch back to the version that was promoted before, and return its name; empty for none.
+
+    Raises ConfigError where nothing is promoted.
+    """
+    with store.reading() as connection:
+        now = promoted_version(connection)
+        rows = connection.execute(select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id)).scalars()
+        stack: list[str] = [""]
+        for name in rows:  # a switch to what lies below the top took the top back
+            if len(stack) > 1 and stack[-2] == name:
+                stack.pop()
+            elif stack[-1] != name:
+                stack.append(name)
+    if not now:
+        raise ConfigError("no version is promoted: there is nothing to take back")
+    before = stack[-2] if len(stack) > 1 else ""
+    _switch(store, before, by, f"take back fleet version {now}")
+    return before
+
+
+def _switch(store: Store, name: str, by: str, what: str) -> None:
+    with entry(store, by, what) as opened:
+        if promoted_version(opened.connection) != name:
+            opened.add(PROMOTIONS, version=name, who=by, at_ns=opened.at_ns)
+
+
+def _fetch(results: Objects, key: str, out: Path) -> None:
+    note = results.read_json(f"results/{key}/result.json")
+    with atomic_directory(out) as staging:
+        for name in note["files"]:
+            target = staging / Path(name).name
+            with target.open("wb") as stream:
+                for part in results.chunks(f"files/{key}/{note['token']}/{name}"):
+                    stream.write(part)

@@ -1,0 +1,106 @@
+"""Keep a fleet's facts in the store: versions, tasks, what is done; each addition is in the audit log."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Any
+
+from barsight.core.errors import ConfigError
+from barsight.core.extras import extra
+from barsight.fleet.versions import FleetTask, Version
+from barsight.store.audit import entry
+from barsight.store.opening import Store, open_store
+from barsight.store.tables import FLEET_RESULTS, FLEET_TASKS, FLEET_VERSIONS
+
+with extra("store"):
+    from sqlalchemy import Connection, select
+
+
+def note_plan(store: Store, tasks: Iterable[FleetTask], archive: str, by: str) -> int:
+    """Add a version and those of its tasks that the store doesn't have; return their number."""
+    planned = list(tasks)
+    with entry(store, by, f"fleet plan of {len(planned)} recordings") as opened:
+        known = set(opened.connection.execute(select(FLEET_TASKS.c.key)).scalars())
+        names = set(opened.connection.execute(select(FLEET_VERSIONS.c.name)).scalars())
+        for version in {task.version for task in planned if task.version.name not in names}:
+            opened.add(FLEET_VERSIONS, **asdict(version), at_ns=opened.at_ns)
+        fresh = {task.key: task for task in planned if task.key not in known}
+        for key, task in fresh.items():
+            opened.add(
+                FLEET_TASKS, key=key, version=task.version.name, archive=archive, recording=task.name,
+                passes=json.dumps(task.passes), bytes=task.size, pairs=task.pairs, at_ns=opened.at_ns,
+            )  # fmt: skip
+    return len(fresh)
+
+
+def note_result(url: str, key: str, content: dict[str, Any], by: str) -> None:
+    """Add a published task's row from a worker; nothing where it is there."""
+    with open_store(url) as store:
+        note_results(store, {key: content}, by)
+
+
+def note_results(store: Store, contents: dict[str, dict[str, Any]], by: str) -> None:
+    """Add the rows of published tasks that the store lacks. contents: their result.json."""
+    with entry(store, by, f"fleet results of {len(contents)} recordings") as opened:
+        known = noted_keys(opened.connection)
+        for key, content in contents.items():
+            if key not in known:
+                opened.add(
+                    FLEET_RESULTS, key=key, measured_s=content["measured_s"], whole_s=content["whole_s"],
+                    peak_bytes=content["peak_bytes"], at_ns=time.time_ns(),
+                    result_bytes=sum(file["bytes"] for file in content["files"].values()),
+                )  # fmt: skip
+
+
+def noted_keys(connection: Connection) -> set[str]:
+    """List the keys that have a row of their result."""
+    return set(connection.execute(select(FLEET_RESULTS.c.key)).scalars())
+
+
+def read_versions(connection: Connection) -> list[Version]:
+    """List the versions in the order in which they were planned first."""
+    rows = connection.execute(select(FLEET_VERSIONS).order_by(FLEET_VERSIONS.c.id)).all()
+    return [Version(r.name, r.configuration, r.calibration, r.magnet, r.software, r.rig) for r in rows]
+
+
+def find_version(connection: Connection, name: str | None) -> Version:
+    """Find a version by the beginning of its name; the one planned last where None. Raises ConfigError."""
+    versions = read_versions(connection)
+    found = [one for one in versions if name is None or one.name.startswith(name)]
+    if name is None and found:
+        return found[-1]
+    if len(found) != 1:
+        known = ", ".join(one.name for one in versions) or "none"
+        raise ConfigError(f"{name or 'the fleet'}: names no version that is planned; known: {known}")
+    return found[0]
+
+
+def read_tasks(connection: Connection, version: Version) -> list[FleetTask]:
+    """List a version's tasks in the order of the plan."""
+    chosen = select(FLEET_TASKS).where(FLEET_TASKS.c.version == version.name).order_by(FLEET_TASKS.c.id)
+    return [
+        FleetTask(r.key, r.recording, tuple(json.loads(r.passes)), version, r.bytes, r.pairs)
+        for r in connection.execute(chosen).all()
+    ]
+
+
+def read_archive(connection: Connection, version: Version) -> str:
+    """Return the URL of the archive that a version was planned over last."""
+    chosen = select(FLEET_TASKS.c.archive).where(FLEET_TASKS.c.version == version.name)
+    return str(connection.execute(chosen.order_by(FLEET_TASKS.c.id.desc()).limit(1)).scalar_one())
+
+
+def seconds_by_size(connection: Connection) -> list[tuple[int, int, float, int]]:
+    """List bytes, pairs, seconds and bytes of result of tasks that are done, the newest thousand."""
+    joined = (
+        select(
+            FLEET_TASKS.c.bytes, FLEET_TASKS.c.pairs, FLEET_RESULTS.c.whole_s, FLEET_RESULTS.c.result_bytes
+        )
+        .join(FLEET_RESULTS, FLEET_RESULTS.c.key == FLEET_TASKS.c.key)
+        .order_by(FLEET_RESULTS.c.id.desc())
+        .limit(1000)
+    )
+    return [(r[0], r[1], r[2], r[3]) for r in connection.execute(joined).all()]

@@ -1,0 +1,77 @@
+"""Lend temporary folders to tasks, and sweep those that dead ones left."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import barsight
+from barsight.core.extras import extra
+
+with extra("fleet"):
+    import psutil
+
+MIN_AGE_S = 60.0
+"""A younger folder may be one whose owner is just being written down."""
+
+
+def scratch_root() -> Path:
+    """Return this user's folder for all tasks of this machine."""
+    root = Path(tempfile.gettempdir()) / f"barsight-fleet-{os.getuid()}"
+    root.mkdir(mode=0o700, exist_ok=True)
+    return root
+
+
+@contextlib.contextmanager
+def scratch_folder(key: str) -> Iterator[Path]:
+    """Yield an empty folder, named after its owner's process and start, that is gone at the end."""
+    name = f"{key[:16]}-{os.getpid()}-{psutil.Process().create_time():.2f}-"
+    folder = Path(tempfile.mkdtemp(prefix=name, dir=scratch_root()))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def sweep(min_age_s: float = MIN_AGE_S) -> int:
+    """Remove this user's folders whose owner no longer runs and that are old enough; count them."""
+    count = 0
+    for folder in scratch_root().iterdir():
+        parts = folder.name.split("-")
+        if not folder.is_dir() or folder.is_symlink() or len(parts) != 4:
+            continue
+        with contextlib.suppress(OSError, ValueError):
+            is_old = time.time() - folder.stat().st_mtime >= min_age_s
+            if is_old and not _lives(int(parts[1]), float(parts[2])):
+                shutil.rmtree(folder)
+                count += 1
+    return count
+
+
+def _lives(pid: int, started: float) -> bool:
+    try:
+        return bool(abs(psutil.Process(pid).create_time() - started) < 1.0)
+    except psutil.Error:
+        return False
+
+
+def compile_once() -> None:
+    """Compile the kernels of a measurement unless this machine has done so: one compiles, others wait."""
+    package = Path(barsight.__file__).parent
+    stamp = max(int(path.stat().st_mtime) for path in package.rglob("*.py"))
+    mark = scratch_root() / f"kernels-{barsight.__version__}-{stamp}"
+    with (scratch_root() / "kernels.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if mark.exists():
+            return
+        load = "from barsight.core.compiling.ahead import load_kernels; load_kernels('measure')"
+        if subprocess.run([sys.executable, "-P", "-c", load], stderr=subprocess.DEVNULL).returncode == 0:
+            mark.touch()

@@ -1,0 +1,119 @@
+"""Measure one recording of an archive: claim, download, measure under limits, upload, publish, note."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from barsight.core.errors import BarsightError, Failed
+from barsight.fleet.archive import download
+from barsight.fleet.ledger import Claim, claim, fail, held, publish
+from barsight.fleet.limits import LimitedRun, run_limited
+from barsight.fleet.objects import Objects, open_objects
+from barsight.fleet.records import note_result
+from barsight.fleet.scratch import compile_once, scratch_folder
+from barsight.fleet.versions import FleetTask, arguments
+
+COMMAND = (sys.executable, "-m", "barsight", "measure")
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """All that tasks of a run share: URLs of archive, results and store (None: the driver writes the rows),
+    and limits. lease_s: after which a silent worker's claim is free. threads: of each; 0 leaves it alone.
+    """
+
+    archive: str
+    results: str
+    store: str | None
+    memory_gib: float = 8.0
+    timeout_s: float = 7200.0
+    lease_s: float = 60.0
+    threads: int = 0
+    by: str = "fleet"
+    command: tuple[str, ...] = COMMAND
+
+
+def run_task(task: FleetTask, settings: TaskSettings) -> str:
+    """Measure a recording unless another worker has it or did it, and return its key, whatever came of it.
+
+    A recording that fails is tried again at once until it is parked.
+    """
+    results = open_objects(settings.results, create=True)
+    while True:
+        mine = claim(results, task.key, settings.lease_s)
+        if not isinstance(mine, Claim):
+            return task.key
+        with held(results, mine, settings.lease_s):
+            ended = _try(task, mine, settings, results)
+            if not isinstance(ended, Failed):
+                return task.key
+            if fail(results, mine, f"{ended.code}: {ended.reason}"):
+                return task.key
+
+
+def _try(task: FleetTask, mine: Claim, settings: TaskSettings, results: Objects) -> Failed | None:
+    """Measure once; None where it is published, by this try or another."""
+    started = time.monotonic()
+    with scratch_folder(task.key) as folder:
+        (folder / "in").mkdir()
+        paths = list(download(open_objects(settings.archive), task.name, task.passes, folder / "in"))
+        words = [*map(str, paths), "-o", str(folder / "out"), "--at", "end"]
+        words += arguments(results, task.version, folder)
+        if settings.command == COMMAND:
+            compile_once()
+        fetched_s = time.monotonic() - started
+        ran = run_limited(
+            [*settings.command, *words],
+            folder,
+            _environment(settings),
+            settings.memory_gib,
+            settings.timeout_s,
+        )
+        if isinstance(ran, Failed):
+            return ran
+        files = _upload(folder / "out", f"files/{task.key}/{mine.token}", results)
+        content = _content(task, ran, fetched_s, time.monotonic() - started, files)
+        if publish(results, mine, content) and settings.store is not None:
+            try:
+                note_result(settings.store, task.key, content, settings.by)
+            except BarsightError as error:  # the driver writes what is missing
+                sys.stderr.write(f"{error}\n")
+    return None
+
+
+def _environment(settings: TaskSettings) -> dict[str, str]:
+    own = dict(os.environ)
+    if settings.threads:
+        own |= {name: str(settings.threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+    return own
+
+
+def _upload(out: Path, target: str, results: Objects) -> dict[str, dict[str, object]]:
+    files: dict[str, dict[str, object]] = {}
+    for path in sorted(p for p in out.rglob("*") if p.is_file()):
+        name = path.relative_to(out).as_posix()
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        results.upload(path, f"{target}/{name}")
+        files[name] = {"bytes": path.stat().st_size, "sha256": digest}
+    return files
+
+
+def _content(
+    task: FleetTask, ran: LimitedRun, fetched_s: float, whole_s: float, files: dict[str, dict[str, object]]
+) -> dict[str, object]:
+    return {
+        "recording": task.name,
+        "version": task.version.name,
+        "measured_s": round(ran.seconds, 3),
+        "fetched_s": round(fetched_s, 3),
+        "whole_s": round(whole_s, 3),
+        "peak_bytes": ran.peak_bytes,
+        "published_at": time.time(),
+        "files": files,
+    }

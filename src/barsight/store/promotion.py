@@ -1,0 +1,37 @@
+"""Tell which surveys count: of recordings that were measured anew, those of the promoted version."""
+
+from __future__ import annotations
+
+from barsight.core.extras import extra
+from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
+
+with extra("store"):
+    from sqlalchemy import Connection, and_, exists, or_, select
+    from sqlalchemy.sql.elements import ColumnElement
+
+
+def promoted_version(connection: Connection) -> str:
+    """Return the version that page and plant see; empty where none was promoted."""
+    newest = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1)
+    return str(connection.execute(newest).scalar() or "")
+
+
+def counts() -> ColumnElement[bool]:
+    """Build the condition on SURVEYS that keeps those that count.
+
+    A survey that the store has for a version's sake counts while that version is promoted. Any other counts
+    unless the promoted version has one of the same recording, told by its first and last frame's times.
+    """
+    promoted = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1).scalar_subquery()
+    own, chosen, other, twin = (
+        FLEET_SURVEYS.alias("own"), FLEET_SURVEYS.alias("chosen"), FLEET_SURVEYS.alias("other"),
+        SURVEYS.alias("twin"),
+    )  # fmt: skip
+    is_chosen = exists().where(chosen.c.map_id == SURVEYS.c.map_id, chosen.c.version == promoted)
+    is_own = exists().where(own.c.map_id == SURVEYS.c.map_id, own.c.is_own.is_(True))
+    has_twin = exists().where(
+        other.c.version == promoted, twin.c.map_id == other.c.map_id,
+        twin.c.captured_from_ns == SURVEYS.c.captured_from_ns,
+        twin.c.captured_to_ns == SURVEYS.c.captured_to_ns,
+    )  # fmt: skip
+    return or_(is_chosen, and_(~is_own, ~has_twin))

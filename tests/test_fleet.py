@@ -1,0 +1,223 @@
+"""The fleet: keys, claims, limits, S3, restarts, comparison and promotion, against stand-ins."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from barsight.core.errors import Failed
+from barsight.fleet.archive import find_recordings, manifest_digest
+from barsight.fleet.cluster import connect
+from barsight.fleet.comparing import FigureChange, RecordingComparison
+from barsight.fleet.comparison_page import comparison_page
+from barsight.fleet.driver import count_states, drive, parked_reasons
+from barsight.fleet.findings import holm, judge
+from barsight.fleet.ledger import Claim, claim, held, publish, published_keys
+from barsight.fleet.limits import LimitedRun, run_limited
+from barsight.fleet.objects import Objects, open_objects
+from barsight.fleet.planning import estimate, in_order, plan_tasks
+from barsight.fleet.records import note_plan, noted_keys
+from barsight.fleet.scratch import scratch_root, sweep
+from barsight.fleet.task import TaskSettings, run_task
+from barsight.fleet.versions import Version
+from barsight.fleet.window import Window
+from barsight.store.audit import AuditChain, entry, verify_chain
+from barsight.store.opening import open_store
+from barsight.store.promotion import counts, promoted_version
+from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
+from fleet_rounds import make_archive, moto_server, stand_in
+
+VERSION = Version("v1", "configuration", "", "", "0")
+
+
+def settings(folder: Path, archive: str, results: str, **more: float) -> TaskSettings:
+    return TaskSettings(archive, results, None, lease_s=5.0, command=stand_in(folder), **more)  # type: ignore[arg-type]
+
+
+def no_progress(*_: int) -> None:
+    """Take progress."""
+
+
+def test_a_key_tells_content_and_version_and_not_the_place(tmp_path: Path) -> None:
+    make_archive(tmp_path / "a", {"crane1/r": "x", "crane2/moved": "x", "crane2/survey/p1": "y"})
+    (tmp_path / "a/crane2/moved/mav0/name").write_text("crane1/r")
+    (tmp_path / "a/crane2/survey/survey.json").write_text('{"passes": ["p1"]}')
+    (tmp_path / "a/crane1/r/truth").mkdir()
+    (tmp_path / "a/crane1/r/truth/t.npz").write_text("not measured")
+    archive, results = open_objects(str(tmp_path / "a")), open_objects(str(tmp_path / "r"), create=True)
+    found = find_recordings(archive)
+    assert [one.name for one in found] == ["crane1/r", "crane2/moved", "crane2/survey"]
+    assert found[2].passes == ("p1",)
+    read: list[int] = []
+    first, moved, other = (manifest_digest(archive, results, one, read.append) for one in found)
+    assert first == moved != other
+    count = len(read)
+    assert manifest_digest(archive, results, found[0], read.append) == first
+    assert len(read) == count, "an unchanged listing is not read again"
+    assert VERSION.key(first) != replace(VERSION, calibration="c").key(first) != VERSION.key(other)
+
+
+def test_a_claim_has_one_owner_until_its_lease_runs_out(tmp_path: Path) -> None:
+    results = open_objects(str(tmp_path / "r"), create=True)
+    mine = claim(results, "k", 0.3)
+    assert isinstance(mine, Claim) and claim(results, "k", 0.3) == "claimed"
+    time.sleep(0.35)
+    later = claim(results, "k", 5)
+    assert isinstance(later, Claim) and later.number == 2
+    assert publish(results, later, {"n": 2}) and publish(results, later, {"n": 2}), "a put sent twice"
+    assert not publish(results, mine, {"n": 1}), "the slow one comes too late"
+    assert claim(results, "k", 5) == "published" and published_keys(results) == {"k"}
+    with held(results, Claim("z", 1, "t"), 0.4):
+        time.sleep(0.6)
+        assert claim(results, "z", 5) == "claimed", "a claim that is held is renewed"
+    assert isinstance(claim(results, "z", 5), Claim)
+
+
+@pytest.mark.parametrize(
+    ("code", "wanted"),
+    [
+        ("import sys; sys.exit('it is torn')", "refused: exit code 1: it is torn"),
+        ("x = bytearray(300 << 20); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(9)",
+         "over-memory"),
+        ("import time; time.sleep(9)", "timeout: did not end in 0.8 s"),
+    ],
+)  # fmt: skip
+def test_limits_end_a_command_and_say_why(tmp_path: Path, code: str, wanted: str) -> None:
+    seconds = 8.0 if "bytearray" in code else 0.8
+    failed = run_limited([sys.executable, "-I", "-c", code], tmp_path, os.environ, 0.2, seconds)
+    assert isinstance(failed, Failed) and f"{failed.code}: {failed.reason}".startswith(wanted)
+    assert isinstance(run_limited(["true"], tmp_path, os.environ, 1, 5), LimitedRun)
+
+
+def test_a_run_on_s3_parks_the_bad_and_publishes_the_rest_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = {f"r{i}": "good" for i in range(6)} | {"bad": "poison", "slow": "hangs"}
+    archive = open_objects(str(make_archive(tmp_path / "a", kinds)))
+    with moto_server() as (url, _):
+        for name, value in {
+            "AWS_ENDPOINT_URL": url, "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "y",
+            "AWS_REGION": "us-east-1",
+        }.items():  # fmt: skip
+            monkeypatch.setenv(name, value)
+        results = open_objects("s3://yard/results", create=True)
+        tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+        shared = settings(tmp_path, archive.url, results.url, timeout_s=1.0)
+        with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
+            assert note_plan(store, tasks, archive.url, "t") == 8
+            with connect(2, None) as client:
+                drive(client, tasks, shared, store, results, Window(), no_progress)
+            with store.reading() as connection:
+                assert noted_keys(connection) == published_keys(results)
+                assert isinstance(verify_chain(connection), AuditChain)
+        assert count_states(results, tasks).published == 6
+        told = {task.name: reason for task, reason in parked_reasons(results, tasks)}
+        assert told["bad"] == "refused: exit code 1: barsight: this recording is torn"
+        assert told["slow"] == "timeout: did not end in 1 s"
+        for task in tasks:
+            note = results.read_json(f"results/{task.key}/result.json")
+            if note is not None:
+                data = results.read(f"files/{task.key}/{note['token']}/bundles.json")
+                assert data is not None
+                assert hashlib.sha256(data).hexdigest() == note["files"]["bundles.json"]["sha256"]
+                whole = b"good" + task.name.encode()
+                assert json.loads(data)["sha"] == hashlib.sha256(whole).hexdigest()
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
+    archive = open_objects(str(make_archive(tmp_path / "a", {"r": "good"})))
+    results = open_objects(str(tmp_path / "r"), create=True)
+    (task,) = plan_tasks(archive, results, VERSION, None, no_progress)
+    shared = settings(tmp_path, archive.url, results.url)
+    assert run_task(task, shared) == task.key
+    before = sorted(one.path for one in results.list())
+    assert run_task(task, shared) == task.key
+    assert sorted(one.path for one in results.list()) == before
+    assert not [p for p in scratch_root().iterdir() if p.name.startswith(task.key[:16])]
+
+
+def test_folders_of_the_dead_are_swept_and_no_others() -> None:
+    dead = scratch_root() / "k-999999999-1.00-x"
+    alive = scratch_root() / f"k-{os.getpid()}-{time.time():.2f}-x"
+    dead.mkdir(exist_ok=True)
+    sweep()
+    assert dead.exists(), "it is young"
+    sweep(min_age_s=0)
+    assert not dead.exists()
+    assert not alive.exists()
+
+
+def test_the_night_passes_midnight() -> None:
+    night = Window(("22:00", "06:00"))
+    at = [night.is_open(datetime(2026, 1, 1, hour)) for hour in (21, 22, 3, 6)]
+    assert at == [False, True, True, False]
+    assert not Window(idle=True).is_open(busy_ratio=1.0) and Window(idle=True).is_open(busy_ratio=0.0)
+
+
+def test_the_estimate_is_by_what_was_measured_and_priorities_come_first(tmp_path: Path) -> None:
+    archive = open_objects(str(make_archive(tmp_path / "a", {"a": "x", "b": "x", "c/d": "x"})))
+    results = open_objects(str(tmp_path / "r"), create=True)
+    tasks = [replace(t, pairs=10) for t in plan_tasks(archive, results, VERSION, None, no_progress)]
+    told = estimate(tasks, [(1, 5, 20.0, 7), (1, 10, 40.0, 9)])
+    assert told.seconds == pytest.approx(3 * 40.0) and told.written_bytes == 24
+    assert [task.name for task in in_order(tasks, ("c/", "b"))] == ["c/d", "b", "a"]
+
+
+def change(recording: str, shift: float, sigma: float, p: float) -> RecordingComparison:
+    one = FigureChange(recording, 1, "top_z_m", 1.0, 1.0 + shift, sigma, p)
+    return RecordingComparison(recording, (one,), (), (), (), {}, (1.0, 1.0), ("a", "b"))
+
+
+def test_holm_keeps_its_level_and_a_shared_shift_is_found() -> None:
+    assert holm([0.01, 0.04, 0.03]) == [True, False, False]
+    shifted = judge("a", "b", [change(f"r{i}", 0.003 + 0.0002 * (i % 3), 0.01, 0.8) for i in range(30)], [])
+    assert [s.figure for s in shifted.shifts if s.is_found] == ["top_z_m"] and not shifted.beyond
+    same = judge("a", "b", [change(f"r{i}", 0.0, 0.01, 1.0) for i in range(30)], ["<lost>"])
+    assert not any(s.is_found for s in same.shifts) and not same.beyond
+    page = comparison_page(judge("a", "b", [change("<r>", 1.0, 0.01, 1e-9)], ["<lost>"]))
+    assert "&lt;r&gt;" in page and "<r>" not in page and "<lost>" not in page
+
+
+def test_a_promoted_version_hides_the_other_survey_of_its_recording(tmp_path: Path) -> None:
+    def seen() -> list[str]:
+        with store.reading() as connection:
+            return sorted(connection.execute(select(SURVEYS.c.map_id).where(counts())).scalars())
+
+    def switch(version: str) -> None:
+        with entry(store, "t", "switch") as opened:
+            opened.add(PROMOTIONS, version=version, who="t", at_ns=opened.at_ns)
+
+    with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
+        with entry(store, "t", "surveys") as opened:
+            for name, at_ns in (("live1", 10), ("new1", 10), ("live2", 20)):
+                opened.add(
+                    SURVEYS, map_id=name, captured_from_ns=at_ns, captured_to_ns=at_ns + 1, added_ns=0,
+                    calibration_id="", is_simulated=True, software_version="", folder="", files="",
+                    heights=b"",
+                )  # fmt: skip
+            opened.add(FLEET_SURVEYS, version="v", map_id="new1", is_own=True)
+        assert seen() == ["live1", "live2"]
+        switch("v")
+        assert seen() == ["live2", "new1"]
+        switch("")
+        assert seen() == ["live1", "live2"]
+        with store.reading() as connection:
+            assert promoted_version(connection) == "" and isinstance(verify_chain(connection), AuditChain)
+
+
+def test_the_listing_knows_its_objects(tmp_path: Path) -> None:
+    objects: Objects = open_objects(str(tmp_path / "o"), create=True)
+    assert objects.write_new("a/b", b"1") and not objects.write_new("a/b", b"2")
+    assert [(one.path, one.size) for one in objects.list("a/")] == [("a/b", 1)]
+    objects.remove("a/b")
+    objects.remove("a/b")
+    assert objects.read("a/b") is None
