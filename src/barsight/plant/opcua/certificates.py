@@ -60,7 +60,7 @@ def own_certificate(folder: Path, uri: str, host: str) -> OwnCertificate:
     return own
 
 
-def make_certificate(uri: str, name: str, hosts: list[str], days: int = _DAYS) -> tuple[bytes, bytes]:
+def make_certificate(uri: str, name: str, hosts: list[str], days: float = _DAYS) -> tuple[bytes, bytes]:
     """Make a certificate of an OPC UA application that signs itself; return it (DER) and its key (PEM)."""
     key = rsa.generate_private_key(public_exponent=65537, key_size=MIN_KEY_BITS)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from barsight.core.errors import Failed
 from barsight.plant.opcua.access import caller
 from barsight.plant.opcua.binding import Node, Server, ua
-from barsight.plant.opcua.events import Emitter
 from barsight.plant.opcua.calls import Handler, answer_method
+from barsight.plant.opcua.events import Emitter
 from barsight.plant.opcua.machine import (
     AUTOMATIC_STATES,
     MAIN_STATES,
@@ -26,6 +27,7 @@ _EVENTS = {
     "acquisition done": 1025, "error": 1019, "error resolved": 1020,
 }  # fmt: skip
 ERROR_CONDITION = 1035
+_BARE_IDS = {"RecipeIdExternalDataType": 3002, "RecipeIdInternalDataType": 3013, "ConfigurationIdDataType": 3008}
 _SYSTEM_STATES = {"Preoperational": 3, "Halted": 4, "Error": 5, "Operational": 2}
 """SystemStateDataType: engineering, scheduled downtime, unscheduled downtime, stand by; 1 is production."""
 
@@ -50,6 +52,7 @@ class VisionSystem:
         await server.import_xml(nodeset)
         await server.load_data_type_definitions()
         vision_index = await server.get_namespace_index(VISION_URI)
+        await _register_ids(server, vision_index)
         system = await server.nodes.objects.add_object(
             ua.NodeId("VisionSystem", index), ua.QualifiedName("VisionSystem", index),
             objecttype=ua.NodeId(_SYSTEM, vision_index), instantiate_optional=True,
@@ -166,6 +169,19 @@ class VisionSystem:
         await (await self.find(("SystemState",))).write_value(
             ua.Variant(described, ua.VariantType.ExtensionObject)
         )
+
+
+async def _register_ids(server: Server, vision_index: int) -> None:
+    """Register the ids that add no field to their base: asyncua takes them for the base itself, whose encoding
+    is another's.
+    """
+    for name, number in _BARE_IDS.items():
+        kind = server.get_node(ua.NodeId(number, vision_index))
+        encodings = await kind.get_referenced_nodes(ua.ObjectIds.HasEncoding)
+        binary = [one for one in encodings if (await one.read_browse_name()).Name == "Default Binary"]
+        delattr(ua, name)
+        derived = dataclass(type(name, (ua.BinaryIdBaseDataType,), {"__module__": __name__}))
+        ua.register_extension_object(name, binary[0].nodeid, derived, kind.nodeid)
 
 
 def int32(value: int) -> ua.Variant:
