@@ -17,7 +17,9 @@ from typing import Any
 
 import pytest
 
-NODE_MODULES = Path(os.environ.get("BARSIGHT_NODE_MODULES", Path.home() / ".cache/barsight/npm")) / "node_modules"
+NODE_MODULES = (
+    Path(os.environ.get("BARSIGHT_NODE_MODULES", Path.home() / ".cache/barsight/npm")) / "node_modules"
+)
 CLIENT_URI = "urn:tests:client"
 PASSWORD = "sixteen bars up"
 
@@ -69,10 +71,11 @@ class OpcUaPlant:
             "port": self.port, "folder": str(folder / "pki"), "users": str(folder / "users.json"), **settings
         }  # fmt: skip
         (folder / "settings.json").write_text(json.dumps(told))
-        self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("opcua_plant.py")), str(folder / "settings.json")],
-            text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=(folder / "log").open("w"),
-        )  # fmt: skip
+        with (folder / "log").open("w") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, str(Path(__file__).with_name("opcua_plant.py")), str(folder / "settings.json")],
+                text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log,
+            )  # fmt: skip
         assert self._read() == "up", self.log
 
     @property

@@ -35,8 +35,7 @@ with extra("opcua"):
 MIN_PASSWORD = 10
 _NAME = re.compile(r"[\w.@-]{1,60}")
 _COST = {"n": 2**14, "r": 8, "p": 1, "maxmem": 2**25}
-"""scrypt's: 16 MiB and some 40 ms a password."""
-"""The user whose request is served."""
+"""scrypt's: 16 MiB a password."""
 
 
 @dataclass(frozen=True)

@@ -76,11 +76,10 @@ class Conditions:
                 await self._change(replace(known, is_acknowledged=True, comment=comment, user=user))
 
     async def _add_node(self, code: str) -> Node:
-        node = await self._parent.add_object(
+        return await self._parent.add_object(
             ua.NodeId(f"Alarm.{code}", self._index), ua.QualifiedName(code, self._index),
             ua.NodeId(ua.ObjectIds.BaseObjectType),
         )  # fmt: skip
-        return node
 
     async def _change(self, condition: _Condition) -> None:
         event = self._event(condition)

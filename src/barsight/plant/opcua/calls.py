@@ -15,7 +15,7 @@ _PLAIN = {1: (bool,), 6: (int,), 7: (int,), 12: (str, type(None)), 15: (bytes, t
 
 
 async def answer_method(server: Server, node: Node, role: str, handler: Handler) -> None:
-    """Answer a method by `handler`, for callers who have `role` and give the arguments that the node declares."""
+    """Answer a method by `handler`, for callers with `role` who give the arguments that the node declares."""
     declared: list[Any] = []
     for child in await node.get_properties():
         if (await child.read_browse_name()).Name == "InputArguments":

@@ -32,7 +32,7 @@ class Emitter:
         self._models[name] = generator.event
 
     def make(self, name: str, message: str, severity: int, fields: dict[str, Any]) -> Any:
-        """Make an event. fields: by name (`FromState/Id`), a value, or a Variant where its type isn't known."""
+        """Make an event. fields: by name (`FromState/Id`), a value, or a Variant to set its type too."""
         event = copy.copy(self._models[name])
         event.data_types = dict(event.data_types)
         now = datetime.datetime.now(datetime.UTC)

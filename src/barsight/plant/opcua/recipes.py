@@ -6,8 +6,10 @@ import datetime
 from dataclasses import dataclass
 from typing import Any
 
+from barsight.core.errors import Failed
 from barsight.plant.opcua.binding import ua
 from barsight.plant.opcua.calls import Handler
+from barsight.plant.opcua.machine import step_by_method
 from barsight.plant.opcua.vision import VisionSystem, int32, refusal
 
 NOT_FOUND = 1
@@ -29,7 +31,12 @@ class RecipeMethods:
     def __init__(self, vision: VisionSystem, recipes: Recipes) -> None:
         self._vision = vision
         self.recipes = recipes
-        self.prepared = ""
+        self._chosen = ""
+
+    @property
+    def prepared(self) -> str:
+        """Name the recipe that is prepared: none before Ready, and none after Halt or Reset."""
+        return self._chosen if self._vision.mode.automatic not in (None, "Initialized") else ""
 
     async def add(self) -> None:
         """Link the methods; what a crane's clients may not do here is refused as not supported."""
@@ -60,26 +67,25 @@ class RecipeMethods:
         await active.write_value(ua.Variant(self._configuration(), ua.VariantType.ExtensionObject))
 
     async def _prepare(self, external: Any, internal: Any) -> Any:
+        if isinstance(refused := step_by_method(self._vision.mode, "PrepareRecipe"), Failed):
+            return refusal(refused)
         name = _id_of(internal) or _id_of(external)
         if name not in self.recipes.known:
             return [_recipe(""), ua.Variant(False), int32(NOT_FOUND)]
-        failed = await self._vision.step("PrepareRecipe")
-        if failed is not None:
-            return refusal(failed)
-        self.prepared = name
+        self._chosen = name
+        await self._vision.step("PrepareRecipe")
         await self._vision.emitter.emit(
             "recipe prepared", f"recipe {name} is prepared", InternalId=_recipe(name)
         )
         return [_recipe(name), ua.Variant(True), int32(0)]
 
     async def _unprepare(self, external: Any, internal: Any) -> Any:
+        if isinstance(refused := step_by_method(self._vision.mode, "UnprepareRecipe"), Failed):
+            return refusal(refused)
         name = _id_of(internal) or _id_of(external)
         if name != self.prepared:
             return [_recipe(""), int32(NOT_FOUND)]
-        failed = await self._vision.step("UnprepareRecipe")
-        if failed is not None:
-            return refusal(failed)
-        self.prepared = ""
+        await self._vision.step("UnprepareRecipe")
         return [_recipe(name), int32(0)]
 
     async def _list_recipes(
@@ -92,7 +98,8 @@ class RecipeMethods:
         page = names[start : start + most if most else None]
         listed = [ua.RecipeIdInternalDataType(Id=one) for one in page]
         return [
-            ua.Variant(start + len(page) >= len(names)), ua.Variant(len(page), ua.VariantType.UInt32), handle(),
+            ua.Variant(start + len(page) >= len(names)), ua.Variant(len(page), ua.VariantType.UInt32),
+            handle(),
             ua.Variant(listed, ua.VariantType.ExtensionObject, is_array=True), int32(0),
         ]  # fmt: skip
 

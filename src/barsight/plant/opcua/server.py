@@ -38,7 +38,7 @@ class _Shown:
 async def opcua_server(
     settings: OpcUaSettings, kind: type, source: PlantSource, recipes: Recipes
 ) -> AsyncIterator[asyncio.Task[None]]:
-    """Serve `source` as long as the block runs. kind: the snapshot's dataclass. Yields the task that follows."""
+    """Serve `source` while the block runs. kind: the snapshot's dataclass. Yields the task that follows it."""
     nodeset = settings.nodeset
     own = own_certificate(settings.folder, URI, settings.host)
     users = PasswordUsers(read_users(settings.users), settings.allow_anonymous)

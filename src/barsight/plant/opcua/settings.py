@@ -23,9 +23,9 @@ class OpcUaSettings:
     folder: Path = Path("opcua")
     """Holds certificate, key, `trusted/` with the certificates of clients, and `revoked/` with CRLs."""
     users: Path | None = None
-    """users.json, which `barsight plant user` writes. Without it only viewers come in, where they may."""
+    """users.json, which `add_user` of barsight.plant.opcua.access writes. Without it only viewers come in, where they may."""
     nodesets: Path | None = None
-    """Folder with Opc.Ua.MachineVision.NodeSet2.xml (npm's node-opcua-nodesets). Without it: variables only."""
+    """Folder with Opc.Ua.MachineVision.NodeSet2.xml (npm's node-opcua-nodesets). None: variables only."""
     allow_anonymous: bool = True
     """Let anyone with a trusted certificate read."""
     allow_unsecured: bool = False

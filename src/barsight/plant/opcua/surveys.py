@@ -1,4 +1,4 @@
-"""Define what the plant's side tells the OPC UA server: the state, alarms, surveys, answers to the handshake."""
+"""Define what the OPC UA server asks the plant: state, alarms, surveys, answers to the handshake."""
 
 from __future__ import annotations
 

@@ -27,7 +27,11 @@ _EVENTS = {
     "acquisition done": 1025, "error": 1019, "error resolved": 1020,
 }  # fmt: skip
 ERROR_CONDITION = 1035
-_BARE_IDS = {"RecipeIdExternalDataType": 3002, "RecipeIdInternalDataType": 3013, "ConfigurationIdDataType": 3008}
+_BARE_IDS = {
+    "RecipeIdExternalDataType": 3002,
+    "RecipeIdInternalDataType": 3013,
+    "ConfigurationIdDataType": 3008,
+}
 _SYSTEM_STATES = {"Preoperational": 3, "Halted": 4, "Error": 5, "Operational": 2}
 """SystemStateDataType: engineering, scheduled downtime, unscheduled downtime, stand by; 1 is production."""
 
@@ -122,7 +126,7 @@ class VisionSystem:
         return stepped
 
     async def _learn(self) -> None:
-        """Learn node ids of states and transitions from the types, and add what optional nodes asyncua lacks."""
+        """Learn node ids of states and transitions from the types, and add optional nodes that lack."""
         for number in (_MACHINE, _AUTOMATIC):
             for child in await self.server.get_node(self.node(number)).get_children():
                 name = (await child.read_browse_name()).Name
