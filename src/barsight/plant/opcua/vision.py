@@ -184,7 +184,7 @@ async def _register_ids(server: Server, vision_index: int) -> None:
         encodings = await kind.get_referenced_nodes(ua.ObjectIds.HasEncoding)
         binary = [one for one in encodings if (await one.read_browse_name()).Name == "Default Binary"]
         delattr(ua, name)
-        derived = dataclass(type(name, (ua.BinaryIdBaseDataType,), {"__module__": __name__}))
+        derived: Any = dataclass(type(name, (ua.BinaryIdBaseDataType,), {"__module__": __name__}))
         ua.register_extension_object(name, binary[0].nodeid, derived, kind.nodeid)
 
 
