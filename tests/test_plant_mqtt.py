@@ -1,4 +1,4 @@
-"""The MQTT publisher against Debian's mosquitto: retained state, last will, a broker that goes, a bounded buffer."""
+"""The MQTT publisher against Debian's mosquitto: retained, last will, broker killed, buffer."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from opcua_servers import free_port
 
 aiomqtt = pytest.importorskip("aiomqtt")
@@ -140,7 +141,7 @@ def test_a_broker_that_is_away_costs_bounded_memory_and_the_newest_survives(brok
             await client.subscribe("barsight/crane/events", qos=1)
             listening.set()
             async for message in client.messages:
-                told.append(json.loads(message.payload))
+                told.append(json.loads(message.payload))  # noqa: PERF401
 
     listening: asyncio.Event
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+
 from opcua_servers import free_port, node_package, run_node
 
 snap7 = pytest.importorskip("snap7")

@@ -1,9 +1,9 @@
 """Exchange bytes with a Siemens PLC by S7 PUT and GET: read the crane's inputs, write state and next lift.
 
-The bytes are those of the cyclic telegram, from the same layout; here Barsight is the active side, and the PLC
-only needs a data block without optimised access, and PUT/GET allowed. S7 PUT/GET knows no user: keep it to a
-network of its own. A write longer than one S7 telegram isn't whole in the PLC at every moment, so the PLC takes
-a lift only where its checksum fits.
+The bytes are those of the cyclic telegram, from the same layout. Here Barsight is the active side: the PLC only
+needs data blocks without optimised access, and PUT/GET allowed. S7 PUT/GET knows no user: keep it to a network
+of its own. A write longer than one S7 telegram isn't whole in the PLC at every moment, so the PLC takes a lift
+only where its checksum fits.
 """
 
 from __future__ import annotations
@@ -112,8 +112,10 @@ def run_s7(
     settings: S7Settings, input_bytes: int, outputs: Callable[[], bytes],
     take: Callable[[S7Exchange | Failed], None], stop: threading.Event,
 ) -> None:  # fmt: skip
-    """Exchange at each cycle until `stop` is set. outputs: the bytes to write, asked for at each exchange, so
-    that none is older than a cycle. take: told of each exchange, and of each that failed.
+    """Exchange at each cycle until `stop` is set.
+
+    outputs: the bytes to write, asked for at each exchange, so that none is older than a cycle. take: told of
+    each exchange, and of each that failed.
     """
     link = S7Link(settings, input_bytes)
     wait_s = settings.cycle_s

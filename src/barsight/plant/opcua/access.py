@@ -138,9 +138,9 @@ class PlantSession(InternalSession):  # type: ignore[misc]
 
     def activate_session(self, params: Any, peer_certificate: bytes | None) -> Any:
         """Refuse a channel without certificate, and one whose certificate isn't the judged one."""
-        if peer_certificate is None and not self.iserver.allow_unsecured:
+        if not peer_certificate and not self.iserver.allow_unsecured:
             raise ServiceError(ua.StatusCodes.BadSecurityModeRejected)
-        if peer_certificate is not None and peer_certificate != self.shown:
+        if peer_certificate and peer_certificate != self.shown:
             raise ServiceError(ua.StatusCodes.BadSecurityChecksFailed)
         return super().activate_session(params, peer_certificate)
 

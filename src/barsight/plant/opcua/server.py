@@ -38,7 +38,7 @@ class _Shown:
 async def opcua_server(
     settings: OpcUaSettings, kind: type, source: PlantSource, recipes: Recipes
 ) -> AsyncIterator[asyncio.Task[None]]:
-    """Serve `source` while the block runs. kind: the snapshot's dataclass. Yields the task that follows it."""
+    """Serve `source` while the block runs; yield the task that follows it. kind: the snapshot's dataclass."""
     nodeset = settings.nodeset
     own = own_certificate(settings.folder, URI, settings.host)
     users = PasswordUsers(read_users(settings.users), settings.allow_anonymous)

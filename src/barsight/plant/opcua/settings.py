@@ -23,7 +23,8 @@ class OpcUaSettings:
     folder: Path = Path("opcua")
     """Holds certificate, key, `trusted/` with the certificates of clients, and `revoked/` with CRLs."""
     users: Path | None = None
-    """users.json, which `add_user` of barsight.plant.opcua.access writes. Without it only viewers come in, where they may."""
+    """users.json, which `add_user` of barsight.plant.opcua.access writes. Without it nobody is more than a
+    viewer."""
     nodesets: Path | None = None
     """Folder with Opc.Ua.MachineVision.NodeSet2.xml (npm's node-opcua-nodesets). None: variables only."""
     allow_anonymous: bool = True
@@ -64,4 +65,4 @@ class OpcUaSettings:
         return path
 
 
-NODESET_REMEDY = "run: npm install node-opcua-nodesets, and set opcua.nodesets to node_modules/node-opcua-nodesets/nodesets"
+NODESET_REMEDY = "run: npm install node-opcua-nodesets, and set opcua.nodesets to its folder `nodesets`"

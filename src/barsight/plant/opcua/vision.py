@@ -176,8 +176,9 @@ class VisionSystem:
 
 
 async def _register_ids(server: Server, vision_index: int) -> None:
-    """Register the ids that add no field to their base: asyncua takes them for the base itself, whose encoding
-    is another's.
+    """Register the ids that add no field to their base.
+
+    asyncua takes them for the base itself, whose encoding is another's.
     """
     for name, number in _BARE_IDS.items():
         kind = server.get_node(ua.NodeId(number, vision_index))
