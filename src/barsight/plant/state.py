@@ -1,4 +1,4 @@
-"""Define the one state that telegram, OPC UA, MQTT and S7 serve, as a frozen snapshot, and read it from a store."""
+"""Define the one state that telegram, OPC UA, MQTT and S7 serve, and read it from a store."""
 
 from __future__ import annotations
 
