@@ -71,9 +71,10 @@ class OpcUaPlant:
             "port": self.port, "folder": str(folder / "pki"), "users": str(folder / "users.json"), **settings
         }  # fmt: skip
         (folder / "settings.json").write_text(json.dumps(told))
+        program = str(Path(__file__).with_name("opcua_plant.py"))
         with (folder / "log").open("w") as log:
             self._process = subprocess.Popen(
-                [sys.executable, str(Path(__file__).with_name("opcua_plant.py")), str(folder / "settings.json")],
+                [sys.executable, program, str(folder / "settings.json")],
                 text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log,
             )  # fmt: skip
         assert self._read() == "up", self.log

@@ -15,14 +15,13 @@ import pytest
 
 asyncua = pytest.importorskip("asyncua")
 
-from opcua_plant import DrawnState  # noqa: E402
-from opcua_servers import free_port, opcua_plant  # noqa: E402
-
 from barsight.core.errors import Failed  # noqa: E402
 from barsight.plant.opcua.process import OpcUaProcess  # noqa: E402
 from barsight.plant.opcua.recipes import Recipes  # noqa: E402
 from barsight.plant.opcua.settings import OpcUaSettings  # noqa: E402
 from barsight.plant.opcua.surveys import Told  # noqa: E402
+from opcua_plant import DrawnState  # noqa: E402
+from opcua_servers import free_port, opcua_plant  # noqa: E402
 
 
 def handshake(step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed:
@@ -74,7 +73,7 @@ def test_a_state_that_nobody_renews_goes_bad_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_clients_that_stall_and_subscriptions_left_behind_cost_bounded_memory(tmp_path: Path) -> None:
-    """20 clients, one stopped; then the sequence of asyncua's issue 1982: sessions closed, subscriptions kept."""
+    """20 clients, one stopped; then as in asyncua's issue 1982: sessions closed, subscriptions kept."""
     limits = {"max_subscriptions": 40, "max_subscription_cycles": 60, "allow_unsecured": True}
     seconds = float(os.environ.get("BARSIGHT_OPCUA_SECONDS", "30"))
     with opcua_plant(tmp_path, **limits) as plant:
@@ -119,7 +118,8 @@ async def _leave_behind(url: str, count: int) -> int:
         await client.connect()
         try:
             parameters = asyncua.ua.CreateSubscriptionParameters(
-                RequestedPublishingInterval=1000, RequestedLifetimeCount=100000, RequestedMaxKeepAliveCount=1000
+                RequestedPublishingInterval=1000, RequestedLifetimeCount=100000,
+                RequestedMaxKeepAliveCount=1000,
             )  # fmt: skip
             await client.uaclient.create_subscription(parameters, lambda result: None)
             made += 1

@@ -58,7 +58,7 @@ def test_an_exchange_reads_inputs_and_writes_outputs(plc: DrawnPlc) -> None:
 
 
 def test_nodes7_sees_the_same_numbers(plc: DrawnPlc) -> None:
-    """A foreign client on the PLC's side writes the inputs, and reads what was written, by types of its own."""
+    """A foreign client on the PLC's side writes the inputs, and reads what was written, by its own types."""
     node_package("@st-one-io/nodes7")
     process = run_node(
         "s7_client.js", str(plc.port), "DB100,DINT0=-1234567", "DB100,REAL4=8.25", "DB100,DINT0"

@@ -1,8 +1,9 @@
 """Publish the plant's state to an MQTT broker: plain JSON, retained, with a last will.
 
 Topics below the prefix: `online` (retained `true`, and by the last will `false`), `state` (retained, the
-newest snapshot), `events` (not retained, in order). While the broker is away, only the newest state is kept and
-at most `max_waiting` events; the oldest go, and the next event that gets through says how many (`lost`).
+newest snapshot), `events` (not retained, in order). While the broker is away, only the newest state is
+kept and at most `max_waiting` events; the oldest go, and the next event that gets through says how many
+(`lost`).
 """
 
 from __future__ import annotations

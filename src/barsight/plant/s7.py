@@ -1,9 +1,9 @@
 """Exchange bytes with a Siemens PLC by S7 PUT and GET: read the crane's inputs, write state and next lift.
 
-The bytes are those of the cyclic telegram, from the same layout. Here Barsight is the active side: the PLC only
-needs data blocks without optimised access, and PUT/GET allowed. S7 PUT/GET knows no user: keep it to a network
-of its own. A write longer than one S7 telegram isn't whole in the PLC at every moment, so the PLC takes a lift
-only where its checksum fits.
+The bytes are those of the cyclic telegram, from the same layout. Here Barsight is the active side: the
+PLC only needs data blocks without optimised access, and PUT/GET allowed. S7 PUT/GET knows no user: keep
+it to a network of its own. A write longer than one S7 telegram isn't whole in the PLC at every moment, so
+the PLC takes a lift only where its checksum fits.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class S7Link:
         self._client: snap7.Client | None = None
 
     def exchange(self, outputs: bytes) -> S7Exchange | Failed:
-        """Read the inputs, then write the outputs; return Failed where the PLC can't be reached or refuses."""
+        """Read the inputs, then write the outputs; return Failed where the PLC can't be reached."""
         one = self._settings
         try:
             client = self._connected()

@@ -1,8 +1,8 @@
 """Run the OPC UA server in a process of its own, which asks for the state and dies with its parent.
 
-The server's process asks, and a thread here answers: at most one question is under way, so that nothing piles up
-where either side stalls. A state that is older than `max_age_s`, or a question that isn't answered within it,
-makes all variables Bad.
+The server's process asks, and a thread here answers: at most one question is under way, so that nothing
+piles up where either side stalls. A state that is older than `max_age_s`, or a question that isn't
+answered within it, makes all variables Bad.
 """
 
 from __future__ import annotations
