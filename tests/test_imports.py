@@ -44,7 +44,7 @@ ROOMS = {
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
     "plant": (".", "opcua"),
-    "cli": (".", "calibrate", "bench", "live", "yard", "store"),
+    "cli": (".", "calibrate", "bench", "live", "yard", "store", "plant"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {

@@ -33,7 +33,7 @@ class Partner:
 
 
 class TelegramServer:
-    """Hold the newest state, and serve it while `run` runs. All in one event loop; the store in one thread."""
+    """Hold the newest state, and serve it while `run` runs. One event loop; the store in a thread."""
 
     def __init__(self, store: Store, settings: PlantSettings) -> None:
         self._store = store
