@@ -23,7 +23,7 @@ FLOORS = {
     "live_map": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
     "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11, "labels": 11,
-    "api": 12, "session": 12, "live": 12,
+    "api": 12, "session": 12, "live": 12, "plant": 12,
     "fleet": 13,
     "cli": 14,
 }  # fmt: skip
@@ -45,7 +45,8 @@ ROOMS = {
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
-    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet"),
+    "plant": (".", "opcua"),
+    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {
@@ -75,6 +76,7 @@ ROOT = Path(barsight.__file__).parent
 OPTIONAL = {
     "viser": 1, "plotly": 1, "rosbags": 2, "pymunk": 1, "alembic": 4, "viva_genicam": 1, "fastapi": 1,
     "uvicorn": 1, "zxingcpp": 1, "obstore": 1, "distributed": 1, "dask": 1,
+    "asyncua": 1, "aiomqtt": 1, "snap7": 1,
 }  # fmt: skip
 """Optional libraries, and the number of files that import them: of rosbags one reads and one writes."""
 

@@ -28,6 +28,7 @@ COMMANDS = {
     "yard": "Print the yard as the store knows it, now or at any past time",
     "fleet": "Measure an archive of many cranes anew on Dask, compare two versions, promote one",
     "serve": "Serve the operator's page and its API on a store",
+    "plant": "Speak with the plant: serve the telegram to a PLC, and check it",
     "view": "Show a measured yard in 3D in the browser",
     "info": "Say what is in a recording: sensors, rates, gaps, calibration",
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
@@ -40,7 +41,7 @@ COMMANDS = {
     "export": "Write a measured cloud or map as PLY, PCD, LAS, LAZ, E57, GeoTIFF or CSV",
     "report": "Write report.html anew from a measured yard's files",
 }
-GROUPS = ("bench", "calibrate", "live", "store", "fleet")
+GROUPS = ("bench", "calibrate", "live", "store", "fleet", "plant")
 """Commands that are packages: `command.py` in them finds the second word."""
 SECOND = {"live": ("check",)}
 """Second words of commands that do something without one too."""

@@ -1,0 +1,193 @@
+"""Publish the plant's state to an MQTT broker: plain JSON, retained, with a last will.
+
+Topics below the prefix: `online` (retained `true`, and by the last will `false`), `state` (retained, the
+newest snapshot), `events` (not retained, in order). While the broker is away, only the newest state is
+kept and at most `max_waiting` events; the oldest go, and the next event that gets through says how many
+(`lost`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import enum
+import json
+import ssl
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import ConfigError
+from barsight.core.extras import extra
+from barsight.core.json_values import json_value
+from barsight.core.reading.bounded_reading import read_text
+from barsight.core.settings.values import expect_ranges, expect_values
+
+with extra("mqtt"):
+    import aiomqtt
+
+
+@dataclass(frozen=True)
+class MqttSettings:
+    """The MQTT publisher, from the table `[mqtt]` of plant.toml."""
+
+    host: str = "127.0.0.1"
+    """The broker."""
+    port: int = 1883
+    """Its TCP port; 8883 for TLS as a rule."""
+    prefix: str = "barsight/crane"
+    """Topics begin with it."""
+    user: str | None = None
+    """Name at the broker."""
+    password_file: Path | None = None
+    """A file with the password in its first line."""
+    authority: Path | None = None
+    """The broker's certificate authority (PEM); with it the connection is encrypted."""
+    keepalive_s: int = 5
+    """The broker tells the last will after 1.5 times so long without a sign of life."""
+    max_waiting: int = 100
+    """Events kept while the broker is away."""
+    max_retry_s: float = 10.0
+    """Longest wait between attempts to reach the broker; the first is 0.1 s."""
+    state_every_s: float = 0.1
+    """Least interval between states."""
+
+    def __post_init__(self) -> None:
+        expect_values(self, "mqtt.")
+        expect_ranges(
+            self, "mqtt.", port=(1, 65535), keepalive_s=(1, 3600), max_waiting=(1, 100000),
+            max_retry_s=(0.1, 600), state_every_s=(0.01, 60),
+        )  # fmt: skip
+        if not self.prefix or set("#+\0") & set(self.prefix) or self.prefix.startswith("$"):
+            raise ConfigError(
+                f"mqtt.prefix: {self.prefix!r} is no topic; leave out #, + and a $ at the front"
+            )
+
+
+@dataclass(frozen=True)
+class MqttCounts:
+    """States and events that reached the broker, events that were dropped, and connections."""
+
+    states: int
+    events: int
+    lost: int
+    connections: int
+
+
+class MqttPublisher:
+    """Hold what waits for the broker, and publish it while `run` runs. All in one event loop."""
+
+    def __init__(self, settings: MqttSettings) -> None:
+        self._settings = settings
+        self._state: str | None = None
+        self._events: deque[dict[str, Any]] = deque()
+        self._lost = 0
+        self._unsaid = 0
+        self._states_sent = 0
+        self._events_sent = 0
+        self._connections = 0
+        self._changed = asyncio.Event()
+
+    @property
+    def counts(self) -> MqttCounts:
+        """Count what was sent and lost."""
+        return MqttCounts(self._states_sent, self._events_sent, self._lost, self._connections)
+
+    @property
+    def waiting(self) -> int:
+        """Count the events that wait."""
+        return len(self._events)
+
+    def show(self, snapshot: Any) -> None:
+        """Set the state that is published next; one that still waits is replaced."""
+        self._state = state_json(snapshot)
+        self._changed.set()
+
+    def tell(self, event: dict[str, Any]) -> None:
+        """Add an event; the oldest goes where too many wait."""
+        if len(self._events) >= self._settings.max_waiting:
+            self._events.popleft()
+            self._lost += 1
+            self._unsaid += 1
+        self._events.append(event)
+        self._changed.set()
+
+    async def run(self) -> None:
+        """Connect and publish until cancelled; a broker that is away is tried again and again."""
+        wait_s = 0.1
+        latest: str | None = None
+        while True:
+            began = time.monotonic()
+            with contextlib.suppress(aiomqtt.MqttError, OSError):
+                async with self._client() as client:
+                    self._connections += 1
+                    await client.publish(self._topic("online"), "true", qos=1, retain=True)
+                    latest = self._state = self._state or latest
+                    self._changed.set()
+                    try:
+                        while True:
+                            latest = await self._publish(client) or latest
+                    finally:
+                        if asyncio.current_task() is not None and asyncio.current_task().cancelling():  # type: ignore[union-attr]
+                            await client.publish(
+                                self._topic("online"), "false", qos=1, retain=True, timeout=1
+                            )
+            wait_s = 0.1 if time.monotonic() - began > self._settings.max_retry_s else wait_s
+            await asyncio.sleep(wait_s)
+            wait_s = min(2 * wait_s, self._settings.max_retry_s)
+
+    async def _publish(self, client: aiomqtt.Client) -> str | None:
+        """Publish what waits; return the state that went out."""
+        try:
+            await asyncio.wait_for(self._changed.wait(), self._settings.keepalive_s)
+        except TimeoutError:
+            return None
+        self._changed.clear()
+        state, self._state = self._state, None
+        try:
+            if state is not None:
+                await client.publish(self._topic("state"), state, qos=0, retain=True)
+                self._states_sent += 1
+            while self._events:
+                await client.publish(self._topic("events"), self._event(), qos=1)
+                self._events.popleft()
+                self._events_sent += 1
+                self._unsaid = 0
+        except BaseException:
+            self._state = self._state or state
+            raise
+        await asyncio.sleep(self._settings.state_every_s)
+        return state
+
+    def _event(self) -> str:
+        told = {**self._events[0], "lost": self._unsaid}
+        return json.dumps(json_value(told), default=_plain, allow_nan=False)
+
+    def _topic(self, name: str) -> str:
+        return f"{self._settings.prefix}/{name}"
+
+    def _client(self) -> aiomqtt.Client:
+        one = self._settings
+        password = read_text(one.password_file).splitlines()[0] if one.password_file is not None else None
+        context = ssl.create_default_context(cafile=one.authority) if one.authority is not None else None
+        return aiomqtt.Client(
+            one.host, one.port, username=one.user, password=password, keepalive=one.keepalive_s,
+            will=aiomqtt.Will(self._topic("online"), "false", qos=1, retain=True), timeout=5,
+            tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,
+        )  # fmt: skip
+
+
+def state_json(snapshot: Any) -> str:
+    """Write a frozen snapshot as JSON: its fields by name, what isn't known as null."""
+    return json.dumps(json_value(dataclasses.asdict(snapshot)), default=_plain, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} has no form in JSON")

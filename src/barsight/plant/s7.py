@@ -1,0 +1,132 @@
+"""Exchange bytes with a Siemens PLC by S7 PUT and GET: read the crane's inputs, write state and next lift.
+
+The bytes are those of the cyclic telegram, from the same layout. Here Barsight is the active side: the
+PLC only needs data blocks without optimised access, and PUT/GET allowed. S7 PUT/GET knows no user: keep
+it to a network of its own. A write longer than one S7 telegram isn't whole in the PLC at every moment, so
+the PLC takes a lift only where its checksum fits.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from barsight.core.errors import Failed
+from barsight.core.extras import extra
+from barsight.core.settings.values import expect_ranges, expect_values
+
+with extra("s7"):
+    import snap7
+    from snap7.error import S7Error
+
+
+@dataclass(frozen=True)
+class S7Settings:
+    """The S7 client, from the table `[s7]` of plant.toml."""
+
+    host: str = "127.0.0.1"
+    """The PLC."""
+    port: int = 102
+    """Its TCP port."""
+    rack: int = 0
+    """Rack of the CPU."""
+    slot: int = 1
+    """Slot of the CPU: 1 for S7-1200 and S7-1500, 2 for S7-300."""
+    read_db: int = 100
+    """Data block that the PLC writes: encoders, hoist, magnet, clock, life counter."""
+    read_start: int = 0
+    """First byte there."""
+    write_db: int = 101
+    """Data block that Barsight writes."""
+    write_start: int = 0
+    """First byte there."""
+    cycle_s: float = 0.1
+    """Interval between exchanges."""
+    max_retry_s: float = 5.0
+    """Longest wait between attempts to reach the PLC."""
+
+    def __post_init__(self) -> None:
+        expect_values(self, "s7.")
+        expect_ranges(
+            self, "s7.", port=(1, 65535), rack=(0, 7), slot=(0, 31), read_db=(1, 65535),
+            read_start=(0, 65535), write_db=(1, 65535), write_start=(0, 65535), cycle_s=(0.01, 10),
+            max_retry_s=(0.1, 600),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class S7Exchange:
+    """One exchange. inputs: bytes read. read_s, write_s: time that each took."""
+
+    inputs: bytes
+    read_s: float
+    write_s: float
+
+
+class S7Link:
+    """A connection to a PLC, made anew where it was lost."""
+
+    def __init__(self, settings: S7Settings, input_bytes: int) -> None:
+        self._settings = settings
+        self._input_bytes = input_bytes
+        self._client: snap7.Client | None = None
+
+    def exchange(self, outputs: bytes) -> S7Exchange | Failed:
+        """Read the inputs, then write the outputs; return Failed where the PLC can't be reached."""
+        one = self._settings
+        try:
+            client = self._connected()
+            began = time.monotonic()
+            inputs = bytes(client.db_read(one.read_db, one.read_start, self._input_bytes))
+            read = time.monotonic()
+            client.db_write(one.write_db, one.write_start, bytearray(outputs))
+            written = time.monotonic()
+        except (S7Error, RuntimeError, OSError, ValueError) as error:
+            self.close()
+            reason = f"the PLC at {one.host}:{one.port} can't be read and written: {error}"
+            return Failed("s7-exchange", " ".join(reason.split()))
+        if len(inputs) != self._input_bytes:
+            return Failed("s7-short", f"the PLC gave {len(inputs)} bytes of {self._input_bytes}")
+        return S7Exchange(inputs, read - began, written - read)
+
+    def close(self) -> None:
+        """End the connection, if there is one."""
+        client, self._client = self._client, None
+        if client is not None:
+            try:
+                client.disconnect()
+            except (S7Error, RuntimeError, OSError):
+                return
+
+    def _connected(self) -> snap7.Client:
+        if self._client is None:
+            client = snap7.Client()
+            client.connect(self._settings.host, self._settings.rack, self._settings.slot, self._settings.port)
+            self._client = client
+        return self._client
+
+
+def run_s7(
+    settings: S7Settings, input_bytes: int, outputs: Callable[[], bytes],
+    take: Callable[[S7Exchange | Failed], None], stop: threading.Event,
+) -> None:  # fmt: skip
+    """Exchange at each cycle until `stop` is set.
+
+    outputs: the bytes to write, asked for at each exchange, so that none is older than a cycle. take: told of
+    each exchange, and of each that failed.
+    """
+    link = S7Link(settings, input_bytes)
+    wait_s = settings.cycle_s
+    due = time.monotonic()
+    try:
+        while not stop.is_set():
+            exchanged = link.exchange(outputs())
+            take(exchanged)
+            failed = isinstance(exchanged, Failed)
+            wait_s = min(2 * wait_s, settings.max_retry_s) if failed else settings.cycle_s
+            due = max(due + wait_s, time.monotonic()) if not failed else time.monotonic() + wait_s
+            stop.wait(max(0.0, due - time.monotonic()))
+    finally:
+        link.close()

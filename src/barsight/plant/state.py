@@ -1,0 +1,143 @@
+"""Define the one state that telegram, OPC UA, MQTT and S7 serve, and read it from a store."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from barsight.core.json_values import json_value
+from barsight.store.confirmation import OPEN, OpenLift, newest_survey, open_lifts, yard_clock_ns
+from barsight.store.opening import Store
+
+YAW_SENSE = "counter-clockwise from +x of the yard frame, seen from above"
+
+
+@dataclass(frozen=True)
+class CranePose:
+    """The crane in the yard frame. sigma_m: standard deviations; stamp_ns: of the measurement."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    sigma_m: tuple[float, float, float]
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class OfferedLift:
+    """A lift with all that a crane needs, in the yard frame.
+
+    hoist_height_m: of the faces' plane at contact. approach_height_m: the magnet's faces may travel over any
+    place there, None where the plant names no height. magnet_class: current step for the load, None where the
+    plant has no table. sha256: of all fields but itself and `handshake`.
+    """
+
+    lift_id: int
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    yaw_sense: str
+    hoist_height_m: float
+    approach_height_m: float | None
+    magnet_class: int | None
+    tolerance_x_m: float
+    tolerance_y_m: float
+    tolerance_yaw_deg: float
+    mass_kg: float
+    mass_sigma_kg: float
+    count: int
+    set_down_x_m: float | None
+    set_down_y_m: float | None
+    set_down_z_m: float | None
+    set_down_yaw_deg: float | None
+    valid_until_ns: int
+    map_id: str
+    handshake: str
+    sha256: str = ""
+
+    def digest(self) -> str:
+        """Form the checksum: SHA-256 of the fields' JSON without `handshake` and `sha256`."""
+        content = {k: v for k, v in asdict(self).items() if k not in ("handshake", "sha256")}
+        text = json.dumps(json_value(content), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class PlantAlarm:
+    """An alarm. priority: 1 (highest) to 3."""
+
+    code: str
+    priority: int
+    text: str
+    is_active: bool
+    is_acknowledged: bool
+
+
+@dataclass(frozen=True)
+class PlantState:
+    """The plant's state at `stamp_ns` of the yard's clock. reasons: why it isn't valid; none where it is."""
+
+    mode: str
+    is_valid: bool
+    reasons: tuple[str, ...]
+    life_counter: int
+    stamp_ns: int
+    survey: str
+    pose: CranePose | None = None
+    lift: OfferedLift | None = None
+    alarms: tuple[PlantAlarm, ...] = ()
+    map_id: str | None = None
+    calibration_id: str | None = None
+
+
+def state_of_store(
+    store: Store, life_counter: int, *, approach_height_m: float | None = None,
+    magnet_steps_kg: tuple[float, ...] = (), now_ns: int | None = None,
+) -> PlantState:  # fmt: skip
+    """Read the state: the claimed lift, or else the best offer, where its map is the newest and not too old.
+
+    approach_height_m, magnet_steps_kg: see `PlantSettings`. now_ns: this computer's clock.
+    """
+    with store.reading() as connection:
+        clock_ns = yard_clock_ns(connection, now_ns)
+        survey = newest_survey(connection)
+        lifts = open_lifts(connection)
+    if survey is None:
+        reasons = ("no-survey: the store holds no survey",)
+        return PlantState("idle", False, reasons, life_counter, clock_ns, "none")
+    usable = [
+        one for one in lifts
+        if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns
+    ]  # fmt: skip
+    best = min(usable, key=lambda one: (OPEN.index(one.state) == 0, one.record["rank"]), default=None)
+    lift = None if best is None else offered_lift(best, approach_height_m, magnet_steps_kg)
+    reasons = () if lift is not None else ("no-lift: no lift is offered that is still valid",)
+    return PlantState(
+        "simulated" if survey.is_simulated else "surveyed", lift is not None, reasons, life_counter, clock_ns,
+        "done", None, lift, (), survey.map_id, survey.calibration_id,
+    )  # fmt: skip
+
+
+def offered_lift(
+    lift: OpenLift, approach_height_m: float | None, magnet_steps_kg: tuple[float, ...]
+) -> OfferedLift:
+    """Form what the crane is told of a lift of the store.
+
+    The magnet's class is the first step, from 1, that carries mass and two of its standard deviations.
+    """
+    record: dict[str, Any] = lift.record
+    target, tolerance, place = record["target"], record["tolerance"], record["set_down"] or {}
+    heaviest_kg = record["mass_kg"] + 2 * record["mass_sigma_kg"]
+    steps = [number for number, most in enumerate(magnet_steps_kg, 1) if most >= heaviest_kg]
+    one = OfferedLift(
+        lift.lift_id, target["x_m"], target["y_m"], target["z_m"], target["yaw_deg"], YAW_SENSE,
+        target["z_m"], approach_height_m, steps[0] if steps else None, tolerance["x_m"], tolerance["y_m"],
+        tolerance["yaw_deg"], record["mass_kg"], record["mass_sigma_kg"], record["count"], place.get("x_m"),
+        place.get("y_m"), place.get("z_m"), place.get("yaw_deg"), int(record["valid_until_ns"]), lift.map_id,
+        lift.state,
+    )  # fmt: skip
+    return replace(one, sha256=one.digest())

@@ -1,0 +1,180 @@
+"""The MQTT publisher against Debian's mosquitto: retained, last will, broker killed, buffer."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from opcua_servers import free_port
+
+aiomqtt = pytest.importorskip("aiomqtt")
+
+from barsight.core.errors import ConfigError  # noqa: E402
+from barsight.plant.mqtt import MqttPublisher, MqttSettings  # noqa: E402
+
+MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+
+
+@dataclass(frozen=True)
+class DrawnMode:
+    mode: str
+    life_counter: int
+    mass_kg: float | None = None
+
+
+class Broker:
+    """A mosquitto on a free port, that can be killed and started again."""
+
+    def __init__(self, folder: Path) -> None:
+        if MOSQUITTO is None:
+            pytest.skip("mosquitto is not installed (run .ci/servers)")
+        self.port = free_port()
+        self.config = folder / "mosquitto.conf"
+        self.config.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence false\n")
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [str(MOSQUITTO), "-c", str(self.config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )  # fmt: skip
+        time.sleep(0.3)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    async def until(self, topic: str, test: Callable[[str], bool], timeout_s: float = 10) -> str:
+        """The first message that passes the test."""
+        async with asyncio.timeout(timeout_s), aiomqtt.Client("127.0.0.1", self.port) as client:
+            await client.subscribe(topic, qos=1)
+            async for message in client.messages:
+                if test(message.payload.decode()):
+                    return str(message.payload.decode())
+        raise AssertionError(topic)
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    one = Broker(tmp_path)
+    yield one
+    one.kill()
+
+
+def run_with(publisher: MqttPublisher, body: Callable[[], Awaitable[Any]]) -> Any:
+    async def both() -> Any:
+        running = asyncio.create_task(publisher.run())
+        try:
+            return await body()
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+    return asyncio.run(both())
+
+
+async def until(test: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10):
+        while not test():
+            await asyncio.sleep(0.02)
+
+
+def test_a_late_client_gets_the_state_and_knows_who_is_there(broker: Broker) -> None:
+    publisher = MqttPublisher(MqttSettings(port=broker.port, state_every_s=0.02))
+
+    async def body() -> tuple[dict[str, Any], str]:
+        publisher.show(DrawnMode("surveyed", 7, float("nan")))
+        await until(lambda: publisher.counts.states == 1)
+        state = await broker.until("barsight/crane/state", lambda text: True)
+        return json.loads(state), await broker.until("barsight/crane/online", lambda text: True)
+
+    assert run_with(publisher, body) == ({"mode": "surveyed", "life_counter": 7, "mass_kg": None}, "true")
+    assert asyncio.run(broker.until("barsight/crane/online", lambda text: True)) == "false"
+
+
+def test_the_last_will_tells_a_process_that_died(broker: Broker) -> None:
+    """Not taken leave of: os._exit in the middle."""
+    program = textwrap.dedent(f"""
+        import asyncio, os
+        from barsight.plant.mqtt import MqttPublisher, MqttSettings
+        async def main():
+            publisher = MqttPublisher(MqttSettings(port={broker.port}))
+            running = asyncio.create_task(publisher.run())
+            while publisher.counts.connections == 0:
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0.3)
+            print("up", flush=True)
+            await asyncio.sleep(1)
+            os._exit(1)
+        asyncio.run(main())
+    """)
+
+    async def watch() -> list[str]:
+        with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            await asyncio.to_thread(process.stdout.readline)
+            return [
+                await broker.until("barsight/crane/online", lambda text, w=w: text == w)
+                for w in ("true", "false")
+            ]
+
+    assert asyncio.run(watch()) == ["true", "false"]
+
+
+def test_a_broker_that_is_away_costs_bounded_memory_and_the_newest_survives(broker: Broker) -> None:
+    settings = MqttSettings(port=broker.port, max_waiting=10, max_retry_s=0.2, state_every_s=0.02)
+    publisher = MqttPublisher(settings)
+    told: list[dict[str, Any]] = []
+
+    async def listen() -> None:
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            await client.subscribe("barsight/crane/events", qos=1)
+            listening.set()
+            async for message in client.messages:
+                told.append(json.loads(message.payload))  # noqa: PERF401
+
+    listening: asyncio.Event
+
+    async def body() -> str:
+        nonlocal listening
+        listening = asyncio.Event()
+        publisher.show(DrawnMode("surveyed", 1))
+        await until(lambda: publisher.counts.states == 1)
+        broker.kill()
+        for number in range(1000):
+            publisher.tell({"number": number})
+            publisher.show(DrawnMode("surveyed", number))
+            if number % 100 == 0:
+                await asyncio.sleep(0.05)
+            assert publisher.waiting <= 10
+        broker.start()
+        listener = asyncio.create_task(listen())
+        try:
+            await until(lambda: publisher.counts.connections >= 2)
+            state = await broker.until("barsight/crane/state", lambda text: '"life_counter": 999' in text)
+            await listening.wait()
+            publisher.tell({"number": 1000})
+            await until(lambda: bool(told) and told[-1]["number"] == 1000)
+        finally:
+            listener.cancel()
+            await asyncio.gather(listener, return_exceptions=True)
+        return state
+
+    assert json.loads(run_with(publisher, body))["life_counter"] == 999
+    assert publisher.counts.lost >= 985
+    assert [event["number"] for event in told] == sorted({event["number"] for event in told})
+
+
+def test_topics_with_wildcards_are_refused() -> None:
+    with pytest.raises(ConfigError, match="no topic"):
+        MqttSettings(prefix="yard/#")

@@ -1,0 +1,36 @@
+"""The telegram: bytes against offsets written by hand, and bytes that are no telegram."""
+
+import random
+import struct
+
+from barsight.core.errors import Failed
+from barsight.plant.state import OfferedLift, PlantState
+from barsight.plant.telegram import layout, out_values, pack, unpack
+
+LIFT = OfferedLift(
+    7, 1.5, -0.25, 0.7, 90.5, "ccw", 0.7, None, 2, 0.015, 0.03, 0.2, 1737.4, 522.2, 1, 3.0, 0.0, 0.1, 90.5,
+    1_700_000_000_000_000_000, "map", "offered", "0a0b0c0d" + 56 * "0",
+)  # fmt: skip
+VALID = PlantState("surveyed", True, (), 65537, 5, "done", None, LIFT)
+
+
+def test_bytes_lie_where_the_table_says() -> None:
+    content = pack("out", out_values(VALID, {"answer_number": 3, "answer": 1, "token": 9}))
+    assert struct.unpack_from(">HHHHq", content) == (0xB51A, 1, 1, 1 | 2 | 16, 5)
+    assert struct.unpack_from(">IIq", content, 16) == (7, 0x0A0B0C0D, 1_700_000_000_000_000_000)
+    assert struct.unpack_from(">iiiii", content, 32) == (15000, -2500, 7000, 90500, -(2**31))
+    assert struct.unpack_from(">HHHHII", content, 52) == (150, 300, 200, 2, 17374, 5222)
+    assert struct.unpack_from(">HHHHIiiii", content, 68) == (1, 3, 1, 0, 9, 30000, 0, 1000, 90500)
+    assert len(content) == 96
+
+
+def test_a_state_that_is_not_valid_carries_no_lift() -> None:
+    state = PlantState("surveyed", False, ("x",), 1, 5, "done", None, LIFT)
+    assert unpack("out", pack("out", out_values(state, {})))["lift_id"] == 0  # type: ignore[index]
+
+
+def test_what_is_no_telegram_is_refused() -> None:
+    draw = random.Random(22)
+    for _ in range(2000):
+        content = draw.randbytes(draw.randrange(2 * layout("in").size))
+        assert isinstance(unpack("in", content), Failed)
