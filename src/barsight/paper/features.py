@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from barsight.benchmarks.motion.matching import stereo_places
-from barsight.benchmarks.motion.matching_truth import reproject, true_steps
+from barsight.benchmarks.motion.matching_truth import TrueStep, reproject, true_steps
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
@@ -35,13 +36,15 @@ COUNT = 2000
 class TwoViews:
     """Neighbouring views and the trend's rotation and translation, new_from_old of rect0 (None: not known).
 
-    reproject: gives features' true new places, NaN where not known; None without truth.
+    reproject: gives features' true new places, NaN where not known; None without truth. true_depth_m:
+    (H, W) of the old rectified view, None without truth.
     """
 
     old: PatchPair
     new: PatchPair
     trend: tuple[Float64, Float64] | None
     reproject: Callable[[Float64], Float64] | None
+    true_depth_m: Float64 | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +78,31 @@ def two_views(recording: Recording) -> TwoViews:
     if step is not None:
         old, new = step.old, step.new
     else:
-        pairs = [pair for pair in RectifiedPairs(recording, rectifier)(_middle(recording))
-                 if isinstance(pair, RectifiedPair)]
+        pairs = [
+            pair
+            for pair in RectifiedPairs(recording, rectifier)(_middle(recording))
+            if isinstance(pair, RectifiedPair)
+        ]
         if len(pairs) < 2:
             raise InputError(recording.path, "its middle frames aren't whole", "give another recording")
         old, new = patch_pair(pairs[0]), patch_pair(pairs[1])
     trend = _trend(recording, rectifier, old.pair.stamp_ns, new.pair.stamp_ns)
-    return TwoViews(old, new, trend, None if step is None else lambda places: reproject(step, places))
+    if step is None:
+        return TwoViews(old, new, trend, None, None)
+    return TwoViews(old, new, trend, lambda places: reproject(step, places), _rectified_depth(step))
+
+
+def _rectified_depth(step: TrueStep) -> Float64:
+    """Resample the raw camera's true depth to the rectified view (H, W)."""
+    camera, rig = step.rectifier.camera, step.recording.rig
+    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y = (column - camera.cx_px) / camera.focal_px, (row - camera.cy_px) / camera.focal_px
+    rays = np.dstack([x, y, np.ones_like(x)]).reshape(-1, 3)
+    raw = (rig.body_from_cam0.inverse() @ step.rectifier.body_from_rect0).apply(rays * 1e6) / 1e6
+    pixels = rig.cam0.project(raw)
+    depth = map_coordinates(step.depth_m, [pixels[:, 1], pixels[:, 0]], order=0, cval=np.nan)
+    true: Float64 = (depth / raw[:, 2]).reshape(column.shape)
+    return np.where(np.isfinite(true), true, np.nan)
 
 
 def _middle(recording: Recording) -> set[int]:
@@ -173,11 +194,12 @@ def draw_pairs(views: TwoViews, row: FilteredMatches, where: str, *, filtered: b
     old, new = row.places * scale, row.target * scale
     if not filtered:
         draw_lines(canvas, old, new, row.initial, ORANGE)
-        return picture_of(canvas, f"{row.detector.upper()}, {where}: {int(row.initial.sum())} initial matches")
+        return picture_of(
+            canvas, f"{row.detector.upper()}, {where}: {int(row.initial.sum())} initial matches"
+        )
     foreseen = row.initial & np.isfinite(row.expected).all(axis=1)
     draw_lines(canvas, old, row.expected * scale, foreseen, BLUE)
     draw_lines(canvas, old, new, row.kept, GREEN)
     return picture_of(
         canvas, f"{row.detector.upper()}, {where}: {int(row.kept.sum())} of {int(row.initial.sum())} conform"
     )
-

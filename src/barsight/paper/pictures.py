@@ -76,7 +76,9 @@ def line_picture(
             if dots and known[k]:
                 cv2.circle(canvas, here, 3, colour, -1, cv2.LINE_AA)
             elif k and known[k] and known[k - 1]:
-                cv2.line(canvas, (round(float(u[k - 1])), round(float(v[k - 1]))), here, colour, 1, cv2.LINE_AA)
+                cv2.line(
+                    canvas, (round(float(u[k - 1])), round(float(v[k - 1]))), here, colour, 1, cv2.LINE_AA
+                )
     for text, place in (
         (f"{left:.2f}", (edge, height - 14)), (f"{right:.2f} {axes[0]}", (width - 3 * edge, height - 14)),
         (f"{low:.2f}", (2, height - edge)), (f"{high:.2f} {axes[1]}", (2, edge - 14)),

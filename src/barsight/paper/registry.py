@@ -45,7 +45,7 @@ def _equation(number: int, code: str, paper: str, ours: str, command: str) -> Pa
     return PaperEntry("equation", number, tuple(code.split()), paper, ours, command)
 
 
-_STEREO = "calibration.stereo.bundle_adjustment:__name__"
+_STEREO = "calibration.stereo.bundle_adjustment:adjust"
 _RIGID = "registration.rigid:align_rigid"
 _SVD = "registration.rigid:align_rigid core.pose:nearest_rotation"
 _TREND = "motion.frame_to_frame.motion_trend:MotionTrend"
@@ -55,7 +55,7 @@ EQUATIONS = (
               "barsight calibrate stereo BOARDS -o RIG"),
     _equation(2, "core.pose:Pose.apply", "P_R = R P_L + T", "The same; poses name their frames.",
               "barsight calibrate stereo BOARDS -o RIG"),
-    _equation(3, "calibration.stereo.initialization:__name__", "R = R_R R_L^-1, T = T_R - R T_L",
+    _equation(3, "calibration.stereo.initialization:start_rig", "R = R_R R_L^-1, T = T_R - R T_L",
               "The same, for a start; the adjustment then goes on from it.",
               "barsight calibrate stereo BOARDS -o RIG"),
     _equation(4, "stereo.baselines.winner_takes_all:subpixel_winners", "d* by the parabola through 3 costs",
@@ -71,10 +71,10 @@ EQUATIONS = (
     _equation(7, "features.matching:homography_inliers motion.frame_to_frame.stitching:PaperStitching",
               "one homography by RANSAC", "Literally there. It is one plane's: true matches off it are lost, so "
               "ours checks matches against a motion in 3D.", "barsight bench matching R"),
-    _equation(8, "calibration.camera_imu.calibration:__name__", "the least sum of corner errors over poses, "
+    _equation(8, "calibration.camera_imu.calibration:calibrate_camera_imu", "the least sum of corner errors over poses, "
               "biases, gravity and the clocks' offset", "The same, on a spline, with covariance and verdict.",
               CAMERA_IMU),
-    _equation(9, "inertial.model:__name__", "a~ = a + b_a + n_a",
+    _equation(9, "inertial.model:BodyState", "a~ = a + b_a + n_a",
               "The same, where a is the acceleration minus gravity.", CAMERA_IMU),
     _equation(10, "inertial.model:ImuBias", "w~ = w + b_g + n_g", "The same.", CAMERA_IMU),
     _equation(11, f"{_TREND} inertial.preintegration:Preintegrator", "R, v and p from t to t + dt",
@@ -157,7 +157,7 @@ CONCLUSIONS = (
     PaperEntry("conclusion", 4, ("paper.cloud:contour_scores",), "Accuracy and speed meet the field's demand.",
                "Table 4: the whole pipeline's rate, not the camera's, and errors against truth.",
                "barsight bench yard"),
-    PaperEntry("conclusion", 5, ("yard.lifting:__name__",), "It is a foundation for automatic lifting.",
+    PaperEntry("conclusion", 5, ("pipeline:find_lifts",), "It is a foundation for automatic lifting.",
                "Ours goes on to bundles and lifts, each refused where a check isn't met.",
                "barsight lifts OUT --magnet MAGNET"),
 )  # fmt: skip

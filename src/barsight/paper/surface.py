@@ -78,9 +78,9 @@ def whole_pct(disparity: Float32) -> float:
     return 100 * float((np.abs(known - np.round(known)) < 0.1).mean()) if known.size else float("nan")
 
 
-def relief_pictures(pair: RectifiedPair, disparities: dict[str, Float32], true_m: Float64 | None) -> tuple[
-    PaperPicture, ...
-]:
+def relief_pictures(
+    pair: RectifiedPair, disparities: dict[str, Float32], true_m: Float64 | None
+) -> tuple[PaperPicture, ...]:
     """Paint the view's relief from whole disparities, the paper's and ours [paper Figure 3].
 
     true_m: true depth (H, W) of the rectified view where it is known: the median error stands below.
