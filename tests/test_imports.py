@@ -23,7 +23,7 @@ FLOORS = {
     "live_map": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
     "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11, "labels": 11,
-    "api": 12, "session": 12, "live": 12, "plant": 12,
+    "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12,
     "fleet": 13,
     "cli": 14,
 }  # fmt: skip

@@ -34,6 +34,7 @@ COMMANDS = {
     "convert": "Write a recording in another format (EuRoC folder, ROS bags)",
     "disparity": "Match one pair of pictures",
     "bench": "Compare methods: stereo, subpixel, target-size, yard",
+    "paper": "Reproduce the paper: every equation, figure and table beside ours, on one page",
     "calibrate": "Calibrate two cameras from pictures of a board, or an IMU's noise, with a verdict",
     "odometry": "Estimate the trajectory and compare it with truth where there is any",
     "simulate": "Render a recording of a bar yard with exact truth",

@@ -26,6 +26,7 @@ from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.ground_truth import GroundTruth, find_ground_truth, read_ground_truth
 from barsight.recording.open import open_recording
+from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.odometry_page import OdometryResult, write_odometry_page
 from barsight.report.result_files import write_relative, write_trajectory
 
@@ -51,10 +52,12 @@ def run(arguments: Sequence[str]) -> None:
             settings: The estimate's settings.
         """
         console = SafeConsole()
-        source = open_recording(recording, reading)
+        source: Recording = open_recording(recording, reading)
         rectifier = Rectifier(source.rig)
         if use is not None:
             settings = replace(settings, fusion=replace(settings.fusion, use=",".join(use)))
+            if settings.estimator == "paper":  # it has no `use` of its own
+                source = SelectedSensors(source, use)
         trajectory = make_estimator(settings)(source, rectifier, lambda: None)
         if not trajectory.frames:
             why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"

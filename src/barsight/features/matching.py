@@ -57,6 +57,12 @@ def is_mutual(forward: NearestNeighbours, backward: NearestNeighbours) -> Bool:
     return kept
 
 
+def hamming_distances(first: UInt8, second: UInt8) -> Int64:
+    """Count the bits in which descriptors (N, D) differ, pair by pair: (N,) [paper Eq. 6]."""
+    differing: Int64 = np.unpackbits(first ^ second, axis=1).sum(axis=1, dtype=np.int64)
+    return differing
+
+
 def match_mutual(first: Features, second: Features, ratio: float = 0.9) -> Int64:
     """Match mutual nearest neighbours that pass the ratio test: index pairs (M, 2)."""
     if len(first) < 2 or len(second) < 2:

@@ -21,7 +21,7 @@ class MotionSettings:
     estimator: Literal["fused", "live", "crane", "odometry", "paper"] = "fused"
     """fused: all sensors in one estimate. live: the same frame by frame, without looking ahead. crane:
     encoders, nominal attitude and the gyro's sway, no picture. odometry: frame to frame from the pictures
-    alone, for comparison. paper: the paper's stitching by SVD."""
+    alone, for comparison. paper: the paper's stitching by SVD of matches that follow the IMU's trend."""
     fusion: FusionSettings = field(default_factory=FusionSettings)
     live: FixedLagSettings = field(default_factory=FixedLagSettings)
     crane: CraneSettings = field(default_factory=CraneSettings)

@@ -168,8 +168,8 @@ def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, in
     plane_s = time.perf_counter() - begin
     row("homography", plane, target, start + plane_s)
     begin = time.perf_counter()
-    stereo, sigma, known = _stereo(step.old, places)
-    points = triangulate_stereo(np.where(known[:, None], stereo, [1e3, 0, 0]), step.rectifier.camera)
+    stereo, sigma, known = stereo_places(step.old, places)
+    points = triangulatestereo_places(np.where(known[:, None], stereo, [1e3, 0, 0]), step.rectifier.camera)
     moved = _trend(step)
     trend = plane & known & motion_inliers(points, target, *moved, step.rectifier.camera, TREND_PX)
     row("homography, trend", trend, target, start + plane_s + time.perf_counter() - begin)
@@ -179,7 +179,7 @@ def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, in
     return rows
 
 
-def _stereo(pair: PatchPair, places: Float64) -> tuple[Float64, Float64, Bool]:
+def stereo_places(pair: PatchPair, places: Float64) -> tuple[Float64, Float64, Bool]:
     """Match left to right: u, v, right u (N, 3), sigma (N,) and which features have a depth."""
     camera = pair.pair.camera
     coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px)
@@ -234,7 +234,7 @@ def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple
     if prediction is None:
         return kept, found
     index = np.flatnonzero(known)
-    depth = triangulate_stereo(stereo[index], step.rectifier.camera)[:, 2]
+    depth = triangulatestereo_places(stereo[index], step.rectifier.camera)[:, 2]
     tracks = Tracks(
         (step.old.left,), step.old.pair, index, stereo[index], sigma[index], np.zeros(len(index), np.int64),
         stereo[index, :2], depth,
@@ -258,7 +258,7 @@ def _alone(
     nearest_known = cKDTree(stereo[known, :2]).query(stereo[:, :2], k=NEIGHBOURS)[1]
     around = (stereo[known, 0] - stereo[known, 2])[nearest_known]
     disparity = np.where(known, stereo[:, 0] - stereo[:, 2], np.median(around, axis=1))
-    points = triangulate_stereo(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
+    points = triangulatestereo_places(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
     sigmas = np.where(known[:, None], sigma_px, [sigma_px, sigma_px, GUESSED_PX])
     predicted = predict_projections(points, sigmas, motion, camera)
     repeats = texture_period_px(step.old.pair.left, stereo[:, :2])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -20,9 +21,10 @@ from barsight.core.pose import Pose
 from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.core.types import PosedFrame, RectifiedCamera, Trajectory
 from barsight.features.guided_matching import project_stereo
-from barsight.features.matching import match_mutual
+from barsight.features.matching import hamming_distances, match_mutual
 from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
+from barsight.motion.frame_to_frame.motion_trend import MotionTrend
 from barsight.motion.frontend.relative_pose import rotate_covariance, transport_covariance
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_view
 from barsight.motion.gravity import align_with_gravity
@@ -34,21 +36,29 @@ from barsight.registration.rigid import Alignment, align_rigid
 class StitchingSettings:
     """The paper's stitching."""
 
+    trend: Literal["imu", "crane"] = "imu"
+    """What predicts the motion from frame to frame: imu is the paper's own, its kinematics alone (Eq. 11 and
+    12); crane the encoders. Without the one the other; without both nothing is predicted."""
     homography_px: float = 3.0
     """Matches further off the common homography than this are left out."""
-    trend_px: float = 25.0
-    """Matches further off the motion that crane and IMU predict than this are left out."""
+    trend_px: float = 5.0
+    """Matches further off the predicted motion than this are left out."""
+    hamming: int = 256
+    """Matches whose descriptors differ in more bits than this are left out (Eq. 6); 256 leaves all."""
     min_matches: int = 12
     """A frame with fewer matches is refused."""
 
     def __post_init__(self) -> None:
-        expect_ranges(self, "stitching.", homography_px=POSITIVE, trend_px=POSITIVE, min_matches=(4, inf))
+        expect_ranges(
+            self, "stitching.", homography_px=POSITIVE, trend_px=POSITIVE, min_matches=(4, inf),
+            hamming=(1, 256),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class PaperStitching(TrajectoryEstimator):
     """Mutual ORB matches by Hamming distance [paper Eq. 6], filtered by one homography [paper Eq. 7] and by
-    the predicted motion where the crane tells it, chained by SVD [paper Eq. 13-20].
+    the predicted motion [paper Eq. 12], chained by SVD [paper Eq. 13-20].
 
     The first frame stands where the crane says (`yard`), else levelled at the origin (`world`).
     """
@@ -73,6 +83,12 @@ class StitchedPoses(ImmediatePoses):
         if recording.crane() is not None:
             self._crane = EncoderOdometry(estimator.crane).begin(recording, rectifier)
         self.delay_ns = self._crane.delay_ns if self._crane else 0
+        self._imu: MotionTrend | None = None
+        imu = None
+        if estimator.settings.trend == "imu" or self._crane is None:
+            imu = recording.imu()
+        if imu is not None and recording.index.stamps_ns:
+            self._imu = MotionTrend(imu, recording)
         self._last: tuple[FeatureView, Pose | None] | None = None
         self._noise = np.diag([1e-12] * 6)
 
@@ -94,6 +110,8 @@ class StitchedPoses(ImmediatePoses):
             return Failed("no-encoder", "the encoders don't cover the first frame")
         else:
             pose = align_with_gravity(self._recording).world_from_body
+        if self._imu is not None:
+            self._imu.correct(seen.stamp_ns, pose)
         self._last = view, predicted
         return PosedFrame(seen.stamp_ns, pose, self._noise)
 
@@ -102,7 +120,12 @@ class StitchedPoses(ImmediatePoses):
     ) -> Pose | Failed:
         """Chain the step since the last good frame to its pose, and its covariance."""
         rectifier = self._rectifier
-        trend = _between(last[1], predicted, rectifier)
+        if self._imu is not None:
+            moved = self._imu.predict(view.stamp_ns)
+            body = rectifier.body_from_rect0
+            trend = None if moved is None else body.inverse() @ moved.inverse() @ body
+        else:
+            trend = _between(last[1], predicted, rectifier)
         step = self._step(last[0], view, rectifier.camera, trend)
         if isinstance(step, Failed):
             return step
@@ -119,7 +142,8 @@ class StitchedPoses(ImmediatePoses):
     def finish(self) -> Trajectory:
         """Return all poses."""
         by_crane = self._crane is not None
-        sensors = ("stereo", "crane") if by_crane else ("stereo",)
+        imu = ("imu",) if self._imu is not None else ()
+        sensors = ("stereo", *imu, *(("crane",) if by_crane else ()))
         doubt = "the paper's stitching is for comparison: nothing holds the sensors against each other"
         reference = "yard" if by_crane else "world"
         return Trajectory(reference, tuple(self.placed), tuple(self.refused), sensors, doubts=(doubt,))
@@ -128,6 +152,8 @@ class StitchedPoses(ImmediatePoses):
         self, old: FeatureView, new: FeatureView, camera: RectifiedCamera, trend: Pose | None
     ) -> Alignment | Failed:
         pairs = match_mutual(old.features, new.features)
+        bits = hamming_distances(old.features.descriptors[pairs[:, 0]], new.features.descriptors[pairs[:, 1]])
+        pairs = pairs[bits <= self._settings.hamming]
         first, second = old.points(pairs[:, 0], self._features), new.points(pairs[:, 1], self._features)
         kept = np.isfinite(first[:, 2]) & np.isfinite(second[:, 2])
         if kept.sum() >= self._settings.min_matches:

@@ -1,0 +1,41 @@
+"""Run `barsight paper -o OUT`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.files import expect_empty
+from barsight.paper.page import expect_recording, write_paper
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, run and write."""
+
+    def command(
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        quick: bool = False,
+        recording: Path | None = None,
+    ) -> None:
+        """Reproduce the paper: each equation, figure, table and conclusion beside ours, on one page.
+
+        Args:
+            out: A new folder for the page, OUT/paper.html.
+            quick: Draw less and smaller: 10 m of stack in pairs of 320 x 256 instead of 35 m of 640 x 512.
+            recording: Show the figures on this recording instead of a drawn one; Table 1, the stack's side and
+                the environments stay drawn.
+        """
+        expect_recording(recording)
+        expect_empty(out)
+        console = SafeConsole(stderr=True)
+        with stages(console) as advance:
+            write_paper(out, advance, quick=quick, recording=recording)
+        console.print(f"page: {out / 'paper.html'}", soft_wrap=True, highlight=False, markup=False)
+
+    call(command, "paper", arguments)

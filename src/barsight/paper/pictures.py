@@ -1,0 +1,87 @@
+"""Draw the pictures that the figures share: gray pictures with lines, coloured maps, and lines in a plot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64, UInt8
+from barsight.report.map_images import colours, data_uri, robust_range
+
+Colour = tuple[int, int, int]
+BLUE, GREEN, ORANGE, RED, BLACK = (96, 190, 255), (57, 211, 83), (242, 177, 52), (235, 60, 50), (40, 40, 40)
+WIDTH_PX = 560
+
+
+@dataclass(frozen=True)
+class PaperPicture:
+    """A picture of a figure: its data URI and a line below it."""
+
+    uri: str
+    caption: str
+
+
+def canvas_of(image: UInt8) -> tuple[UInt8, float]:
+    """Stretch a gray picture (H, W) in brightness to (h, w, 3) of the page's width; also the scale."""
+    low, high = np.percentile(image, (1, 99.5))
+    light = np.clip((image - low) * (200 / max(float(high - low), 1.0)), 0, 220).astype(np.uint8)
+    scale = WIDTH_PX / image.shape[1]
+    sized = cv2.resize(light, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(np.dstack([sized] * 3)), scale
+
+
+def picture_of(canvas: UInt8, caption: str) -> PaperPicture:
+    """Encode a picture (H, W, 3) for the page."""
+    opaque = np.full((*canvas.shape[:2], 1), 255, np.uint8)
+    return PaperPicture(data_uri(np.dstack([canvas, opaque]), lossless=False), caption)
+
+
+def draw_lines(canvas: UInt8, old: Float64, new: Float64, kept: Bool, colour: Colour) -> None:
+    """Draw lines from old to new places (N, 2) where `kept`; a dot stands at the new one."""
+    for (x0, y0), (x1, y1) in zip(old[kept], new[kept], strict=True):
+        start, end = (round(x0), round(y0)), (round(x1), round(y1))
+        cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
+        cv2.circle(canvas, end, 2, colour, 1, cv2.LINE_AA)
+
+
+def heat_picture(values: Float32, caption: str, span: tuple[float, float] | None = None) -> PaperPicture:
+    """Paint values (H, W) by colour, dark where unknown."""
+    low, high = span or robust_range(values, 2, 98)
+    painted = colours(values, low, high, cv2.COLORMAP_VIRIDIS)
+    painted[~np.isfinite(values)] = 25
+    scale = WIDTH_PX / values.shape[1]
+    return picture_of(cv2.resize(painted, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), caption)
+
+
+def line_picture(
+    lines: list[tuple[Float64, Float64, Colour]], axes: tuple[str, str], caption: str, *, dots: bool = False
+) -> PaperPicture:
+    """Plot lines (x, y, colour) over one pair of axes; their ends are written beside them."""
+    width, height, edge = 2 * WIDTH_PX, 320, 46
+    canvas = np.full((height, width, 3), 252, np.uint8)
+    xs = np.concatenate([x[np.isfinite(y)] for x, y, _ in lines])
+    ys = np.concatenate([y[np.isfinite(y)] for _, y, _ in lines])
+    if xs.size == 0:
+        return picture_of(canvas, caption)
+    (left, right), (low, high) = (xs.min(), xs.max()), (ys.min(), ys.max())
+    across = (width - 2 * edge) / max(right - left, 1e-9)
+    up = (height - 2 * edge) / max(high - low, 1e-9)
+    for x, y, colour in lines:
+        known = np.isfinite(y)
+        u, v = edge + (x - left) * across, height - edge - (np.where(known, y, 0) - low) * up
+        for k in range(len(x)):
+            here = (round(float(u[k])), round(float(v[k])))
+            if dots and known[k]:
+                cv2.circle(canvas, here, 3, colour, -1, cv2.LINE_AA)
+            elif k and known[k] and known[k - 1]:
+                cv2.line(
+                    canvas, (round(float(u[k - 1])), round(float(v[k - 1]))), here, colour, 1, cv2.LINE_AA
+                )
+    for text, place in (
+        (f"{left:.2f}", (edge, height - 14)), (f"{right:.2f} {axes[0]}", (width - 3 * edge, height - 14)),
+        (f"{low:.2f}", (2, height - edge)), (f"{high:.2f} {axes[1]}", (2, edge - 14)),
+    ):  # fmt: skip
+        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, BLACK, 1, cv2.LINE_AA)
+    return picture_of(canvas, caption)

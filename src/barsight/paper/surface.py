@@ -1,0 +1,102 @@
+"""Show stereo below the pixel on one view [paper Figures 1-3]."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Float32, Float64
+from barsight.core.errors import Failed
+from barsight.core.types import RectifiedPair
+from barsight.paper.pictures import BLUE, RED, PaperPicture, heat_picture, line_picture
+from barsight.report.map_images import hillshade
+from barsight.stereo.search_range import find_disparity_range
+from barsight.stereo.settings import StereoSettings, make_method
+
+WINDOW_PX = 7
+
+
+def match_three(pair: RectifiedPair) -> dict[str, Float32]:
+    """Match by SGBM (the loop's D0), the paper's loop and ours: disparities (H, W) px; empty if none match."""
+    candidates = find_disparity_range(pair)
+    if isinstance(candidates, Failed):
+        return {}
+    names = {"D0 (SGBM)": "sgbm", "paper": "paper", "ours": "barsight"}
+    return {
+        label: make_method(StereoSettings(method=name))(pair, candidates).disparity_px  # type: ignore[arg-type]
+        for label, name in names.items()
+    }
+
+
+def cost_curve(pair: RectifiedPair, disparity: Float32) -> PaperPicture:
+    """Draw the costs about the best of a textured pixel, and the parabola through three [paper Figure 1]."""
+    gray = pair.left.astype(np.float32)
+    strength = cv2.boxFilter(np.abs(cv2.Sobel(gray, cv2.CV_32F, 1, 0)), -1, (WINDOW_PX, WINDOW_PX))
+    reach = WINDOW_PX + 4
+    inside = np.zeros(gray.shape, np.bool_)
+    inside[reach:-reach, reach + int(np.nanmax(disparity)) : -reach] = True
+    usable = inside & np.isfinite(disparity)
+    if not usable.any():
+        usable = np.isfinite(disparity)
+    row, column = np.unravel_index(np.argmax(np.where(usable, strength, -1)), gray.shape)
+    candidates = round(float(disparity[row, column])) + np.arange(-4, 5)
+    half = WINDOW_PX // 2
+    patch = gray[row - half : row + half + 1, column - half : column + half + 1]
+    costs = np.full(candidates.size, np.nan)
+    for k, shift in enumerate(candidates):
+        left = column - shift - half
+        other = pair.right[row - half : row + half + 1, max(left, 0) : max(left, 0) + WINDOW_PX]
+        if left >= 0 and other.shape == patch.shape:
+            costs[k] = float(np.abs(patch - other).mean())
+    best = int(np.clip(np.nanargmin(costs), 1, candidates.size - 2))
+    below, least, above = costs[best - 1 : best + 2]
+    bend = below + above - 2 * least
+    offset = (below - above) / (2 * bend) if bend > 0 else 0.0
+    fine = np.linspace(-1, 1, 60)
+    parabola = least + fine * (above - below) / 2 + fine**2 * bend / 2
+    found = candidates[best] + offset
+    return line_picture(
+        [(candidates.astype(np.float64), costs, RED), (candidates[best] + fine, parabola, BLUE)],
+        ("px", "gray levels"),
+        f"Costs of whole disparities (red) and the parabola (blue): the least is {candidates[best]} px, "
+        f"Eq. 4 says {found:.2f} px.",
+    )
+
+
+def loop_pictures(disparities: dict[str, Float32]) -> tuple[PaperPicture, ...]:
+    """Paint D0 and the loop's end [paper Figure 2], with how far from half a pixel they keep."""
+    return tuple(
+        heat_picture(disparities[label], f"{label}: {whole_pct(disparities[label]):.0f} % lie within 0.1 px of "
+                     "a whole disparity (20 % would by chance)")
+        for label in ("D0 (SGBM)", "paper")
+    )  # fmt: skip
+
+
+def whole_pct(disparity: Float32) -> float:
+    """Compute the share of disparities within 0.1 px of whole ones, %."""
+    known = disparity[np.isfinite(disparity)]
+    return 100 * float((np.abs(known - np.round(known)) < 0.1).mean()) if known.size else float("nan")
+
+
+def relief_pictures(
+    pair: RectifiedPair, disparities: dict[str, Float32], true_m: Float64 | None
+) -> tuple[PaperPicture, ...]:
+    """Paint the view's relief from whole disparities, the paper's and ours [paper Figure 3].
+
+    true_m: true depth (H, W) of the rectified view where it is known: the median error stands below.
+    """
+    shown = {"whole disparities": np.round(disparities["paper"])}
+    shown |= {"paper, below the pixel": disparities["paper"], "ours": disparities["ours"]}
+    made = []
+    for label, disparity in shown.items():
+        camera = pair.camera
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
+        cell = float(np.nanmedian(depth)) / camera.focal_px
+        relief = hillshade((-depth).astype(np.float32), cell)
+        relief[~np.isfinite(depth)] = np.nan
+        note = ""
+        if true_m is not None:
+            note = f"; median depth error {1e3 * float(np.nanmedian(np.abs(depth - true_m))):.0f} mm"
+        made.append(heat_picture(relief, label + note, (0.2, 1.4)))
+    return tuple(made)
