@@ -98,6 +98,7 @@ def test_limits_end_a_command_and_say_why(tmp_path: Path, code: str, wanted: str
     assert isinstance(run_limited(["true"], tmp_path, os.environ, 1, 5), LimitedRun)
 
 
+@pytest.mark.slow
 def test_a_run_on_s3_parks_the_bad_and_publishes_the_rest_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

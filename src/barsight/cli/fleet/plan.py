@@ -21,7 +21,8 @@ def run(arguments: Sequence[str]) -> None:
 
     def command(
         archive: tyro.conf.Positional[str], results: str, store: str = DEFAULT_URL,
-        config: Path | None = None, rig: Path | None = None, magnet: Path | None = None, limit: int | None = None, workers: int = 1,
+        config: Path | None = None, rig: Path | None = None, magnet: Path | None = None,
+        limit: int | None = None, workers: int = 1,
         by: str | None = None,
     ) -> None:  # fmt: skip
         """Find an archive's recordings and plan their measurement; says what is new, done and parked, and
@@ -69,7 +70,8 @@ def run(arguments: Sequence[str]) -> None:
         basis = f"by {told.known} measured" if told.known else "roughly: none was measured yet"
         console.print(
             f"about {told.seconds / 3600 / workers:.2f} h with {workers} workers, "
-            f"{told.fetched_bytes / 1e9:.2f} GB to fetch, {told.written_bytes / 1e9:.2f} GB to write ({basis})",
+            f"{told.fetched_bytes / 1e9:.2f} GB to fetch, {told.written_bytes / 1e9:.2f} GB"
+            f" to write ({basis})",
             highlight=False, soft_wrap=True,
         )  # fmt: skip
 
