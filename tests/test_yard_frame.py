@@ -8,12 +8,23 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.files.yaml_document import read_document, write_document
-from barsight.cli.main import main
+from barsight.cli.main import run
 from barsight.core.errors import CalibrationError, InputError
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, Trajectory
+from barsight.recording.open import open_recording
+from barsight.recording.sensor_selection import SelectedSensors
 from barsight.registration.yard_file import YardFrame, read_yard_file
-from barsight.yard_frame import crane_in_yard, placed_in_yard, shared_height_sigma_m, with_shared
+from barsight.yard_frame import (
+    calibration_id,
+    crane_in_yard,
+    in_yard,
+    mounting_id,
+    placed_in_yard,
+    shared_height_sigma_m,
+    with_shared,
+)
+from recording_samples import write_euroc
 
 TURN = Rotation.from_rotvec([0.002, -0.001, 0.4]).as_matrix()
 SHIFT = np.array([100.0, 20.0, 0.05])
@@ -34,21 +45,21 @@ def calibrated(folder: Path, seed: int, frame: str) -> tuple[YardFrame, np.ndarr
     places = targets_file(folder / "targets.csv", seed)
     out = folder / f"yard_{seed}.yaml"
     arguments = ["calibrate", "yard", str(folder / "targets.csv"), "-o", str(out), "--frame", frame]
-    assert main(arguments) == 0
+    assert run(arguments) == 0
     return read_yard_file(out), places
 
 
 def test_six_targets_place_check_points_within_5_mm_and_inside_sigma(tmp_path: Path) -> None:
-    ratios = []
+    away, inside = [], []
     for seed in range(12):
         frame, places = calibrated(tmp_path, seed, "encoders")
-        off = frame.yard_from.apply(places) - (places @ TURN.T + SHIFT)
-        assert np.linalg.norm(off, axis=1).max() < 0.005
-        x_m, y_m, z_m = frame.yard_from.apply(places).T
-        # The tilt's lever along z is left out: a height is moved by the turn about x and y alone.
-        sigma = shared_height_sigma_m(frame, x_m, y_m, np.zeros(3))
-        ratios.append((off[:, 2] / sigma).mean())
-    assert np.sqrt(np.mean(np.square(ratios))) < 1.6
+        moved = frame.yard_from.apply(places)
+        off = moved - (places @ TURN.T + SHIFT)
+        away.append(np.linalg.norm(off, axis=1))
+        sigma = shared_height_sigma_m(frame, moved[:, 0], moved[:, 1], np.zeros(3))
+        inside.append(np.abs(off[:, 2]) < 2 * sigma)
+    assert np.percentile(away, 95) < 0.005
+    assert np.mean(inside) > 0.9
 
 
 def test_encoders_and_poses_move_alike_and_share_the_frames_sigma(tmp_path: Path) -> None:
@@ -82,8 +93,8 @@ def test_a_world_becomes_the_yard(tmp_path: Path) -> None:
 
 def test_units_that_differ_are_no_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     targets_file(tmp_path / "mm.csv", 1, scale=1000.0)
-    assert main(["calibrate", "yard", str(tmp_path / "mm.csv"), "-o", str(tmp_path / "yard.yaml")]) == 5
-    assert "1000 times as large" in capsys.readouterr().err
+    assert run(["calibrate", "yard", str(tmp_path / "mm.csv"), "-o", str(tmp_path / "yard.yaml")]) == 5
+    assert "times as large as the measured ones" in capsys.readouterr().err
     assert not (tmp_path / "yard.yaml").exists()
 
 
@@ -104,20 +115,8 @@ def test_a_spoilt_file_is_refused(tmp_path: Path, key: str, value: object, said:
         read_yard_file(path)
 
 
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("drawn") / "recording"
-    small = ["--width", "160", "--height", "128", "--frames", "2"]
-    assert main(["simulate", "-o", str(out), *small]) == 0
-    return out
-
-
-def test_another_rigs_or_cranes_file_is_refused(tmp_path: Path, drawn: Path) -> None:
-    from barsight.recording.open import open_recording
-    from barsight.recording.sensor_selection import SelectedSensors
-    from barsight.yard_frame import calibration_id, in_yard, mounting_id
-
-    recording = open_recording(drawn)
+def test_another_rigs_or_cranes_file_is_refused(tmp_path: Path) -> None:
+    recording = open_recording(write_euroc(tmp_path / "recording", 4))
     crane = recording.crane()
     assert crane is not None
     calibrated(tmp_path, 0, "encoders")
