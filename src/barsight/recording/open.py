@@ -59,7 +59,7 @@ def _open(path: Path, settings: RecordingSettings) -> StoredPictures:
 
 
 def bag_at(path: Path) -> BagFile | None:
-    """Open the bag at `path`, whatever is in it; None where there is none. Raises `InputError` for a torn one."""
+    """Open the bag at `path`, whatever is in it; None where there is none. Raises `InputError`."""
     if path.is_dir():
         is_bag = (path / "metadata.yaml").is_file()
     else:

@@ -32,7 +32,7 @@ def rig_for_kalibr(rig: StereoRig) -> tuple[StereoRig, float] | Failed:
         fitted, off_px = fit_four(camera)
         if off_px > MAX_OFF_PX:
             return Failed(
-                "lens", f"{name} has a lens of {len(camera.coefficients)} coefficients, Kalibr takes {TAKEN}, "
+                "lens", f"{name} has a lens of {len(camera.coefficients)} coefficients, Kalibr {TAKEN}, "
                 f"and those are up to {off_px:.2f} px off ({MAX_OFF_PX:g} px are allowed)",
             )  # fmt: skip
         cameras.append(fitted)

@@ -1,4 +1,4 @@
-"""Open bags whose types can't all be parsed: what no sensor sends (a service's events) is listed, not read."""
+"""Open bags whose types can't all be parsed: a service's events are listed, not read."""
 
 from __future__ import annotations
 

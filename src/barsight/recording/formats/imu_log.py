@@ -111,9 +111,7 @@ def _file(path: Path) -> Path:
 
 
 def _rows(path: Path, unit: TimeUnit) -> tuple[str, Int64, Float64]:
-    """Read header text, stamps (N,) ns in time's order and values (N, 6), the gyroscope first where the header
-    says so.
-    """
+    """Read header text, stamps (N,) ns in time's order and values (N, 6), by name where there are more."""
     lines = read_text(path, remedy=f"give {FORM}").splitlines()
     start = next((k for k, line in enumerate(lines) if re.match(r"\s*[-+.\d]", line)), len(lines))
     rows = [(k + 1, line) for k, line in enumerate(lines[start:], start) if line.strip() and line[0] != "#"]
@@ -146,7 +144,8 @@ def _named_columns(path: Path, header: str, count: int) -> list[int]:
     """Find time, gyroscope and accelerometer among more columns, by their names."""
     names = [name.strip() for name in re.split(r"[,;\t]", header)]
     if count < COLUMNS:
-        raise InputError(path, f"has {count} columns", f"give {FORM}")
+        problem = f"line 1: not {COLUMNS} numbers" if count else "holds no samples"
+        raise InputError(path, problem, f"give {FORM}")
     found = {kind: [k for k, name in enumerate(names) if word.search(name)] for kind, word in NAMED.items()}
     if len(names) != count or any(len(columns) != 3 for columns in found.values()):
         raise InputError(path, f"has {count} columns whose names don't tell which are which", NAMES_FORM)
