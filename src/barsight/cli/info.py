@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 from barsight.cli.arguments import by_own_flags, call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import InputError
 from barsight.recording.base import RecordingSettings
+from barsight.recording.formats.bag_file import Topic
 from barsight.recording.info import describe_recording
-from barsight.recording.info_tables import print_info, print_topics
+from barsight.recording.info_tables import print_info
 from barsight.recording.open import bag_at, open_recording
 
 
@@ -47,3 +50,16 @@ def run(arguments: Sequence[str]) -> None:
         print_info(describe_recording(opened), console)
 
     call(command, "info", arguments)
+
+
+def print_topics(topics: Sequence[Topic], duration_s: float, console: Console) -> None:
+    """Print what a bag holds, by topic; rates are means over the bag's duration."""
+    table = Table(title=f"Topics, {duration_s:.2f} s", title_justify="left")
+    for name in ("topic", "type"):
+        table.add_column(name, overflow="fold")
+    for name in ("messages", "rate (Hz)"):
+        table.add_column(name, justify="right")
+    for topic in topics:
+        rate = f"{(topic.count - 1) / duration_s:.2f}" if topic.count > 1 and duration_s > 0 else "-"
+        table.add_row(escape(topic.name), escape(topic.kind), str(topic.count), rate)
+    console.print(table)

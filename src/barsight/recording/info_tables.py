@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from rich.console import Console
@@ -11,7 +10,6 @@ from rich.table import Table
 
 from barsight.calibration.geometry.camera import Camera
 from barsight.core.stamps import NS_PER_S, format_seconds
-from barsight.recording.formats.bag_file import Topic
 from barsight.recording.info import RecordingInfo
 
 DROPPED_SHOWN = 10
@@ -39,19 +37,6 @@ def print_info(info: RecordingInfo, console: Console) -> None:
         console.print(_laser(info))
     for note in info.notes:
         console.print(f"[yellow]note:[/yellow] {escape(note)}", highlight=False)
-
-
-def print_topics(topics: Sequence[Topic], duration_s: float, console: Console) -> None:
-    """Print what a bag holds, by topic; rates are means over the bag's duration."""
-    table = Table(title=f"Topics, {duration_s:.2f} s", title_justify="left")
-    for name in ("topic", "type"):
-        table.add_column(name, overflow="fold")
-    for name in ("messages", "rate (Hz)"):
-        table.add_column(name, justify="right")
-    for topic in topics:
-        rate = f"{(topic.count - 1) / duration_s:.2f}" if topic.count > 1 and duration_s > 0 else "-"
-        table.add_row(escape(topic.name), escape(topic.kind), str(topic.count), rate)
-    console.print(table)
 
 
 def _begin(info: RecordingInfo) -> str:
