@@ -18,7 +18,7 @@ FLOORS = {
     "measurement": 6, "evaluation": 6, "result_folder": 6, "checkpoint": 6, "simulation": 6, "board_views": 6,
     "measure_settings": 6, "rig_plan": 6,
     "store": 7,
-    "pair_chain": 7,
+    "pair_chain": 7, "yard_frame": 7,
     "map_building": 8, "joined_passes": 9,
     "live_map": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,

@@ -29,6 +29,7 @@ from barsight.measurement import Refusal
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap
+from barsight.yard_frame import frame_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class LiveMap:
             settings.map.max_sigma_m, Stopwatch(),
         )  # fmt: skip
         store = TileStore(folder, settings.map.resident_tiles)
-        self._views = FusedViews(binner, store, settings.map)
+        self._views = FusedViews(binner, store, settings.map, frame_of(pairs.recording))
         self._election = SurfaceElection(store, folder, cell_m, settings.map)
         self._min_way_m = keyframe_spacing_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
         self._ahead = np.array([0.0, 0.0, first.range_m])

@@ -9,6 +9,8 @@ from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
@@ -45,7 +47,9 @@ from barsight.recording.base import Recording
 from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
+from barsight.registration.yard_file import YardFrame
 from barsight.stereo.settings import StereoSettings, make_method
+from barsight.yard_frame import frame_of, in_yard, placed_in_yard, shared_height_sigma_m
 
 ProgressCallback = Callable[[str, int, int], None]
 """Told of progress: stage, frames done, frames in all."""
@@ -115,8 +119,10 @@ class FusedViews:
     placed: reference_from_rect0 of the views used, stamps_ns theirs.
     """
 
-    def __init__(self, binner: PointBinner, store: TileStore, settings: MapSettings) -> None:
-        self._binner, self.store, self._settings = binner, store, settings
+    def __init__(
+        self, binner: PointBinner, store: TileStore, settings: MapSettings, yard: YardFrame | None = None
+    ) -> None:
+        self._binner, self.store, self._settings, self._yard = binner, store, settings, yard
         self.placed: list[Pose] = []
         self.stamps_ns: list[int] = []
 
@@ -128,11 +134,23 @@ class FusedViews:
         if isinstance(view, Failed):
             return Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
         if isinstance(view, PosedView):
+            view = self._with_shared(view, posed)
             with self._binner.watch("fuse", 1):
                 fuse_view(self.store, view.cells, self._settings)
             self.placed.append(posed.reference_from_body @ self._binner.body_from_rect0)
             self.stamps_ns.append(posed.stamp_ns)
         return view
+
+    def _with_shared(self, view: PosedView, posed: PosedFrame) -> PosedView:
+        """Add what the yard frame may be off to what the heights' errors share."""
+        if self._yard is None:
+            return view
+        cells, size = view.cells, self._binner.cell_m
+        body_m = posed.reference_from_body.translation
+        x_m, y_m = (np.multiply(of, size, dtype=np.float64) for of in (cells.x, cells.y))
+        off = shared_height_sigma_m(self._yard, x_m, y_m, body_m)
+        shared = np.hypot(cells.shared_m, off).astype(np.float32)
+        return replace(view, cells=replace(cells, shared_m=shared))
 
 
 def inspect_recording(
@@ -142,7 +160,8 @@ def inspect_recording(
 
     Raises InputError where the sensors' clocks differ.
     """
-    source, watch = SelectedSensors(recording, settings.use), Stopwatch()
+    source: Recording = SelectedSensors(recording, settings.use)
+    source, watch = in_yard(source, settings.yard), Stopwatch()
     if faults := clock_faults(source):
         raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
     configuration, inputs = to_json(asdict(settings)), source.digests()
@@ -180,6 +199,7 @@ def estimate_trajectory(
                 trajectory = checkpointed(
                     probed.checkpoints, "trajectory", lambda: estimate(source, rectifier, count, pairs)
                 )
+            trajectory = placed_in_yard(trajectory, frame_of(source))
             trim_heap()
             calibrated = self_calibrate(
                 source.rig, rectifier, trajectory.drift, probed.calibration_px,
@@ -232,7 +252,9 @@ def build_map(
         way.stereo, way.rectifier.body_from_rect0, probed.cell_m, probed.per_pixel, settings.map.max_sigma_m,
         watch,
     )  # fmt: skip
-    views = FusedViews(binner, TileStore(scratch, settings.map.resident_tiles), settings.map)
+    views = FusedViews(
+        binner, TileStore(scratch, settings.map.resident_tiles), settings.map, frame_of(source)
+    )
     free, tops, preview = FreeSpace(probed.cell_m), TopPhoto(probed.cell_m), None
     for done, (frame, posed, neighbours) in enumerate(_placed(way.matched, way.poses), start=1):
         view = views.add(frame, posed, neighbours)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 from barsight.core.errors import ConfigError
@@ -27,6 +28,9 @@ class MeasureSettings:
     """Sensors that may be used, where the recording has them."""
     self_calibrate: Literal["none", "yaw"] = "none"
     """yaw: turn the right camera as the crane's known travel asks for (see `barsight calibrate check`)."""
+    yard: Path | None = None
+    """The file that `barsight calibrate yard` wrote: the map, its poses and lifts then lie in the surveyed
+    yard, and its sigma is in theirs."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
     stereo: StereoSettings = field(default_factory=StereoSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)

@@ -21,7 +21,7 @@ from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
-from barsight.core.types import Agreement, Contour, CraneSamples, LaserProfile, Trajectory
+from barsight.core.types import Agreement, Contour, LaserProfile, Trajectory
 from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
 from barsight.map_building import (
     BuiltMap,
@@ -44,7 +44,6 @@ from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Measurement, PassRecord, StageTime, to_json
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.identity import ID_DIGITS
 from barsight.yard.inventory.stock_list import (
     ListedBundle,
     StockMatch,
@@ -60,6 +59,7 @@ from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
+from barsight.yard_frame import frame_notes, frame_of, with_shared, yard_frame_id
 
 MIN_DOWN_COSINE = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
@@ -240,7 +240,7 @@ def find_lifts(
         lifts=lifts,
         stock=stock,
         travel=travel,
-        yard_frame_id=_yard_frame_id(source.crane(), trajectory),
+        yard_frame_id=yard_frame_id(source, trajectory),
         passes=_records(mapped, travels),
     )
 
@@ -284,14 +284,6 @@ def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord,
             zip(mapped.passes, travels, ties.corrections, strict=True)
         )
     )  # fmt: skip
-
-
-def _yard_frame_id(crane: CraneSamples | None, trajectory: Trajectory) -> str | None:
-    """Compute a digest of how the body hangs from the crane, by which the map lies in the yard."""
-    if crane is None or trajectory.reference != "yard":
-        return None
-    hung = {"crane_to_body_m": crane.crane_to_body_m, "yard_from_body": crane.yard_from_body_nominal}
-    return json_digest(to_json(hung))[:ID_DIGITS]
 
 
 def _elect(
@@ -354,6 +346,7 @@ def _warnings(mapped: MappedYard) -> list[Notice]:
 def _pass_warnings(probed: ProbedRecording, way: TrackedRecording, built: BuiltMap) -> list[Notice]:
     """Gather what a pass's sensors, calibration and trajectory had to assume or leave out."""
     warnings = [Notice("assumed", text) for text in probed.source.notes]
+    warnings += [Notice("assumed", text) for text in frame_notes(frame_of(probed.source))]
     warnings += probed.doubts
     warnings += [Notice("calibration", text) for text in probed.first.warnings]
     warnings += [Notice("calibration-drift", text) for text in way.drift_warnings]
@@ -393,7 +386,8 @@ def _travel(
     shift_ns, window_ns = source.rig.timeshift_cam_imu_ns, seconds_to_ns(settings.motion.crane.window_s)
     camera = way.rectifier.camera
     range_m = probed.first.range_m
-    return Travel.of(way.trajectory, source.crane(), shift_ns, window_ns, range_m, camera, built.stamps_ns)
+    trajectory = with_shared(way.trajectory, frame_of(source))
+    return Travel.of(trajectory, source.crane(), shift_ns, window_ns, range_m, camera, built.stamps_ns)
 
 
 def _lifts(

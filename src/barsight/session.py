@@ -33,6 +33,7 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.result import Yard
 from barsight.yard.magnet.description import load_magnet
+from barsight.yard_frame import in_yard
 
 GRACE_NS = NS_PER_S
 """A frame waits so long for a sensor's readings, the first one for signs of every sensor."""
@@ -77,7 +78,8 @@ class Session:
             self._rig, self._here, self._noise, is_simulated=self._is_simulated
         )  # fmt: skip
         self._recordings.append(self._recording)
-        self._source = SelectedSensors(self._recording, self._settings.use)
+        selected = SelectedSensors(self._recording, self._settings.use)
+        self._source = in_yard(selected, self._settings.yard)
         key = checkpoint_key(self._recording, to_json(asdict(self._settings)), {})
         self._checkpoints = checkpoint_folder(self._folder / "checkpoints" / name, key)
         self._pairs = RectifiedPairs(self._source, Rectifier(self._rig), self._checkpoints)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TypeVar
 
 import tyro
 
-from barsight.core.errors import ConfigError
+from barsight.core.errors import ConfigError, InputError
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.renamed import refuse_old_flags
 
@@ -23,6 +24,14 @@ def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> N
     """Parse `arguments` by the function's signature and call it; wrong usage exits with 2."""
     refuse_old_flags(arguments)
     tyro.cli(command, prog=f"barsight {name}", args=_listed(arguments), compact_help=False)
+
+
+def by_own_flags(error: InputError) -> InputError:
+    """Name a setting of the recording by the flag that this command has for it: --camchain, not
+    recording.camchain.
+    """
+    remedy = re.sub(r"\brecording\.(\w+)", lambda m: "--" + m[1].replace("_", "-"), error.remedy)
+    return InputError(error.path, error.problem, remedy)
 
 
 def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[str]) -> None:

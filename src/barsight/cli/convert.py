@@ -8,9 +8,10 @@ from typing import Annotated
 
 import tyro
 
-from barsight.cli.arguments import call
+from barsight.cli.arguments import by_own_flags, call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import InputError
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.recording.writers.convert import Target, convert
@@ -34,7 +35,10 @@ def run(arguments: Sequence[str]) -> None:
             settings: How to read it.
         """
         console = SafeConsole(stderr=True)
-        source = open_recording(recording, settings)
+        try:
+            source = open_recording(recording, settings)
+        except InputError as error:
+            raise by_own_flags(error) from None
         with stages(console) as advance:
             done = convert(source, out, to, lambda n, total: advance("pictures", n, total))
         text = f"{done.images} pictures written to {done.out}"

@@ -18,7 +18,7 @@ from barsight.core.types import Disparity
 from barsight.measurement import Preview
 from barsight.pair_matching import match_pictures
 from barsight.report.result_files import write_preview
-from barsight.stereo.disparity_files import write_disparity
+from barsight.stereo.disparity_files import write_calib, write_disparity
 from barsight.stereo.settings import StereoSettings
 
 _POOR = "warning: hardly anything is matched well: two pictures of one pair, bright and sharp enough?"
@@ -48,6 +48,7 @@ def run(arguments: Sequence[str]) -> None:
             right: The right picture.
             out: The file to write: .pfm, .png (16 bits, disparity times 256) or .tif (disparity and sigma).
             rig: Rig file (ours, Kalibr's, OpenCV's) or EuRoC folder: the pictures are raw and get rectified.
+                Focal length, baseline and doffs go beside FILE, into NAME_calib.txt (Middlebury's form).
             range: Candidates A:B in px; found from the pictures when not given.
             preview: PNG to write with the left picture beside the disparity in colours.
             settings: The method and its settings.
@@ -59,7 +60,10 @@ def run(arguments: Sequence[str]) -> None:
             low, high = _parsed_range(range)
             settings = replace(settings, min_disparity_px=low, max_disparity_px=high)
         pair, disparity = match_pictures(left, right, settings, rig)
+        with_rig = None if rig is None else out.with_name(f"{out.stem}_calib.txt")
         write_disparity(out, disparity)
+        if with_rig is not None:
+            write_calib(with_rig, pair.camera)
         if preview is not None:
             write_preview(Preview(pair.left, disparity.disparity_px), preview)
         console.print(_summary(out, disparity), soft_wrap=True, highlight=False)

@@ -18,6 +18,7 @@ from barsight.map_building import matching
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.result_files import write_height
+from barsight.yard_frame import in_yard
 
 POLL_S = 0.02
 NICENESS = 10
@@ -57,7 +58,7 @@ class Mapping:
 
     def __init__(self, link: Link, recording: GrowingRecording) -> None:
         self._link, self._recording = link, recording
-        source = SelectedSensors(recording, link.settings.use)
+        source = in_yard(SelectedSensors(recording, link.settings.use), link.settings.yard)
         self._pairs = RectifiedPairs(source, Rectifier(recording.rig), link.checkpoints)
         checkpoints = link.checkpoints if link.settings.self_calibrate == "none" else None
         self._match = matching(self._pairs, link.settings, checkpoints, Stopwatch())

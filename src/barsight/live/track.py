@@ -24,6 +24,7 @@ from barsight.motion.estimator import PoseEstimator
 from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
+from barsight.yard_frame import in_yard
 
 POLL_S = 0.002
 GRACE_S = 0.3
@@ -66,7 +67,7 @@ class Tracking:
         self._rectifier = Rectifier(recording.rig)
         self._pairs = RectifiedPairs(recording, self._rectifier, link.checkpoints)
         self._frames = link.frames()
-        self._source = SelectedSensors(recording, link.settings.use)
+        self._source = in_yard(SelectedSensors(recording, link.settings.use), link.settings.yard)
         motion = replace(link.settings.motion, estimator="live")
         self._estimator = make_estimator(motion)
         self._poses: PoseEstimator | None = None

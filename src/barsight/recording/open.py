@@ -10,6 +10,7 @@ from barsight.calibration.boards.detection_files import has_detections
 from barsight.core.errors import InputError
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.bag import BagRecording
+from barsight.recording.formats.bag_file import BagFile
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.euroc import EurocRecording
 from barsight.recording.formats.kitti import KittiRecording, is_kitti
@@ -55,6 +56,15 @@ def _open(path: Path, settings: RecordingSettings) -> StoredPictures:
     if is_kitti(path):
         return KittiRecording(path, settings)
     raise InputError(path, "is not a recording that Barsight recognises", f"give {_hint(path) or KNOWN}")
+
+
+def bag_at(path: Path) -> BagFile | None:
+    """Open the bag at `path`, whatever is in it; None where there is none. Raises `InputError`."""
+    if path.is_dir():
+        is_bag = (path / "metadata.yaml").is_file()
+    else:
+        is_bag = path.is_file() and path.suffix in BAG_KINDS
+    return BagFile(path) if is_bag else None
 
 
 def _open_bag_folder(path: Path, bags: list[Path], settings: RecordingSettings) -> BagRecording:

@@ -16,7 +16,7 @@ from barsight.core.arrays import Float32
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_path
 from barsight.core.reading.bounded_reading import read_bytes
-from barsight.core.types import Disparity
+from barsight.core.types import Disparity, RectifiedCamera
 
 _KITTI_STEPS = 256
 _MAX_BYTES = 1 << 30
@@ -53,6 +53,19 @@ def write_disparity(target: Path, disparity: Disparity) -> None:
         )
     with atomic_path(target) as temporary:
         temporary.write_bytes(data)
+
+
+def write_calib(target: Path, camera: RectifiedCamera) -> None:
+    """Write Middlebury's calib.txt of a rectified pair; its depth, mm, is baseline * f / (disparity + doffs).
+
+    cam0, cam1: px; doffs: cx1 - cx0, px; baseline: mm.
+    """
+    f, cx, cy, doffs = camera.focal_px, camera.cx_px, camera.cy_px, camera.doffs_px
+    lines = [f"cam{k}=[{f!r} 0 {c!r}; 0 {f!r} {cy!r}; 0 0 1]" for k, c in enumerate((cx, cx + doffs))]
+    lines += [f"doffs={doffs!r}", f"baseline={1e3 * camera.baseline_m!r}"]
+    lines += [f"width={camera.width}", f"height={camera.height}"]
+    with atomic_path(target) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_disparity(path: Path) -> Disparity:

@@ -10,11 +10,12 @@ import numpy as np
 
 from barsight.calibration.files.euroc import read_rig, write_rig
 from barsight.calibration.files.kalibr import read_camchain, write_camchain
+from barsight.calibration.files.kalibr_lens import rig_for_kalibr
 from barsight.calibration.files.opencv import read_opencv_rig, write_opencv_rig
 from barsight.calibration.files.rig_file import VERSION_KEY, read_own_rig, write_rig_file
 from barsight.calibration.files.yaml_document import read_document
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.core.errors import CalibrationError
+from barsight.core.errors import CalibrationError, Failed
 from barsight.core.files import atomic_directory, atomic_path
 from barsight.core.reading.bounded_reading import MAX_SETTINGS_BYTES, read_text
 
@@ -74,12 +75,22 @@ def body_is_cam0(rig: StereoRig) -> bool:
     return bool(np.array_equal(rig.body_from_cam0.matrix, np.eye(4)))
 
 
-def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> None:
-    """Write a rig whole or not at all; an OpenCV file's suffix says YAML or XML."""
+def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> float:
+    """Write a rig whole or not at all; an OpenCV file's suffix says YAML or XML.
+
+    Returns how far off, px, the written lenses are at most: Kalibr's take four coefficients.
+    Raises CalibrationError where a lens has no such form.
+    """
+    off_px = 0.0
+    if form is RigFormat.KALIBR:
+        fitted = rig_for_kalibr(rig)
+        if isinstance(fitted, Failed):
+            raise CalibrationError(path, fitted.reason, "calibrate with --lens radtan4 or equidistant")
+        rig, off_px = fitted
     if form is RigFormat.EUROC:
         with atomic_directory(path) as folder:
             write_rig(folder / "mav0", rig, 0.0)
-        return
+        return off_px
     with atomic_path(path) as temporary:
         if form is RigFormat.KALIBR:
             write_camchain(temporary, rig, TOPICS)
@@ -87,6 +98,7 @@ def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> None:
             write_opencv_rig(temporary, rig, xml=path.suffix.lower() == ".xml")
         else:
             write_rig_file(temporary, rig)
+    return off_px
 
 
 def _is_opencv(path: Path) -> bool:

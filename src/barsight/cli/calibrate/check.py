@@ -14,6 +14,7 @@ from rich.table import Table
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import MeasurementError
 from barsight.core.files import expect_output
 from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import FusionSettings
@@ -43,7 +44,8 @@ def run(arguments: Sequence[str]) -> None:
         """Has the rig drifted since its calibration? Ordinary crane travel over any scene shows it.
 
         Rows of matches show pitch, roll and focal ratio between the cameras; the encoders' travel shows the
-        yaw, which costs most, and the baseline. A drift is no error: the exit code stays 0.
+        yaw, which costs most, and the baseline. The exit code is 5 where it
+        drifted or readings contradict each other.
 
         Args:
             recording: The recording, with encoders for yaw and baseline.
@@ -62,8 +64,16 @@ def run(arguments: Sequence[str]) -> None:
         if out is not None:
             write_rig_check_report(check, str(recording), out.with_suffix(".html"), out)
         _print(check, SafeConsole())
+        if check.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION):
+            raise MeasurementError(f"{recording}: {check.state}: " + "; ".join(bad_lines(check)))
 
     call(command, "calibrate check", arguments)
+
+
+def bad_lines(check: RigCheck) -> list[str]:
+    """List the lines that are not good, each with its reason."""
+    bad = (DriftState.RECALIBRATE, DriftState.CONTRADICTION)
+    return [f"{line.name}: {line.reason}" for line in check.lines if line.state in bad]
 
 
 def _print(check: RigCheck, console: Console) -> None:

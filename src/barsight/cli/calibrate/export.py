@@ -28,12 +28,16 @@ def run(arguments: Sequence[str]) -> None:
             rig: The rig to read: ours, Kalibr's camchain, OpenCV's YAML or XML, or an EuRoC folder.
             out: The file to write (the folder, for euroc).
             to: The format to write. OpenCV's files lose where the rig sits on its body, and all but ours the
-                covariance.
+                covariance. Kalibr takes lenses of four coefficients: others are fitted with four, and refused
+                where that is more than 0.1 px off.
         """
         read = read_rig_file(rig)
-        write_any_rig(out, read, to)
+        off_px = write_any_rig(out, read, to)
+        fitted = f"; lenses of four coefficients, up to {off_px:.3f} px off" if off_px else ""
         SafeConsole(stderr=True).print(
-            f"{escape(str(out))}: baseline {read.baseline_m * 1e3:.2f} mm", soft_wrap=True, highlight=False
+            f"{escape(str(out))}: baseline {read.baseline_m * 1e3:.2f} mm{fitted}",
+            soft_wrap=True,
+            highlight=False,
         )
 
     call(command, "calibrate export", arguments)

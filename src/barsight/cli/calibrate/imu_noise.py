@@ -15,7 +15,7 @@ from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import Failed, InputError
 from barsight.core.files import atomic_paths, expect_output
-from barsight.recording.formats.imu_log import AccelUnit, GyroUnit, read_imu_log
+from barsight.recording.formats.imu_log import AccelUnit, GyroUnit, TimeUnit, read_imu_log
 from barsight.report.calibration.imu_noise_page import write_imu_noise_report
 
 SHORT_S = 1800.0
@@ -29,21 +29,24 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         gyro_unit: tyro.conf.EnumChoicesFromValues[GyroUnit] = GyroUnit.AUTO,
         accel_unit: tyro.conf.EnumChoicesFromValues[AccelUnit] = AccelUnit.AUTO,
+        time_unit: tyro.conf.EnumChoicesFromValues[TimeUnit] = TimeUnit.AUTO,
         topic: str = "/imu0",
     ) -> None:
         """Noise densities, random walks and bias instability of an IMU at rest, in Kalibr's imu.yaml.
 
         Args:
-            log: Columns of time (s or ns), gyroscope and accelerometer, with commas or spaces; or an EuRoC
-                folder with imu0/data.csv. An hour or more, on something that doesn't shake.
+            log: Columns of time, gyroscope and accelerometer, with commas or spaces (more columns where the
+                header names them); an EuRoC folder with imu0/data.csv; or a bag with one IMU.
+                An hour or more, on something that doesn't shake.
             out: The file to write (.yaml); its report goes beside it (.html and .json).
             gyro_unit: The gyroscope's unit; auto takes degrees where the header says so.
             accel_unit: The accelerometer's unit; auto goes by gravity.
+            time_unit: The stamps' unit, from any epoch; auto goes by the header, else by the rate.
             topic: The rostopic to state in the file.
         """
         expect_output(out, ".yaml", ".yml")
         console = SafeConsole(stderr=True)
-        read = read_imu_log(log, gyro_unit, accel_unit)
+        read = read_imu_log(log, gyro_unit, accel_unit, time_unit)
         fit = fit_imu_noise(read.samples)
         if isinstance(fit, Failed):
             raise InputError(log, fit.reason, "log an hour or more with the IMU at rest")

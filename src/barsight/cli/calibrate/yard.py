@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from barsight.calibration.files.yaml_document import write_document
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.arrays import Float64
-from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.files import atomic_paths, expect_output
 from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
@@ -27,10 +25,17 @@ from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.surveyed_targets import read_targets
 from barsight.recording.open import open_recording
 from barsight.registration.yard import YardCalibration, calibrate_yard
+from barsight.registration.yard_file import write_yard_file
 from barsight.report.calibration.yard_page import write_yard_report
+from barsight.result_folder import open_folder
+from barsight.yard_frame import MAX_PLACE_M as MAX_UNSURE_M
+from barsight.yard_frame import MAX_TURN_DEG as MAX_UNSURE_DEG
+from barsight.yard_frame import calibration_id, recording_id
 
 MAX_TURN_DEG = 0.05
 MAX_PLACE_M = 0.01
+MAX_SCALE_OFF = 0.02
+"""A metre further off than this is no baseline's error: units differ, or points are mixed up."""
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -39,7 +44,8 @@ def run(arguments: Sequence[str]) -> None:
     def command(
         source: tyro.conf.Positional[Path],
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
-        frame: Literal["world", "body"] = "world",
+        frame: Literal["world", "encoders", "body"] = "world",
+        measured: Path | None = None,
         sigma_m: float = 0.005,
         reading: Annotated[RecordingSettings, tyro.conf.arg(name="recording")] = RecordingSettings(),  # noqa: B008
     ) -> None:
@@ -49,7 +55,10 @@ def run(arguments: Sequence[str]) -> None:
             source: A .csv of targets (name,yard_x,yard_y,yard_z,x,y,z in m; optionally sigma_m, and check = 1
                 for targets set apart), or a recording in which bridge and trolley move.
             out: The .yaml file to write; its report goes beside it (.html and .json).
-            frame: What x, y, z of the targets are measured in; body gives how the rig is mounted.
+            frame: What x, y, z of the targets are measured in: a world, the yard as the encoders have it,
+                or the body, which gives how the rig is mounted.
+            measured: The folder of results in whose map the targets were measured; it says the frame, and
+                the file is then bound to its rig and crane.
             sigma_m: One coordinate's error of a target, survey and measurement together, where no sigma_m
                 column says it.
             reading: How to read the recording.
@@ -60,13 +69,17 @@ def run(arguments: Sequence[str]) -> None:
         console = SafeConsole(stderr=True)
         hangs = None
         if source.suffix.lower() == ".csv":
+            owners = {} if measured is None else _measured_owners(measured)
+            if owners:
+                frame = "world" if owners["mounting_id"] is None else "encoders"
             found = _from_targets(source, frame, sigma_m)
         else:
-            moved = _from_moves(source, reading, console)
+            moved, owners = _from_moves(source, reading, console)
             found, hangs = moved.calibration, moved.yard_from_body
+        _expect_usable(found, source)
         verdict = "good" if _is_good(found) else "usable with care"
         with atomic_paths(out, out.with_suffix(".html"), out.with_suffix(".json")) as (path, html, data):
-            write_document(path, _content(found, hangs))
+            write_yard_file(path, found, hangs, owners)
             write_yard_report(found, verdict, str(source), html, data)
         _print(found, verdict, out, console)
 
@@ -85,7 +98,9 @@ def _from_targets(path: Path, frame: str, sigma_m: float) -> YardCalibration:
     return found
 
 
-def _from_moves(path: Path, reading: RecordingSettings, console: Console) -> MovedYard:
+def _from_moves(
+    path: Path, reading: RecordingSettings, console: Console
+) -> tuple[MovedYard, dict[str, str | None]]:
     recording = open_recording(path, reading)
     crane = recording.crane()
     if crane is None:
@@ -97,24 +112,41 @@ def _from_moves(path: Path, reading: RecordingSettings, console: Console) -> Mov
     moved = yard_from_moves(trajectory, crane, recording.rig.timeshift_cam_imu_ns)
     if isinstance(moved, Failed):
         raise MeasurementError(f"{path}: {moved.reason}")
-    return moved
+    owners = {
+        "calibration_id": calibration_id(recording.rig), "mounting_id": None,
+        "recording_id": recording_id(recording.digests()),
+    }  # fmt: skip
+    return moved, owners
 
 
-def _content(found: YardCalibration, hangs: Float64 | None) -> dict[str, Any]:
-    pose = found.alignment.target_from_source
-    content: dict[str, Any] = {
-        "barsight_yard": 1,
-        f"yard_from_{pose.source}": pose.matrix.tolist(),
-        "covariance": found.alignment.covariance.tolist(),
-        "scale": found.alignment.scale,
-        "scale_sigma": found.alignment.scale_sigma,
-        "points": int((~found.checks).sum()),
-        "rms_m": float(np.sqrt((found.off_m[~found.checks] ** 2).sum(axis=1).mean())),
-        "doubts": list(found.doubts),
+def _measured_owners(folder: Path) -> dict[str, str | None]:
+    """Read which rig, crane and recording a folder of results is of."""
+    said, path = open_folder(folder)[0], folder / "result.json"
+    if said["configuration"].get("yard") is not None:
+        raise InputError(path, "was measured with --yard", "measure the targets in a map without it")
+    if said.get("passes"):
+        raise InputError(path, "is of several passes", "measure the targets in a map of one pass")
+    by_encoders = said["reference"] == "yard"
+    return {
+        "calibration_id": said["calibration_id"],
+        "mounting_id": said["yard_frame_id"] if by_encoders else None,
+        "recording_id": None if by_encoders else recording_id(said["hashes"]["inputs"]),
     }
-    if hangs is not None:
-        content["R_yard_body"] = hangs.tolist()
-    return content
+
+
+def _expect_usable(found: YardCalibration, source: Path) -> None:
+    """Raise MeasurementError where units or points are mixed up, or the frame places nothing."""
+    scale, off_m = found.alignment.scale, np.linalg.norm(found.off_m[~found.checks], axis=1)
+    if abs(scale - 1) > MAX_SCALE_OFF:
+        size = f"{scale:.4g} times as large as" if scale > 1 else f"only {scale:.4g} of"
+        remedy = "give both in metres and each name its own place"
+        raise MeasurementError(f"{source}: the yard's places are {size} the measured ones: {remedy}")
+    if found.turn_sigma_deg > MAX_UNSURE_DEG or found.place_sigma_m > MAX_UNSURE_M:
+        raise MeasurementError(
+            f"{source}: the points disagree by up to {off_m.max():.3g} m and tell the turn to "
+            f"± {found.turn_sigma_deg:.3g} deg, the place to ± {found.place_sigma_m:.3g} m only: names are "
+            "mixed up, or the points lie too close together"
+        )
 
 
 def _is_good(found: YardCalibration) -> bool:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from barsight.calibration.files.yaml_document import read_document
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import open_regular
 from barsight.core.stamps import NS_PER_S
+from barsight.recording.formats.bag_reader import BagReader
 from barsight.recording.own_files import expect_inner_name, leads_outside
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
@@ -67,9 +67,10 @@ class BagFile:
         with self._opened() as reader:
             self._typestore = reader.typestore
             counts: dict[tuple[str, str], int] = {}
-            for connection in reader.connections:
+            for connection in reader.all_connections:
                 key = (connection.topic, connection.msgtype)
                 counts[key] = counts.get(key, 0) + connection.msgcount
+            self.duration_s = reader.duration / NS_PER_S if any(counts.values()) else 0.0
         self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
     def messages(self, names: Collection[str]) -> Iterator[RawMessage]:
@@ -109,9 +110,9 @@ class BagFile:
         return int(seconds) * NS_PER_S + int(nanoseconds)
 
     @contextlib.contextmanager
-    def _opened(self) -> Iterator[AnyReader]:
+    def _opened(self) -> Iterator[BagReader]:
         try:
-            reader = AnyReader(self._files, default_typestore=ros2_types())
+            reader = BagReader(self._files, ros2_types())
             reader.open()
         except Exception as error:
             raise self._torn(error) from error

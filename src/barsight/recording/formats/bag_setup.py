@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -139,8 +140,31 @@ def _two_cameras(path: Path, pictures: Sequence[Topic]) -> list[str | None]:
             f"has {len(bases)} picture topics ({_list(pictures)}); the camchain's aren't among them",
             "name both with recording.cam0_topic and recording.cam1_topic",
         )
-    left_first = sorted(bases, key=lambda name: ("right" in name, name))
+    left_first = sorted(bases, key=lambda name: ("right" in name.lower(), name))
+    if not side_by_side(*left_first):
+        raise InputError(
+            path, f"has two picture topics, {left_first[0]} and {left_first[1]}, whose names don't say that "
+            "they are a left and a right one", "name both with recording.cam0_topic and recording.cam1_topic",
+        )  # fmt: skip
     return [left_first[0], left_first[1]]
+
+
+def side_by_side(left: str, right: str) -> bool:
+    """Check whether two names differ in left and right, l and r, or in a number and the next, and in nothing
+    else.
+    """
+    first, second = (re.findall(r"\d+|[a-z]+", name.lower()) for name in (left, right))
+    if len(first) != len(second):
+        return False
+    pairs = {(a, b) for a, b in zip(first, second, strict=True) if a != b}
+    return bool(pairs) and all(_is_next(a, b) for a, b in pairs)
+
+
+def _is_next(a: str, b: str) -> bool:
+    if a.isdigit() and b.isdigit():
+        return int(b) == int(a) + 1
+    sides = (("left", "right"), ("l", "r"))
+    return any(a.replace(left, right, 1) == b and a.endswith(left) for left, right in sides)
 
 
 def _imu_topic(

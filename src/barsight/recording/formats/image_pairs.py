@@ -17,6 +17,14 @@ FOLDERS = (
     ("image_0", "image_1"), ("image_left", "image_right"), ("l", "r"),
 )  # fmt: skip
 MARKS = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("_l", "_r"), ("l", "r"))
+INSIDE = tuple(
+    re.compile(rf"(?P<before>.*){mark}(?P<after>.*)")
+    for mark in (
+        "(?P<side>[Ll]eft|[Rr]ight|LEFT|RIGHT)", r"[Cc]am(era)?[-_]?(?P<side>[01])(?!\d)",
+        r"(?<=[a-z0-9_.-])(?P<side>[LR])(?=[-_.\d]|$)", r"(?<=[-_.])(?P<side>[lr])(?=[-_.\d])",
+    )
+)  # fmt: skip
+"""Marks inside a name, as in imageL0 and imageR0."""
 FORMS = (
     "a folder with left and right (or cam0 and cam1) inside, with pictures named left01.png and right01.png, "
     "or an EuRoC recording"
@@ -61,6 +69,14 @@ def find_pairs(path: Path) -> tuple[PicturePair, ...]:
         left, right = ({_cut(f.stem, mark): f for f in files if _has(f.stem, mark)} for mark in marks)
         if left and right and set(left) & set(right):
             return _matched(path, left, right)
+    for inside in INSIDE:
+        sides: tuple[dict[str, Path], dict[str, Path]] = ({}, {})
+        for file in files:
+            if found := inside.fullmatch(file.stem):
+                side = found["side"].lower() in ("right", "r", "1")
+                sides[side][found["before"] + found["after"]] = file
+        if set(sides[0]) & set(sides[1]):
+            return _matched(path, *sides)
     raise InputError(path, "holds no pairs of pictures", f"give {FORMS}")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from decimal import Decimal
 from enum import StrEnum
 from pathlib import Path
 
@@ -12,12 +13,33 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range, read_text
-from barsight.core.stamps import NS_PER_S, parse_seconds
+from barsight.core.stamps import NS_PER_S
 from barsight.core.types import ImuSamples
+from barsight.recording.formats.bag_file import IMU_TYPE, BagFile
 
 GRAVITY_MPS2 = 9.80665
 COLUMNS = 7
 FORM = "seven columns: time, three of the gyroscope, three of the accelerometer (or these two exchanged)"
+NAMES_FORM = "more than seven columns need a header that names gyro and accel"
+BAGS = (".bag", ".mcap", ".db3")
+NAMED = {
+    "gyro": re.compile(r"gyr|angular|omega|^w_|^w[xyz]\b|^g[xyz]\b", re.IGNORECASE),
+    "accel": re.compile(r"acc|^a_|^a[xyz]\b", re.IGNORECASE),
+}
+
+
+class TimeUnit(StrEnum):
+    """auto: by the header, else the one in which the samples come at 2.5 to 2500 Hz."""
+
+    AUTO = "auto"
+    S = "s"
+    MS = "ms"
+    US = "us"
+    NS = "ns"
+
+
+UNIT_NS = {TimeUnit.S: NS_PER_S, TimeUnit.MS: 10**6, TimeUnit.US: 10**3, TimeUnit.NS: 1}
+SLOWEST_S = 0.4
 
 
 class GyroUnit(StrEnum):
@@ -45,14 +67,16 @@ class ImuLog:
 
 
 def read_imu_log(
-    path: Path, gyro_unit: GyroUnit = GyroUnit.AUTO, accel_unit: AccelUnit = AccelUnit.AUTO
-) -> ImuLog:
-    """Read a log of an IMU at rest; a folder's `imu0/data.csv` is found. Raises InputError.
+    path: Path, gyro_unit: GyroUnit = GyroUnit.AUTO, accel_unit: AccelUnit = AccelUnit.AUTO,
+    time_unit: TimeUnit = TimeUnit.AUTO,
+) -> ImuLog:  # fmt: skip
+    """Read a log of an IMU at rest, or a bag; a folder's `imu0/data.csv` is found. Raises InputError.
 
-    Stamps are whole ns where they have no decimal point and 15 digits or more, else seconds.
+    Stamps may be of any epoch, also from start-up; their unit is as `TimeUnit` has it.
     """
-    file = _file(path)
-    header, stamp_ns, values = _rows(file)
+    is_bag = path.suffix in BAGS or (path / "metadata.yaml").is_file()
+    file = path if is_bag else _file(path)
+    header, stamp_ns, values = _bag_rows(path) if is_bag else _rows(file, time_unit)
     norms = [float(np.median(np.linalg.norm(values[:, k : k + 3], axis=1))) for k in (0, 3)]
     notes = []
     first, second = values[:, :3], values[:, 3:]
@@ -86,35 +110,108 @@ def _file(path: Path) -> Path:
     return path
 
 
-def _rows(path: Path) -> tuple[str, Int64, Float64]:
-    """Read header text, stamps (N,) ns in time's order and values (N, 6)."""
+def _rows(path: Path, unit: TimeUnit) -> tuple[str, Int64, Float64]:
+    """Read header text, stamps (N,) ns in time's order and values (N, 6), by name where there are more."""
     lines = read_text(path, remedy=f"give {FORM}").splitlines()
     start = next((k for k, line in enumerate(lines) if re.match(r"\s*[-+.\d]", line)), len(lines))
     rows = [(k + 1, line) for k, line in enumerate(lines[start:], start) if line.strip() and line[0] != "#"]
+    header = lines[start - 1].lstrip("# ") if start else ""
+    count = len(_parts(rows[0][1])) if rows else 0
+    columns = list(range(COLUMNS)) if count == COLUMNS else _named_columns(path, header, count)
     stamps, values = [], []
     for number, line in rows:
-        parts = line.replace(",", " ").replace(";", " ").replace("\t", " ").split()
+        parts = _parts(line)
         try:
-            if len(parts) != COLUMNS:
+            if len(parts) != count:
                 raise ValueError
-            text = parts[0]
-            stamps.append(int(text) if len(text) >= 15 and text.isdigit() else parse_seconds(text))
-            values.append([float(part) for part in parts[1:]])
-        except ValueError:
-            raise InputError(path, f"line {number}: not {COLUMNS} numbers", f"give {FORM}") from None
+            stamps.append(Decimal(parts[0]))
+            values.append([float(parts[k]) for k in columns[1:]])
+        except (ArithmeticError, ValueError):
+            raise InputError(path, f"line {number}: not {count} numbers", f"give {FORM}") from None
     array = np.array(values, dtype=np.float64).reshape(-1, 6)
-    stamp_ns = np.array(stamps, dtype=np.int64)
-    if stamp_ns.size < 2:
-        raise InputError(path, "holds no samples", f"give {FORM}")
+    stamp_ns = _stamps_ns(path, stamps, header, unit)
     good = in_range(array).all(axis=1)
     stamp_ns, array = stamp_ns[good], array[good]
+    _expect_rising(path, stamp_ns)
+    return " ".join(lines[:start]), stamp_ns, array
+
+
+def _parts(line: str) -> list[str]:
+    return line.rstrip(" ,;\t").replace(",", " ").replace(";", " ").replace("\t", " ").split()
+
+
+def _named_columns(path: Path, header: str, count: int) -> list[int]:
+    """Find time, gyroscope and accelerometer among more columns, by their names."""
+    names = [name.strip() for name in re.split(r"[,;\t]", header)]
+    if count < COLUMNS:
+        problem = f"line 1: not {COLUMNS} numbers" if count else "holds no samples"
+        raise InputError(path, problem, f"give {FORM}")
+    found = {kind: [k for k, name in enumerate(names) if word.search(name)] for kind, word in NAMED.items()}
+    if len(names) != count or any(len(columns) != 3 for columns in found.values()):
+        raise InputError(path, f"has {count} columns whose names don't tell which are which", NAMES_FORM)
+    return [0, *found["gyro"], *found["accel"]]
+
+
+def _stamps_ns(path: Path, stamps: list[Decimal], header: str, unit: TimeUnit) -> Int64:
+    """Convert stamps to whole ns."""
+    if len(stamps) < 2:
+        raise InputError(path, "holds no samples", f"give {FORM}")
+    if not all(stamp.is_finite() for stamp in stamps):
+        raise InputError(path, "holds a stamp that is no number", "drop that line")
+    if unit is TimeUnit.AUTO:
+        unit = _time_unit(path, stamps, header)
+    scaled = [stamp * UNIT_NS[unit] for stamp in stamps]
+    if not all(abs(stamp) < 2**63 for stamp in scaled):
+        raise InputError(path, f"holds stamps that are no time in {unit}", "give their unit by --time-unit")
+    return np.array([int(stamp) for stamp in scaled], dtype=np.int64)
+
+
+def _time_unit(path: Path, stamps: list[Decimal], header: str) -> TimeUnit:
+    named = re.search(r"[\[(_ ](ns|us|\u00b5s|ms|s|sec)[\])]?\s*$", re.split(r"[,;\t]", header)[0].strip())
+    step = float(np.median(np.abs(np.diff(np.array([float(stamp) for stamp in stamps])))))
+    fits = [one for one, ns in UNIT_NS.items() if SLOWEST_S * 1e-3 <= step * ns / NS_PER_S < SLOWEST_S]
+    if named:
+        text = named[1].replace("\u00b5", "u").replace("sec", "s")
+        return TimeUnit(text)
+    if len(fits) != 1:
+        raise InputError(
+            path, f"its stamps lie {step:.3g} apart: no IMU's rate in s, ms, us or ns", "give --time-unit"
+        )
+    return fits[0]
+
+
+def _bag_rows(path: Path) -> tuple[str, Int64, Float64]:
+    """Read the one IMU of a bag: header stamps (N,) ns and values (N, 6), SI units."""
+    bag = BagFile(path)
+    topics = [topic for topic in bag.topics if topic.kind == IMU_TYPE and topic.count]
+    if len(topics) != 1:
+        held = ", ".join(topic.name for topic in topics or bag.topics) or "nothing"
+        what = "several IMU topics" if topics else "no IMU topic"
+        raise InputError(path, f"has {what} ({held})", "give a bag with one")
+    stamps, values = [], []
+    for message in bag.messages([topics[0].name]):
+        try:
+            decoded = bag.decode(message)
+        except ValueError as error:
+            raise InputError(path, f"{message.topic} {error}", "copy the bag again") from None
+        w, a = decoded.angular_velocity, decoded.linear_acceleration
+        stamps.append(message.stamp_ns)
+        values.append([w.x, w.y, w.z, a.x, a.y, a.z])
+    table, stamp_ns = np.array(values, np.float64).reshape(-1, 6), np.array(stamps, np.int64)
+    good = in_range(table).all(axis=1)
+    _expect_rising(path, stamp_ns[good])
+    return "", stamp_ns[good], table[good]
+
+
+def _expect_rising(path: Path, stamp_ns: Int64) -> None:
     back = np.flatnonzero(np.diff(stamp_ns) <= 0)
+    if stamp_ns.size < 2:
+        raise InputError(path, "holds no samples", f"give {FORM}")
     if back.size:
         raise InputError(
             path, f"{back.size} stamps repeat or go back, first near {stamp_ns[back[0]] / NS_PER_S:.3f} s",
             "sort the log by time and drop doubled lines",
         )  # fmt: skip
-    return " ".join(lines[:start]), stamp_ns, array
 
 
 def _is_gravity(norm: float) -> bool:

@@ -12,12 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from barsight.core.errors import OutputError
+from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_directory, lies_within
+from barsight.core.types import RefusedFrame
 from barsight.recording.stored_images import StoredPictures
 from barsight.recording.writers.bag import BAG_FLAVOURS, write_bag
 from barsight.recording.writers.euroc import write_euroc
 
+REMEDY = "record gray, colour (rgb8, bgr8), Bayer or compressed pictures"
 Target = Literal["euroc", "ros2-mcap", "ros2-sqlite3", "ros1"]
 
 
@@ -53,7 +55,16 @@ def convert(
         else:
             flavour = BAG_FLAVOURS[target]
             written = write_bag(recording, staging, out.name, flavour, lambda done: report(done, total))
+        if written == 0:
+            raise InputError(
+                recording.path, f"none of its pictures can be read: {_reason(recording)}", REMEDY
+            )
     return ConversionReport(out, written, total - written)
+
+
+def _reason(recording: StoredPictures) -> str:
+    first = next(iter(recording.frames()), None)
+    return first.reason if isinstance(first, RefusedFrame) else "it has none"
 
 
 def _silent(done: int, total: int) -> None:

@@ -1,0 +1,119 @@
+"""Read and write `yard.yaml`: where a frame lies in the yard, how surely, and of which rig and crane."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barsight.calibration.files.yaml_document import Document, canonical_pose, read_document, write_document
+from barsight.core.arrays import Float64
+from barsight.core.errors import CalibrationError
+from barsight.core.pose import Pose, nearest_rotation
+from barsight.registration.yard import YardCalibration
+
+FRAMES = ("world", "encoders", "body")
+REMEDY = "take the file that barsight calibrate yard wrote"
+OWNERS = ("calibration_id", "mounting_id", "recording_id")
+
+
+@dataclass(frozen=True, eq=False)
+class YardFrame:
+    """yard_from: the yard from one of `FRAMES`; covariance (6, 6) as `Alignment` has it.
+
+    yard_from_body: (3, 3) how the rig hangs, where crane moves told it. calibration_id: of the rig,
+    mounting_id: of how the encoders say that it hangs, recording_id: of the inputs in whose frame the points
+    were measured; None where the file doesn't say. doubts: of the calibration. digest: SHA-256 of the file.
+    """
+
+    path: Path
+    yard_from: Pose
+    covariance: Float64
+    yard_from_body: Float64 | None
+    calibration_id: str | None
+    mounting_id: str | None
+    recording_id: str | None
+    doubts: tuple[str, ...]
+    digest: str
+
+    @property
+    def attitude(self) -> Float64 | None:
+        """Return how the rig hangs (3, 3), yard from body, where the file tells it."""
+        return self.yard_from.rotation if self.yard_from.source == "body" else self.yard_from_body
+
+
+def write_yard_file(
+    path: Path, found: YardCalibration, hangs: Float64 | None, owners: dict[str, str | None]
+) -> None:
+    """Write a calibration. hangs: (3, 3) yard from body, or None. owners: values of `OWNERS`."""
+    pose = found.alignment.target_from_source
+    content: dict[str, Any] = {
+        "barsight_yard": 1,
+        f"yard_from_{pose.source}": pose.matrix.tolist(),
+        "covariance": found.alignment.covariance.tolist(),
+        "scale": found.alignment.scale,
+        "scale_sigma": found.alignment.scale_sigma,
+        "points": int((~found.checks).sum()),
+        "rms_m": float(np.sqrt((found.off_m[~found.checks] ** 2).sum(axis=1).mean())),
+        "doubts": list(found.doubts),
+        **{name: value for name, value in owners.items() if value is not None},
+    }
+    if hangs is not None:
+        content["R_yard_body"] = hangs.tolist()
+    write_document(path, content)
+
+
+def read_yard_file(path: Path) -> YardFrame:
+    """Read a yard file. Raises CalibrationError naming the file and what can't be."""
+    document = read_document(path)
+    if document.values.get("barsight_yard") != 1:
+        raise CalibrationError(path, "is no yard file (barsight_yard: 1 is missing)", REMEDY)
+    frames = [name for name in FRAMES if f"yard_from_{name}" in document.values]
+    if len(frames) != 1:
+        raise CalibrationError(path, "must hold one of yard_from_world, _encoders, _body", REMEDY)
+    pose = canonical_pose("yard", frames[0], _matrix(document, f"yard_from_{frames[0]}"))
+    owners = {name: document.values.get(name) for name in OWNERS}
+    for name, value in owners.items():
+        if value is not None and not isinstance(value, str):
+            raise document.error(name, "is no text", REMEDY)
+    doubts = document.values.get("doubts")
+    return YardFrame(
+        path, pose, _covariance(document), _attitude(document), owners["calibration_id"],
+        owners["mounting_id"], owners["recording_id"],
+        tuple(str(one) for one in doubts) if isinstance(doubts, list) else (),
+        hashlib.sha256(path.read_bytes()).hexdigest(),
+    )  # fmt: skip
+
+
+def _matrix(document: Document, key: str) -> Float64:
+    document.pose(key, "yard", "source")
+    return document.matrix(key)
+
+
+def _rows(document: Document, key: str, size: int) -> Float64:
+    value = document.get(key)
+    if not isinstance(value, list) or [len(r) if isinstance(r, list) else 0 for r in value] != [size] * size:
+        raise document.error(key, f"is not a {size}x{size} matrix", REMEDY)
+    numbers = document.numbers_in(key, [number for row in value for number in row])
+    return np.array(numbers, np.float64).reshape(size, size)
+
+
+def _covariance(document: Document) -> Float64:
+    covariance = _rows(document, "covariance", 6)
+    whole = (covariance + covariance.T) / 2
+    off = np.abs(covariance - covariance.T).max()
+    if off > 1e-6 * np.abs(whole).max() or np.linalg.eigvalsh(whole).min() < -1e-9 * np.abs(whole).max():
+        raise document.error("covariance", "can't be one (not symmetric or negative)", REMEDY)
+    return whole
+
+
+def _attitude(document: Document) -> Float64 | None:
+    if document.values.get("R_yard_body") is None:
+        return None
+    matrix = _rows(document, "R_yard_body", 3)
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4 or np.linalg.det(matrix) < 0:
+        raise document.error("R_yard_body", "is not a rotation", REMEDY)
+    return nearest_rotation(matrix)

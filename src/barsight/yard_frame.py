@@ -1,0 +1,182 @@
+"""Apply a yard file to a measurement: encoders, poses, map and sigma; refuse one of another rig or crane."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.arrays import Float64
+from barsight.core.errors import InputError
+from barsight.core.json_values import json_digest
+from barsight.core.pose import skew
+from barsight.core.types import CraneSamples, Trajectory
+from barsight.measurement import to_json
+from barsight.recording.base import Recording
+from barsight.recording.wrapper import RecordingProxy
+from barsight.registration.yard_file import YardFrame, read_yard_file
+from barsight.yard.identity import ID_DIGITS
+
+MAX_TURN_DEG, MAX_PLACE_M = 1.0, 0.5
+"""A frame less sure than this (1 sigma, worst axis) places nothing for a crane."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingInYard(RecordingProxy):
+    """`whole` with its encoders' readings in the surveyed yard."""
+
+    frame: YardFrame
+
+    def crane(self) -> CraneSamples | None:
+        """Return the readings, moved into the yard or with the attitude that was calibrated."""
+        crane = self.whole.crane()
+        return None if crane is None else crane_in_yard(crane, self.frame)
+
+
+def in_yard(recording: Recording, yard: Path | None) -> Recording:
+    """View a recording through the yard file, the recording itself where there is none.
+
+    Raises CalibrationError for a file that can't be, InputError for one of another rig, crane or recording.
+    """
+    if yard is None:
+        return recording
+    frame = read_yard_file(yard)
+    _expect_sure(frame)
+    _expect_fits(frame, recording)
+    return RecordingInYard(recording, frame)
+
+
+def frame_of(recording: Recording) -> YardFrame | None:
+    """Return the yard file that a recording is seen through."""
+    return recording.frame if isinstance(recording, RecordingInYard) else None
+
+
+def calibration_id(rig: StereoRig) -> str:
+    """Compute the digest of a rig that results carry."""
+    return json_digest(to_json(asdict(rig)))[:ID_DIGITS]
+
+
+def mounting_id(crane: CraneSamples) -> str:
+    """Compute the digest of how the body hangs from the crane."""
+    hung = {"crane_to_body_m": crane.crane_to_body_m, "yard_from_body": crane.yard_from_body_nominal}
+    return json_digest(to_json(hung))[:ID_DIGITS]
+
+
+def recording_id(inputs: Mapping[str, str]) -> str:
+    """Compute the digest of a recording's inputs."""
+    return json_digest(dict(inputs))[:ID_DIGITS]
+
+
+def yard_frame_id(recording: Recording, trajectory: Trajectory) -> str | None:
+    """Compute a digest of what places the map in the yard; None where it isn't there."""
+    crane, frame = recording.crane(), frame_of(recording)
+    if trajectory.reference != "yard":
+        return None
+    mounted = None if crane is None else mounting_id(crane)
+    return mounted if frame is None else json_digest([mounted, frame.digest])[:ID_DIGITS]
+
+
+def crane_in_yard(crane: CraneSamples, frame: YardFrame) -> CraneSamples:
+    """Move encoder readings into the surveyed yard, or give the body the attitude that was calibrated."""
+    pose = frame.yard_from
+    if pose.source == "encoders":
+        return replace(
+            crane, position_m=pose.apply(crane.position_m),
+            crane_to_body_m=pose.rotation @ crane.crane_to_body_m,
+            yard_from_body_nominal=pose.rotation @ crane.yard_from_body_nominal,
+        )  # fmt: skip
+    return crane if frame.attitude is None else replace(crane, yard_from_body_nominal=frame.attitude)
+
+
+def placed_in_yard(trajectory: Trajectory, frame: YardFrame | None) -> Trajectory:
+    """Move a trajectory of `world` into the yard, each pose with its own covariance alone."""
+    if frame is None or trajectory.reference != "world" or frame.yard_from.source != "world":
+        return trajectory
+    turn = np.kron(np.eye(2), frame.yard_from.rotation)
+    frames = tuple(
+        replace(
+            one, reference_from_body=frame.yard_from @ one.reference_from_body,
+            covariance=turn @ one.covariance @ turn.T,
+        )
+        for one in trajectory.frames
+    )  # fmt: skip
+    return replace(trajectory, reference="yard", frames=frames)
+
+
+def with_shared(trajectory: Trajectory, frame: YardFrame | None) -> Trajectory:
+    """Add what the yard frame may be off to each pose's covariance; it is common to all of them."""
+    if frame is None or trajectory.reference != "yard":
+        return trajectory
+    frames = []
+    for one in trajectory.frames:
+        carry = np.eye(6)
+        if frame.yard_from.source == "body" or frame.attitude is not None:
+            carry[3:] = 0.0  # only the attitude is taken; the encoders say where the body is
+        else:
+            carry[3:, :3] = -skew(one.reference_from_body.translation - frame.yard_from.translation)
+        frames.append(replace(one, covariance=one.covariance + carry @ frame.covariance @ carry.T))
+    return replace(trajectory, frames=tuple(frames))
+
+
+def shared_height_sigma_m(frame: YardFrame, x_m: Float64, y_m: Float64, body_m: Float64) -> Float64:
+    """Compute what the yard frame may add to heights at places (N,), m. body_m: (3,) of the body that saw
+    them.
+    """
+    about = body_m if frame.attitude is not None else frame.yard_from.translation
+    lifted = 0.0 if frame.attitude is not None else 1.0
+    row = np.zeros((x_m.size, 6))
+    row[:, 0], row[:, 1], row[:, 5] = y_m - about[1], -(x_m - about[0]), lifted
+    sigma: Float64 = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", row, frame.covariance, row), 0))
+    return sigma
+
+
+def _expect_sure(frame: YardFrame) -> None:
+    turn, place = (
+        float(np.sqrt(max(np.linalg.eigvalsh(part)[-1], 0)))
+        for part in (frame.covariance[:3, :3], frame.covariance[3:, 3:])
+    )
+    if np.degrees(turn) > MAX_TURN_DEG or place > MAX_PLACE_M:
+        raise InputError(
+            frame.path, f"is too unsure to place anything: turned to ± {np.degrees(turn):.3g} deg, placed to "
+            f"± {place:.3g} m", "calibrate with more targets, well apart",
+        )  # fmt: skip
+
+
+def _expect_fits(frame: YardFrame, recording: Recording) -> None:
+    """Raise InputError where the frame is of another rig, crane or recording, or of no use to this one."""
+    crane, path, source = recording.crane(), frame.path, frame.yard_from.source
+    own = calibration_id(recording.rig)
+    if frame.calibration_id not in (None, own):
+        problem = (
+            f"belongs to another rig or calibration ({frame.calibration_id}; {recording.path} has {own})"
+        )
+        raise InputError(path, problem, "calibrate the yard again with this rig")
+    if crane is None:
+        if source != "world":
+            problem = f"says where the {source} lies, but {recording.path} has no encoders that are used"
+            raise InputError(path, problem, "give a yard file of this recording's world")
+        if frame.recording_id not in (None, recording_id(recording.digests())):
+            problem = f"is of another recording's world, which {recording.path} doesn't share"
+            raise InputError(path, problem, "measure the targets in this recording's map")
+        return
+    if source == "world" and frame.attitude is None:
+        problem = f"is of a world without encoders; {recording.path} has encoders"
+        raise InputError(path, problem, "measure the targets in a map by encoders (--frame encoders)")
+    if frame.mounting_id not in (None, mounting_id(crane)):
+        problem = (
+            f"belongs to another crane, or the rig was mounted anew since (not as {recording.path} says)"
+        )
+        raise InputError(path, problem, "calibrate the yard again")
+
+
+def frame_notes(frame: YardFrame | None) -> tuple[str, ...]:
+    """List what is only assumed of the yard frame."""
+    if frame is None:
+        return ()
+    notes = [f"yard frame {frame.path.name}: {doubt}" for doubt in frame.doubts]
+    if frame.calibration_id is None:
+        notes.append(f"{frame.path.name} doesn't say which rig it is of: taken to be this one's")
+    return tuple(notes)
