@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import time
 from dataclasses import dataclass
@@ -41,8 +42,8 @@ def check_telegram(one: TelegramSettings) -> TelegramCheck | Failed:
                 lives.append(found["life"])
     except OSError as error:
         return Failed("telegram-link", f"{one.host}:{one.port}: {error}")
-    gaps_s = [later - before for before, later in zip(stamps[1:], stamps[2:], strict=False)]
-    counts = [(later - before) & 0xFFFF for before, later in zip(lives, lives[1:], strict=False)]
+    gaps_s = [later - before for before, later in itertools.pairwise(stamps[1:])]
+    counts = [(later - before) & 0xFFFF for before, later in itertools.pairwise(lives)]
     is_alive = all(0 < each < 1000 for each in counts)
     cycle = f"cycle {min(gaps_s) * 1e3:.1f}...{max(gaps_s) * 1e3:.1f} ms, set {one.cycle_s * 1e3:g} ms"
     lines = [*_told("in", sent, one.byte_order), *_told("out", content, one.byte_order), cycle]

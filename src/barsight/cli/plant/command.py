@@ -8,7 +8,7 @@ from barsight.cli.arguments import pass_on
 
 KINDS = {
     "run": "Serve the cyclic telegram to a PLC by TCP; Ctrl-C ends it",
-    "check": "Connect as a PLC, show both sides' bytes, and measure the cycle; exit code 5 where it doesn't hold",
+    "check": "Connect as a PLC, show the bytes, measure the cycle; exit code 5 where it doesn't hold",
 }
 
 

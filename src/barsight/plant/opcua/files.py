@@ -17,7 +17,7 @@ IDLE_S = 60.0
 
 
 @dataclass
-class _Transfer:
+class _OpenFile:
     node: Node
     file: BinaryIO
     used_at: float
@@ -31,7 +31,7 @@ class Transfers:
         self._parent = parent
         self._index = index
         self._results = results
-        self._open: dict[int, _Transfer] = {}
+        self._open: dict[int, _OpenFile] = {}
         self._handles = 0
 
     async def open(self, options: Any) -> Any:
@@ -51,7 +51,7 @@ class Transfers:
             ua.NodeId(name, self._index), ua.QualifiedName(name, self._index),
             objecttype=ua.NodeId(ua.ObjectIds.FileType),
         )  # fmt: skip
-        self._open[number] = _Transfer(node, file, time.monotonic())
+        self._open[number] = _OpenFile(node, file, time.monotonic())
         for method, handler in (
             ("Read", self._reader(number)), ("Close", self._closer(number)),
             ("GetPosition", self._teller(number)), ("SetPosition", self._seeker(number)),
