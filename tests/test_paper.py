@@ -73,7 +73,7 @@ def test_the_trend_follows_a_known_motion() -> None:
     going = np.maximum(t - 2, 0)
     rate, push = np.where(t > 2, 0.02, 0.0), np.where(t > 2, 0.3, 0.0)
     angle = 0.02 * going
-    gyro = np.column_stack([0 * t, 0 * t, rate]) + [0.004, -0.002, 0.003]
+    gyro = np.column_stack([0 * t, 0 * t, rate]) + np.array([0.004, -0.002, 0.003])
     force = np.column_stack([push * np.cos(angle), -push * np.sin(angle), np.full_like(t, 9.80665)])
     rng = np.random.default_rng(1)
     imu = ImuSamples(np.round(t * 1e9).astype(np.int64), gyro, force + rng.normal(0, 1e-3, force.shape))
