@@ -126,4 +126,4 @@ def test_the_quick_page(tmp_path: Path) -> None:
         part = page.split(f'<article id="{entry.place}">')[1].split("</article>")[0]
         assert entry.kind != "figure" or "<img" in part or "<table" in part or entry.number == 6
         assert entry.kind != "table" or "<table" in part
-    assert "src=\"http" not in page
+    assert 'src="http' not in page
