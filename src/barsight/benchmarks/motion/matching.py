@@ -27,6 +27,7 @@ from barsight.features.guided_matching import (
     match_across,
     match_left,
     predict_projections,
+    triangulate_stereo,
 )
 from barsight.features.matching import (
     homography_inliers,

@@ -59,7 +59,7 @@ class MotionTrend:
         self._free: tuple[int, BodyState] | None = None
 
     def predict(self, stamp_ns: int) -> Pose | None:
-        """Predict old_from_new of `body` at a frame; None without a velocity or where the IMU leaves a gap."""
+        """Predict old_from_new of `body` at a frame; None without a velocity or in an IMU's gap."""
         self._free = None
         state = self._state
         if state is None:
