@@ -28,8 +28,7 @@ def run(arguments: Sequence[str]) -> None:
         Args:
             out: A new folder for the page, OUT/paper.html.
             quick: Draw less and smaller: 10 m of stack in pairs of 320 x 256 instead of 35 m of 640 x 512.
-            recording: Show the figures on this recording instead of a drawn one; Table 1, the stack's side and
-                the environments stay drawn.
+            recording: Show the figures on this recording; Table 1, the side and the environments stay drawn.
         """
         expect_recording(recording)
         expect_empty(out)

@@ -1,1 +1,1 @@
-"""The paper that Barsight began from: each equation, figure, table and conclusion beside ours (`barsight paper`)."""
+"""The paper that Barsight began from: each equation, figure, table and conclusion beside ours."""

@@ -42,8 +42,8 @@ class DriftRow:
 
 @dataclass(frozen=True)
 class ContourScore:
-    """Vision minus laser over a folder's contours, both filtered. relative_pct: MAE against the paper's 3.77 m
-    and against the stack's height; the largest likewise (corrected: an error over a named length).
+    """Vision minus laser over a folder's contours, both filtered. relative_pct: MAE against the paper's
+    3.77 m and against the stack's height; the largest likewise (an error over a named length).
     """
 
     samples: int

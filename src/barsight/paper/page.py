@@ -32,6 +32,7 @@ from barsight.recording.open import open_recording
 from barsight.report.page import environment, resource
 
 Cells = list[list[str]]
+_OF_PAPER = ("SGBM", "CSCA", "its own")
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ def _number(value: float, decimals: int = 1, unit: str = "") -> str:
 
 
 def _table_1(sizes: TargetSizeBench) -> PaperTable:
-    heads = ("range mm", *(f"paper: {name}, mm (printed %, recomputed %)" for name in ("SGBM", "CSCA", "its own")),
+    heads = ("range mm", *(f"paper: {name} mm (printed %, recomputed %)" for name in _OF_PAPER),
              *(f"here: {method.method} %" for method in sizes.methods))  # fmt: skip
     rows = []
     measured = {one.range_mm: k for k, one in enumerate(sizes.methods[0].ranges)}
@@ -159,8 +160,8 @@ def _table_1(sizes: TargetSizeBench) -> PaperTable:
         row += ["–" if k is None else _number(m.ranges[k].size.mean_abs_pct, 2) for m in sizes.methods]
         rows.append(row)
     note = (
-        f"Here: mean error of {sizes.poses} drawn bar(s) of 90 mm at each range, by the crane's camera of 1250 px "
-        "and 0.5 m; the paper names neither its camera nor its way of measuring."
+        f"Here: mean error of {sizes.poses} drawn bar(s) of 90 mm at each range, by the crane's camera of "
+        "1250 px and 0.5 m; the paper names neither its camera nor its way of measuring."
     )
     return PaperTable(heads, rows, note)
 
@@ -217,9 +218,9 @@ def _table_4(
             [f"here: {method}", *figures, "3D", "face scan", spacing, _number(hertz, 2), _number(truth)]
         )
     note = (
-        "Relative errors here: against the paper's 3.77 m, and against the stack's own height. Spacing: one pixel "
-        "at the floor, 8 m away. Hz: pairs a second of the whole pipeline, map included. Against the laser both "
-        "contours are filtered and all samples count, steps too; against truth unfiltered smooth places count."
+        "Relative errors here: against the paper's 3.77 m, and against the stack's own height. Spacing: one "
+        "pixel at the floor, 8 m away. Hz: pairs a second of the whole pipeline, map included. Against the "
+        "laser both contours are filtered and all samples count, steps too; against truth, smooth places."
     )
     return PaperTable(heads, rows, note)
 

@@ -17,7 +17,7 @@ WINDOW_PX = 7
 
 
 def match_three(pair: RectifiedPair) -> dict[str, Float32]:
-    """Match by SGBM (the loop's D0), the paper's loop and ours: disparities (H, W) px; empty if none match."""
+    """Match by SGBM (the loop's D0), the paper's loop and ours: disparities (H, W) px."""
     candidates = find_disparity_range(pair)
     if isinstance(candidates, Failed):
         return {}
@@ -66,8 +66,8 @@ def cost_curve(pair: RectifiedPair, disparity: Float32) -> PaperPicture:
 def loop_pictures(disparities: dict[str, Float32]) -> tuple[PaperPicture, ...]:
     """Paint D0 and the loop's end [paper Figure 2], with how far from half a pixel they keep."""
     return tuple(
-        heat_picture(disparities[label], f"{label}: {whole_pct(disparities[label]):.0f} % lie within 0.1 px of "
-                     "a whole disparity (20 % would by chance)")
+        heat_picture(disparities[label], f"{label}: {whole_pct(disparities[label]):.0f} % lie within "
+                     "0.1 px of a whole disparity (20 % would by chance)")
         for label in ("D0 (SGBM)", "paper")
     )  # fmt: skip
 

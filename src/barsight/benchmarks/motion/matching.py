@@ -169,7 +169,7 @@ def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, in
     row("homography", plane, target, start + plane_s)
     begin = time.perf_counter()
     stereo, sigma, known = stereo_places(step.old, places)
-    points = triangulatestereo_places(np.where(known[:, None], stereo, [1e3, 0, 0]), step.rectifier.camera)
+    points = triangulate_stereo(np.where(known[:, None], stereo, [1e3, 0, 0]), step.rectifier.camera)
     moved = _trend(step)
     trend = plane & known & motion_inliers(points, target, *moved, step.rectifier.camera, TREND_PX)
     row("homography, trend", trend, target, start + plane_s + time.perf_counter() - begin)
@@ -234,7 +234,7 @@ def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple
     if prediction is None:
         return kept, found
     index = np.flatnonzero(known)
-    depth = triangulatestereo_places(stereo[index], step.rectifier.camera)[:, 2]
+    depth = triangulate_stereo(stereo[index], step.rectifier.camera)[:, 2]
     tracks = Tracks(
         (step.old.left,), step.old.pair, index, stereo[index], sigma[index], np.zeros(len(index), np.int64),
         stereo[index, :2], depth,
@@ -258,7 +258,7 @@ def _alone(
     nearest_known = cKDTree(stereo[known, :2]).query(stereo[:, :2], k=NEIGHBOURS)[1]
     around = (stereo[known, 0] - stereo[known, 2])[nearest_known]
     disparity = np.where(known, stereo[:, 0] - stereo[:, 2], np.median(around, axis=1))
-    points = triangulatestereo_places(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
+    points = triangulate_stereo(np.column_stack([stereo[:, :2], stereo[:, 0] - disparity]), camera)
     sigmas = np.where(known[:, None], sigma_px, [sigma_px, sigma_px, GUESSED_PX])
     predicted = predict_projections(points, sigmas, motion, camera)
     repeats = texture_period_px(step.old.pair.left, stereo[:, :2])

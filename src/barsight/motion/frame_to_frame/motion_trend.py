@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
@@ -52,13 +53,13 @@ class MotionTrend:
         self._velocity_mps, self._bias = np.full(3, np.nan), ImuBias.none()
         if not isinstance(rest, Failed):
             self._velocity_mps, self._bias = np.zeros(3), rest.bias
+            upright = Rotation.align_vectors(np.array([[0.0, 0.0, 1.0]]), rest.up_in_body[None])[0]
+            self._level = upright.as_matrix()
         self._state: TrendState | None = None
         self._free: tuple[int, BodyState] | None = None
 
     def predict(self, stamp_ns: int) -> Pose | None:
-        """Predict old_from_new of `body` at a frame; None where the velocity isn't known yet or the IMU leaves
-        a gap.
-        """
+        """Predict old_from_new of `body` at a frame; None without a velocity or in an IMU's gap."""
         self._free = None
         state = self._state
         if state is None:
