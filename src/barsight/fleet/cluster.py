@@ -53,7 +53,8 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Any]:
 
 def slots(client: Any) -> int:
     """Count the threads of the workers that are there now, at least 1."""
-    return max(1, sum(client.nthreads().values()))
+    threads: dict[str, int] = client.nthreads()
+    return max(1, sum(threads.values()))
 
 
 def run_all(

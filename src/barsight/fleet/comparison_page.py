@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 from barsight.fleet.findings import LEVEL, Findings
@@ -66,7 +67,7 @@ def _intervals(findings: Findings) -> list[tuple[str, ...]]:
     told = [one.intervals for one in findings.recordings if one.intervals]
     if not told:
         return []
-    rows = []
+    rows = list[tuple[str, ...]]()
     for figure in told[0]:
         before, after = (sum(one[figure][side] for one in told) / len(told) for side in (0, 1))
         rows.append((figure, f"{before:.4f}", f"{after:.4f}"))
@@ -77,7 +78,7 @@ def _numbers(numbers: tuple[int, ...]) -> str:
     return " ".join(map(str, numbers))
 
 
-def _table(heads: tuple[str, ...], rows: list[tuple[object, ...]] | list[tuple[str, ...]]) -> str:
+def _table(heads: tuple[str, ...], rows: Sequence[Sequence[object]]) -> str:
     if not rows:
         return "<p>None.</p>"
     head = "".join(f"<th>{escape(name)}</th>" for name in heads)

@@ -41,7 +41,8 @@ def refine(source: Float64, target: Float64, start: Pose) -> Pose:
     pose = start
     for _ in range(ROUNDS):
         moved = pose.apply(source)
-        far, index = tree.query(moved, distance_upper_bound=REACH_M)
+        found = tree.query(moved, distance_upper_bound=REACH_M)
+        far, index = np.asarray(found[0]), np.asarray(found[1])
         met = np.isfinite(far)
         if met.sum() < NEIGHBOURS:
             break

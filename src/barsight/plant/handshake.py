@@ -67,17 +67,26 @@ def report_executed(store: Store, claim: Claim, lift: OfferedLift, load_kg: floa
     try:
         take_lift(store, claim.lift_id, claim.who)
     except BarsightError as error:
+        told = (
+            f"lift {claim.lift_id} was executed and can't be recorded ({error}): survey before the next lift"
+        )
+        _raise(store, claim.who, "lift-unrecorded", told)
         return Failed("refused", str(error))
     if load_kg is None:
         return "unweighed"
     if abs(load_kg - lift.mass_kg) <= LOAD_SIGMAS * lift.mass_sigma_kg:
         return "confirmed"
+    told = f"lift {claim.lift_id}: {load_kg:.0f} kg were weighed, {lift.mass_kg:.0f} kg were told"
+    _raise(store, claim.who, "load-contradicts", told)
+    return "contradicted"
+
+
+def _raise(store: Store, who: str, code: str, told: str) -> None:
+    """Raise an alarm in the store, at the yard's clock."""
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
-    told = f"lift {claim.lift_id}: {load_kg:.0f} kg were weighed, {lift.mass_kg:.0f} kg were told"
-    with entry(store, claim.who, "load contradicts", clock_ns) as opened:
-        raise_alarm(opened, "load-contradicts", told)
-    return "contradicted"
+    with entry(store, who, code, clock_ns) as opened:
+        raise_alarm(opened, code, told)
 
 
 def report_failed(store: Store, claim: Claim, note: str) -> str | Failed:

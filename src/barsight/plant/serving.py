@@ -51,7 +51,7 @@ class TelegramServer:
             await server.serve_forever()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        partner = Partner(f"plc {writer.get_extra_info('peername')[0]}")
+        partner = Partner("plc {}:{}".format(*writer.get_extra_info("peername")[:2]))
         listening = asyncio.create_task(self._listen(reader, partner))
         one = self._settings.telegram
         due = time.monotonic()
@@ -79,6 +79,7 @@ class TelegramServer:
                 state = await asyncio.to_thread(
                     state_of_store, self._store, self._counter,
                     approach_height_m=source.approach_height_m, magnet_steps_kg=source.magnet_steps_kg,
+                    allow_simulated=source.allow_simulated,
                 )  # fmt: skip
         except BarsightError as error:
             return PlantState("idle", False, (f"store: {error}",), self._counter, time.time_ns(), "none")
@@ -116,9 +117,13 @@ class TelegramServer:
 
     def _step(self, who: str, found: dict[str, int]) -> tuple[int, int]:
         source = self._settings.store
-        lift = state_of_store(
-            self._store, 0, approach_height_m=source.approach_height_m, magnet_steps_kg=source.magnet_steps_kg
-        ).lift
+        state = state_of_store(
+            self._store, 0, approach_height_m=source.approach_height_m,
+            magnet_steps_kg=source.magnet_steps_kg, allow_simulated=source.allow_simulated,
+        )  # fmt: skip
+        lift = state.lift
+        if found["command"] == CLAIM and not state.is_valid:
+            return REFUSED, 0
         if lift is None or lift.lift_id != found["lift_id"] or int(lift.sha256[:8], 16) != found["checksum"]:
             return REFUSED, 0
         if found["command"] == CLAIM:

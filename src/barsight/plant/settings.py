@@ -22,6 +22,8 @@ class StoreSource:
     """The magnet's faces may travel over any place of the yard at this height."""
     magnet_steps_kg: tuple[float, ...] = ()
     """Most load of each step of the magnet's current, from step 1."""
+    allow_simulated: bool = False
+    """Offer lifts of a simulated yard too, to try a PLC's program; never with a crane."""
 
     def __post_init__(self) -> None:
         expect_values(self, "store.")

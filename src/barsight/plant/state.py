@@ -96,30 +96,40 @@ class PlantState:
 
 def state_of_store(
     store: Store, life_counter: int, *, approach_height_m: float | None = None,
-    magnet_steps_kg: tuple[float, ...] = (), now_ns: int | None = None,
+    magnet_steps_kg: tuple[float, ...] = (), allow_simulated: bool = False, now_ns: int | None = None,
 ) -> PlantState:  # fmt: skip
     """Read the state: the claimed lift, or else the best offer, where its map is the newest and not too old.
 
-    approach_height_m, magnet_steps_kg: see `PlantSettings`. now_ns: this computer's clock.
+    approach_height_m, magnet_steps_kg, allow_simulated: see `PlantSettings`. now_ns: this computer's clock.
     """
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection, now_ns)
         survey = newest_survey(connection)
         lifts = open_lifts(connection)
     if survey is None:
-        reasons = ("no-survey: the store holds no survey",)
-        return PlantState("idle", False, reasons, life_counter, clock_ns, "none")
+        empty = ("no-survey: the store holds no survey",)
+        return PlantState("idle", False, empty, life_counter, clock_ns, "none")
     usable = [
         one for one in lifts
         if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns
     ]  # fmt: skip
     best = min(usable, key=lambda one: (OPEN.index(one.state) == 0, one.record["rank"]), default=None)
     lift = None if best is None else offered_lift(best, approach_height_m, magnet_steps_kg)
-    reasons = () if lift is not None else ("no-lift: no lift is offered that is still valid",)
+    reasons = _reasons(lift, survey.is_simulated and not allow_simulated, bool(magnet_steps_kg))
     return PlantState(
-        "simulated" if survey.is_simulated else "surveyed", lift is not None, reasons, life_counter, clock_ns,
+        "simulated" if survey.is_simulated else "surveyed", not reasons, reasons, life_counter, clock_ns,
         "done", None, lift, (), survey.map_id, survey.calibration_id,
     )  # fmt: skip
+
+
+def _reasons(lift: OfferedLift | None, is_simulated: bool, has_steps: bool) -> tuple[str, ...]:
+    """List what forbids a crane to act on the state."""
+    if lift is None:
+        return ("no-lift: no lift is offered that is still valid",)
+    found = ["simulated: the yard was never measured"] if is_simulated else []
+    if has_steps and lift.magnet_class is None:
+        found.append("too-heavy: no step of the magnet surely carries the load")
+    return tuple(found)
 
 
 def offered_lift(
