@@ -30,6 +30,7 @@ from barsight.paper.pictures import PaperPicture
 from barsight.paper.registry import ENTRIES
 from barsight.recording.open import open_recording
 from barsight.report.page import environment, resource
+from barsight.simulation.settings import CameraSettings
 
 Cells = list[list[str]]
 _OF_PAPER = ("SGBM", "CSCA", "its own")
@@ -207,7 +208,7 @@ def _table_4(
         score = cloud.contour_scores(scratch / method)
         truth = result.get("truth", {}).get("contour, smooth places", {}).get("mae_mm", math.nan)
         hertz = result["frames"]["used"] / result["seconds"]
-        spacing = f"{1e3 * runs.CameraSettings().above_floor_m / focal_px:.1f}"
+        spacing = f"{1e3 * CameraSettings().above_floor_m / focal_px:.1f}"
         figures = ["–"] * 4
         if score is not None:
             figures = [

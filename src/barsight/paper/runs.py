@@ -22,6 +22,7 @@ from barsight.recording.sensor_selection import SelectedSensors
 from barsight.simulation.effects.settings import FaultSettings, LightSettings
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import simulate
+from barsight.stereo.method import StereoMethod
 from barsight.stereo.settings import MethodName, StereoSettings, make_method
 
 SEED = 11
@@ -48,7 +49,7 @@ QUICK_ENVIRONMENTS = ("dim lamps", "haze")
 
 @dataclass(frozen=True)
 class PaperScale:
-    """How large the drawn things are. size_px: width and height; ranges_mm, poses: of Table 1."""
+    """Scale of a run sets how much is drawn. size_px: width, height; ranges_mm, poses: of Table 1."""
 
     length_m: float
     frames: int
@@ -171,5 +172,5 @@ def _environment_row(name: str, method: str, content: dict[str, Any] | BarsightE
 
 def target_sizes(scale: PaperScale) -> TargetSizeBench:
     """Measure a drawn bar of 90 mm by the methods of Table 1."""
-    methods = {name: make_method(StereoSettings(method=name)) for name in METHODS}
+    methods: dict[str, StereoMethod] = {name: make_method(StereoSettings(method=name)) for name in METHODS}
     return bench_target_size(methods, scale.poses, scale.ranges_mm)
