@@ -35,14 +35,13 @@ class IcpScore:
 def refine(source: Float64, target: Float64, start: Pose) -> Pose:
     """Refine target_from_source by point to plane between points (N, 3) [Chen and Medioni 1992]."""
     tree = cKDTree(target)
-    around = target[tree.query(target, k=NEIGHBOURS)[1]]
+    around = target[np.asarray(tree.query(target, k=NEIGHBOURS)[1])]
     spread = around - around.mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
     pose = start
     for _ in range(ROUNDS):
         moved = pose.apply(source)
-        found = tree.query(moved, distance_upper_bound=REACH_M)
-        far, index = np.asarray(found[0]), np.asarray(found[1])
+        far, index = map(np.asarray, tree.query(moved, distance_upper_bound=REACH_M))
         met = np.isfinite(far)
         if met.sum() < NEIGHBOURS:
             break

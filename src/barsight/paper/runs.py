@@ -49,7 +49,7 @@ QUICK_ENVIRONMENTS = ("dim lamps", "haze")
 
 @dataclass(frozen=True)
 class PaperScale:
-    """How large the drawn things are. size_px: width and height; ranges_mm, poses: of Table 1."""
+    """Scale of a run sets how much is drawn. size_px: width, height; ranges_mm, poses: of Table 1."""
 
     length_m: float
     frames: int

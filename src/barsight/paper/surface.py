@@ -38,8 +38,7 @@ def cost_curve(pair: RectifiedPair, disparity: Float32) -> PaperPicture:
     usable = inside & np.isfinite(disparity)
     if not usable.any():
         usable = np.isfinite(disparity)
-    best = int(np.argmax(np.where(usable, strength, -1)))
-    row, column = divmod(best, gray.shape[1])
+    row, column = divmod(int(np.argmax(np.where(usable, strength, -1))), gray.shape[1])
     candidates = round(float(disparity[row, column])) + np.arange(-4, 5)
     half = WINDOW_PX // 2
     patch = gray[row - half : row + half + 1, column - half : column + half + 1]
