@@ -47,7 +47,7 @@ def run_node(script: str, *arguments: str) -> subprocess.Popen[str]:
 
 def write_identity(folder: Path, name: str, days: float = 100) -> dict[str, str]:
     """A client's certificate and key as PEM files; returns their paths, and `der`'s."""
-    from barsight.plant.opcua.certificates import make_certificate
+    from barsight.plant.opcua.security.certificates import make_certificate
 
     der, key = make_certificate(CLIENT_URI, name, ["localhost"], days)
     text = "\n".join(textwrap.wrap(base64.b64encode(der).decode(), 64))
@@ -61,7 +61,7 @@ class OpcUaPlant:
     """A running server with its drawn plant."""
 
     def __init__(self, folder: Path, **settings: Any) -> None:
-        from barsight.plant.opcua.access import add_user
+        from barsight.plant.opcua.security.access import add_user
 
         self.folder, self.port = folder, free_port()
         (folder / "pki/trusted").mkdir(parents=True)

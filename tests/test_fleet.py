@@ -21,7 +21,7 @@ from barsight.fleet.comparing import FigureChange, RecordingComparison
 from barsight.fleet.comparison_page import comparison_page
 from barsight.fleet.driver import count_states, drive, parked_reasons
 from barsight.fleet.findings import holm, judge
-from barsight.fleet.ledger import Claim, claim, held, publish, published_keys
+from barsight.fleet.ledger import HeldRecording, claim, held, publish, published_keys
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.planning import estimate, in_order, plan_tasks
@@ -29,7 +29,7 @@ from barsight.fleet.records import note_plan, noted_keys
 from barsight.fleet.scratch import scratch_root, sweep
 from barsight.fleet.task import TaskSettings, run_task
 from barsight.fleet.versions import Version
-from barsight.fleet.window import Window
+from barsight.fleet.window import RunWindow
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.opening import open_store
 from barsight.store.promotion import counts, promoted_version
@@ -69,17 +69,17 @@ def test_a_key_tells_content_and_version_and_not_the_place(tmp_path: Path) -> No
 def test_a_claim_has_one_owner_until_its_lease_runs_out(tmp_path: Path) -> None:
     results = open_objects(str(tmp_path / "r"), create=True)
     mine = claim(results, "k", 0.3)
-    assert isinstance(mine, Claim) and claim(results, "k", 0.3) == "claimed"
+    assert isinstance(mine, HeldRecording) and claim(results, "k", 0.3) == "claimed"
     time.sleep(0.35)
     later = claim(results, "k", 5)
-    assert isinstance(later, Claim) and later.number == 2
+    assert isinstance(later, HeldRecording) and later.number == 2
     assert publish(results, later, {"n": 2}) and publish(results, later, {"n": 2}), "a put sent twice"
     assert not publish(results, mine, {"n": 1}), "the slow one comes too late"
     assert claim(results, "k", 5) == "published" and published_keys(results) == {"k"}
-    with held(results, Claim("z", 1, "t"), 0.4):
+    with held(results, HeldRecording("z", 1, "t"), 0.4):
         time.sleep(0.6)
         assert claim(results, "z", 5) == "claimed", "a claim that is held is renewed"
-    assert isinstance(claim(results, "z", 5), Claim)
+    assert isinstance(claim(results, "z", 5), HeldRecording)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_run_on_s3_parks_the_bad_and_publishes_the_rest_once(
         with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
             assert note_plan(store, tasks, archive.url, "t") == 8
             with connect(2, None) as client:
-                drive(client, tasks, shared, store, results, Window(), no_progress)
+                drive(client, tasks, shared, store, results, RunWindow(), no_progress)
             with store.reading() as connection:
                 assert noted_keys(connection) == published_keys(results)
                 assert isinstance(verify_chain(connection), AuditChain)
@@ -158,10 +158,10 @@ def test_folders_of_the_dead_are_swept_and_no_others() -> None:
 
 
 def test_the_night_passes_midnight() -> None:
-    night = Window(("22:00", "06:00"))
+    night = RunWindow(("22:00", "06:00"))
     at = [night.is_open(datetime(2026, 1, 1, hour)) for hour in (21, 22, 3, 6)]
     assert at == [False, True, True, False]
-    assert not Window(idle=True).is_open(busy_ratio=1.0) and Window(idle=True).is_open(busy_ratio=0.0)
+    assert not RunWindow(idle=True).is_open(busy_ratio=1.0) and RunWindow(idle=True).is_open(busy_ratio=0.0)
 
 
 def test_the_estimate_is_by_what_was_measured_and_priorities_come_first(tmp_path: Path) -> None:

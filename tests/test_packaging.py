@@ -47,6 +47,7 @@ EXTRAS = {
         "store/migrations/versions/v0003_fleet.py",
         "fleet/records.py",
         "fleet/promoting.py",
+        "plant/handshake.py",
         "store/migrations/versions/v0001_first.py",
         "store/migrations/versions/v0002_page.py",
         "page/conditions.py",
@@ -63,6 +64,14 @@ EXTRAS = {
         "fleet/cluster.py",
     },
     "page": {"page/app.py", "page/serve.py"},
+    "opcua": {
+        "plant/opcua/security/binding.py",
+        "plant/opcua/security/access.py",
+        "plant/opcua/security/certificates.py",
+    },
+    "mqtt": {"plant/mqtt.py"},
+    "s7": {"plant/s7.py"},
+    "labels": {"labels/code_reading.py"},
 }
 """Which modules may import what an extra installs."""
 

@@ -134,7 +134,7 @@ def test_strangers_stay_out(report: dict[str, Any]) -> None:
 
 def test_users_are_kept_by_digest(tmp_path: Path) -> None:
     from barsight.core.errors import ConfigError, InputError
-    from barsight.plant.opcua.access import PasswordUsers, add_user, read_users
+    from barsight.plant.opcua.security.access import PasswordUsers, add_user, read_users
 
     path = tmp_path / "users.json"
     add_user(path, "crane", "operator", PASSWORD)

@@ -18,7 +18,7 @@ asyncua = pytest.importorskip("asyncua")
 from barsight.core.errors import Failed  # noqa: E402
 from barsight.plant.opcua.process import OpcUaProcess  # noqa: E402
 from barsight.plant.opcua.recipes import Recipes  # noqa: E402
-from barsight.plant.opcua.settings import OpcUaSettings  # noqa: E402
+from barsight.plant.opcua.security.settings import OpcUaSettings  # noqa: E402
 from barsight.plant.opcua.surveys import Told  # noqa: E402
 from opcua_plant import DrawnState  # noqa: E402
 from opcua_servers import free_port, opcua_plant  # noqa: E402

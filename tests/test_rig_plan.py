@@ -12,7 +12,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.main import run
 from barsight.core.types import StereoFrame
 from barsight.pair_matching import match_pictures
-from barsight.rig_plan import CAMERAS, Wish, depth_sigma_m, plan_rig
+from barsight.sensors.rig_plan import CAMERAS, Wish, depth_sigma_m, plan_rig
 from barsight.simulation.settings import CameraSettings
 from barsight.simulation.simulate import simulate
 from barsight.stereo.settings import StereoSettings

@@ -46,7 +46,7 @@ GROUPS = ("bench", "calibrate", "live", "store", "fleet", "plant")
 """Commands that are packages: `command.py` in them finds the second word."""
 SECOND = {"live": ("check",)}
 """Second words of commands that do something without one too."""
-ROOMS = {"yard": ("lifts", "explain", "labels", "compare"), "store": ("yard", "serve")}
+ROOMS = {"bench": ("paper",), "yard": ("lifts", "explain", "labels", "compare"), "store": ("yard", "serve")}
 """Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
 _interrupts: list[int] = []

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
-from barsight.rig_plan import CAMERAS, Wish, plan_rig
+from barsight.sensors.rig_plan import CAMERAS, Wish, plan_rig
 
 
 def run(arguments: Sequence[str]) -> None:

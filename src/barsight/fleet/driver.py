@@ -15,7 +15,7 @@ from barsight.fleet.records import note_results, noted_keys
 from barsight.fleet.scratch import sweep
 from barsight.fleet.task import TaskSettings, run_task
 from barsight.fleet.versions import FleetTask
-from barsight.fleet.window import Window
+from barsight.fleet.window import RunWindow
 from barsight.store.opening import Store
 
 POLL_S = 2.0
@@ -48,7 +48,7 @@ def drive(
     settings: TaskSettings,
     store: Store,
     results: Objects,
-    window: Window,
+    window: RunWindow,
     advance: Callable[[int, int], None],
     run: Callable[[Any, Any], str] = run_task,
 ) -> None:

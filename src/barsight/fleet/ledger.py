@@ -24,7 +24,7 @@ Held = Literal["published", "parked", "claimed"]
 
 
 @dataclass(frozen=True)
-class Claim:
+class HeldRecording:
     """A key that is ours for a while. token: of this try. number: counts the claims of the key from 1."""
 
     key: str
@@ -32,7 +32,7 @@ class Claim:
     token: str
 
 
-def claim(results: Objects, key: str, lease_s: float) -> Claim | Held:
+def claim(results: Objects, key: str, lease_s: float) -> HeldRecording | Held:
     """Take a key by put-if-absent, or tell who has it. One whose lease has run out is taken over.
 
     Clocks of the machines must agree to a small part of the lease.
@@ -51,12 +51,12 @@ def claim(results: Objects, key: str, lease_s: float) -> Claim | Held:
     if number >= MOST_LOST:
         park(results, key, f"its worker ended {number} times without a word", number)
         return "parked"
-    mine = Claim(key, number + 1, secrets.token_hex(8))
+    mine = HeldRecording(key, number + 1, secrets.token_hex(8))
     return mine if results.write_new(_path(mine), _claim_text(mine, lease_s)) else "claimed"
 
 
 @contextmanager
-def held(results: Objects, mine: Claim, lease_s: float) -> Iterator[None]:
+def held(results: Objects, mine: HeldRecording, lease_s: float) -> Iterator[None]:
     """Renew a claim from a thread of its own while the block runs, and let it run out at once after it."""
     ended = threading.Event()
 
@@ -77,13 +77,13 @@ def held(results: Objects, mine: Claim, lease_s: float) -> Iterator[None]:
         results.write(_path(mine), _claim_text(mine, 0.0))
 
 
-def publish(results: Objects, mine: Claim, content: dict[str, Any]) -> bool:
+def publish(results: Objects, mine: HeldRecording, content: dict[str, Any]) -> bool:
     """Write the key's result.json, its last object, where there is none; tell whether it is ours."""
     text = json.dumps({"key": mine.key, "token": mine.token, **content}, indent=1)
     return results.write_new(f"results/{mine.key}/result.json", text.encode())
 
 
-def fail(results: Objects, mine: Claim, reason: str) -> bool:
+def fail(results: Objects, mine: HeldRecording, reason: str) -> bool:
     """Note a failure; tell whether the recording is parked by it."""
     note = {"token": mine.token, "reason": reason, "host": socket.gethostname(), "at": time.time()}
     results.write_new(f"failures/{mine.key}/{mine.number:04d}.json", json.dumps(note).encode())
@@ -129,10 +129,10 @@ def running_keys(results: Objects, among: set[str]) -> set[str]:
     }
 
 
-def _path(mine: Claim) -> str:
+def _path(mine: HeldRecording) -> str:
     return f"claims/{mine.key}/{mine.number:04d}.json"
 
 
-def _claim_text(mine: Claim, lease_s: float) -> bytes:
+def _claim_text(mine: HeldRecording, lease_s: float) -> bytes:
     owner = {"host": socket.gethostname(), "pid": os.getpid(), "token": mine.token}
     return json.dumps({**owner, "at": time.time(), "expires": time.time() + lease_s}).encode()

@@ -15,7 +15,7 @@ FIRST_S, PER_PAIR_S, PER_BYTE_S, RESULT_BYTES = 8.0, 1.5, 1e-6, 15_000_000
 
 
 @dataclass(frozen=True)
-class Estimate:
+class WorkEstimate:
     """Work that is left: seconds of one worker, bytes to fetch and to write. known: tasks it rests on."""
 
     seconds: float
@@ -52,7 +52,7 @@ def plan_tasks(
     return list(tasks.values())
 
 
-def estimate(tasks: list[FleetTask], measured: list[tuple[int, int, float, int]]) -> Estimate:
+def estimate(tasks: list[FleetTask], measured: list[tuple[int, int, float, int]]) -> WorkEstimate:
     """Estimate the work of tasks by what others took: by their pairs, or by bytes where these aren't known.
 
     measured: bytes, pairs, seconds and bytes of result of tasks that are done.
@@ -67,7 +67,7 @@ def estimate(tasks: list[FleetTask], measured: list[tuple[int, int, float, int]]
         else:
             seconds += median(per_byte) * task.size if per_byte else FIRST_S + PER_BYTE_S * task.size
     each = median(written) if written else RESULT_BYTES
-    return Estimate(seconds, sum(t.size for t in tasks), round(each * len(tasks)), len(measured))
+    return WorkEstimate(seconds, sum(t.size for t in tasks), round(each * len(tasks)), len(measured))
 
 
 def in_order(tasks: list[FleetTask], priorities: tuple[str, ...]) -> list[FleetTask]:

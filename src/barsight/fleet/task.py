@@ -11,7 +11,7 @@ from pathlib import Path
 
 from barsight.core.errors import BarsightError, Failed
 from barsight.fleet.archive import download
-from barsight.fleet.ledger import Claim, claim, fail, held, publish
+from barsight.fleet.ledger import HeldRecording, claim, fail, held, publish
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.records import note_result
@@ -46,7 +46,7 @@ def run_task(task: FleetTask, settings: TaskSettings) -> str:
     results = open_objects(settings.results, create=True)
     while True:
         mine = claim(results, task.key, settings.lease_s)
-        if not isinstance(mine, Claim):
+        if not isinstance(mine, HeldRecording):
             return task.key
         with held(results, mine, settings.lease_s):
             ended = _try(task, mine, settings, results)
@@ -56,7 +56,7 @@ def run_task(task: FleetTask, settings: TaskSettings) -> str:
                 return task.key
 
 
-def _try(task: FleetTask, mine: Claim, settings: TaskSettings, results: Objects) -> Failed | None:
+def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: Objects) -> Failed | None:
     """Measure once; None where it is published, by this try or another."""
     started = time.monotonic()
     with scratch_folder(task.key) as folder:

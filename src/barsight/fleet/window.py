@@ -14,7 +14,7 @@ with extra("fleet"):
 
 
 @dataclass(frozen=True)
-class Window:
+class RunWindow:
     """The times at which tasks start. between: local times HH:MM from and to, past midnight too. idle:
     whether a core of the driver's machine must be free of other work.
     """

@@ -16,7 +16,7 @@ CYCLES = 20
 
 @dataclass(frozen=True)
 class TelegramCheck:
-    """What was seen. lines: for people. is_good: whether cycle and life counter hold."""
+    """Record what a check saw. lines: for people. is_good: whether cycle and life counter hold."""
 
     lines: tuple[str, ...]
     is_good: bool

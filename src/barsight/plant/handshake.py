@@ -22,7 +22,7 @@ LOAD_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
-class Claim:
+class LiftClaim:
     """A claim. token: 32 bits that its later steps carry; it tells claims apart and is no secret."""
 
     lift_id: int
@@ -30,8 +30,8 @@ class Claim:
     token: int
 
 
-def claim_lift(store: Store, lift: OfferedLift, who: str) -> Claim | Failed:
-    """Claim an offered lift. The same claim again returns the same token; another's is refused."""
+def claim_lift(store: Store, lift: OfferedLift, who: str) -> LiftClaim | Failed:
+    """LiftClaim an offered lift. The same claim again returns the same token; another's is refused."""
     found = claim_of(store, lift.lift_id)
     if found is not None:
         return found if found.who == who else Failed("claimed", f"lift {lift.lift_id} is {found.who}'s")
@@ -42,7 +42,7 @@ def claim_lift(store: Store, lift: OfferedLift, who: str) -> Claim | Failed:
     return claim_of(store, lift.lift_id) or Failed("refused", f"lift {lift.lift_id} ended meanwhile")
 
 
-def claim_of(store: Store, lift_id: int) -> Claim | None:
+def claim_of(store: Store, lift_id: int) -> LiftClaim | None:
     """Find the claim that a lift stands in; None where its last state is another."""
     with store.reading() as connection:
         row = connection.execute(
@@ -54,10 +54,10 @@ def claim_of(store: Store, lift_id: int) -> Claim | None:
     if row is None or row.state != "claimed":
         return None
     digest = hashlib.sha256(f"{lift_id} {row.who} {row.at_ns}".encode()).digest()
-    return Claim(lift_id, row.who, int.from_bytes(digest[:4], "big") or 1)
+    return LiftClaim(lift_id, row.who, int.from_bytes(digest[:4], "big") or 1)
 
 
-def report_executed(store: Store, claim: Claim, lift: OfferedLift, load_kg: float | None) -> str | Failed:
+def report_executed(store: Store, claim: LiftClaim, lift: OfferedLift, load_kg: float | None) -> str | Failed:
     """Report a claimed lift as executed: `confirmed`, `contradicted` by the load cell, or `unweighed`.
 
     A contradiction raises the alarm `load-contradicts`; the next survey tells what truly moved.
@@ -89,7 +89,7 @@ def _raise(store: Store, who: str, code: str, told: str) -> None:
         raise_alarm(opened, code, told)
 
 
-def report_failed(store: Store, claim: Claim, note: str) -> str | Failed:
+def report_failed(store: Store, claim: LiftClaim, note: str) -> str | Failed:
     """Report that a claimed lift failed."""
     if claim_of(store, claim.lift_id) != claim:
         return Failed("token", f"lift {claim.lift_id} isn't claimed with this token")

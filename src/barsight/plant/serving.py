@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from barsight.core.errors import BarsightError, Failed
-from barsight.plant.handshake import Claim, claim_lift, claim_of, report_executed, report_failed
+from barsight.plant.handshake import LiftClaim, claim_lift, claim_of, report_executed, report_failed
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import OfferedLift, PlantState, state_of_store
 from barsight.plant.telegram import layout, out_values, pack, unpack
@@ -136,7 +136,7 @@ class TelegramServer:
             return DONE, claim_now.token
         return self._end(claim_now, lift, found), claim_now.token
 
-    def _end(self, claim: Claim, lift: OfferedLift, found: dict[str, int]) -> int:
+    def _end(self, claim: LiftClaim, lift: OfferedLift, found: dict[str, int]) -> int:
         flags = found["flags"]
         if found["command"] != EXECUTED:
             told = report_failed(self._store, claim, f"the PLC says so, flags {flags}")

@@ -8,7 +8,14 @@ from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
-from barsight.core.extras import extra
+from barsight.fleet.cluster import connect
+from barsight.fleet.driver import count_states, drive
+from barsight.fleet.ledger import forgive
+from barsight.fleet.objects import open_objects
+from barsight.fleet.planning import in_order
+from barsight.fleet.records import find_version, read_archive, read_tasks
+from barsight.fleet.task import TaskSettings
+from barsight.fleet.window import RunWindow
 from barsight.store.audit import user_name
 from barsight.store.opening import DEFAULT_URL, open_store
 
@@ -44,16 +51,7 @@ def run(arguments: Sequence[str]) -> None:
         """
         if min(workers, memory_gib, timeout_s) <= 0 or lease_s < 2:
             raise ConfigError("fleet run: workers, memory and time are above 0, the lease is 2 s or more")
-        with extra("fleet"):
-            from barsight.fleet.cluster import connect
-            from barsight.fleet.driver import count_states, drive
-            from barsight.fleet.ledger import forgive
-            from barsight.fleet.objects import open_objects
-            from barsight.fleet.planning import in_order
-            from barsight.fleet.records import find_version, read_archive, read_tasks
-            from barsight.fleet.task import TaskSettings
-            from barsight.fleet.window import Window
-        window = Window(between, idle)
+        window = RunWindow(between, idle)
         target = open_objects(results, create=True)
         with open_store(store) as opened:
             with opened.reading() as connection:
@@ -71,14 +69,8 @@ def run(arguments: Sequence[str]) -> None:
             )  # fmt: skip
             with connect(workers, scheduler) as client, stages(SafeConsole(stderr=True)) as advance:
                 drive(
-                    client,
-                    tasks,
-                    settings,
-                    opened,
-                    target,
-                    window,
-                    lambda n, all_: advance("measure", n, all_),
-                )
+                    client, tasks, settings, opened, target, window, lambda n, all_: advance("measure", n, all_)
+                )  # fmt: skip
             counts = count_states(target, tasks)
         SafeConsole().print(
             f"version {chosen.name}: {counts.published} published, {counts.parked} parked of {len(tasks)}",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from barsight.plant.opcua.access import caller, has_role
-from barsight.plant.opcua.binding import Node, Server, ua
 from barsight.plant.opcua.events import Emitter
+from barsight.plant.opcua.security.access import caller, has_role
+from barsight.plant.opcua.security.binding import Node, Server, ua
 from barsight.plant.opcua.surveys import AlarmLine
 
 MAX_CONDITIONS = 200

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from barsight.plant.opcua.access import has_role
-from barsight.plant.opcua.binding import Node, Server, ua
+from barsight.plant.opcua.security.access import has_role
+from barsight.plant.opcua.security.binding import Node, Server, ua
 
 Handler = Callable[..., Awaitable[Any]]
 MAX_TEXT = 4096

@@ -7,7 +7,7 @@ import datetime
 import uuid
 from typing import Any
 
-from barsight.plant.opcua.binding import EventGenerator, Node, Server, ua
+from barsight.plant.opcua.security.binding import EventGenerator, Node, Server, ua
 
 
 class Emitter:

@@ -6,9 +6,9 @@ import time
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-from barsight.plant.opcua.binding import Node, Server, ua
 from barsight.plant.opcua.calls import answer_method
 from barsight.plant.opcua.results import TRANSFERRED, KeptResults
+from barsight.plant.opcua.security.binding import Node, Server, ua
 
 MAX_OPEN = 10
 MAX_PIECE_BYTES = 1 << 20

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from barsight.core.errors import InputError
-from barsight.plant.opcua.binding import ua
 from barsight.plant.opcua.files import Transfers
 from barsight.plant.opcua.recipes import NOT_FOUND, RecipeMethods, handle
 from barsight.plant.opcua.results import KeptResults, SurveyResult, read_result, told
+from barsight.plant.opcua.security.binding import ua
 from barsight.plant.opcua.surveys import Survey
 from barsight.plant.opcua.vision import VisionSystem, int32, refusal
 

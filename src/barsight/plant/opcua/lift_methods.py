@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 from barsight.core.errors import Failed
-from barsight.plant.opcua.access import caller, has_role
-from barsight.plant.opcua.binding import Node, Server, ua
 from barsight.plant.opcua.calls import MAX_TEXT
+from barsight.plant.opcua.security.access import caller, has_role
+from barsight.plant.opcua.security.binding import Node, Server, ua
 from barsight.plant.opcua.surveys import PlantSource
 
 STEPS: dict[str, dict[str, ua.VariantType]] = {

@@ -18,8 +18,8 @@ from typing import Any
 
 from barsight.core.errors import Failed
 from barsight.plant.opcua.recipes import Recipes
+from barsight.plant.opcua.security.settings import OpcUaSettings
 from barsight.plant.opcua.server import opcua_server
-from barsight.plant.opcua.settings import OpcUaSettings
 from barsight.plant.opcua.surveys import Told
 
 MAX_AGE_S = 0.3

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from barsight.core.errors import Failed
-from barsight.plant.opcua.binding import ua
 from barsight.plant.opcua.calls import Handler
 from barsight.plant.opcua.machine import step_by_method
+from barsight.plant.opcua.security.binding import ua
 from barsight.plant.opcua.vision import VisionSystem, int32, refusal
 
 NOT_FOUND = 1

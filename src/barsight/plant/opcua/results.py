@@ -12,7 +12,7 @@ from typing import Any
 
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import read_json
-from barsight.plant.opcua.binding import ua
+from barsight.plant.opcua.security.binding import ua
 
 RESULT_FILES = ("bundles.json", "lifts.json")
 TRANSFERRED = "height.tif"

@@ -7,15 +7,15 @@ import contextlib
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
-from barsight.plant.opcua.access import BoundedServer, PasswordUsers, PlantRules, read_users
 from barsight.plant.opcua.alarms import Conditions
-from barsight.plant.opcua.binding import Node, Server, ua
-from barsight.plant.opcua.certificates import own_certificate
 from barsight.plant.opcua.events import Emitter
 from barsight.plant.opcua.jobs import JobMethods
 from barsight.plant.opcua.lift_methods import LiftMethods
 from barsight.plant.opcua.recipes import RecipeMethods, Recipes
-from barsight.plant.opcua.settings import OpcUaSettings
+from barsight.plant.opcua.security.access import BoundedServer, PasswordUsers, PlantRules, read_users
+from barsight.plant.opcua.security.binding import Node, Server, ua
+from barsight.plant.opcua.security.certificates import own_certificate
+from barsight.plant.opcua.security.settings import OpcUaSettings
 from barsight.plant.opcua.surveys import PlantSource, Told
 from barsight.plant.opcua.variables import StateVariables
 from barsight.plant.opcua.vision import ERROR_CONDITION, VisionSystem

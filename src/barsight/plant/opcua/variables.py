@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from barsight.plant.opcua.binding import Node, Server, ua
+from barsight.plant.opcua.security.binding import Node, Server, ua
 
 _SCALARS = {
     bool: ua.VariantType.Boolean,

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.errors import Failed
-from barsight.plant.opcua.access import caller
-from barsight.plant.opcua.binding import Node, Server, ua
 from barsight.plant.opcua.calls import Handler, answer_method
 from barsight.plant.opcua.events import Emitter
 from barsight.plant.opcua.machine import (
@@ -19,6 +17,8 @@ from barsight.plant.opcua.machine import (
     step_by_itself,
     step_by_method,
 )
+from barsight.plant.opcua.security.access import caller
+from barsight.plant.opcua.security.binding import Node, Server, ua
 
 VISION_URI = "http://opcfoundation.org/UA/MachineVision"
 _SYSTEM, _MACHINE, _AUTOMATIC = 1003, 1017, 1021

@@ -17,7 +17,7 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
 from barsight.core.reading.bounded_reading import read_text
-from barsight.plant.opcua.binding import (
+from barsight.plant.opcua.security.binding import (
     InternalServer,
     InternalSession,
     ServiceError,
@@ -26,8 +26,8 @@ from barsight.plant.opcua.binding import (
     UserRole,
     ua,
 )
-from barsight.plant.opcua.certificates import judge_certificate
-from barsight.plant.opcua.settings import OPCUA_ROLES, OpcUaSettings
+from barsight.plant.opcua.security.certificates import judge_certificate
+from barsight.plant.opcua.security.settings import OPCUA_ROLES, OpcUaSettings
 
 with extra("opcua"):
     from cryptography import x509

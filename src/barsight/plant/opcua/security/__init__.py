@@ -1,0 +1,1 @@
+"""Bind asyncua: its settings, certificates, users and roles."""
