@@ -11,6 +11,8 @@ import pytest
 
 from opcua_servers import PASSWORD, node_package, opcua_plant, walk, write_identity
 
+pytestmark = pytest.mark.slow  # each server takes some ten seconds to start
+
 pytest.importorskip("asyncua")
 
 MOVED = {"Good": True, "BadInvalidState": False}

@@ -23,6 +23,8 @@ from barsight.plant.opcua.surveys import Told  # noqa: E402
 from opcua_plant import DrawnState  # noqa: E402
 from opcua_servers import free_port, opcua_plant  # noqa: E402
 
+pytestmark = pytest.mark.slow  # each server takes some ten seconds to start
+
 
 def handshake(step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed:
     return f"{step} by {who}"
