@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
@@ -68,9 +69,8 @@ def run(arguments: Sequence[str]) -> None:
                 by or user_name(),
             )  # fmt: skip
             with connect(workers, scheduler) as client, stages(SafeConsole(stderr=True)) as advance:
-                drive(
-                    client, tasks, settings, opened, target, window, lambda n, all_: advance("measure", n, all_)
-                )  # fmt: skip
+                told = partial(advance, "measure")
+                drive(client, tasks, settings, opened, target, window, told)
             counts = count_states(target, tasks)
         SafeConsole().print(
             f"version {chosen.name}: {counts.published} published, {counts.parked} parked of {len(tasks)}",

@@ -23,8 +23,8 @@ class OpcUaSettings:
     folder: Path = Path("opcua")
     """Holds certificate, key, `trusted/` with the certificates of clients, and `revoked/` with CRLs."""
     users: Path | None = None
-    """users.json, which `add_user` of barsight.plant.opcua.security.access writes. Without it nobody is more than a
-    viewer."""
+    """users.json, which `add_user` of barsight.plant.opcua.security.access writes. Without it nobody is more
+    than a viewer."""
     nodesets: Path | None = None
     """Folder with Opc.Ua.MachineVision.NodeSet2.xml (npm's node-opcua-nodesets). None: variables only."""
     allow_anonymous: bool = True
