@@ -14,7 +14,7 @@ KINDS = ("DataMatrix", "QRCode", "MicroQRCode", "Aztec", "PDF417", "Code128", "C
 """Kinds that carry their own check. Code39 and ITF don't: noise reads as one."""
 MAX_TEXT = 200
 ENLARGED = 2
-"""Pictures are read enlarged: a module of 2 pixels is then read as often as one of 4."""
+"""Pictures are read enlarged, for the sake of small modules."""
 
 
 @dataclass(frozen=True, eq=False)
