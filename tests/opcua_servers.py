@@ -33,7 +33,7 @@ def free_port() -> int:
 def node_package(name: str) -> Path:
     """The folder of an npm package; skips where node or the package is absent."""
     if shutil.which("node") is None or not (NODE_MODULES / name).is_dir():
-        pytest.skip(f"npm's {name} is not installed (run .ci/servers)")
+        pytest.skip(f"npm's {name} is not installed (run .ci/servers plant)")
     return NODE_MODULES / name
 
 
