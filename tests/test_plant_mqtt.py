@@ -175,6 +175,32 @@ def test_a_broker_that_is_away_costs_bounded_memory_and_the_newest_survives(brok
     assert [event["number"] for event in told] == sorted({event["number"] for event in told})
 
 
+def test_a_publisher_ends_though_its_broker_is_gone(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The farewell fails as the broker is away: that must not stand in the place of the cancellation."""
+    publisher = MqttPublisher(MqttSettings(port=broker.port, state_every_s=0.02))
+
+    async def body() -> None:
+        publish = aiomqtt.Client.publish
+
+        async def failing(client: aiomqtt.Client, topic: str, *args: Any, **kwargs: Any) -> None:
+            if topic.endswith("online"):
+                raise aiomqtt.MqttError("gone")
+            await publish(client, topic, *args, **kwargs)
+
+        publisher.show(DrawnMode("surveyed", 1))
+        await until(lambda: publisher.counts.states == 1)
+        monkeypatch.setattr(aiomqtt.Client, "publish", failing)
+
+    async def bounded() -> None:
+        running = asyncio.create_task(publisher.run())
+        await body()
+        running.cancel()
+        _, pending = await asyncio.wait({running}, timeout=5)
+        assert not pending and running.cancelled()
+
+    asyncio.run(bounded())
+
+
 def test_topics_with_wildcards_are_refused() -> None:
     with pytest.raises(ConfigError, match="no topic"):
         MqttSettings(prefix="yard/#")

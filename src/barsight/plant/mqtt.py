@@ -131,10 +131,12 @@ class MqttPublisher:
                         while True:
                             latest = await self._publish(client) or latest
                     finally:
-                        if asyncio.current_task() is not None and asyncio.current_task().cancelling():  # type: ignore[union-attr]
+                        if _is_cancelled():
                             await client.publish(
                                 self._topic("online"), "false", qos=1, retain=True, timeout=1
                             )
+            if _is_cancelled():  # what a broker that is gone raised on the way out stood in its place
+                raise asyncio.CancelledError
             wait_s = 0.1 if time.monotonic() - began > self._settings.max_retry_s else wait_s
             await asyncio.sleep(wait_s)
             wait_s = min(2 * wait_s, self._settings.max_retry_s)
@@ -178,6 +180,12 @@ class MqttPublisher:
             will=aiomqtt.Will(self._topic("online"), "false", qos=1, retain=True), timeout=5,
             tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,
         )  # fmt: skip
+
+
+def _is_cancelled() -> bool:
+    """Check whether the running task was asked to end."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 def state_json(snapshot: Any) -> str:
