@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.benchmarks.motion.matching import _stereo
+from barsight.benchmarks.motion.matching import stereo_places
 from barsight.benchmarks.motion.matching_truth import TrueStep, true_steps
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
@@ -43,7 +43,7 @@ def test_a_prediction_that_is_one_bar_off_is_refused(data: Path) -> None:
     """The true motion is followed; 60 to 180 mm beside it nothing is."""
     for step in true_steps(data / "yard_dev"):
         corners = detect_corners(step.old.pair.left, TrackSettings(), np.empty((0, 2))).astype(np.float64)
-        stereo, sigma, known = _stereo(step.old, corners)
+        stereo, sigma, known = stereo_places(step.old, corners)
         index = np.flatnonzero(known)
         stereo, depth = stereo[index], triangulate_stereo(stereo[index], step.rectifier.camera)[:, 2]
         tracks = Tracks(
