@@ -218,12 +218,13 @@ def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
 
 
 def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path) -> None:
-    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m`."""
+    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m,sigma_m`."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
-        file.write("profile,x_m,y_m,z_m\n")
+        file.write("profile,x_m,y_m,z_m,sigma_m\n")
         for profile in laser:
+            sigma = f"{profile.range_std_m:.5f}" if np.isfinite(profile.range_std_m) else ""
             for x, y, z in zip(profile.x_m, profile.y_m, profile.z_m, strict=True):
-                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f}\n")
+                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f},{sigma}\n")
 
 
 def write_preview(preview: Preview, target: Path) -> None:
