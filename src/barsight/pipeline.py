@@ -8,7 +8,7 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -21,7 +21,7 @@ from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
-from barsight.core.types import Agreement, Trajectory
+from barsight.core.types import Trajectory
 from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
 from barsight.map_building import (
     BuiltMap,
@@ -184,19 +184,15 @@ def find_lifts(
     back. notices: warnings that the caller has.
     """
     settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
-    watch, profiles, surface = mapped.watch, mapped.profiles, mapped.surface
+    watch, profiles = mapped.watch, mapped.profiles
     with watch("bundles"):
-        heights = surface_map(surface, mapped.free, mapped.tops, mapped.history)
+        heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
         bundles = find_bundles(heights, settings.bundles)
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)
         placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
         stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None
-    warnings = [*_warnings(mapped), *notices]
-    if mapped.stock is not None:
-        warnings += [Notice("stock-list", text) for text in stock_warnings(mapped.stock, stock)]
-        contradiction = None if stock is None else list_contradiction(mapped.stock, stock)
-        warnings += [Notice("stock-contradicts", contradiction)] if contradiction else []
+    warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *notices]
     with watch("lifts"):
         travels = [_travel(one.probed, one.way, one.built, settings) for one in mapped.passes]
         travel = travels[0] if len(travels) == 1 else Travel.joined(travels)
@@ -217,10 +213,10 @@ def find_lifts(
         frames_used=sum(len(one.built.placed) for one in mapped.passes),
         refusals=tuple(refusal for one in mapped.passes for refusal in one.built.refusals),
         sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors, *profiles.sensors))),
-        surface=surface,
+        surface=mapped.surface,
         contours=profiles.contours,
         laser=profiles.laser,
-        agreements=tuple(a for a in profiles.agreed if isinstance(a, Agreement)),
+        agreements=profiles.agreements,
         laser_checks=profiles.checks,
         stages=_stages(mapped),
         warnings=tuple(warnings),
@@ -311,6 +307,16 @@ def _warnings(mapped: MappedYard) -> list[Notice]:
             reason = f"{len(one.built.refusals)} of {_frames_total(one.probed)} frames were refused"
             warnings.append(Notice("frames-refused", reason))
     return warnings
+
+
+def _stock_notices(listed: tuple[ListedBundle, ...] | None, stock: StockMatch | None) -> Iterator[Notice]:
+    """Yield what the stock list and the map disagree on; nothing where there is no list."""
+    if listed is None:
+        return
+    yield from (Notice("stock-list", text) for text in stock_warnings(listed, stock))
+    contradiction = None if stock is None else list_contradiction(listed, stock)
+    if contradiction:
+        yield Notice("stock-contradicts", contradiction)
 
 
 def _pass_warnings(probed: ProbedRecording, way: TrackedRecording, built: BuiltMap) -> list[Notice]:

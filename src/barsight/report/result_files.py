@@ -300,8 +300,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
             "cells_unknown": rows * columns - surface.seen - surface.filled,
             "median_sigma_m": surface.median_sigma_m,
         },
-        "agreement": [asdict(agreement) for agreement in measurement.agreements],
-        "laser": _laser_content(measurement.laser_checks),
+        **_laser_content(measurement),
         "truth": None,
         "warnings": [asdict(warning) for warning in measurement.warnings],
         "vetoes": [{"code": v.code, "message": v.reason} for v in measurement.lifts.vetoes],
@@ -312,12 +311,17 @@ def summary(measurement: Measurement) -> dict[str, Any]:
     return rounded
 
 
-def _laser_content(checks: tuple[LaserCheck, ...] | None) -> list[dict[str, Any]] | None:
-    """Describe the profiles' checks; offsets in mm, null where they can't be told."""
-    return None if checks is None else [_check_content(check) for check in checks]
+def _laser_content(measurement: Measurement) -> dict[str, Any]:
+    """Describe the laser's agreement, and its profiles' checks where they were to be fused."""
+    checks = measurement.laser_checks
+    return {
+        "agreement": [asdict(agreement) for agreement in measurement.agreements],
+        "laser": None if checks is None else [_check_content(check) for check in checks],
+    }
 
 
 def _check_content(check: LaserCheck) -> dict[str, Any]:
+    """Describe a profile's check; offsets in mm, null where they can't be told."""
     offset = {field.name: getattr(check.offset, field.name, None) for field in fields(LaserOffset)}
     ratio = offset.pop("alike_ratio")
     told = {name.replace("_m", "_mm"): None if m is None else 1e3 * m for name, m in offset.items()}

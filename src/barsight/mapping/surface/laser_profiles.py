@@ -36,6 +36,11 @@ class Profiles:
     left_out: bool
 
     @property
+    def agreements(self) -> tuple[Agreement, ...]:
+        """Select the profiles that could be compared."""
+        return tuple(one for one in self.agreed if isinstance(one, Agreement))
+
+    @property
     def sensors(self) -> tuple[str, ...]:
         """Name the laser where a profile of it was fused."""
         return ("laser",) if any(check.is_believed for check in self.checks or ()) else ()
