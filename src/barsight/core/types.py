@@ -298,6 +298,12 @@ class HeightSource:
     LASER = 2
     FILLED = 3
 
+    @classmethod
+    def measured(cls, source: UInt8) -> Bool:
+        """Mark the cells (...) that a sensor measured, by their codes (...)."""
+        found: Bool = (source == cls.VISION) | (source == cls.LASER)
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class Contour:
