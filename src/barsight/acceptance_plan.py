@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from barsight.core.errors import ConfigError
 from barsight.core.settings.file import read_settings
@@ -92,7 +94,7 @@ class DummyBundle:
     """A strapped bundle that was measured by hand. x_m, y_m: middle of its axis; yaw_deg: from +Y, as
     bundles have it; width_m: circle around all bars; top_z_m: its highest line. sigma_m: of each length.
 
-    bars and bar_diameter_m: of a hexagonal packing. mass_kg: None where nobody weighed it; it isn't judged then.
+    bars and bar_diameter_m: of a hexagonal packing. mass_kg: isn't judged where nobody weighed it.
     """
 
     name: str
@@ -229,7 +231,9 @@ class AcceptancePlan:
         for touch in self.touch_down:
             self._expect_known(touch.name, (touch.on,), self.artefacts)
 
-    def kinds(self) -> tuple[tuple[Plate | Sphere | SphereBar | HeightStep | DummyBundle | TouchDown, ...], ...]:
+    def kinds(
+        self,
+    ) -> tuple[tuple[Plate | Sphere | SphereBar | HeightStep | DummyBundle | TouchDown, ...], ...]:
         """Return all that is named, kind by kind."""
         return self.plate, self.sphere, self.sphere_bar, self.step, self.dummy_bundle, self.touch_down
 
@@ -246,5 +250,24 @@ class AcceptancePlan:
 
 
 def read_plan(path: Path) -> AcceptancePlan:
-    """Read a plan (TOML). Raises InputError for a file that can't be read and ConfigError for what can't be."""
+    """Read a plan (TOML). Raises InputError where it can't be read and ConfigError for what can't be."""
     return read_settings(path, AcceptancePlan, HELP, "plan")
+
+
+def plan_text(plan: AcceptancePlan) -> str:
+    """Write a plan as TOML that `read_plan` reads to the same."""
+    lines = [f"yard = {json.dumps(plan.yard)}", ""]
+    for one in fields(plan):
+        value = getattr(plan, one.name)
+        if is_dataclass(value):
+            lines += [f"[{one.name}]", *_settings(value), ""]
+        elif isinstance(value, tuple):
+            for item in value:
+                lines += [f"[[{one.name}]]", *_settings(item), ""]
+    return "\n".join(lines)
+
+
+def _settings(record: Any) -> list[str]:
+    """Write the fields that are given; numbers, texts and lists look in TOML as in JSON."""
+    values = {one.name: getattr(record, one.name) for one in fields(record)}
+    return [f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None]

@@ -15,7 +15,7 @@ from barsight.acceptance.pictures import FRAMES, PictureHealth, check_pictures
 from barsight.acceptance.quantities import Decision, JudgedQuantity, decide, judge_all
 from barsight.acceptance.uncertainty import combine
 from barsight.acceptance_plan import AcceptancePlan, ErrorLimits
-from barsight.core.errors import Failed
+from barsight.core.errors import Failed, InputError
 from barsight.core.types import StereoFrame
 from barsight.map_building import ProgressCallback
 from barsight.measure_folder import measure_into
@@ -65,16 +65,26 @@ def accept(
         rig.append(check_rig(source, FusionSettings(), CheckSettings(), lambda: None))
         pictures.append(check_pictures(some_frames(source)))
         inputs[str(path)] = dict(source.digests())
+    _expect_one_rig(seen)
     judged = judge_all(plan, seen) + tuple(_dirt(pictures, plan.limits))
     causes = name_causes(plan, seen, rig, pictures)
     return Acceptance(plan, tuple(seen), judged, tuple(rig), tuple(pictures), causes, inputs)
 
 
+def _expect_one_rig(seen: Sequence[Observation]) -> None:
+    first = seen[0]
+    for other in seen[1:]:
+        for what in ("calibration_id", "yard_frame_id"):
+            if getattr(other, what) != getattr(first, what):
+                problem = f"has another {what.removesuffix('_id').replace('_', ' ')} than {first.recording}"
+                raise InputError(other.recording, problem, "accept one rig at a time")
+
+
 def some_frames(source: Recording) -> Iterator[StereoFrame]:
     """Yield frames spread evenly over a recording, as many as the check of the pictures takes."""
     stamps = list(source.index.stamps_ns)
-    chosen = np.linspace(0, len(stamps) - 1, min(FRAMES, len(stamps))).astype(int) if stamps else []
-    for frame in source.frames({stamps[k] for k in chosen}):
+    chosen = np.linspace(0, max(len(stamps) - 1, 0), min(FRAMES, len(stamps))).astype(int)
+    for frame in source.frames({stamps[k] for k in chosen.tolist()}):
         if isinstance(frame, StereoFrame):
             yield frame
 

@@ -14,7 +14,7 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.motion.rig_check.drift_check import RigCheck
 
-PLATE_PX, PLATE_MM = 0.01, 0.5
+PLATE_PX, PLATE_MM = 0.03, 0.5
 """Noise of a plate's height, beside what its own uncertainty is: disparity, and the map's."""
 SPHERE_PX, SPHERE_MM = 0.03, 1.5
 """The same of a sphere's: pixels round its cap."""
@@ -43,7 +43,9 @@ UNKNOWNS = (
     Unknown("mounting across the bridge", "mm", 1e3, 1e-3),
     Unknown("mounting roll", "deg", 180 / np.pi, np.radians(0.01)),
     Unknown("mounting pitch", "deg", 180 / np.pi, np.radians(0.01)),
+    Unknown("flattened caps", "mm", 1e3, 3e-3),
 )
+"""The last is no cause: matching's blur lowers the caps of all spheres alike."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +66,16 @@ def name_causes(
     pictures: Sequence[tuple[PictureHealth, ...] | Failed],
 ) -> tuple[Cause, ...]:  # fmt: skip
     """Name the causes, none where the rig is as it should be."""
-    dirt = max((one for row in pictures if not isinstance(row, Failed) for one in row), key=lambda h: h.dirt_pct, default=None)
+    dirt = max(
+        (one for row in pictures if not isinstance(row, Failed) for one in row),
+        key=lambda h: h.dirt_pct,
+        default=None,
+    )
     causes = []
     if dirt is not None and dirt.dirt_pct > plan.limits.dirt_pct:
-        causes.append(Cause(f"dirty lens of {dirt.camera}", dirt.dirt_pct, np.nan, "% of the picture", np.inf))
+        causes.append(
+            Cause(f"dirty lens of {dirt.camera}", dirt.dirt_pct, np.nan, "% of the picture", np.inf)
+        )
     rows = [row for view in seen for row in _artefact_rows(plan, view)]
     rows += [row for check in checks if not isinstance(check, Failed) for row in _travel_rows(check)]
     causes += _ratio_causes(checks)
@@ -77,15 +85,18 @@ def name_causes(
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """An error, its sigma, and how it answers to the UNKNOWNS."""
+    """An error, its sigma, and how it answers to the UNKNOWNS. artefact: whose it is; empty of the travel."""
 
+    artefact: str
     error: float
     sigma: float
     answer: Float64
 
 
 def _best_cause(rows: Sequence[_Row]) -> Cause | None:
-    """Let each unknown go free in turn, the others as a healthy rig has them; take what explains most."""
+    """Let each unknown go free in turn, the others as a healthy rig has them, and leave each artefact out in
+    turn; take what explains most.
+    """
     if not rows:
         return None
     weight = np.array([1 / row.sigma for row in rows])
@@ -94,13 +105,21 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
     ordinary = np.array([one.ordinary for one in UNKNOWNS])
     healthy, _, _ = _solved(design, error, 1 / ordinary**2)
     best: Cause | None = None
-    for k, one in enumerate(UNKNOWNS):
+    for k, one in enumerate(UNKNOWNS[:-1]):
         prior = 1 / ordinary**2
         prior[k] = 0.0
         chi2, value, sigma = _solved(design, error, prior)
         gain = healthy - chi2
         if gain > (CLEAR if best is None else best.chi2):
-            best = Cause(one.name, one.scale * value[k], one.scale * sigma[k], one.unit, gain)
+            best = Cause(one.name, one.scale * float(value[k]), one.scale * float(sigma[k]), one.unit, gain)
+    for name in sorted({row.artefact for row in rows} - {""}):
+        others = np.array([row.artefact != name for row in rows])
+        chi2, _, _ = _solved(design[others], error[others], 1 / ordinary**2)
+        gain = healthy - chi2
+        if gain > (CLEAR + int((~others).sum()) if best is None else best.chi2):
+            off = [1e3 * row.error for row in rows if row.artefact == name]
+            sigma_mm = max(1e3 * row.sigma for row in rows if row.artefact == name)
+            best = Cause(f"{name} stands elsewhere", float(max(off, key=abs)), sigma_mm, "mm", gain)
     return best
 
 
@@ -121,7 +140,7 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
             place = np.array([plate.x_m, plate.y_m, plate.z_m])
             noise = np.hypot(1e-3 * PLATE_MM, PLATE_PX * view.view.px_m(plate.z_m))
             error, own = found.z_m - plate.z_m, float(np.hypot(noise, plate.sigma_m))
-            yield _Row(error, own, _moves(view.view, place)[2])
+            yield _Row(plate.name, error, own, _moves(view.view, place)[2])
     for sphere in plan.sphere:
         seen = view.spheres[sphere.name]
         if isinstance(seen, Failed) or sphere.place_sigma_m is None:
@@ -131,7 +150,8 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         noises = [noise, noise, np.hypot(1e-3 * SPHERE_MM, SPHERE_PX * view.view.px_m(place[2]))]
         for k, answer in enumerate(_moves(view.view, place)):
             own = float(np.hypot(noises[k], sphere.place_sigma_m))
-            yield _Row(float(seen.centre_m[k] - place[k]), own, answer)
+            answer[-1] = -1.0 if k == 2 else 0.0
+            yield _Row(sphere.name, float(seen.centre_m[k] - place[k]), own, answer)
     known = {s.name: s for s in plan.sphere}
     for bar in plan.sphere_bar:
         ends = [known[name] for name in bar.spheres]
@@ -144,7 +164,7 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         way = (second - first) / np.linalg.norm(second - first)
         answer = way @ (_moves(view.view, second) - _moves(view.view, first))
         error = float(np.linalg.norm(b.centre_m - a.centre_m)) - bar.length_m
-        yield _Row(error, float(np.hypot(2e-3 * PLACE_MM, bar.sigma_m)), answer)
+        yield _Row(bar.name, error, float(np.hypot(2e-3 * PLACE_MM, bar.sigma_m)), answer)
 
 
 def _moves(view: ViewGeometry, place: Float64) -> Float64:
@@ -164,12 +184,19 @@ def _moves(view: ViewGeometry, place: Float64) -> Float64:
         np.array([0.0, 1.0, 0.0]),
         np.array([0.0, down, aside]),
         np.array([-down, 0.0, 0.0]),
+        np.zeros(3),
     ])  # fmt: skip
 
 
 def _travel_rows(check: RigCheck) -> Iterator[_Row]:
-    """Take yaw and baseline as the crane's travel shows them; together, as they are known together."""
-    drift = check.drift
+    """Take yaw and baseline as the crane's travel shows them, together, as they are known together, and the
+    yaw that rows of matches show, whatever the baseline is.
+    """
+    drift, rows = check.drift, check.rows
+    if not isinstance(rows, Failed):
+        answer = np.zeros(len(UNKNOWNS))
+        answer[0] = 1.0
+        yield _Row("", float(rows.values[3]), float(rows.sigmas[3]), answer)
     if isinstance(drift, Failed):
         return
     known = np.linalg.inv(drift.covariance)
@@ -181,7 +208,7 @@ def _travel_rows(check: RigCheck) -> Iterator[_Row]:
             answer = np.zeros(len(UNKNOWNS))
             # A rig longer than calibrated was calibrated too short: what is off is the calibration.
             answer[:2] = axes[:, k] * (1, -1)
-            yield _Row(float(axes[:, k] @ told / weight[k]), float(weight[k] ** -0.5), answer)
+            yield _Row("", float(axes[:, k] @ told / weight[k]), float(weight[k] ** -0.5), answer)
 
 
 def _ratio_causes(checks: Sequence[RigCheck | Failed]) -> Iterator[Cause]:

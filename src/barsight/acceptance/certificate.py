@@ -21,9 +21,10 @@ from barsight.report.page import environment, resource
 SCHEMA_VERSION = 1
 REMEDY = "take the certificate that barsight accept wrote"
 RULE = (
-    "ISO 14253-1: passed only where |error| + U is within the limit. Errors are the worst of all recordings. U is the "
-    "test value uncertainty (ISO/TS 23165) with a coverage of 95.45 % (k = 2 for many degrees of freedom): "
-    "what the artefacts and the survey leave open, not the scatter of the rig under test."
+    "ISO 14253-1: passed only where |error| + U is within the limit. Errors are the worst of all "
+    "recordings. U is the test value uncertainty (ISO/TS 23165) with a coverage of 95.45 % (k = 2 for "
+    "many degrees of freedom): what the artefacts and the survey leave open, not the scatter of the rig "
+    "under test."
 )
 
 
@@ -38,9 +39,8 @@ class CommissioningStep:
 
 
 def certificate_content(
-    found: Acceptance, calibration_id: str, yard_frame_id: str | None, simulated: bool, signer: str,
-    steps: Sequence[CommissioningStep] = (),
-) -> dict[str, Any]:  # fmt: skip
+    found: Acceptance, signer: str, steps: Sequence[CommissioningStep] = ()
+) -> dict[str, Any]:
     """Collect all that the certificate says, as JSON values. signer: who answers for it, in words."""
     rows = [asdict(one) | {"decision": str(one.decision)} for one in found.quantities]
     content = {
@@ -50,9 +50,9 @@ def certificate_content(
         "signer": signer,
         "yard": found.plan.yard,
         "passed": found.is_passed,
-        "is_simulated": simulated,
-        "calibration_id": calibration_id,
-        "yard_frame_id": yard_frame_id,
+        "is_simulated": any(view.is_simulated for view in found.observations),
+        "calibration_id": found.observations[0].calibration_id,
+        "yard_frame_id": found.observations[0].yard_frame_id,
         "rule": RULE,
         "plan": asdict(found.plan),
         "plan_sha256": json_digest(json_value(asdict(found.plan))),
@@ -124,15 +124,17 @@ def error_bar(row: dict[str, Any]) -> str:
         return ""
     reach = 1.6 * row["limit"]
     middle, half = (
-        110 + 100 * max(min(value / reach, 1.0), -1.0) for value in (row["error"], row["uncertainty"]["expanded"])
+        110 + 100 * max(min(value / reach, 1.0), -1.0)
+        for value in (row["error"], row["uncertainty"]["expanded"])
     )
     half = max(half - 110, 0.5)
     edge = 100 / 1.6
     colour = {"passed": "#2a7d46", "failed": "#b3261e"}.get(row["decision"], "#a86a00")
     return (
         '<svg width="220" height="16" role="img" aria-label="error against limit">'
-        f'<rect x="{110 - edge:.1f}" y="1" width="{2 * edge:.1f}" height="14" fill="none" stroke="currentColor" '
-        'stroke-opacity=".5"/>'
-        f'<rect x="{middle - half:.1f}" y="5" width="{2 * half:.1f}" height="6" fill="{colour}" opacity=".4"/>'
+        f'<rect x="{110 - edge:.1f}" y="1" width="{2 * edge:.1f}" height="14" fill="none" '
+        'stroke="currentColor" stroke-opacity=".5"/>'
+        f'<rect x="{middle - half:.1f}" y="5" width="{2 * half:.1f}" height="6" '
+        f'fill="{colour}" opacity=".4"/>'
         f'<rect x="{middle - 1:.1f}" y="2" width="2" height="12" fill="{colour}"/></svg>'
     )

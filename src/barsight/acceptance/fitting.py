@@ -22,8 +22,12 @@ STEP_M = 0.02
 NEAR_M = 0.02
 """A height further off isn't the artefact's."""
 TIGHT_RATIO = 0.07
-"""Share of the radius by which a sphere's heights may be off at last: flat floor doesn't fit so well."""
+"""Share of the radius by which a sphere's heights may be off at last."""
+ROUND_RATIO = 0.5
+"""Share of a plane's misfit that a sphere's may have."""
 STARTS = 6
+THINNED = 5
+"""Of so many heights one takes part in the search for a plate."""
 CORRELATED_M = 0.03
 """Cells nearer than this see the same pixels: their errors are alike."""
 MIN_SHARE = 0.5
@@ -74,7 +78,7 @@ def fit_sphere(yard: YardMap, sphere: Sphere, search_m: float) -> FittedSphere |
             centre = _solve(cap, centre, radius)
         if len(cap) >= MIN_SHARE * expected and (best is None or len(cap) > len(best[1])):
             best = centre, cap
-    if best is None:
+    if best is None or not _is_round(best[1], best[0], radius):
         return Failed("not-found", f"{sphere.name}: no sphere within {search_m:g} m of its place")
     centre, cap = best
     free = _solve(cap, np.append(centre, radius), None)
@@ -83,6 +87,14 @@ def fit_sphere(yard: YardMap, sphere: Sphere, search_m: float) -> FittedSphere |
     alone = max(len(cap) * (yard.cell_m / CORRELATED_M) ** 2, 1.0)
     sigma = float(residual.std()) * np.sqrt(1 + 1 / CAP_RATIO**2) / np.sqrt(alone)
     return FittedSphere(centre, float(sigma), 2 * float(free[3]), float(high - low), len(cap))
+
+
+def _is_round(cap: Float64, centre: Float64, radius: float) -> bool:
+    """Check that a sphere fits heights (N, 3) far better than a plane does."""
+    flat = np.column_stack([cap[:, :2], np.ones(len(cap))])
+    off_plane = cap[:, 2] - flat @ np.linalg.lstsq(flat, cap[:, 2], rcond=None)[0]
+    off_sphere = np.linalg.norm(cap - centre, axis=1) - radius
+    return bool(off_sphere.std() < ROUND_RATIO * off_plane.std())
 
 
 def _starts(points: Float64, sphere: Sphere, search_m: float, expected: float) -> list[Float64]:
@@ -111,8 +123,35 @@ def fit_plate(yard: YardMap, plate: Plate, search_m: float) -> FittedPlate | Fai
     turn = np.radians(plate.yaw_deg)
     axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     half = np.array(plate.size_m) / 2
-    expected = np.prod(2 * (half - EDGE_M)) / yard.cell_m**2
-    best, shift = -np.inf, np.zeros(2)
+    expected = float(np.prod(2 * (half - EDGE_M))) / yard.cell_m**2
+    shift = _plate_shift(points[::THINNED], plate, search_m, axes, expected / THINNED)
+    if shift is None:
+        return Failed("not-found", f"{plate.name}: no level plate within {search_m:g} m of its place")
+    at = (points[:, :2] - (plate.x_m, plate.y_m) - shift) @ axes.T
+    used = points[_inside(at, half - EDGE_M)]
+    used = used[np.abs(used[:, 2] - np.median(used[:, 2])) < NEAR_M]
+    flat = np.column_stack([used[:, :2] - (plate.x_m, plate.y_m) - shift, np.ones(len(used))])
+
+    def off_plane(plane: Float64) -> Float64:
+        off: Float64 = flat @ plane - used[:, 2]
+        return off
+
+    start = [0.0, 0.0, np.median(used[:, 2])]
+    plane = least_squares(off_plane, start, loss="soft_l1", f_scale=2e-3).x
+    residual = used[:, 2] - flat @ plane
+    low, high = np.percentile(residual, (2.5, 97.5))
+    alone = max(len(used) * (yard.cell_m / CORRELATED_M) ** 2, 1.0)
+    return FittedPlate(
+        float(plane[2]), float(residual.std() / np.sqrt(alone)), shift,
+        float(np.degrees(np.arctan(np.hypot(*plane[:2])))), float(high - low), len(used),
+    )  # fmt: skip
+
+
+def _plate_shift(
+    points: Float64, plate: Plate, search_m: float, axes: Float64, expected: float
+) -> Float64 | None:
+    """Find the shift (2,) at which most heights lie level on the plate and fewest around it."""
+    half, shift, best = np.array(plate.size_m) / 2, None, -np.inf
     for dx in _steps(search_m):
         for dy in _steps(search_m):
             at = (points[:, :2] - (plate.x_m + dx, plate.y_m + dy)) @ axes.T
@@ -121,25 +160,12 @@ def fit_plate(yard: YardMap, plate: Plate, search_m: float) -> FittedPlate | Fai
                 continue
             level = np.abs(points[:, 2] - np.median(points[inner, 2])) < NEAR_M
             beside = _inside(at, half + EDGE_M) & ~_inside(at, half)
-            score = (inner & level).sum() - (beside & level).sum() - 0.01 * expected * np.hypot(dx, dy) / search_m
+            score = (
+                (inner & level).sum() - (beside & level).sum() - 0.01 * expected * np.hypot(dx, dy) / search_m
+            )
             if score > best:
                 best, shift = float(score), np.array([dx, dy])
-    at = (points[:, :2] - (plate.x_m, plate.y_m) - shift) @ axes.T
-    used = points[_inside(at, half - EDGE_M)]
-    if not np.isfinite(best) or len(used) < MIN_SHARE * expected:
-        return Failed("not-found", f"{plate.name}: no level plate within {search_m:g} m of its place")
-    used = used[np.abs(used[:, 2] - np.median(used[:, 2])) < NEAR_M]
-    flat = np.column_stack([used[:, :2] - (plate.x_m, plate.y_m) - shift, np.ones(len(used))])
-    plane = least_squares(
-        lambda p: flat @ p - used[:, 2], [0.0, 0.0, np.median(used[:, 2])], loss="soft_l1", f_scale=2e-3
-    ).x
-    residual = used[:, 2] - flat @ plane
-    low, high = np.percentile(residual, (2.5, 97.5))
-    alone = max(len(used) * (yard.cell_m / CORRELATED_M) ** 2, 1.0)
-    return FittedPlate(
-        float(plane[2]), float(residual.std() / np.sqrt(alone)), shift,
-        float(np.degrees(np.arctan(np.hypot(*plane[:2])))), float(high - low), len(used),
-    )  # fmt: skip
+    return shift
 
 
 def _known(yard: YardMap, x_m: float, y_m: float, reach_m: float) -> Float64:
@@ -161,13 +187,13 @@ def _known(yard: YardMap, x_m: float, y_m: float, reach_m: float) -> Float64:
 
 def _steps(search_m: float) -> Float64:
     """List offsets to try, the smallest first: of equals the nearest is taken."""
-    steps = np.arange(-round(search_m / STEP_M), round(search_m / STEP_M) + 1) * STEP_M
-    ordered: Float64 = steps[np.argsort(np.abs(steps), kind="stable")]
-    return ordered
+    count = round(search_m / STEP_M)
+    steps = STEP_M * np.arange(-count, count + 1, dtype=np.float64)
+    return steps[np.argsort(np.abs(steps), kind="stable")]
 
 
 def _inside(at: Float64, half: Float64) -> Bool:
-    inside: Bool = (np.abs(at) < half).all(axis=1)
+    inside: Bool = np.all(np.abs(at) < half, axis=1)
     return inside
 
 

@@ -20,10 +20,14 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.yard.types import YardMap
 
-PLATES = (("plate 1", 0.12, 0.22, 0.0), ("plate 2", 0.38, 0.82, 0.12), ("plate 3", 0.38, 0.46, 0.22),
-          ("plate 4", 0.88, 0.58, 0.33))  # fmt: skip
-SPHERES = (("monument 1", 0.12, 0.9, 0.0), ("monument 2", 0.12, 0.56, 0.12), ("monument 3", 0.3, 0.1, 0.0),
-           ("monument 4", 0.88, 0.92, 0.12), ("monument 5", 0.88, 0.08, 0.0))  # fmt: skip
+PLATES = (
+    ("plate 1", 0.12, 0.16, 0.0), ("plate 2", 0.38, 0.82, 0.12), ("plate 3", 0.38, 0.46, 0.22),
+    ("plate 4", 0.88, 0.55, 0.33), ("plate 5", 0.62, 0.12, 0.0), ("plate 6", 0.12, 0.5, 0.33),
+)  # fmt: skip
+SPHERES = (
+    ("monument 1", 0.14, 0.92, 0.0), ("monument 2", 0.12, 0.75, 0.12), ("monument 3", 0.34, 0.14, 0.0),
+    ("monument 4", 0.85, 0.86, 0.12), ("monument 5", 0.85, 0.14, 0.0),
+)  # fmt: skip
 """Names, places as shares of the area, heights as shares of the cameras' height."""
 BARS = (("bar along", "monument 3", "monument 5"), ("bar across", "monument 4", "monument 5"),
         ("bar aslant", "monument 1", "monument 4"))  # fmt: skip
@@ -74,30 +78,34 @@ def lay_out(area: Area, yard: str, floor: YardMap | None = None) -> AcceptancePl
     places: dict[str, Float64] = {}
     for name, along, across, *_ in (*PLATES, *SPHERES, DUMMY):
         wanted, reach = area.at(along, across), {"p": 0.7 * side, "m": 0.7 * wide, "d": 0.4}[name[0]]
-        taken = [place for place in places.values()]
+        taken = list(places.values())
         spot = wanted if free is None or floor is None else _nearest_free(floor, free, wanted, reach, taken)
         if spot is None:
             return Failed("no-floor", f"no free floor for {name}: {2 * reach:.1f} m across are wanted")
         places[name] = np.round(spot, 2)
     tops = {name: round(max(up * area.above_floor_m, 0.02), 2) for name, _, _, up in PLATES}
-    plates = tuple(
-        Plate(name, *map(float, places[name]), tops[name], (round(side, 2),) * 2) for name, *_ in PLATES
-    )
+    plates = tuple(_plate(name, places[name], tops[name], side) for name, *_ in PLATES)
     spheres = tuple(
-        Sphere(
-            name, *map(float, places[name]), round(up * area.above_floor_m + wide / 2, 3), round(wide, 3),
-            place_sigma_m=0.0005,
-        )
-        for name, _, _, up in SPHERES
-    )  # fmt: skip
+        _monument(name, places[name], up * area.above_floor_m + wide / 2, wide) for name, _, _, up in SPHERES
+    )
     return AcceptancePlan(
         yard, plates, spheres, _bars(spheres),
         tuple(
             HeightStep(f"step {k}", "plate 1", name, round(tops[name] - tops["plate 1"], 3))
-            for k, (name, *_) in enumerate(PLATES[1:], 1)
+            for k, name in enumerate((n for n in tops if tops[n] > tops["plate 1"]), 1)
         ),
         (_dummy(places[DUMMY[0]]),), (), _limits(area),
     )  # fmt: skip
+
+
+def _plate(name: str, place: Float64, top_m: float, side_m: float) -> Plate:
+    side = round(side_m, 2)
+    return Plate(name, float(place[0]), float(place[1]), top_m, (side, side))
+
+
+def _monument(name: str, place: Float64, centre_m: float, wide_m: float) -> Sphere:
+    x, y = float(place[0]), float(place[1])
+    return Sphere(name, x, y, round(centre_m, 3), round(wide_m, 3), place_sigma_m=0.0005)
 
 
 def _bars(spheres: tuple[Sphere, ...]) -> tuple[SphereBar, ...]:
@@ -109,10 +117,10 @@ def _bars(spheres: tuple[Sphere, ...]) -> tuple[SphereBar, ...]:
 
 
 def _dummy(place: Float64) -> DummyBundle:
-    """Take nineteen bars of 60 mm, hexagonally packed, 1.6 m long."""
+    """Take nineteen bars of 60 mm, hexagonally packed, 1.4 m long."""
     diameter, pitch = 0.06, 0.06 * 1.003
     return DummyBundle(
-        DUMMY[0], float(place[0]), float(place[1]), 3.0, 1.6, round(4 * pitch + diameter, 4),
+        DUMMY[0], float(place[0]), float(place[1]), 3.0, 1.4, round(4 * pitch + diameter, 4),
         round(2 * pitch * 3**0.5 + diameter, 4), 19, diameter,
     )  # fmt: skip
 
@@ -121,9 +129,9 @@ def _limits(area: Area) -> ErrorLimits:
     """Set limits to shares of a pixel, as a good calibration holds them; figures as metres, then mm."""
     up, across = 1e3 * area.height_px_m, 1e3 * area.ground_px_m
     return ErrorLimits(
-        height_mm=round(0.1 * up, 1), position_mm=round(1.0 * across, 1), length_mm=round(1.0 * across, 1),
+        height_mm=round(0.1 * up, 1), position_mm=round(1.3 * across, 1), length_mm=round(1.3 * across, 1),
         step_mm=round(0.08 * up, 1), flatness_mm=round(0.15 * up, 1), lift_mm=round(2.0 * across, 1),
-        yaw_deg=0.5, width_mm=round(3.0 * across, 1), bundle_length_mm=round(6.0 * across, 1),
+        yaw_deg=0.5, width_mm=round(4.5 * across, 1), bundle_length_mm=round(6.0 * across, 1),
         touch_mm=round(2.0 * across, 1), repeat_mm=round(0.6 * across, 1), laser_mm=round(0.1 * up, 1),
     )  # fmt: skip
 

@@ -44,10 +44,15 @@ class ViewGeometry:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What one recording shows of a plan. map_id: of the measured folder; warnings: its codes."""
+    """What one recording shows of a plan. map_id, calibration_id, yard_frame_id: of the measured folder;
+    warnings: its codes.
+    """
 
     recording: str
     map_id: str
+    calibration_id: str
+    yard_frame_id: str | None
+    is_simulated: bool
     spheres: Mapping[str, FittedSphere | Failed]
     plates: Mapping[str, FittedPlate | Failed]
     bundles: Mapping[str, Bundle | Failed]
@@ -65,7 +70,7 @@ def observe(folder: Path, plan: AcceptancePlan, rig: StereoRig, recording: str) 
     heights, search = read_heights(folder), plan.conditions.search_m
     bundles = read_bundles(folder / "bundles.json")
     return Observation(
-        recording, identity.map_id,
+        recording, identity.map_id, identity.calibration_id, identity.yard_frame_id, identity.is_simulated,
         {one.name: fit_sphere(heights, one, search) for one in plan.sphere},
         {one.name: fit_plate(heights, one, search) for one in plan.plate},
         {one.name: _nearest(bundles, one, search) for one in plan.dummy_bundle},
@@ -74,7 +79,7 @@ def observe(folder: Path, plan: AcceptancePlan, rig: StereoRig, recording: str) 
             for row in summary["agreement"] or []
             if row.get("equivalence_mm") is not None
         ),
-        _view(folder, rig),
+        view_geometry(folder, rig),
         tuple(str(one["code"]) for one in summary["warnings"] or []),
     )  # fmt: skip
 
@@ -87,7 +92,8 @@ def _nearest(bundles: tuple[Bundle, ...], dummy: DummyBundle, search_m: float) -
     return min(near, key=lambda b: float(np.linalg.norm(b.centre_m[:2] - place)))
 
 
-def _view(folder: Path, rig: StereoRig) -> ViewGeometry:
+def view_geometry(folder: Path, rig: StereoRig) -> ViewGeometry:
+    """Compute from where a measured folder was seen. Raises InputError where it has no trajectory."""
     path = read_path(folder)
     if path is None:
         raise InputError(folder, "has no trajectory.tum", "measure the recording again")

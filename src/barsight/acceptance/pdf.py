@@ -45,7 +45,7 @@ def write_pdf(content: dict[str, Any], digest: str, signature: dict[str, str] | 
         text(content["rule"]),
         text("Signature", "Heading3"),
         text(f"Digest of the content (SHA-256): {digest}"),
-        text("Not signed." if signature is None else f"{signature['algorithm']} {signature['signature']}, key {signature['public_key']}"),
+        text(_signed(signature)),
     ]  # fmt: skip
     SimpleDocTemplate(str(target), pagesize=A4, title="Acceptance certificate", invariant=1).build(parts)
 
@@ -58,29 +58,44 @@ def headline(content: dict[str, Any]) -> str:
 
 def facts(content: dict[str, Any]) -> list[str]:
     """List what was tested, by whom and when."""
+    software = content["software"]
     lines = [
-        f"Yard: {content['yard'] or 'not named'}. Issued {content['issued_at']} by {content['signer'] or 'nobody named'}, "
-        f"{content['software']['name']} {content['software']['version']}.",
+        f"Yard: {content['yard'] or 'not named'}. Issued {content['issued_at']} by "
+        f"{content['signer'] or 'nobody named'}, {software['name']} {software['version']}.",
         f"Calibration {content['calibration_id']}, yard frame {content['yard_frame_id'] or 'none'}, "
         f"plan {content['plan_sha256'][:12]}.",
     ]
     lines += [f"Recording {one['path']}, map {one['map_id']}." for one in content["recordings"]]
-    lines += [f"Step done {s['done_at']}: {s['name']}, {s['result']} ({s['digest'][:12]})." for s in content["steps"]]
+    lines += [
+        f"Step done {step['done_at']}: {step['name']}, {step['result']} ({step['digest'][:12]})."
+        for step in content["steps"]
+    ]
     return lines
 
 
 def findings(content: dict[str, Any]) -> list[str]:
     """List causes and warnings."""
-    lines = [
-        f"Cause: {one['name']}, {format_number(one['value'], 3)} ± {format_number(one['sigma'], 3)} {one['unit']}."
-        for one in content["causes"]
-    ]
-    lines += [f"Rig against the crane's travel, recording {k}: {one['state']}." for k, one in enumerate(content["rig"], 1)]
+    lines = []
+    for one in content["causes"]:
+        value, sigma = (_plain(one[name], 3) for name in ("value", "sigma"))
+        lines.append(f"Cause: {one['name']}, {value} ± {sigma} {one['unit']}.")
+    for number, one in enumerate(content["rig"], 1):
+        lines.append(f"Rig against the crane's travel, recording {number}: {one['state']}.")
     return lines + [f"Warning of the measurement: {code}." for code in content["warnings"]]
+
+
+def _signed(signature: dict[str, str] | None) -> str:
+    if signature is None:
+        return "Not signed."
+    return f"{signature['algorithm']} {signature['signature']}, key {signature['public_key']}"
 
 
 def _row(one: dict[str, Any]) -> tuple[str, ...]:
     whole = one["uncertainty"]
     numbers = (one["error"], whole["expanded"], whole["coverage"], one["limit"])
-    told = [format_number(value, 2).replace("−", "-").replace("\u202f", " ") for value in numbers]
-    return (one["name"], *told, one["unit"], one["decision"])
+    return (one["name"], *(_plain(value, 2) for value in numbers), one["unit"], one["decision"])
+
+
+def _plain(value: Any, decimals: int) -> str:
+    """Format with characters that the PDF's own fonts have."""
+    return format_number(value, decimals).replace("−", "-").replace("\u202f", " ").replace("–", "-")

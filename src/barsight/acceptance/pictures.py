@@ -20,10 +20,10 @@ AROUND = 11
 FRAMES = 12
 FEWEST = 4
 DARKER = 0.12
-"""Spots are darker than around by this share, or blurred to the share below, in most pictures."""
+"""Spots are darker than around by this share, or blurred to the share below, in almost every picture."""
 BLURRED = 0.55
-MOST = 85.0
-"""Percentile of the pictures that must show it."""
+EXCEPTIONS = 8
+"""Of so many pictures one may hide a spot: something bright lies just there."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,7 @@ def check_pictures(frames: Iterable[StereoFrame]) -> tuple[PictureHealth, ...] |
     pictures: list[tuple[UInt8, UInt8]] = [(frame.left, frame.right) for frame in frames]
     if len(pictures) < FEWEST:
         return Failed("few-pictures", f"{len(pictures)} pictures; {FEWEST} are the least to tell dirt by")
-    return tuple(
-        _health(f"cam{side}", [pair[side] for pair in pictures]) for side in range(2)
-    )
+    return tuple(_health(f"cam{side}", [pair[side] for pair in pictures]) for side in range(2))
 
 
 def _health(camera: str, images: list[UInt8]) -> PictureHealth:
@@ -56,8 +54,9 @@ def _health(camera: str, images: list[UInt8]) -> PictureHealth:
         blurred.append(_over_surroundings(contrast))
         sharp.append(float(np.median(contrast)))
         gray.append(float(np.median(image)))
-    spoiled = np.percentile(dark, MOST, axis=0) < np.log(1 - DARKER)
-    spoiled |= np.percentile(blurred, MOST, axis=0) < np.log(BLURRED)
+    last = len(images) - 1 - len(images) // EXCEPTIONS
+    spoiled = np.sort(dark, axis=0)[last] < np.log(1 - DARKER)
+    spoiled |= np.sort(blurred, axis=0)[last] < np.log(BLURRED)
     return PictureHealth(camera, 100 * float(spoiled.mean()), float(np.median(sharp)), float(np.median(gray)))
 
 

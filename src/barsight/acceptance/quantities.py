@@ -167,8 +167,8 @@ class _Judge:
             half = worst.equivalence_mm - abs(worst.bias_mm)
             part = UncertaintyPart("independent samples of the profile", half / 2, "t", inf, "this test")
             yield self._judged(
-                f"laser profile {profile}: equivalence", "laser_mm", [row.bias_mm for row in rows], [part], "",
-                expanded=half, error=worst.bias_mm,
+                f"laser profile {profile}: equivalence", "laser_mm", [row.bias_mm for row in rows], [part],
+                "", expanded=half, error=worst.bias_mm,
             )  # fmt: skip
 
     def repeats(self, judged: Sequence[JudgedQuantity]) -> Iterator[JudgedQuantity]:
@@ -203,7 +203,9 @@ class _Judge:
             whole, tuple(parts), limit, decision, reason if decision is Decision.NOT_MEASURED else "",
         )  # fmt: skip
 
-    def _own(self, sigma: float, source: str = "calibration of the artefact", unit: float = 1e3) -> UncertaintyPart:
+    def _own(
+        self, sigma: float, source: str = "calibration of the artefact", unit: float = 1e3
+    ) -> UncertaintyPart:
         free = self._plan.conditions.degrees_of_freedom
         return UncertaintyPart(source, unit * sigma, "normal", free, "the plan")
 
@@ -248,4 +250,5 @@ def _top(view: Observation, name: str, artefacts: Sequence[Artefact]) -> Float64
         return sphere
     (own,) = (one for one in artefacts if one.name == name)
     assert isinstance(own, Sphere)
-    return sphere.centre_m + (0, 0, own.diameter_m / 2)
+    top: Float64 = sphere.centre_m + np.array([0.0, 0.0, own.diameter_m / 2])
+    return top

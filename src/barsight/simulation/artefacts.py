@@ -72,5 +72,7 @@ def _bundle(dummy: DummyBundle) -> StackedBundle:
         ("width_m", 2 * laid.radius_m, dummy.width_m), ("top_z_m", laid.top_z_m, dummy.top_z_m),
     ):  # fmt: skip
         if abs(own - stated) > 0.002:
-            raise ConfigError(f"{dummy.name}: {what} of such a bundle on the floor is {own:.4f}, not {stated}")
+            raise ConfigError(
+                f"{dummy.name}: {what} of such a bundle on the floor is {own:.4f}, not {stated}"
+            )
     return laid

@@ -1,6 +1,6 @@
 """Build the stock as primitives, capped cylinders, boxes and spheres with materials, in a grid of cells.
 
-Primitives 0 .. cylinders-1 are cylinders, the rest boxes and spheres. Rows of `shape` (float64, `yard`, metres):
+Primitives 0 .. cylinders-1 are cylinders, the rest boxes and spheres. Rows of `shape` (float64, `yard`, m):
 cylinder: centre 0:3, axis 3:6 (unit), direction of angle 0 6:9, of angle 90 degrees 9:12, radius 12,
 half length 13. Box: centre 0:3, three unit axes 3:12, half sizes 12:15. A sphere has its radius at 12 and
 no sizes at 13 and 14.
@@ -67,7 +67,9 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
             cylinders += rounds
             cylinder_materials += [plain_material(0.13, 0.5, rng) for _ in rounds]
             boxes += [*facets, label]
-            box_materials += [plain_material(0.13, 0.5, rng) for _ in facets] + [plain_material(0.75, 0.0, rng, weight=0.3)]
+            box_materials += [plain_material(0.13, 0.5, rng) for _ in facets] + [
+                plain_material(0.75, 0.0, rng, weight=0.3)
+            ]
     for beam in stock.beams:
         boxes.append(_beam_shape(beam))
         box_materials.append(plain_material(rng.uniform(0.3, 0.42), 0.0, rng))
