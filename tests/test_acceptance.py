@@ -27,16 +27,16 @@ from barsight.acceptance.pictures import PictureHealth, check_pictures
 from barsight.acceptance.quantities import Decision, decide, judge_all
 from barsight.acceptance.signature import is_signed_by
 from barsight.acceptance.uncertainty import UncertaintyPart, combine
-from barsight.acceptance_plan import AcceptancePlan, Plate, Sphere, TouchDown, plan_text, read_plan
+from barsight.artefacts.plan import AcceptancePlan, Plate, Sphere, TouchDown, plan_text, read_plan
 from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError
 from barsight.core.types import StereoFrame
-from barsight.simulation.artefacts import lay_artefacts
 from barsight.simulation.effects.faults import SpoiledLens
 from barsight.simulation.effects.settings import FaultSettings
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.worlds.artefacts import lay_artefacts
 from barsight.yard.types import HeightMap
 
 AREA = Area((0.2, 3.8), (-1.35, 1.35), 4.5, 625.0, 0.5)

@@ -10,7 +10,7 @@ import barsight
 
 FLOORS = {
     "core": 0,
-    "calibration": 1, "acceptance_plan": 1,
+    "calibration": 1, "artefacts": 1,
     "recording": 2, "sensors": 2, "stereo": 2, "features": 2, "inertial": 2, "registration": 2,
     "motion": 3,
     "mapping": 4,

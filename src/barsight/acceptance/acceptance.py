@@ -14,7 +14,7 @@ from barsight.acceptance.observation import Observation, observe
 from barsight.acceptance.pictures import FRAMES, PictureHealth, check_pictures
 from barsight.acceptance.quantities import Decision, JudgedQuantity, decide, judge_all
 from barsight.acceptance.uncertainty import combine
-from barsight.acceptance_plan import AcceptancePlan, ErrorLimits
+from barsight.artefacts.plan import AcceptancePlan, ErrorLimits
 from barsight.core.errors import Failed, InputError
 from barsight.core.types import StereoFrame
 from barsight.map_building import ProgressCallback

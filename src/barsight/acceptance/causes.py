@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.acceptance.observation import Observation, ViewGeometry
 from barsight.acceptance.pictures import PictureHealth
-from barsight.acceptance_plan import AcceptancePlan
+from barsight.artefacts.plan import AcceptancePlan
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.motion.rig_check.drift_check import RigCheck
@@ -50,8 +50,8 @@ UNKNOWNS = (
 
 @dataclass(frozen=True)
 class Cause:
-    """What is wrong, most certain first: value and sigma in `unit`; chi2: by how much it explains the errors
-    better than an ordinary rig.
+    """A cause of errors: value and sigma in `unit`; chi2: by how much it explains them better than an
+    ordinary rig.
     """
 
     name: str

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from barsight.acceptance_plan import Plate, Sphere
+from barsight.artefacts.plan import Plate, Sphere
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.types import HeightSource

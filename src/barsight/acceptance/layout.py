@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from barsight.acceptance_plan import (
+from barsight.artefacts.plan import (
     AcceptancePlan,
     DummyBundle,
     ErrorLimits,

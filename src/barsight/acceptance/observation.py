@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from barsight.acceptance.fitting import FittedPlate, FittedSphere, fit_plate, fit_sphere
-from barsight.acceptance_plan import AcceptancePlan, DummyBundle
+from barsight.artefacts.plan import AcceptancePlan, DummyBundle
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
@@ -44,8 +44,9 @@ class ViewGeometry:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What one recording shows of a plan. map_id, calibration_id, yard_frame_id: of the measured folder;
-    warnings: its codes.
+    """The artefacts as one recording shows them.
+
+    map_id, calibration_id, yard_frame_id: of the measured folder; warnings: its codes.
     """
 
     recording: str

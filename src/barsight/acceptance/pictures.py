@@ -28,7 +28,7 @@ EXCEPTIONS = 8
 
 @dataclass(frozen=True)
 class PictureHealth:
-    """Of one camera: share of the picture that dirt darkens or drops blur, %; contrast of neighbouring pixels
+    """Health of one camera: share of the picture that dirt darkens or drops blur, %; contrast of neighbouring pixels
     over brightness, median (sharpness); gray level, median.
     """
 

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from barsight.acceptance.observation import Observation
 from barsight.acceptance.uncertainty import CombinedUncertainty, UncertaintyPart, combine
-from barsight.acceptance_plan import (
+from barsight.artefacts.plan import (
     AcceptancePlan,
     Artefact,
     DummyBundle,

@@ -8,16 +8,16 @@ from typing import Annotated
 
 import tyro
 
-from barsight.acceptance_plan import read_plan
+from barsight.artefacts.plan import read_plan
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import MAX_VALUE
-from barsight.simulation.artefacts import lay_artefacts
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
+from barsight.simulation.worlds.artefacts import lay_artefacts
 
 
 def run(arguments: Sequence[str]) -> None:

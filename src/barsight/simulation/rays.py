@@ -46,7 +46,10 @@ def hit_cylinder(
 def _hit_sphere(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """Find the first ray parameter over `near` at which the ray enters the sphere, else FAR."""
+    """Find the first ray parameter over `near` at which the ray enters the sphere, else FAR.
+
+    shape: (P, 15), see `Primitives`; p: its number. Origin o in m, direction d of any length.
+    """
     cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
     a = dx * dx + dy * dy + dz * dz
     b = cx * dx + cy * dy + cz * dz

@@ -269,7 +269,8 @@ def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float
 def _shade_sphere(primitives: Primitives, look: Shading, p: int, x: float, y: float, z: float) -> float:
     """Shade sphere `p` at (x, y, z) m in `yard`: its diffuse radiance, between those of its axes' six ends.
 
-    An end counts as the square of the normal along it. The texture runs around the first axis.
+    An end counts as the square of the normal along it. The texture runs around the first axis. tile:
+    (TILE, TILE, 4); x, y, z: in `yard`, m.
     """
     lamps, lightmap, tile = look
     shape, material = primitives.shape, primitives.material

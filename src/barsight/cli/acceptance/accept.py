@@ -18,7 +18,7 @@ from barsight.acceptance.layout import Area, lay_out
 from barsight.acceptance.quantities import Decision
 from barsight.acceptance.signature import sign
 from barsight.acceptance.yard_area import measured_area
-from barsight.acceptance_plan import plan_text, read_plan
+from barsight.artefacts.plan import plan_text, read_plan
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole

@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from barsight.acceptance_plan import AcceptancePlan, DummyBundle, Plate, Sphere
+from barsight.artefacts.plan import AcceptancePlan, DummyBundle, Plate, Sphere
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 from barsight.simulation.scene import Primitives, Scene, build_grid, build_scene, plain_material

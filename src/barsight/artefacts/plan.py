@@ -181,7 +181,7 @@ class ErrorLimits:
 
 @dataclass(frozen=True)
 class AmbientConditions:
-    """What holds for the whole test. temperature_c: of the artefacts; sigma of it; expansion_per_k: of what
+    """Conditions of the whole test. temperature_c: of the artefacts; sigma of it; expansion_per_k: of what
     they are made of. Calibrated values are of 20 degrees. degrees_of_freedom: of the artefacts' sigmas.
     """
 
