@@ -28,8 +28,9 @@ EXCEPTIONS = 8
 
 @dataclass(frozen=True)
 class PictureHealth:
-    """Health of one camera: share of the picture that dirt darkens or drops blur, %; contrast of neighbouring pixels
-    over brightness, median (sharpness); gray level, median.
+    """Health of one camera: share of the picture that dirt darkens or drops blur, %.
+
+    sharpness: contrast of neighbouring pixels over brightness, median; gray: level, median.
     """
 
     camera: str
