@@ -23,6 +23,7 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Trajectory
 from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
+from barsight.labels.bundle_labels import label_bundles
 from barsight.map_building import (
     BuiltMap,
     ProbedRecording,
@@ -190,6 +191,10 @@ def find_lifts(
         bundles = find_bundles(heights, settings.bundles)
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)
+    if settings.labels.read:
+        with watch("labels"):
+            bundles = _labelled(newest, heights, bundles, settings)
+    with watch("stock"):
         placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
         stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None
     warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *notices]
@@ -230,6 +235,14 @@ def find_lifts(
         yard_frame_id=yard_frame_id(source, trajectory),
         passes=_records(mapped, travels),
     )
+
+
+def _labelled(
+    newest: MappedPass, heights: YardMap, bundles: tuple[Bundle, ...], settings: MeasureSettings
+) -> tuple[Bundle, ...]:
+    """Read the labels in the newest pass's pictures: what lay there before may be gone."""
+    poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
+    return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
 
 
 def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:
