@@ -48,24 +48,23 @@ def render_view(scene: Scene, look: Shading, rays: Float32, side: int, yard_from
     of which a pixel inside one primitive takes the diagonal ones only.
     """
     image = np.empty((rays.shape[0] // side, rays.shape[1] // side), dtype=np.float32)
-    _render(
-        *scene, look.lamps, look.lightmap, look.tile, look.codes, rays, side, yard_from_cam.rotation.copy(),
-        yard_from_cam.translation.copy(), image,
-    )  # fmt: skip
+    pose = np.column_stack([yard_from_cam.rotation, yard_from_cam.translation])
+    _render(*scene, look.lamps, look.lightmap, look.tile, look.codes, rays, side, pose, image)
     return image
 
 
 @kernel(parallel=True)
 def _render(
     primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, tile: Float32, codes: UInt8,
-    rays: Float32, side: int, R: Float64, centre: Float64, image: Float32,
+    rays: Float32, side: int, pose: Float64, image: Float32,
 ) -> None:  # fmt: skip
     """Render the radiance image (H, W) by ray casting, 1 about white paper under the lamps.
 
-    codes: see `Shading`. rays: (side H, side W, 2) directions with z = 1. R: (3, 3) and
-    centre: (3,) m, yard_from_cam. Fills image; a ray that hits nothing adds 0.
+    codes: see `Shading`. rays: (side H, side W, 2) directions with z = 1. pose: (3, 4),
+    turn and place (m) of yard_from_cam. Fills image; a ray that hits nothing adds 0.
     """
-    ox, oy, oz = centre[0], centre[1], centre[2]
+    R = pose[:, :3]
+    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     for v in numba.prange(image.shape[0]):
         scene, look = Scene(primitives, grid), Shading(lamps, lightmap, tile, codes)
         for u in range(image.shape[1]):
