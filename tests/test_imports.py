@@ -45,7 +45,7 @@ ROOMS = {
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
-    "plant": (".", "opcua.security", "opcua"),
+    "plant": (".", "opcua.security", "opcua", "links"),
     "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
