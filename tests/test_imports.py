@@ -22,13 +22,8 @@ FLOORS = {
     "map_building": 8, "labels": 8, "joined_passes": 9,
     "live_map": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
-<<<<<<< HEAD
-    "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11, "labels": 11,
-    "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12, "acceptance": 12,
-=======
     "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11,
-    "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12,
->>>>>>> main
+    "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12, "acceptance": 12,
     "fleet": 13,
     "cli": 14,
 }  # fmt: skip
@@ -50,13 +45,8 @@ ROOMS = {
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
-<<<<<<< HEAD
-    "plant": (".", "opcua.security", "opcua"),
-    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant", "acceptance"),
-=======
     "plant": (".", "opcua.security", "opcua", "links"),
-    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant"),
->>>>>>> main
+    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant", "acceptance"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {

@@ -11,12 +11,12 @@ from typing import Any
 import barsight
 from barsight.acceptance.acceptance import Acceptance
 from barsight.acceptance.pdf import write_pdf
-from barsight.acceptance.signature import sign
 from barsight.core.errors import Failed, InputError
-from barsight.core.files import atomic_path, atomic_paths
+from barsight.core.files import atomic_paths
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.report.page import environment, resource
+from barsight.report.signing import sign_file
 
 SCHEMA_VERSION = 1
 REMEDY = "take the certificate that barsight accept wrote"
@@ -76,38 +76,32 @@ def certificate_content(
     return plain
 
 
-def certificate_files(out: Path) -> tuple[Path, Path, Path]:
+def certificate_files(out: Path) -> tuple[Path, ...]:
     """Name the files of a certificate: JSON, page and PDF; a suffix of `out` is left off."""
     stem = out.with_suffix("") if out.suffix in (".json", ".html", ".pdf") else out
-    json_file, page, pdf = (stem.with_name(stem.name + suffix) for suffix in (".json", ".html", ".pdf"))
-    return json_file, page, pdf
+    return tuple(stem.with_name(stem.name + suffix) for suffix in (".json", ".html", ".pdf"))
 
 
 def write_certificate(content: dict[str, Any], out: Path, key: Path | None, pdf: bool) -> str:
-    """Write JSON, page and, if asked, the PDF, all or none, and the signature beside; return the digest.
+    """Write JSON, page and, if asked, the PDF, all or none; return the content's digest.
 
-    key: Ed25519 private key (PEM) to sign the digest with.
+    key: Ed25519 private key (PEM) that signs each file; the signature lies beside it as NAME.sig.
     """
     files = certificate_files(out)
+    files = files if pdf else files[:2]
     digest = json_digest(content)
-    signature = None if key is None else sign(digest, key)
     page = environment().get_template("certificate_page.html.jinja").render(
-        c=content, digest=digest, signature=signature, css=resource("page.css"), bar=error_bar
+        c=content, digest=digest, signed=key is not None, css=resource("page.css"), bar=error_bar
     )  # fmt: skip
-    with atomic_paths(*(files if pdf else files[:2])) as paths:
+    with atomic_paths(*files) as paths:
         write_sealed(content, paths[0])
         paths[1].write_text(page, encoding="utf-8", errors="replace")
         if pdf:
-            write_pdf(content, digest, signature, paths[2])
-    if signature is not None:
-        with atomic_path(signature_file(files[0])) as path:
-            write_sealed({"schema_version": SCHEMA_VERSION, "signed_sha256": digest, **signature}, path)
+            write_pdf(content, digest, key is not None, paths[2])
+    if key is not None:
+        for file in files:
+            sign_file(file, key)
     return digest
-
-
-def signature_file(certificate: Path) -> Path:
-    """Return the file beside a certificate that holds its signature."""
-    return certificate.with_name(certificate.stem + ".signature.json")
 
 
 def read_certificate(path: Path) -> dict[str, Any]:

@@ -68,23 +68,15 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
         straps = _straps(bundle, settings.yard, rng)
         for k, (rounds, facets, label) in enumerate(straps):
             cylinders += rounds
-<<<<<<< HEAD
             cylinder_materials += [plain_material(0.13, 0.5, rng) for _ in rounds]
-            boxes += [*facets, label]
-            box_materials += [plain_material(0.13, 0.5, rng) for _ in facets] + [
-                plain_material(0.75, 0.0, rng, weight=0.3)
-            ]
-=======
-            cylinder_materials += [_plain(0.13, 0.5, rng) for _ in rounds]
             boxes += facets
-            box_materials += [_plain(0.13, 0.5, rng) for _ in facets]
-            paper = _plain(0.75, 0.0, rng, weight=0.3)
+            box_materials += [plain_material(0.13, 0.5, rng) for _ in facets]
+            paper = plain_material(0.75, 0.0, rng, weight=0.3)
             if max(settings.yard.label_m) > 0:
                 paper[CODE] = number
             if max(settings.yard.label_m) == 0 or k == len(straps) // 2:
                 boxes.append(label)
                 box_materials.append(paper)
->>>>>>> main
     for beam in stock.beams:
         boxes.append(_beam_shape(beam))
         box_materials.append(plain_material(rng.uniform(0.3, 0.42), 0.0, rng))

@@ -16,7 +16,6 @@ from barsight.acceptance.acceptance import Acceptance, accept
 from barsight.acceptance.certificate import certificate_content, certificate_files, write_certificate
 from barsight.acceptance.layout import Area, lay_out
 from barsight.acceptance.quantities import Decision
-from barsight.acceptance.signature import sign
 from barsight.acceptance.yard_area import measured_area
 from barsight.artefacts.plan import plan_text, read_plan
 from barsight.cli.arguments import call
@@ -26,6 +25,7 @@ from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.files import atomic_path, expect_output
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import RecordingSettings
+from barsight.report.signing import sign_file
 from barsight.result_folder import read_heights
 
 COLOURS = {Decision.PASSED: "green", Decision.FAILED: "red"}
@@ -60,7 +60,8 @@ def run(arguments: Sequence[str]) -> None:
             yard: The file that barsight calibrate yard wrote.
             rig: A rig file to use instead of the recordings' own calibration.
             preset: As of barsight measure.
-            key: Ed25519 private key (PEM) that signs the certificate.
+            key: Ed25519 private key (PEM) that signs each file of the certificate; the signature lies beside
+                it as NAME.sig.
             signer: Who answers for the certificate.
             keep: A new folder for what was measured of each recording.
         """
@@ -83,10 +84,12 @@ def _accept(
     wanted = read_plan(files[0])
     page = certificate_files(out)[1]
     expect_output(page)
-    if key is not None:
-        sign("", key)  # a wrong key shows before the measuring, not after
     has_pdf = find_spec("reportlab") is not None
     with tempfile.TemporaryDirectory(prefix="barsight.") as scratch:
+        if key is not None:  # a wrong key shows before the measuring, not after
+            probe = Path(scratch) / "probe"
+            probe.touch()
+            sign_file(probe, key)
         work = Path(scratch) if keep is None else keep
         work.mkdir(parents=True, exist_ok=True)
         with stages(console) as advance:
