@@ -366,3 +366,25 @@ def test_a_plan_stands_on_free_floor_only() -> None:
     assert apart.min() > 0.4
     full = dataclasses.replace(stacked, z_m=ones)
     assert isinstance(lay_out(area, "full", full), Failed)
+
+
+def test_a_plan_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "plan.toml").write_text(plan_text(planned()))
+    line = ["simulate", str(tmp_path / "rec"), "--artefacts", str(tmp_path / "plan.toml"), "--length", "4"]
+    small = [
+        "--frames",
+        "2",
+        "--camera.width-px",
+        "64",
+        "--camera.height-px",
+        "64",
+        "--camera.focal-px",
+        "60",
+    ]
+    assert run([*line, *small, "--depth-views", "0", "--camera.above-floor-m", "4.5"]) == 0
+    truth = np.load(tmp_path / "rec" / "truth" / "height.npz")
+    for plate in planned().plate:
+        column, row = np.abs(truth["x"] - plate.x_m).argmin(), np.abs(truth["y"] - plate.y_m).argmin()
+        assert truth["z"][column, row] == pytest.approx(plate.z_m, abs=1e-6)
+    capsys.readouterr()
+    assert run([*line, "--draw", "3"]) == 2 and "takes no drawn world" in capsys.readouterr().err

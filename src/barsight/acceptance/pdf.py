@@ -45,7 +45,7 @@ def write_pdf(content: dict[str, Any], digest: str, signed: bool, target: Path) 
         text(content["rule"]),
         text("Signature", "Heading3"),
         text(f"Digest of the content (SHA-256): {digest}"),
-        text("Signed with Ed25519: the signature lies beside this file as .sig." if signed else "Not signed."),
+        text("Signed with Ed25519: the signature lies beside as .sig." if signed else "Not signed."),
     ]  # fmt: skip
     SimpleDocTemplate(str(target), pagesize=A4, title="Acceptance certificate", invariant=1).build(parts)
 

@@ -286,7 +286,7 @@ def _shade_sphere(primitives: Primitives, look: Shading, p: int, x: float, y: fl
     An end counts as the square of the normal along it. The texture runs around the first axis. tile:
     (TILE, TILE, 4); x, y, z: in `yard`, m.
     """
-    lamps, lightmap, tile = look
+    lamps, lightmap, tile, _ = look
     shape, material = primitives.shape, primitives.material
     radius = shape[p, 12]
     nx, ny, nz = (x - shape[p, 0]) / radius, (y - shape[p, 1]) / radius, (z - shape[p, 2]) / radius

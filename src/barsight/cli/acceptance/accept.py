@@ -83,7 +83,7 @@ def _accept(
     console = SafeConsole(stderr=True)
     wanted = read_plan(files[0])
     page = certificate_files(out)[1]
-    expect_output(page)
+    expect_output(page, ".html")
     has_pdf = find_spec("reportlab") is not None
     with tempfile.TemporaryDirectory(prefix="barsight.") as scratch:
         if key is not None:  # a wrong key shows before the measuring, not after
