@@ -4,3 +4,7 @@
 
 A checkout's tool: it is no part of the installed package.
 """
+
+import os
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when NumPy is loaded: a fork must not lose its threads

@@ -12,8 +12,10 @@ import numpy as np
 
 from barsight.calibration.files.euroc import read_rig
 from barsight.calibration.files.rig_file import write_rig_file
+from barsight.calibration.files.yaml_document import write_document
 from barsight.cli.main import run
 from barsight.core.files import atomic_directory
+from barsight.plant.telegram import IN_MAGIC, VERSION, pack
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import simulate
 from barsight.yard.magnet.description import example_magnet
@@ -78,6 +80,7 @@ def _files(made: Path) -> None:
     for name, to in (("camchain.yaml", "kalibr"), ("opencv.yaml", "opencv"), ("opencv.xml", "opencv")):
         _done(["calibrate", "export", str(made / "rig.yaml"), "-o", str(made / name), "--to", to])
     (made / "magnet.toml").write_text(example_magnet(), encoding="utf-8")
+    _places(made)
     (made / "settings.toml").write_text(
         'preset = "best"\nuse = ["stereo", "crane"]\n[map]\ncell_m = 0.05\n[stereo]\nmethod = "sgbm"\n'
     )
@@ -106,6 +109,30 @@ def _files(made: Path) -> None:
         picture = cv2.imread(str(made / "left.png"), cv2.IMREAD_UNCHANGED)
         assert picture is not None
         cv2.imwrite(str(made / f"left{suffix}"), picture)
+
+
+def _places(made: Path) -> None:
+    """Write what a crane and its plant are described with."""
+    write_document(
+        made / "yard.yaml",
+        {
+            "barsight_yard": 1,
+            "yard_from_encoders": np.eye(4).tolist(),
+            "covariance": (1e-6 * np.eye(6)).tolist(),
+            "R_yard_body": np.diag([1.0, -1.0, -1.0]).tolist(),
+            "calibration_id": "0123456789abcdef",
+            "doubts": ["few points"],
+        },
+    )
+    (made / "crane.toml").write_text(
+        'calibration = "rig.yaml"\n[cameras]\nserials = ["1", "2"]\nrate_hz = 30\n[encoders]\nport = 5602\n'
+        "rate_hz = 20\np_crane_body_m = [0.0, 0.3, -1.2]\nR_yard_body = [1, 0, 0, 0, -1, 0, 0, 0, -1]\n"
+        "position_std_m = 0.002\n"
+    )
+    (made / "plant.toml").write_text(
+        '[store]\nurl = "sqlite:///y.db"\nmagnet_steps_kg = [1000.0, 3000.0]\n[telegram]\nport = 2000\n'
+    )
+    (made / "telegram.bin").write_bytes(pack("in", {"magic": IN_MAGIC, "version": VERSION, "life": 7}))
 
 
 def _corners(folder: Path) -> None:

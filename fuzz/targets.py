@@ -56,6 +56,38 @@ def _magnet(folder: Path) -> int:
     return 0
 
 
+def _yard_frame(folder: Path) -> int:
+    from barsight.registration.yard_file import read_yard_file
+
+    read_yard_file(folder / "yard.yaml")
+    return 0
+
+
+def _crane(folder: Path) -> int:
+    from barsight.live.settings import read_crane
+
+    read_crane(folder / "crane.toml").rig()
+    return 0
+
+
+def _plant(folder: Path) -> int:
+    from barsight.plant.settings import read_plant
+
+    read_plant(folder / "plant.toml")
+    return 0
+
+
+def _telegram(folder: Path) -> int:
+    from barsight.core.errors import Failed, InputError
+    from barsight.plant.telegram import unpack
+
+    path = folder / "telegram.bin"
+    found = unpack("in", path.read_bytes() if path.is_file() else b"")
+    if isinstance(found, Failed):
+        raise InputError(path, found.reason, "send what telegram.toml says")
+    return 0
+
+
 def _stock(name: str) -> Call:
     def call(folder: Path) -> int:
         from barsight.yard.inventory.stock_list import read_stock
@@ -105,6 +137,10 @@ TARGETS = (
     _rig("rig.yaml"), _rig("camchain.yaml"), _rig("opencv.yaml"), _rig("opencv.xml"),
     Target("corners", ("corners", "rig.yaml"), ("corners/*",), _detections, (), 1.5),
     Target("magnet", ("magnet.toml",), ("magnet.toml",), _magnet, (), 2),
+    Target("yard frame", ("yard.yaml",), ("yard.yaml",), _yard_frame, (), 1.5),
+    Target("crane", ("crane.toml", "rig.yaml"), ("crane.toml",), _crane, (), 1.5),
+    Target("plant", ("plant.toml",), ("plant.toml",), _plant),
+    Target("telegram", ("telegram.bin",), ("telegram.bin",), _telegram, (), 0.5),
     Target("stock csv", ("stock.csv",), ("stock.csv",), _stock("stock.csv"), (), 1.5),
     Target("stock json", ("stock.json",), ("stock.json",), _stock("stock.json"), (), 1.5),
     Target(
@@ -145,6 +181,15 @@ TARGETS = (
     Target("compare", ("out", "old"), RESULT, run_words("compare", "FOLDER/out", "FOLDER/old"), (), 1),
     Target(
         "store", ("out",), RESULT, run_words("store", "add", "sqlite:///FOLDER/yard.db", "FOLDER/out"), (), 1
+    ),
+    Target(
+        "labels", ("euroc", "out"), (*RESULT, "euroc/mav0/**/*"),
+        run_words("labels", "FOLDER/euroc", "FOLDER/out"), ("out",), 0.2
+    ),
+    Target(
+        "fleet", ("euroc",), ("euroc/mav0/**/*",),
+        run_words("fleet", "plan", "FOLDER/euroc", "--results", "FOLDER/made", "--store", "sqlite:///FOLDER/yard.db"),
+        (), 0.2, warm=False,
     ),
     Target("export", ("out",), RESULT, run_words("export", "FOLDER/out", "FOLDER/made.las"), ("made.las",)),
     Target("view", ("out",), RESULT, _view, (), 0.6, warm=False),

@@ -54,6 +54,7 @@ A_NUMBER = r"-?\d+\.\d+(e[-+]\d+)?"
 EXPORT = "calibrate export F/rig.xml -o F/made.yaml --to kalibr"
 FOUND: list[tuple[str, Damage, str, str]] = [
     ("mcap/mcap.mcap", link_to_itself, "info F/mcap", "mcap.mcap: can't be read"),
+    ("one.bag", sparse, "info F/one.bag", "is no ROS 1 bag"),
     ("kitti/calib.txt", number("-150", "1e300"), "info F/kitti", "line 2: expected 12 numbers in range"),
     ("kitti/calib.txt", number("312.5", "5e-324"), "info F/kitti", "the focal lengths 5e-324"),
     ("euroc/mav0/imu0/sensor.yaml", number(A_NUMBER, "-1e308"), "info F/euroc", "out of range"),
@@ -91,6 +92,7 @@ def seeds(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run(command) == 0
     rows = [f"T{k},{k}.5,{k * k}.5,1.0,{k}.0,{k * k}.0,0.5" for k in range(4)]
     (folder / "targets.csv").write_text("name,yard_x,yard_y,yard_z,x,y,z\n" + "\n".join(rows) + "\n")
+    (folder / "one.bag").touch()
     write_results(folder / "out", 0.0)
     (folder / "magnet.toml").write_text(example_magnet(), encoding="utf-8")
     return folder

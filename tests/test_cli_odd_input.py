@@ -90,6 +90,16 @@ def test_contours_elsewhere_are_not_held_against_the_laser(recording: Path) -> N
     assert np.isnan(table["z_m"][table["profile"] == 4]).all()
 
 
+def test_a_laser_that_vision_is_too_coarse_for_is_not_fused(recording: Path) -> None:
+    _, compared = measured(recording)
+    out, result = measured(recording, "--overwrite", "--map.laser", "fuse")
+    assert compared["laser"] is None and result["agreement"] == compared["agreement"]
+    assert [(row["profile"], row["fused"]) for row in result["laser"]] == [(0, False), (1, False)]
+    reasons = [w["message"] for w in result["warnings"] if w["code"] == "laser-off"]
+    assert reasons == [f"profile {row['profile']} is not fused: {row['reason']}" for row in result["laser"]]
+    assert 2 not in contour_table(out)["source"] and "laser" not in result["sensors_used"]
+
+
 def test_a_laser_of_one_point(recording: Path) -> None:
     keep_rows(recording, 1, "laser0")
     _, result = measured(recording)

@@ -12,6 +12,7 @@ from barsight.core.arrays import Float32, UInt8
 from barsight.core.notices import Notice
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
 from barsight.mapping.passes.changes import HeightChange
+from barsight.mapping.surface.laser_check import LaserCheck
 from barsight.mapping.surface.surface import Surface
 from barsight.registration.pass_ties import PairTie, PassCorrection
 from barsight.yard.inventory.stock_list import StockMatch
@@ -76,7 +77,8 @@ class Measurement:
 
     seconds: by the clock on the wall; the stages' own seconds overlap. yard_frame_id: digest of how the body
     hangs from the crane; None where the map isn't in the yard's frame. passes: of several recordings; the
-    recording is then the newest.
+    recording is then the newest. agreements: of vision alone. laser_checks: of the laser before it was fused;
+    None where that wasn't asked for.
     """
 
     recording_path: Path
@@ -95,6 +97,7 @@ class Measurement:
     contours: tuple[Contour, ...]
     laser: tuple[LaserProfile, ...]
     agreements: tuple[Agreement, ...]
+    laser_checks: tuple[LaserCheck, ...] | None
     stages: tuple[StageTime, ...]
     warnings: tuple[Notice, ...]
     seconds: float

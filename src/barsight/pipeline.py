@@ -8,20 +8,20 @@ crane or matched features -> trajectory -------------+-> map -> height surface -
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from barsight.core.errors import Failed, InputError, MeasurementError
+from barsight.core.errors import InputError, MeasurementError
 from barsight.core.json_values import json_digest
 from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
-from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
-from barsight.core.types import Agreement, Contour, LaserProfile, Trajectory
+from barsight.core.types import Trajectory
 from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
 from barsight.map_building import (
     BuiltMap,
@@ -32,12 +32,11 @@ from barsight.map_building import (
     estimate_trajectory,
     inspect_recording,
 )
-from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
-from barsight.mapping.surface.contours import cut_contours
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
+from barsight.mapping.surface.laser_profiles import Profiles, cut_profiles
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
@@ -65,16 +64,6 @@ MIN_DOWN_COSINE = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
 MAX_BELOW_FLOOR_RATIO = 0.3
 """Depth under the floor over the working distance, at most; depths of one pair are rough."""
-
-
-@dataclass(frozen=True, eq=False)
-class Profiles:
-    """Contours, the laser's profiles in the map's frame, their agreement or why there is none."""
-
-    contours: tuple[Contour, ...]
-    laser: tuple[LaserProfile, ...]
-    agreed: tuple[Agreement | Failed, ...]
-    left_out: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +141,8 @@ def map_yard(
     free, tops = (joined.free, joined.tops) if joined else (passes[0].built.free, passes[0].built.tops)
     trajectory = _whole([one.way.trajectory for one in done])
     with watch("contours"):
-        profiles = _compare_with_laser(done[-1].probed.source, trajectory, surface, settings)
+        profiles = cut_profiles(done[-1].probed.source, trajectory, surface, settings.map, scratch)
+    surface = profiles.surface
     return MappedYard(
         settings, done, joined, trajectory, surface, free, tops, profiles, stock, watch, began_s
     )
@@ -194,19 +184,15 @@ def find_lifts(
     back. notices: warnings that the caller has.
     """
     settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
-    watch, profiles, surface = mapped.watch, mapped.profiles, mapped.surface
+    watch, profiles = mapped.watch, mapped.profiles
     with watch("bundles"):
-        heights = surface_map(surface, mapped.free, mapped.tops, mapped.history)
+        heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
         bundles = find_bundles(heights, settings.bundles)
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)
         placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
         stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None
-    warnings = [*_warnings(mapped), *notices]
-    if mapped.stock is not None:
-        warnings += [Notice("stock-list", text) for text in stock_warnings(mapped.stock, stock)]
-        contradiction = None if stock is None else list_contradiction(mapped.stock, stock)
-        warnings += [Notice("stock-contradicts", contradiction)] if contradiction else []
+    warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *notices]
     with watch("lifts"):
         travels = [_travel(one.probed, one.way, one.built, settings) for one in mapped.passes]
         travel = travels[0] if len(travels) == 1 else Travel.joined(travels)
@@ -226,11 +212,12 @@ def find_lifts(
         frames_total=sum(_frames_total(one.probed) for one in mapped.passes),
         frames_used=sum(len(one.built.placed) for one in mapped.passes),
         refusals=tuple(refusal for one in mapped.passes for refusal in one.built.refusals),
-        sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors))),
-        surface=surface,
+        sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors, *profiles.sensors))),
+        surface=mapped.surface,
         contours=profiles.contours,
         laser=profiles.laser,
-        agreements=tuple(a for a in profiles.agreed if isinstance(a, Agreement)),
+        agreements=profiles.agreements,
+        laser_checks=profiles.checks,
         stages=_stages(mapped),
         warnings=tuple(warnings),
         seconds=time.perf_counter() - mapped.began_s,
@@ -302,24 +289,6 @@ def _elect(
     return surface
 
 
-def _compare_with_laser(
-    source: Recording, trajectory: Trajectory, surface: Surface, settings: MeasureSettings
-) -> Profiles:
-    """Cut contours and hold them against the laser's profiles.
-
-    Profiles are places in the yard: a map in a frame of its own can't be held against them.
-    """
-    whole = source.laser()
-    laser = whole if trajectory.reference == "yard" else ()
-    contours = cut_contours(surface, laser, settings.map.profile_y_m, settings.map.contours)
-    by_number = {contour.profile: contour for contour in contours}
-    speed_mps = _speed_along_x(trajectory)
-    agreed = tuple(
-        compute_agreement(by_number[p.profile], p, speed_mps) for p in laser if p.profile in by_number
-    )
-    return Profiles(contours, laser, agreed, len(laser) < len(whole))
-
-
 def _warnings(mapped: MappedYard) -> list[Notice]:
     """Gather what every stage of every pass had to assume or leave out."""
     warnings, profiles = list[Notice](), mapped.profiles
@@ -329,10 +298,7 @@ def _warnings(mapped: MappedYard) -> list[Notice]:
             own = [Notice(notice.code, f"pass {number}: {notice.message}") for notice in own]
         warnings += own
     warnings += mapped.joined.notices() if mapped.joined is not None else ()
-    warnings += [Notice(a.code, a.reason) for a in profiles.agreed if isinstance(a, Failed)]
-    if profiles.left_out:
-        reason = "without a crane the map isn't in the laser's yard: no agreement"
-        warnings.append(Notice("laser-frame", reason))
+    warnings += profiles.notices()
     for one in mapped.passes:
         if len(one.built.placed) == 1:
             reason = "one frame made the map: no height is confirmed by another"
@@ -341,6 +307,16 @@ def _warnings(mapped: MappedYard) -> list[Notice]:
             reason = f"{len(one.built.refusals)} of {_frames_total(one.probed)} frames were refused"
             warnings.append(Notice("frames-refused", reason))
     return warnings
+
+
+def _stock_notices(listed: tuple[ListedBundle, ...] | None, stock: StockMatch | None) -> Iterator[Notice]:
+    """Yield what the stock list and the map disagree on; nothing where there is no list."""
+    if listed is None:
+        return
+    yield from (Notice("stock-list", text) for text in stock_warnings(listed, stock))
+    contradiction = None if stock is None else list_contradiction(listed, stock)
+    if contradiction:
+        yield Notice("stock-contradicts", contradiction)
 
 
 def _pass_warnings(probed: ProbedRecording, way: TrackedRecording, built: BuiltMap) -> list[Notice]:
@@ -413,13 +389,3 @@ def _lifts(
         now_ns,
         contradicted=listed,
     )
-
-
-def _speed_along_x(trajectory: Trajectory) -> float:
-    """Estimate the velocity along X while travelling, signed, m/s: the median over the steps
-    between frames.
-    """
-    seconds = np.diff(trajectory.stamp_ns) / NS_PER_S
-    if seconds.size == 0:
-        return float("nan")
-    return float(np.median(np.diff(trajectory.positions_m[:, 0]) / seconds))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -273,12 +274,16 @@ def read_contours(folder: Path) -> tuple[Contour, ...]:
 
 
 def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
-    """Read laser.csv; empty where there is no such file. The files don't carry range_std_m: it is NaN."""
-    table = _read_table(folder / "laser.csv", 4)
-    parts = _by_profile(table)
+    """Read laser.csv; empty where there is no such file. range_std_m is NaN where nobody stated it, as in
+    folders of older versions.
+    """
+    table = _read_table(folder / "laser.csv", 4, 5)
+    stated = table.shape[1] == 5
     return tuple(
-        LaserProfile(number, part[:, 1], part[:, 2], part[:, 3], float("nan"))
-        for number, part in parts.items()
+        LaserProfile(
+            number, part[:, 1], part[:, 2], part[:, 3], float(part[0, 4]) if stated else float("nan")
+        )
+        for number, part in _by_profile(table).items()
     )
 
 
@@ -286,20 +291,20 @@ def _by_profile(table: Float64) -> dict[int, Float64]:
     return {int(number): table[table[:, 0] == number] for number in np.unique(table[:, 0])}
 
 
-def _read_table(path: Path, columns: int) -> Float64:
-    """Read (N, columns) from a CSV with a header; an empty field is NaN."""
+def _read_table(path: Path, *columns: int) -> Float64:
+    """Read (N, one of `columns`) from a CSV with a header; an empty field is NaN."""
     if not path.is_file():
-        return np.empty((0, columns))
+        return np.empty((0, columns[0]))
     lines = read_text(path, remedy=REMEDY).splitlines()[1:]
     if not lines:
-        return np.empty((0, columns))
-    filled = (line.replace(",,", ",nan,").replace(",,", ",nan,") for line in lines)
+        return np.empty((0, columns[0]))
+    filled = (re.sub(",(?=,|$)", ",nan", line) for line in lines)
     try:
         table = np.loadtxt(filled, dtype=np.float64, delimiter=",", ndmin=2)
     except ValueError as error:
         raise InputError(path, f"is torn ({str(error).split(';')[0]})", REMEDY) from error
-    if table.shape[1] != columns:
-        raise InputError(path, f"has {table.shape[1]} columns instead of {columns}", REMEDY)
+    if table.shape[1] not in columns:
+        raise InputError(path, f"has {table.shape[1]} columns instead of {columns[-1]}", REMEDY)
     if (~in_range(table) & ~np.isnan(table)).any() or np.isnan(table[:, 0]).any():
         raise InputError(path, "holds a number out of range", REMEDY)
     return table

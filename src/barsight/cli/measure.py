@@ -96,7 +96,7 @@ def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -
 def _agreement_table(agreements: list[dict[str, Any]]) -> Table:
     heads = {
         "bias": "bias", "median": "median", "smooth_mae": "smooth MAE",
-        "mae": "MAE", "p95": "P95", "max": "max",
+        "mae": "MAE", "p95": "P95", "max": "max", "equivalence": "equal within",
     }  # fmt: skip
     table = Table(title="Vision minus laser, mm", box=SIMPLE_HEAD)
     for head in ("prof.", "y m", "seen %", *heads.values()):

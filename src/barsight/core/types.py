@@ -298,6 +298,12 @@ class HeightSource:
     LASER = 2
     FILLED = 3
 
+    @classmethod
+    def measured(cls, source: UInt8) -> Bool:
+        """Mark the cells (...) that a sensor measured, by their codes (...)."""
+        found: Bool = (source == cls.VISION) | (source == cls.LASER)
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class Contour:
@@ -327,6 +333,12 @@ class Agreement:
     x_shift_mm, z_shift_mm: how far the laser's profile lies along x and above where it fits best (NaN where
     too little is in common); time_shift_s: the delay of its clock that explains x_shift at the travel's
     speed. They are reported only: no other figure is corrected by them.
+    The last ones are of smooth places, with intervals of 95 % that know how neighbours repeat each other:
+    effective_samples, as many as there are independent ones; smooth_bias and its low and high; the limits of
+    agreement there, each known to ± smooth_loa_half; slope, the bias that grows with height, mm per m;
+    equivalence, the least margin for which two one-sided tests of 5 % call both means equivalent; vision_sd,
+    the spread that the laser's own sigma doesn't explain; within_95_pct, the share of differences inside what
+    both sigmas state. NaN under eight samples.
     """
 
     profile: int
@@ -345,3 +357,17 @@ class Agreement:
     x_shift_mm: float
     z_shift_mm: float
     time_shift_s: float
+    smooth_samples: int
+    effective_samples: float
+    smooth_bias_mm: float
+    smooth_bias_low_mm: float
+    smooth_bias_high_mm: float
+    smooth_loa_low_mm: float
+    smooth_loa_high_mm: float
+    smooth_loa_half_mm: float
+    slope_mm_per_m: float
+    slope_low_mm_per_m: float
+    slope_high_mm_per_m: float
+    equivalence_mm: float
+    vision_sd_mm: float
+    within_95_pct: float

@@ -50,7 +50,7 @@ def _score_contours(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
             continue
         measured = heights.setdefault(profile, np.full((2, x_true.size), np.nan))
         k = round((float(row["x_m"]) - x_true[0]) / _SPACING_M)
-        if int(row["source"]) == HeightSource.VISION and 0 <= k < x_true.size:
+        if int(row["source"]) in (HeightSource.VISION, HeightSource.LASER) and 0 <= k < x_true.size:
             measured[:, k] = float(row["z_m"]), float(row["sigma_m"])
     errors, sigmas, smooth, covered = [], [], [], []
     for profile, (z, sigma) in heights.items():
@@ -81,7 +81,7 @@ def _score_height(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
     )
     inside = (column >= 0) & (row >= 0) & (column < z.shape[1]) & (row < z.shape[0])
     column, row = column * inside, row * inside
-    seen = inside & (source[row, column] == HeightSource.VISION)
+    seen = inside & HeightSource.measured(source[row, column])
     error = np.where(seen, z[row, column] - z_true, np.nan)
     spread = np.where(seen, sigma[row, column], np.nan)
     level = smooth_places(z_true) & smooth_places(z_true.T).T

@@ -9,6 +9,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.types import Agreement, Contour, HeightSource, LaserProfile
+from barsight.mapping.agreement_intervals import agreement_intervals
 
 JUMP_M = 0.03
 _FURTHEST_M = 0.06
@@ -19,9 +20,14 @@ def profile_difference(contour: Contour, laser: LaserProfile) -> Float64:
     """Subtract the laser from vision (m) at each laser point (N,), NaN where vision measured
     nothing there.
     """
+    return _at_laser(contour, contour.z_m, laser) - laser.z_m
+
+
+def _at_laser(contour: Contour, values: Float64, laser: LaserProfile) -> Float64:
+    """Interpolate values (M,) of a contour's samples that vision measured to the laser's points (N,)."""
     if contour.x_m.size == 0:
         return np.full(laser.x_m.shape, np.nan)
-    measured = np.where(contour.source == HeightSource.VISION, contour.z_m, np.nan)
+    measured = np.where(contour.source == HeightSource.VISION, values, np.nan)
     spacing = contour.x_m[1] - contour.x_m[0] if contour.x_m.size > 1 else 0.01
     place = (laser.x_m - contour.x_m[0]) / spacing
     before = np.floor(place + 1e-3).astype(np.int64)
@@ -30,8 +36,8 @@ def profile_difference(contour: Contour, laser: LaserProfile) -> Float64:
     k = before.clip(0, measured.size - 1)
     following = np.append(measured[1:], np.nan)
     on_sample = share < 2e-3
-    z = np.where(on_sample, measured[k], measured[k] * (1 - share) + following[k] * share)
-    return np.where(inside, z, np.nan) - laser.z_m
+    value = np.where(on_sample, measured[k], measured[k] * (1 - share) + following[k] * share)
+    return np.where(inside, value, np.nan)
 
 
 def smooth_places(z_m: Float64, reach: int = 2) -> Bool:
@@ -88,7 +94,11 @@ def compute_agreement(
         )
     bias, spread = float(compared.mean()), float(compared.std(ddof=1))
     size = np.abs(compared)
-    smooth = np.abs(error[np.isfinite(error) & smooth_places(laser.z_m)]) * 1e3
+    level = smooth_places(laser.z_m)
+    smooth = np.abs(error[np.isfinite(error) & level]) * 1e3
+    sure = agreement_intervals(
+        error, laser.z_m, _at_laser(contour, contour.sigma_m, laser), laser.range_std_m, level
+    )
     x_shift, z_shift = profile_shift(contour, laser)
     return Agreement(
         profile=laser.profile,
@@ -107,4 +117,18 @@ def compute_agreement(
         x_shift_mm=1e3 * x_shift,
         z_shift_mm=1e3 * z_shift,
         time_shift_s=x_shift / speed_mps if speed_mps else float("nan"),
+        smooth_samples=sure.samples,
+        effective_samples=sure.effective_samples,
+        smooth_bias_mm=sure.bias_mm,
+        smooth_bias_low_mm=sure.bias_low_mm,
+        smooth_bias_high_mm=sure.bias_high_mm,
+        smooth_loa_low_mm=sure.loa_low_mm,
+        smooth_loa_high_mm=sure.loa_high_mm,
+        smooth_loa_half_mm=sure.loa_half_mm,
+        slope_mm_per_m=sure.slope_mm_per_m,
+        slope_low_mm_per_m=sure.slope_low_mm_per_m,
+        slope_high_mm_per_m=sure.slope_high_mm_per_m,
+        equivalence_mm=sure.equivalence_mm,
+        vision_sd_mm=sure.other_sd_mm,
+        within_95_pct=sure.within_95_pct,
     )

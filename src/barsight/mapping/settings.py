@@ -49,6 +49,15 @@ class MapSettings:
     contours: Literal["fused", "paper"] = "fused"
     """fused: the surface as it is, unknown where not seen. paper: its median, cubic interpolation and
     filter; what it fills is flagged."""
+    laser: Literal["compare", "fuse"] = "compare"
+    """compare: the laser's profiles stay out of the map, as its independent reference. fuse: those that agree
+    with vision are fused into it; agreement is then that of vision before. Those that are off are named and
+    left out."""
+    laser_sigma_m: float = 0.002
+    """Sigma of a laser point's height on a cell; that of its `sensor.yaml`, where that is larger."""
+    laser_off_m: float = 0.01
+    """A profile is fused only where vision would show that it is so far off in height, or twice as far along
+    x; coarser maps need more."""
     profile_y_m: tuple[float, ...] = ()
     """Where to cut contours; at the laser's profiles when not given, else in the middle."""
 
@@ -57,5 +66,6 @@ class MapSettings:
             self, "map.", cell_m=(0.001, 10), min_views=(1, inf), resident_tiles=(16, inf),
             min_shift=(0, 0.5), sharpen_px=(0, 5), top_ratio=(OVER_0, 1), own_ratio=(OVER_0, 1),
             along_ratio=(OVER_0, 1), gate_sigma=POSITIVE, max_sigma_m=POSITIVE, min_gate_m=NOT_NEGATIVE,
-            along_m=NOT_NEGATIVE, fill_m=NOT_NEGATIVE,
+            along_m=NOT_NEGATIVE, fill_m=NOT_NEGATIVE, laser_sigma_m=(1e-4, 0.1),
+            laser_off_m=(0.001, 0.1),
         )  # fmt: skip

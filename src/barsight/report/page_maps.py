@@ -133,7 +133,7 @@ def map_figures(raster: Raster, laser: tuple[LaserProfile, ...]) -> tuple[MapFig
         _bar(low * 1e3, high * 1e3, cv2.COLORMAP_VIRIDIS, "mm"),
         (tint, UNKNOWN_KEY),
     )
-    _, worst = robust_range(raster.sigma_m[raster.source == HeightSource.VISION], 1, 95)
+    _, worst = robust_range(raster.sigma_m[HeightSource.measured(raster.source)], 1, 95)
     sigma = MapFigure(
         "sigma",
         "Uncertainty",

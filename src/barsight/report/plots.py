@@ -93,8 +93,9 @@ def contour_plot(compared: ComparedContour) -> Plot:
     kept = keep_extremes(contour.z_m, MAX_POINTS)
     x, z, sigma = contour.x_m[kept], contour.z_m[kept] * 1e3, contour.sigma_m[kept] * 1e3
     source = contour.source[kept]
-    seen = np.where(source == HeightSource.VISION, z, np.nan)
-    traces = [_band(x, seen, BAND_SIGMAS * sigma), _line("vision", x, seen, "--series-0", 1.4)]
+    seen = np.where(HeightSource.measured(source), z, np.nan)
+    name = "vision and laser" if (source == HeightSource.LASER).any() else "vision"
+    traces = [_band(x, seen, BAND_SIGMAS * sigma), _line(name, x, seen, "--series-0", 1.4)]
     filled = source == HeightSource.FILLED
     if filled.any():
         traces.append(_markers("filled", x[filled], z[filled], "--filled", 5))
@@ -102,7 +103,7 @@ def contour_plot(compared: ComparedContour) -> Plot:
         "xaxis": {"title": {"text": "x / m"}},
         "yaxis": {"title": {"text": "height / mm"}},
     }
-    caption = f"Profile {contour.profile}. The band is vision ± {BAND_SIGMAS} sigma; unknown places are gaps."
+    caption = f"Profile {contour.profile}. The band is {name} ± {BAND_SIGMAS} sigma; unknown places are gaps."
     if kept.size < contour.x_m.size:
         caption += f" The plot shows the extremes of {contour.x_m.size} samples; contour.csv has them all."
     if laser is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from barsight.core.stamps import NS_PER_S, format_seconds
 from barsight.core.types import Contour, LaserProfile, Trajectory
 from barsight.mapping.free_space import UNPROVEN, FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
+from barsight.mapping.surface.laser_check import LaserCheck, LaserOffset
 from barsight.mapping.surface.surface import Layers, Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measurement import Measurement, PassRecord, Preview
@@ -217,12 +218,13 @@ def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
 
 
 def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path) -> None:
-    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m`."""
+    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m,sigma_m`."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
-        file.write("profile,x_m,y_m,z_m\n")
+        file.write("profile,x_m,y_m,z_m,sigma_m\n")
         for profile in laser:
+            sigma = f"{profile.range_std_m:.5f}" if np.isfinite(profile.range_std_m) else ""
             for x, y, z in zip(profile.x_m, profile.y_m, profile.z_m, strict=True):
-                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f}\n")
+                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f},{sigma}\n")
 
 
 def write_preview(preview: Preview, target: Path) -> None:
@@ -298,7 +300,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
             "cells_unknown": rows * columns - surface.seen - surface.filled,
             "median_sigma_m": surface.median_sigma_m,
         },
-        "agreement": [asdict(agreement) for agreement in measurement.agreements],
+        **_laser_content(measurement),
         "truth": None,
         "warnings": [asdict(warning) for warning in measurement.warnings],
         "vetoes": [{"code": v.code, "message": v.reason} for v in measurement.lifts.vetoes],
@@ -307,6 +309,26 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         content["passes"] = [_pass_content(number, one) for number, one in enumerate(measurement.passes, 1)]
     rounded: dict[str, Any] = json_value(content, decimals=6)
     return rounded
+
+
+def _laser_content(measurement: Measurement) -> dict[str, Any]:
+    """Describe the laser's agreement, and its profiles' checks where they were to be fused."""
+    checks = measurement.laser_checks
+    return {
+        "agreement": [asdict(agreement) for agreement in measurement.agreements],
+        "laser": None if checks is None else [_check_content(check) for check in checks],
+    }
+
+
+def _check_content(check: LaserCheck) -> dict[str, Any]:
+    """Describe a profile's check; offsets in mm, null where they can't be told."""
+    offset = {field.name: getattr(check.offset, field.name, None) for field in fields(LaserOffset)}
+    ratio = offset.pop("alike_ratio")
+    told = {name.replace("_m", "_mm"): None if m is None else 1e3 * m for name, m in offset.items()}
+    return {
+        "profile": check.profile, "fused": check.is_believed, "samples": check.samples, **told,
+        "alike_ratio": ratio, "reason": check.reason,
+    }  # fmt: skip
 
 
 def _pass_content(number: int, one: PassRecord) -> dict[str, Any]:

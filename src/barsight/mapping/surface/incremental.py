@@ -265,10 +265,9 @@ def gather_surface(folder: Path, cell_m: float, tiles: dict[TileKey, TileFigures
 def tile_figures(key: TileKey, layers: Layers) -> TileFigures:
     """Count what a finished tile knows."""
     there = layers.source != HeightSource.UNKNOWN
-    seen, filled = ((layers.source == code).sum() for code in (HeightSource.VISION, HeightSource.FILLED))
-    sigmas = (
-        layers.sigma_m[layers.source == HeightSource.VISION][::17] if there.any() else np.empty(0, np.float32)
-    )
+    measured = HeightSource.measured(layers.source)
+    seen, filled = measured.sum(), (layers.source == HeightSource.FILLED).sum()
+    sigmas = layers.sigma_m[measured][::17] if there.any() else np.empty(0, np.float32)
     spans = [_span(there.any(axis=axis), key[axis] * TILE_CELLS) for axis in (0, 1)]
     return TileFigures(int(seen), int(filled), sigmas, *spans)
 

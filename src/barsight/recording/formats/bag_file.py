@@ -42,6 +42,9 @@ class Topic:
     count: int
 
 
+_MAGIC = b"#ROSBAG V2.0\n"
+
+
 @dataclass(frozen=True)
 class RawMessage:
     """A message as stored. stamp_ns: its header's stamp."""
@@ -64,6 +67,8 @@ class BagFile:
         self._files = _files(path)
         _expect_own_files(path)
         _expect_whole_database(self._files)
+        if self._is_ros1:
+            self._expect_bag()
         with self._opened() as reader:
             self._typestore = reader.typestore
             counts: dict[tuple[str, str], int] = {}
@@ -72,6 +77,16 @@ class BagFile:
                 counts[key] = counts.get(key, 0) + connection.msgcount
             self.duration_s = reader.duration / NS_PER_S if any(counts.values()) else 0.0
         self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+    def _expect_bag(self) -> None:
+        """Refuse a file that doesn't begin as a bag; rosbags would read its first line, however long."""
+        try:
+            with self.path.open("rb") as file:
+                begin = file.read(len(_MAGIC))
+        except OSError as error:
+            raise self._torn(error) from error
+        if len(begin) == len(_MAGIC) and begin != _MAGIC:
+            raise InputError(self.path, "is no ROS 1 bag (#ROSBAG V2.0 is missing)", "copy it again")
 
     def messages(self, names: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order of their receipt."""

@@ -132,7 +132,7 @@ def is_beam(sheet: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
 
 def _level(height_map: HeightMap) -> UInt8:
     """Mark 1 where measured heights have no step beside them: surfaces that steps bound."""
-    measured = height_map.source == HeightSource.VISION
+    measured = HeightSource.measured(height_map.source)
     z = height_map.z_m
     around = np.ones((3, 3), np.uint8)
     far = np.float32(1e6)

@@ -86,7 +86,7 @@ def _search(
     height_map: HeightMap, floor: float | None, templates: Templates, settings: BundleSettings
 ) -> list[Bundle]:
     """Search a map that is short enough to be held."""
-    if not (height_map.source == HeightSource.VISION).any():
+    if not HeightSource.measured(height_map.source).any():
         return []
     found: list[FittedOutline] = []
     stock_over_m = -np.inf if floor is None else floor + settings.min_rise_m

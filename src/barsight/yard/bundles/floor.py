@@ -33,7 +33,7 @@ def _levels(height_map: HeightMap, block: int) -> Float32:
     """Compute the heights of those blocks that are level."""
     rows, columns = (n // block for n in height_map.shape)
     part = np.s_[: rows * block, : columns * block]
-    z = np.where(height_map.source[part] == HeightSource.VISION, height_map.z_m[part], np.nan)
+    z = np.where(HeightSource.measured(height_map.source[part]), height_map.z_m[part], np.nan)
     cut = z.reshape(rows, block, columns, block)
     blocks = cut.transpose(0, 2, 1, 3).reshape(rows * columns, block * block)
     known = np.isfinite(blocks).sum(axis=1)

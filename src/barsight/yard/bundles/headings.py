@@ -66,7 +66,7 @@ def _slopes(
     squared slopes, twice their product and their sum. By strips: a long yard's slopes are many times its map.
     """
     low, high = max(first * block - 1, 0), min(last * block + 1, height_map.z_m.shape[1])
-    seen = height_map.source[:, low:high] == HeightSource.VISION
+    seen = HeightSource.measured(height_map.source[:, low:high])
     seen &= height_map.z_m[:, low:high] > stock_over_m
     z = np.where(seen, height_map.z_m[:, low:high], np.nan).astype(np.float64)
     gy, gx = np.gradient(z, height_map.cell_m)

@@ -10,7 +10,7 @@ from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.yard.types import HeightMap
 
-_VISION = HeightSource.VISION
+_VISION, _LASER = HeightSource.VISION, HeightSource.LASER
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ def align_map(height_map: HeightMap, heading_rad: float, stock_over_m: float = -
     """
     cell = height_map.cell_m
     if heading_rad == 0.0:
-        measured = height_map.source == HeightSource.VISION
+        measured = HeightSource.measured(height_map.source)
         z = np.where(measured, height_map.z_m, np.float32(np.nan))
         sigma = np.where(measured, height_map.sigma_m, np.float32(np.nan))
         return AlignedMap(0.0, height_map.x0_m, height_map.y0_m, cell, z, sigma, stock_over_m)
@@ -87,5 +87,6 @@ def _turned(
         for j in range(z_turned.shape[1]):
             column = int(np.rint(first[0] + cosine * j - sine * i))
             row = int(np.rint(first[1] + sine * j + cosine * i))
-            if 0 <= row < z.shape[0] and 0 <= column < z.shape[1] and source[row, column] == _VISION:
+            inside = 0 <= row < z.shape[0] and 0 <= column < z.shape[1]
+            if inside and (source[row, column] == _VISION or source[row, column] == _LASER):
                 z_turned[i, j], sigma_turned[i, j] = z[row, column], sigma[row, column]

@@ -114,7 +114,7 @@ def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64
     places = column - low[1], row - low[0]
     gray = cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan)
     z = cv2.remap(
-        np.where(sources == HeightSource.VISION, heights, np.float32(np.nan)),
+        np.where(HeightSource.measured(sources), heights, np.float32(np.nan)),
         *places,
         cv2.INTER_NEAREST,
         borderValue=np.nan,

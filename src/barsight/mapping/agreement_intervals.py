@@ -1,0 +1,116 @@
+"""Estimate how sure an agreement is: neighbours along a profile repeat each other, so fewer samples count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from barsight.core.arrays import Bool, Float64
+
+FEWEST = 8
+"""Samples under which nothing is said of how sure a mean is."""
+Z_95 = 1.959964
+
+
+@dataclass(frozen=True)
+class AgreementIntervals:
+    """Intervals of 95 % of a bias (mm), its limits and its slope over height (mm/m); NaN where too little is
+    known.
+
+    effective_samples: independent samples that know the mean as well [Bayley 1946]. loa_low, loa_high: limits
+    of agreement, each known to ± loa_half [Bland 1999]. equivalence_mm: the least margin for which two
+    one-sided tests of 5 % call the means equivalent [Schuirmann 1987]. other_sd_mm: spread that the
+    reference's own sigma doesn't explain. within_95_pct: share inside the 95 % that both sigmas state.
+    """
+
+    samples: int
+    effective_samples: float
+    bias_mm: float
+    bias_low_mm: float
+    bias_high_mm: float
+    loa_low_mm: float
+    loa_high_mm: float
+    loa_half_mm: float
+    slope_mm_per_m: float
+    slope_low_mm_per_m: float
+    slope_high_mm_per_m: float
+    equivalence_mm: float
+    other_sd_mm: float
+    within_95_pct: float
+
+
+def effective_samples(series: Float64) -> float:
+    """Count the independent samples that know the mean of a series as well; NaN marks gaps in it.
+
+    series: (N,) evenly spaced. The sum of autocorrelations ends where a pair of them falls to nothing, and
+    each pair counts at most as much as the one before it [Geyer 1992].
+    """
+    known = np.isfinite(series)
+    count = int(known.sum())
+    if count < FEWEST:
+        return float(count)
+    centred = np.where(known, series - series[known].mean(), 0.0)
+    if not centred.any():
+        return float(count)
+    size = 1 << int(np.ceil(np.log2(2 * series.size)))
+    products = np.fft.irfft(np.abs(np.fft.rfft(centred, size)) ** 2, size)[: series.size]
+    pairs = np.rint(np.fft.irfft(np.abs(np.fft.rfft(known.astype(float), size)) ** 2, size)[: series.size])
+    lags = np.arange(count // 2)
+    lags = lags[pairs[lags] > 0]
+    rho = products[lags] / pairs[lags] * count / products[0]
+    weight = np.where(lags == 0, 1.0, 2 * pairs[lags] / count)
+    terms = (weight * rho)[: 2 * (lags.size // 2)].reshape(-1, 2).sum(axis=1)
+    ended = np.flatnonzero(terms <= 0)
+    terms = np.minimum.accumulate(terms[: ended[0]] if ended.size else terms)
+    return count / max(float(terms.sum()), 1.0)
+
+
+def agreement_intervals(
+    difference_m: Float64, reference_m: Float64, sigma_m: Float64, reference_sigma_m: float, places: Bool
+) -> AgreementIntervals:
+    """Compute the intervals of differences (N,) evenly spaced along a profile, m, at the marked places.
+
+    difference_m: NaN where there is none. reference_m: (N,) heights. sigma_m: (N,) of what is compared;
+    reference_sigma_m: NaN where nobody states it; it is then taken as nothing. places: (N,) those that count.
+    """
+    used = places & np.isfinite(difference_m)
+    series = np.where(used, 1e3 * difference_m, np.nan)
+    d, count = series[used], int(used.sum())
+    if count < FEWEST:
+        return AgreementIntervals(count, *[float("nan")] * 13)
+    alone = effective_samples(series)
+    bias, spread = float(d.mean()), float(d.std(ddof=1))
+    free = max(alone - 1, 1.0)
+    standard = spread / np.sqrt(alone)
+    half, one_sided = (float(student.ppf(share, free)) * standard for share in (0.975, 0.95))
+    slope, slope_half = _slope(series, reference_m + difference_m / 2, used)
+    laser = 0.0 if np.isnan(reference_sigma_m) else reference_sigma_m
+    stated = 1e3 * np.hypot(sigma_m[used], laser)
+    return AgreementIntervals(
+        count, alone, bias, bias - half, bias + half, bias - Z_95 * spread, bias + Z_95 * spread,
+        float(student.ppf(0.975, free)) * spread * float(np.sqrt(1 / alone + Z_95**2 / (2 * free))),
+        slope, slope - slope_half, slope + slope_half, abs(bias) + one_sided,
+        float(np.sqrt(max(spread**2 - (1e3 * laser) ** 2, 0.0))),
+        100 * float(np.mean(np.abs(d) <= Z_95 * stated)),
+    )  # fmt: skip
+
+
+def _slope(series: Float64, mean_m: Float64, used: Bool) -> tuple[float, float]:
+    """Fit the difference over the mean of both (proportional bias): mm/m and half its 95 % interval.
+
+    Its variance grows as the residuals' neighbours repeat each other. NaN where all heights are alike.
+    """
+    height = mean_m[used] - mean_m[used].mean()
+    square = float(height @ height)
+    if square < 1e-6 * height.size:
+        return float("nan"), float("nan")
+    d = series[used]
+    slope = float(height @ d) / square
+    rest = np.full_like(series, np.nan)
+    rest[used] = d - d.mean() - slope * height
+    alone = effective_samples(rest)
+    free = max(alone - 2, 1.0)
+    variance = float(rest[used] @ rest[used]) / max(d.size - 2, 1) / square * d.size / alone
+    return slope, float(student.ppf(0.975, free)) * float(np.sqrt(variance))
