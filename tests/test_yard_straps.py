@@ -226,9 +226,7 @@ def test_no_drawn_pack_has_a_gully_that_parts_two() -> None:
 
 
 @pytest.mark.parametrize(("rows", "side"), [(OTHER_ROWS, PackSide.SEEN), (ROWS, PackSide.OPEN)])
-def test_straps_of_the_layer_below_end_no_pack(
-    rows: tuple[tuple[float, float], ...], side: PackSide
-) -> None:
+def test_straps_of_the_layer_below_end_no_pack(rows: tuple[tuple[float, float], ...], side: PackSide) -> None:
     """Those that lie in line with its own may hold its own lower bars."""
     below = (0.09, -0.05), (0.11, -0.07), (0.12, -0.23), (0.4, -0.3)
     assert pack_beside(level_of(*LEFT, *below), rows, 0.1).sides == (PackSide.SEEN, side)
