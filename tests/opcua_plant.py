@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.errors import Failed
+from barsight.plant.link_settings import OpcUaSettings
 from barsight.plant.opcua.recipes import Recipes
-from barsight.plant.opcua.security.settings import OpcUaSettings
 from barsight.plant.opcua.server import opcua_server
 from barsight.plant.opcua.surveys import AlarmLine, Survey, Told
 

@@ -19,10 +19,10 @@ FLOORS = {
     "measure_settings": 6,
     "store": 7,
     "pair_chain": 7, "yard_frame": 7,
-    "map_building": 8, "joined_passes": 9,
+    "map_building": 8, "labels": 8, "joined_passes": 9,
     "live_map": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
-    "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11, "labels": 11,
+    "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11,
     "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12,
     "fleet": 13,
     "cli": 14,
@@ -45,7 +45,7 @@ ROOMS = {
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
-    "plant": (".", "opcua.security", "opcua"),
+    "plant": (".", "opcua.security", "opcua", "links"),
     "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""

@@ -1,7 +1,9 @@
 """Labels: codes drawn into pictures are read, placed on the map, attached and held against the stock list."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,11 +13,22 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
 from barsight.core.pose import Pose
 from barsight.labels.attachment import PlacedCode, contradictions, unite
+from barsight.labels.bundle_labels import bundle_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
+from barsight.labels.plates import find_plates
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_heights, read_path
-from barsight.yard.inventory.stock_list import ListedBundle
+from barsight.simulation.lighting import bake, hall_lamps
+from barsight.simulation.render import Shading, render_view
+from barsight.simulation.scene import Primitives, Scene, build_grid
+from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.simulate import simulate
+from barsight.simulation.textures import label_codes, label_text, surface_tile
+from barsight.simulation.truth import label_rows
+from barsight.yard.inventory.stock_list import ListedBundle, contradicted_bundles, match_stock
+from barsight.yard.label_settings import LabelSettings
+from barsight.yard.types import Bundle, BundleLabel, HeightMap
 from cli_runs import FAST
 from lift_yards import laid, record
 
@@ -173,3 +186,135 @@ def test_a_label_lies_on_the_highest_bundle_there_and_the_list_may_contradict() 
     assert contradictions(labels, (low, high), listed) == ()
     (told,) = contradictions(labels, (low, high), (ListedBundle("N7", 3.0, 0.2), listed[1]))
     assert told.startswith("N7 is listed at x 3.00 m")
+
+
+NEAR = SimulationSettings(
+    length_m=1.4,
+    frames=7,
+    seed=41,
+    depth_views=0,
+    camera=CameraSettings(
+        width_px=640, height_px=512, focal_px=1000, above_floor_m=2.2, baseline_m=0.2, trolley_y_m=0.75
+    ),
+    yard=YardSettings(max_layers=1, bar_length_m=3, label_m=(0.16, 0.14)),
+)
+"""Labels of 140 mm squares: 5.6 mm a module, 2.2 mm a pixel."""
+
+
+def measured_bundles(recording: Path, out: Path, *flags: str) -> dict[str, Any]:
+    how = ("--labels.read", "--stereo.method", "sgbm")
+    assert run(["measure", str(recording), "-o", str(out), *how, *flags]) == 0
+    content: dict[str, Any] = json.loads((out / "bundles.json").read_text())
+    return content
+
+
+@pytest.mark.slow
+def test_measure_reads_labels_and_holds_the_stock_list_against_them(tmp_path: Path) -> None:
+    recording = tmp_path / "recording"
+    simulate(recording, NEAR)
+    truth = {
+        one["text"]: one["center"] for one in json.loads((recording / "truth" / "labels.json").read_text())
+    }
+    read = {
+        one["label"]["text"]: one
+        for one in measured_bundles(recording, tmp_path / "out")["bundles"]
+        if one["label"]
+    }
+    assert read and set(read) <= set(truth)
+    for text, one in read.items():
+        assert abs(truth[text][0] - one["axis_centre_m"][0]) < one["width_m"] / 2
+        assert one["label"]["kind"] == "QRCode" and one["label"]["reads"] >= 2
+        assert one["label"]["confidence"] >= 0.75
+    rows = [f"{text},{one['axis_centre_m'][0]},{one['axis_centre_m'][1]}" for text, one in read.items()]
+    stock = tmp_path / "stock.csv"
+    stock.write_text("\n".join(["name,x_m,y_m", *rows]))
+    match = measured_bundles(recording, tmp_path / "right", "--bundles.stock-list", str(stock))["stock"]
+    assert [one["disagrees"] for one in match["matched"]] == [[]] * len(read)
+    stock.write_text("\n".join(["name,x_m,y_m", *rows]).replace(next(iter(read)), "OTHER"))
+    match = measured_bundles(recording, tmp_path / "wrong", "--bundles.stock-list", str(stock))["stock"]
+    told = {one["name"]: one["disagrees"] for one in match["matched"]}
+    assert told["OTHER"] == [f"its label reads {next(iter(read))!r}, which the list lacks"]
+    warned = json.loads((tmp_path / "wrong" / "result.json").read_text())["warnings"]
+    assert any(w["code"].startswith("stock-") and "OTHER" in w["message"] for w in warned)
+
+
+def paper_on(bundle: Bundle, *plates: tuple[float, float, float, float]) -> HeightMap:
+    """A map of 10 mm cells over a bundle along Y at x = 1 m, of gray level 60; plates of 180: middle x and y,
+    sizes along x and y, m."""
+    z = np.full((300, 200), bundle.top_z_m, np.float32)
+    gray = np.full(z.shape, 60, np.uint8)
+    for x, y, wide, high in plates:
+        rows, columns = (
+            slice(round((at - size / 2) / 0.01), round((at + size / 2) / 0.01))
+            for at, size in ((y + 1.5, high), (x, wide))
+        )
+        gray[rows, columns] = 180
+    seen = np.ones(z.shape, np.uint8)
+    return HeightMap(0.0, -1.5, 0.01, z, z * 0 + 0.003, z * 0 + 4, seen, gray)
+
+
+def test_plates_of_a_labels_size_are_found_and_gleams_are_not() -> None:
+    bundle = record(laid(1.0), 0)
+    x, y = bundle.centre_m[:2]
+    (found,) = find_plates(bundle, paper_on(bundle, (x, y + 0.2, 0.1, 0.06)), (0.1, 0.06))
+    np.testing.assert_allclose(found, [x, y + 0.2], atol=0.015)
+    assert find_plates(bundle, paper_on(bundle, (x, y, 0.06, 0.1)), (0.1, 0.06)) != []
+    assert find_plates(bundle, paper_on(bundle, (x, y, 0.02, 1.0)), (0.1, 0.06)) == []
+    assert find_plates(bundle, paper_on(bundle), (0.1, 0.06)) == []
+    assert find_plates(bundle, paper_on(bundle, (x + 0.6, y, 0.1, 0.06)), (0.1, 0.06)) == []
+    assert find_plates(bundle, replace(paper_on(bundle), gray=None), (0.1, 0.06)) == []
+
+
+def test_a_bundle_has_the_text_that_is_sure_or_is_illegible() -> None:
+    bundle = record(laid(1.0), 3)
+    at, blank = bundle.centre_m.copy(), paper_on(bundle)
+    at[2] = bundle.top_z_m
+
+    def of(*readings: tuple[str, int], heights: HeightMap = blank) -> BundleLabel | None:
+        codes = [
+            PlacedCode(text, "QRCode", at, (k, len(text))) for text, count in readings for k in range(count)
+        ]
+        return bundle_label(bundle, unite(codes, (bundle,)), heights, LabelSettings())
+
+    assert of(("N7", 3)) == BundleLabel("N7", "QRCode", 3, 0.8)
+    assert of(("N7", 1)) == of(("N7", 3), ("N99", 1)) == BundleLabel(None, "illegible", 0, 0.0)
+    assert of() is None
+    plate = paper_on(bundle, (at[0], at[1], 0.1, 0.06))
+    assert of(heights=plate) == BundleLabel(None, "illegible", 0, 0.0)
+    assert of(("N7", 2), heights=plate) == BundleLabel("N7", "QRCode", 2, 0.75)
+
+
+def test_a_label_that_reads_another_name_contradicts_the_list() -> None:
+    bundle = replace(record(laid(1.0), 3), label=BundleLabel("N7", "QRCode", 3, 0.8))
+    x, y = bundle.centre_m[:2]
+    other = ListedBundle("N7", x + 5, y)
+    for name, told in (("N7", ()), ("N8", ("its label reads 'N7', another one's of the list",))):
+        listed = (ListedBundle(name, x, y), *((other,) if name == "N8" else ()))
+        match = match_stock(listed, (bundle,))
+        assert match.matched[0].disagrees == told
+        assert bool(contradicted_bundles(match)) == bool(told)
+    unread = replace(bundle, label=BundleLabel(None, "illegible", 0, 0.0))
+    assert match_stock((ListedBundle("N8", x, y),), (unread,)).matched[0].disagrees == ()
+
+
+def test_drawn_codes_are_read_off_the_render() -> None:
+    """A box with a code on its upper face, seen from above by a camera that is turned."""
+    codes = label_codes(12, 3)
+    shape = np.array([[0, 0, 0.5, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0.1, 0.06, 0.01]], dtype=np.float64)
+    material = np.array([[0.75, 0, 0, 0, 0, 1, 0, 0.3, 2, 1]], np.float32)
+    primitives = Primitives(shape, material, 0)
+    scene = Scene(primitives, build_grid(primitives, (0.1, 0.5)))
+    lamps = hall_lamps(8.0)
+    look = Shading(
+        lamps, bake(scene, lamps, np.random.default_rng(0)), surface_tile(np.random.default_rng(1), 0.0064),
+        codes,
+    )  # fmt: skip
+    u, v = np.meshgrid((np.arange(320) - 159.5) / 400, (np.arange(256) - 127.5) / 400)
+    c, s = np.cos(0.4), np.sin(0.4)
+    above = Pose("yard", "cam0", np.array([[c, s, 0], [s, -c, 0], [0, 0, -1]]), np.array([0, 0, 0.8]))
+    rays = np.stack([u, v], axis=-1).astype(np.float32)
+    image = np.clip(300 * render_view(scene, look, rays, 1, above), 0, 255).astype(np.uint8)
+    (found,) = read_codes(image)
+    assert (found.text, found.kind) == (label_text(12, 2), "QRCode") == ("000120002", "QRCode")
+    np.testing.assert_allclose(found.middle_px, [159.5, 127.5], atol=3)
+    assert label_rows(scene, 12) == [{"text": "000120002", "center": [0.0, 0.0, 0.5]}]

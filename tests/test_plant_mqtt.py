@@ -21,7 +21,8 @@ from opcua_servers import free_port
 aiomqtt = pytest.importorskip("aiomqtt")
 
 from barsight.core.errors import ConfigError  # noqa: E402
-from barsight.plant.mqtt import MqttPublisher, MqttSettings  # noqa: E402
+from barsight.plant.link_settings import MqttSettings  # noqa: E402
+from barsight.plant.mqtt import MqttPublisher  # noqa: E402
 
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
 
@@ -106,7 +107,8 @@ def test_the_last_will_tells_a_process_that_died(broker: Broker) -> None:
     """Not taken leave of: os._exit in the middle."""
     program = textwrap.dedent(f"""
         import asyncio, os
-        from barsight.plant.mqtt import MqttPublisher, MqttSettings
+        from barsight.plant.link_settings import MqttSettings
+        from barsight.plant.mqtt import MqttPublisher
         async def main():
             publisher = MqttPublisher(MqttSettings(port={broker.port}))
             running = asyncio.create_task(publisher.run())

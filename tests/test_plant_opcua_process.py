@@ -16,9 +16,9 @@ import pytest
 asyncua = pytest.importorskip("asyncua")
 
 from barsight.core.errors import Failed  # noqa: E402
+from barsight.plant.link_settings import OpcUaSettings  # noqa: E402
 from barsight.plant.opcua.process import OpcUaProcess  # noqa: E402
 from barsight.plant.opcua.recipes import Recipes  # noqa: E402
-from barsight.plant.opcua.security.settings import OpcUaSettings  # noqa: E402
 from barsight.plant.opcua.surveys import Told  # noqa: E402
 from opcua_plant import DrawnState  # noqa: E402
 from opcua_servers import free_port, opcua_plant  # noqa: E402

@@ -15,7 +15,8 @@ from opcua_servers import free_port, node_package, run_node
 snap7 = pytest.importorskip("snap7")
 
 from barsight.core.errors import Failed  # noqa: E402
-from barsight.plant.s7 import S7Exchange, S7Link, S7Settings, run_s7  # noqa: E402
+from barsight.plant.link_settings import S7Settings  # noqa: E402
+from barsight.plant.s7 import S7Exchange, S7Link, run_s7  # noqa: E402
 
 INPUT_BYTES, OUTPUT_BYTES = 32, 400
 

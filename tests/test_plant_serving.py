@@ -10,9 +10,11 @@ import pytest
 
 pytest.importorskip("sqlalchemy")
 
+from barsight.plant.feed import StateFeed
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import PlantSettings, StoreSource, TelegramSettings
 from barsight.plant.state import state_of_store
+from barsight.plant.steps import LiftSteps
 from barsight.store.confirmation import open_lifts
 from barsight.store.opening import Store, open_store
 from page_yards import fill_store
@@ -59,7 +61,8 @@ def serve(store: Store, url: str, talk: Callable[[Plc, Plc], Awaitable[None]]) -
 
     async def both() -> None:
         port = asyncio.get_running_loop().create_future()
-        running = asyncio.create_task(TelegramServer(store, settings).run(port.set_result))
+        server = TelegramServer(feed, LiftSteps(store, settings), telegram)
+        running = asyncio.create_task(server.run(port.set_result))
         streams = [await asyncio.open_connection("127.0.0.1", await port) for _ in range(2)]
         try:
             await talk(*(Plc(*one) for one in streams))
@@ -69,7 +72,8 @@ def serve(store: Store, url: str, talk: Callable[[Plc, Plc], Awaitable[None]]) -
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
 
-    asyncio.run(both())
+    with StateFeed(store, settings) as feed:
+        asyncio.run(both())
 
 
 def test_one_plc_claims_and_executes_and_another_can_not(tmp_path: Path) -> None:

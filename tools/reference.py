@@ -23,7 +23,7 @@ import barsight
 from barsight.cli import main
 from reference_codes import codes_page
 from reference_schemas import schemas_page
-from reference_settings import CRANE, MAGNET, Use, settings_page, shown, type_text, walk
+from reference_settings import CRANE, MAGNET, PLANT, Use, settings_page, shown, type_text, walk
 
 PAGES = Path(__file__).parents[1] / "docs" / "reference"
 PACKAGE = Path(barsight.__file__).parent
@@ -135,7 +135,7 @@ def settings_uses(all_commands: list[Command]) -> dict[type, list[tuple[str, str
             use = Use.of(name, hint)
             for kind, prefix in walk(use.kind, use.prefix):
                 uses.setdefault(kind, []).append((" ".join(command.words), prefix))
-    for name, file in (("Magnet", MAGNET), ("CraneConfig", CRANE)):
+    for name, file in (("Magnet", MAGNET), ("CraneConfig", CRANE), ("PlantSettings", PLANT)):
         for kind, prefix in walk(find(name), ""):
             if not prefix.startswith("measure."):  # as --config has them
                 uses.setdefault(kind, []).append((file, prefix))

@@ -17,8 +17,8 @@ import tyro
 
 _POSITIONAL = cast(Any, tyro.conf.Positional[int]).__metadata__[0]
 _NAMES = {int: "whole number", float: "number", str: "text", bool: "yes or no", Path: "path"}
-MAGNET, CRANE = "a magnet's file", "crane.toml"
-FILES = (MAGNET, CRANE)
+MAGNET, CRANE, PLANT = "a magnet's file", "crane.toml", "plant.toml"
+FILES = (MAGNET, CRANE, PLANT)
 """Files that hold settings, beside flags and the files of `--config`."""
 
 

@@ -13,6 +13,7 @@ from barsight.motion.settings import MotionSettings
 from barsight.recording.base import RecordingSettings
 from barsight.stereo.settings import StereoSettings
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lift_settings import LiftSettings
 
 _FAST_SHIFT = 0.1
@@ -36,6 +37,7 @@ class MeasureSettings:
     motion: MotionSettings = field(default_factory=MotionSettings)
     map: MapSettings = field(default_factory=MapSettings)
     bundles: BundleSettings = field(default_factory=BundleSettings)
+    labels: LabelSettings = field(default_factory=LabelSettings)
     lift: LiftSettings = field(default_factory=LiftSettings)
 
     def __post_init__(self) -> None:

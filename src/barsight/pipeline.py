@@ -23,6 +23,7 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Trajectory
 from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
+from barsight.labels.bundle_labels import label_bundles
 from barsight.map_building import (
     BuiltMap,
     ProbedRecording,
@@ -185,13 +186,10 @@ def find_lifts(
     """
     settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
     watch, profiles = mapped.watch, mapped.profiles
-    with watch("bundles"):
-        heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
-        bundles = find_bundles(heights, settings.bundles)
-        if mapped.joined is not None:
-            bundles = mapped.joined.doubted(bundles)
-        placed_in_yard = mapped.stock is not None and trajectory.reference == "yard"
-        stock = match_stock(mapped.stock, bundles) if placed_in_yard and mapped.stock is not None else None
+    heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
+    bundles = _bundles(mapped, heights)
+    listed = mapped.stock if trajectory.reference == "yard" else None
+    stock = None if listed is None else match_stock(listed, bundles)
     warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *notices]
     with watch("lifts"):
         travels = [_travel(one.probed, one.way, one.built, settings) for one in mapped.passes]
@@ -230,6 +228,22 @@ def find_lifts(
         yard_frame_id=yard_frame_id(source, trajectory),
         passes=_records(mapped, travels),
     )
+
+
+def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
+    """Find the bundles, and read their labels in the newest pass's pictures: what lay there before may be
+    gone.
+    """
+    settings, newest = mapped.settings, mapped.newest
+    with mapped.watch("bundles"):
+        bundles = find_bundles(heights, settings.bundles)
+        if mapped.joined is not None:
+            bundles = mapped.joined.doubted(bundles)
+    if not settings.labels.read:
+        return bundles
+    with mapped.watch("labels"):
+        poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
+        return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
 
 
 def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:

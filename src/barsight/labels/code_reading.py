@@ -46,5 +46,5 @@ def read_codes(image: UInt8) -> tuple[SeenCode, ...]:
             continue
         corners = [[c.x, c.y] for c in (at.top_left, at.top_right, at.bottom_right, at.bottom_left)]
         places = (np.array(corners, dtype=np.float64) + 0.5) / ENLARGED - 0.5
-        found.append(SeenCode(text, str(code.format).rpartition(".")[2], places))
+        found.append(SeenCode(text, code.format.name, places))
     return tuple(found)

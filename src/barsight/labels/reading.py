@@ -12,10 +12,9 @@ import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
-from barsight.core.types import RefusedFrame
 from barsight.labels.attachment import Label, PlacedCode, contradictions, unite
-from barsight.labels.code_reading import read_codes
-from barsight.labels.placing import PlacedCamera, first_surface, pose_at
+from barsight.labels.bundle_labels import placed_codes
+from barsight.labels.placing import pose_at
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.result_folder import open_folder, read_heights, read_path
@@ -52,22 +51,14 @@ def read_labels(
     path = read_path(folder)
     if path is None:
         raise InputError(folder, "has no trajectory.tum", "measure the recording again")
-    bundles, parted = read_bundles(folder / "bundles.json"), read_heights(folder)
-    heights = parted.part(slice(0, parted.shape[0]), slice(0, parted.shape[1]))
-    rectifier = Rectifier(recording.rig)
+    bundles, heights = read_bundles(folder / "bundles.json"), read_heights(folder)
+    pairs = RectifiedPairs(recording, Rectifier(recording.rig))
+    poses = {stamp: pose for stamp in recording.index.stamps_ns if (pose := pose_at(path, stamp)) is not None}
     codes, pictures = list[PlacedCode](), 0
-    for pair in RectifiedPairs(recording, rectifier)():
+    for found in placed_codes(pairs, poses, heights):
         count()
-        body = None if isinstance(pair, RefusedFrame) else pose_at(path, pair.stamp_ns)
-        if isinstance(pair, RefusedFrame) or body is None:
-            continue
-        cameras = PlacedCamera.of_pair(body @ rectifier.body_from_rect0, rectifier.camera)
-        for number, (image, camera) in enumerate(zip((pair.left, pair.right), cameras, strict=True)):
-            pictures += 1
-            for code in read_codes(image):
-                place = first_surface(heights, *camera.sight(code.middle_px))
-                if place is not None:
-                    codes.append(PlacedCode(code.text, code.kind, place, (pair.stamp_ns, number)))
+        codes += found
+        pictures += 2
     labels = unite(codes, bundles)
     return ReadLabels(said["map_id"], pictures, labels, contradictions(labels, bundles, listed))
 

@@ -20,51 +20,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.core.json_values import json_value
 from barsight.core.reading.bounded_reading import read_text
-from barsight.core.settings.values import expect_ranges, expect_values
+from barsight.plant.link_settings import MqttSettings
 
 with extra("mqtt"):
     import aiomqtt
 
-
-@dataclass(frozen=True)
-class MqttSettings:
-    """The MQTT publisher, from the table `[mqtt]` of plant.toml."""
-
-    host: str = "127.0.0.1"
-    """The broker."""
-    port: int = 1883
-    """Its TCP port; 8883 for TLS as a rule."""
-    prefix: str = "barsight/crane"
-    """Topics begin with it."""
-    user: str | None = None
-    """Name at the broker."""
-    password_file: Path | None = None
-    """A file with the password in its first line."""
-    authority: Path | None = None
-    """The broker's certificate authority (PEM); with it the connection is encrypted."""
-    keepalive_s: int = 5
-    """The broker tells the last will after 1.5 times so long without a sign of life."""
-    max_waiting: int = 100
-    """Events kept while the broker is away."""
-    max_retry_s: float = 10.0
-    """Longest wait between attempts to reach the broker; the first is 0.1 s."""
-    state_every_s: float = 0.1
-    """Least interval between states."""
-
-    def __post_init__(self) -> None:
-        expect_values(self, "mqtt.")
-        expect_ranges(
-            self, "mqtt.", port=(1, 65535), keepalive_s=(1, 3600), max_waiting=(1, 100000),
-            max_retry_s=(0.1, 600), state_every_s=(0.01, 60),
-        )  # fmt: skip
-        if not self.prefix or set("#+\0") & set(self.prefix) or self.prefix.startswith("$"):
-            raise ConfigError(
-                f"mqtt.prefix: {self.prefix!r} is no topic; leave out #, + and a $ at the front"
-            )
+MqttError = aiomqtt.MqttError
+"""Raised where the broker can't be reached or refuses."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +87,7 @@ class MqttPublisher:
         while True:
             began = time.monotonic()
             with contextlib.suppress(aiomqtt.MqttError, OSError):
-                async with self._client() as client:
+                async with mqtt_client(self._settings, will=True) as client:
                     self._connections += 1
                     await client.publish(self._topic("online"), "true", qos=1, retain=True)
                     latest = self._state = self._state or latest
@@ -171,15 +136,16 @@ class MqttPublisher:
     def _topic(self, name: str) -> str:
         return f"{self._settings.prefix}/{name}"
 
-    def _client(self) -> aiomqtt.Client:
-        one = self._settings
-        password = read_text(one.password_file).splitlines()[0] if one.password_file is not None else None
-        context = ssl.create_default_context(cafile=one.authority) if one.authority is not None else None
-        return aiomqtt.Client(
-            one.host, one.port, username=one.user, password=password, keepalive=one.keepalive_s,
-            will=aiomqtt.Will(self._topic("online"), "false", qos=1, retain=True), timeout=5,
-            tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,
-        )  # fmt: skip
+
+def mqtt_client(one: MqttSettings, *, will: bool) -> aiomqtt.Client:
+    """Make a client of the broker. will: whether it tells `online` false where it is lost."""
+    password = read_text(one.password_file).splitlines()[0] if one.password_file is not None else None
+    context = ssl.create_default_context(cafile=one.authority) if one.authority is not None else None
+    last = aiomqtt.Will(f"{one.prefix}/online", "false", qos=1, retain=True) if will else None
+    return aiomqtt.Client(
+        one.host, one.port, username=one.user, password=password, keepalive=one.keepalive_s, will=last,
+        timeout=5, tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,
+    )  # fmt: skip
 
 
 def _is_cancelled() -> bool:

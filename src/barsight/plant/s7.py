@@ -15,45 +15,11 @@ from dataclasses import dataclass
 
 from barsight.core.errors import Failed
 from barsight.core.extras import extra
-from barsight.core.settings.values import expect_ranges, expect_values
+from barsight.plant.link_settings import S7Settings
 
 with extra("s7"):
     import snap7
     from snap7.error import S7Error
-
-
-@dataclass(frozen=True)
-class S7Settings:
-    """The S7 client, from the table `[s7]` of plant.toml."""
-
-    host: str = "127.0.0.1"
-    """The PLC."""
-    port: int = 102
-    """Its TCP port."""
-    rack: int = 0
-    """Rack of the CPU."""
-    slot: int = 1
-    """Slot of the CPU: 1 for S7-1200 and S7-1500, 2 for S7-300."""
-    read_db: int = 100
-    """Data block that the PLC writes: encoders, hoist, magnet, clock, life counter."""
-    read_start: int = 0
-    """First byte there."""
-    write_db: int = 101
-    """Data block that Barsight writes."""
-    write_start: int = 0
-    """First byte there."""
-    cycle_s: float = 0.1
-    """Interval between exchanges."""
-    max_retry_s: float = 5.0
-    """Longest wait between attempts to reach the PLC."""
-
-    def __post_init__(self) -> None:
-        expect_values(self, "s7.")
-        expect_ranges(
-            self, "s7.", port=(1, 65535), rack=(0, 7), slot=(0, 31), read_db=(1, 65535),
-            read_start=(0, 65535), write_db=(1, 65535), write_start=(0, 65535), cycle_s=(0.01, 10),
-            max_retry_s=(0.1, 600),
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -73,15 +39,20 @@ class S7Link:
         self._input_bytes = input_bytes
         self._client: snap7.Client | None = None
 
-    def exchange(self, outputs: bytes) -> S7Exchange | Failed:
-        """Read the inputs, then write the outputs; return Failed where the PLC can't be reached."""
+    def read(self) -> S7Exchange | Failed:
+        """Read the inputs; return Failed where the PLC can't be reached."""
+        return self.exchange(None)
+
+    def exchange(self, outputs: bytes | None) -> S7Exchange | Failed:
+        """Read the inputs, then write the outputs, if any; return Failed where the PLC can't be reached."""
         one = self._settings
         try:
             client = self._connected()
             began = time.monotonic()
             inputs = bytes(client.db_read(one.read_db, one.read_start, self._input_bytes))
             read = time.monotonic()
-            client.db_write(one.write_db, one.write_start, bytearray(outputs))
+            if outputs is not None:
+                client.db_write(one.write_db, one.write_start, bytearray(outputs))
             written = time.monotonic()
         except (S7Error, RuntimeError, OSError, ValueError) as error:
             self.close()

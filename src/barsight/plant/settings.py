@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 from barsight.core.errors import ConfigError
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import expect_choice, expect_ranges, expect_values
+from barsight.plant.link_settings import MqttSettings, OpcUaSettings, S7Settings
 
 HELP_AT = "docs/how-to/connect-a-plant.md has an example"
+LINKS = ("telegram", "opcua", "mqtt", "s7")
+Link = TypeVar("Link", OpcUaSettings, MqttSettings)
 
 
 @dataclass(frozen=True)
@@ -53,13 +57,49 @@ class TelegramSettings:
 
 
 @dataclass(frozen=True)
+class LiveSource:
+    """A live run, from the table `[live]`: its mode may forbid lifts, and its pose is passed on."""
+
+    folder: Path
+    """OUT of `barsight live`."""
+
+    def __post_init__(self) -> None:
+        expect_values(self, "live.")
+
+
+@dataclass(frozen=True)
 class PlantSettings:
-    """All of plant.toml that the telegram's process reads."""
+    """All of plant.toml. A link is served where its table is there."""
 
     store: StoreSource = field(default_factory=StoreSource)
-    telegram: TelegramSettings = field(default_factory=TelegramSettings)
+    live: LiveSource | None = None
+    telegram: TelegramSettings | None = None
+    opcua: OpcUaSettings | None = None
+    mqtt: MqttSettings | None = None
+    s7: S7Settings | None = None
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Name the links that are served."""
+        return tuple(name for name in LINKS if getattr(self, name) is not None)
 
 
 def read_plant(path: Path) -> PlantSettings:
-    """Read plant.toml. Raises InputError or ConfigError."""
-    return read_settings(path, PlantSettings, HELP_AT, "config")
+    """Read plant.toml; paths in it are relative to it. Raises InputError or ConfigError."""
+    plant = read_settings(path, PlantSettings, HELP_AT, "config")
+    if not plant.links:
+        tables = ", ".join(f"[{name}]" for name in LINKS)
+        raise ConfigError(f"{path}: names no link to serve; add one of {tables}; {HELP_AT}")
+    at = path.absolute().parent
+    return replace(
+        plant,
+        live=None if plant.live is None else LiveSource(at / plant.live.folder),
+        opcua=None if plant.opcua is None else _beside(at, plant.opcua, "folder", "users", "nodesets"),
+        mqtt=None if plant.mqtt is None else _beside(at, plant.mqtt, "password_file", "authority"),
+    )
+
+
+def _beside(at: Path, settings: Link, *names: str) -> Link:
+    """Resolve paths against the folder of plant.toml."""
+    paths = {name: getattr(settings, name) for name in names}
+    return replace(settings, **{name: at / path for name, path in paths.items() if path is not None})

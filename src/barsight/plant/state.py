@@ -10,7 +10,12 @@ from typing import Any
 from barsight.core.json_values import json_value
 from barsight.store.confirmation import OPEN, OpenLift, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.opening import Store
+from barsight.store.states import standing_alarms
 
+MAX_ALARMS = 20
+"""Newest alarms that are told to the plant."""
+URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
+"""Codes of alarms of priority 1: what the store says of the yard may not be true. All others have 2."""
 YAW_SENSE = "counter-clockwise from +x of the yard frame, seen from above"
 
 
@@ -68,7 +73,7 @@ class OfferedLift:
 
 @dataclass(frozen=True)
 class PlantAlarm:
-    """An alarm. priority: 1 (highest) to 3."""
+    """An alarm that isn't cleared. priority: 1 (highest) or 2. is_active: its cause may still be there."""
 
     code: str
     priority: int
@@ -106,9 +111,10 @@ def state_of_store(
         clock_ns = yard_clock_ns(connection, now_ns)
         survey = newest_survey(connection)
         lifts = open_lifts(connection)
+        alarms = tuple(_alarm(*one) for one in standing_alarms(connection)[:MAX_ALARMS])
     if survey is None:
         empty = ("no-survey: the store holds no survey",)
-        return PlantState("idle", False, empty, life_counter, clock_ns, "none")
+        return PlantState("idle", False, empty, life_counter, clock_ns, "none", alarms=alarms)
     usable = [
         one for one in lifts
         if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns
@@ -118,8 +124,12 @@ def state_of_store(
     reasons = _reasons(lift, survey.is_simulated and not allow_simulated, bool(magnet_steps_kg))
     return PlantState(
         "simulated" if survey.is_simulated else "surveyed", not reasons, reasons, life_counter, clock_ns,
-        "done", None, lift, (), survey.map_id, survey.calibration_id,
+        "done", None, lift, alarms, survey.map_id, survey.calibration_id,
     )  # fmt: skip
+
+
+def _alarm(code: str, reason: str, state: str) -> PlantAlarm:
+    return PlantAlarm(code, 1 if code in URGENT else 2, reason, state != "returned", state == "acknowledged")
 
 
 def _reasons(lift: OfferedLift | None, is_simulated: bool, has_steps: bool) -> tuple[str, ...]:

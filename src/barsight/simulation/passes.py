@@ -54,7 +54,7 @@ def simulate_passes(
             is_last = number == count - 1
             here = yard.after if is_last else yard.before
             if is_last and yard.rows:
-                here = LaidYard(here.scene, {**here.truth, "changes.json": yard.rows})
+                here = replace(here, truth={**here.truth, "changes.json": yard.rows})
 
             def advance(done: int, total: int, first: int = number * settings.frames) -> None:
                 if progress is not None:

@@ -12,7 +12,7 @@ from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.pose import Pose
 from barsight.simulation.lighting import Lamps, Lightmap, lamp_beam, longest_axis, sun_patch
 from barsight.simulation.rays import FAR, trace
-from barsight.simulation.scene import Grid, Primitives, Scene
+from barsight.simulation.scene import CODE, Grid, Primitives, Scene
 from barsight.simulation.textures import ALONG_M, AROUND_M, TILE
 
 FLOOR_ALBEDO = 0.22
@@ -25,12 +25,20 @@ DUST_ALBEDO = 0.6
 MASK = TILE - 1
 
 
+NO_CODES: UInt8 = np.zeros((0, 1, 1), np.uint8)
+INK = 0.12
+"""Albedo of a code's dark modules over paper's."""
+
+
 class Shading(NamedTuple):
-    """Shading inputs besides the geometry. tile: (TILE, TILE, 4), see `surface_tile`."""
+    """Shading inputs besides the geometry. tile: (TILE, TILE, 4), see `surface_tile`. codes: (N, S, S) uint8,
+    one module a cell, 0 dark: what `Primitives.material` numbers from 1.
+    """
 
     lamps: Lamps
     lightmap: Lightmap
     tile: Float32
+    codes: UInt8 = NO_CODES
 
 
 def render_view(scene: Scene, look: Shading, rays: Float32, side: int, yard_from_cam: Pose) -> Float32:
@@ -40,26 +48,25 @@ def render_view(scene: Scene, look: Shading, rays: Float32, side: int, yard_from
     of which a pixel inside one primitive takes the diagonal ones only.
     """
     image = np.empty((rays.shape[0] // side, rays.shape[1] // side), dtype=np.float32)
-    _render(
-        *scene, look.lamps, look.lightmap, look.tile, rays, side, yard_from_cam.rotation.copy(),
-        yard_from_cam.translation.copy(), image,
-    )  # fmt: skip
+    pose = np.column_stack([yard_from_cam.rotation, yard_from_cam.translation])
+    _render(*scene, look.lamps, look.lightmap, look.tile, look.codes, rays, side, pose, image)
     return image
 
 
 @kernel(parallel=True)
 def _render(
-    primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, tile: Float32, rays: Float32,
-    side: int, R: Float64, centre: Float64, image: Float32,
+    primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, tile: Float32, codes: UInt8,
+    rays: Float32, side: int, pose: Float64, image: Float32,
 ) -> None:  # fmt: skip
     """Render the radiance image (H, W) by ray casting, 1 about white paper under the lamps.
 
-    rays: (side H, side W, 2) directions with z = 1. R: (3, 3) and
-    centre: (3,) m, yard_from_cam. Fills image; a ray that hits nothing adds 0.
+    codes: see `Shading`. rays: (side H, side W, 2) directions with z = 1. pose: (3, 4),
+    turn and place (m) of yard_from_cam. Fills image; a ray that hits nothing adds 0.
     """
-    ox, oy, oz = centre[0], centre[1], centre[2]
+    R = pose[:, :3]
+    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     for v in numba.prange(image.shape[0]):
-        scene, look = Scene(primitives, grid), Shading(lamps, lightmap, tile)
+        scene, look = Scene(primitives, grid), Shading(lamps, lightmap, tile, codes)
         for u in range(image.shape[1]):
             total, taken, first, same = 0.0, 0, -2, True
             for n in range(side * side):
@@ -87,7 +94,7 @@ def shade(
     rx: float, ry: float, rz: float,
 ) -> float:  # fmt: skip
     """Shade radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz), m."""
-    lamps, lightmap, tile = look
+    lamps, lightmap, tile, _ = look
     x, y, z = ox + rx, oy + ry, oz + rz
     if p == primitives.shape.shape[0]:
         return _shade_floor(lamps, lightmap, tile, p, x, y)
@@ -235,7 +242,7 @@ def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float
 
     The face is that which the point lies nearest to, by the box's half sizes.
     """
-    lamps, lightmap, tile = look
+    lamps, lightmap, tile, codes = look
     shape, material = primitives.shape, primitives.material
     cx, cy, cz = x - shape[p, 0], y - shape[p, 1], z - shape[p, 2]
     longest = longest_axis(shape, p)
@@ -260,6 +267,13 @@ def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float
         sun = lightmap.sun[t + 6 * i0] * (1 - i + i0) + lightmap.sun[t + 6 * i1] * (i - i0)
         diffuse += sun * sun_patch(lamps.sun, x, y, z)
     radiance: float = material[p, 0] * (1 + material[p, 7] * (pattern - 1)) * diffuse
+    if material[p, CODE] > 0 and face == 2 and sign == 1:
+        half, count = min(shape[p, 12], shape[p, 13]), codes.shape[1]
+        u = (cx * shape[p, 3] + cy * shape[p, 4] + cz * shape[p, 5]) / half
+        v = (cx * shape[p, 6] + cy * shape[p, 7] + cz * shape[p, 8]) / half
+        row, column = math.floor((1 - v) / 2 * count), math.floor((1 + u) / 2 * count)
+        if 0 <= row < count and 0 <= column < count and codes[int(material[p, CODE]) - 1, row, column] == 0:
+            radiance *= INK
     return radiance
 
 

@@ -4,8 +4,8 @@ Primitives 0 .. cylinders-1 are cylinders, the rest boxes. Rows of `shape` (floa
 cylinder: centre 0:3, axis 3:6 (unit), direction of angle 0 6:9, of angle 90 degrees 9:12, radius 12,
 half length 13. Box: centre 0:3, three unit axes 3:12, half sizes 12:15.
 Rows of `material` (float32): base albedo, gloss, texture offsets (m) around and along, twist (m/m), texture
-scale along, rib pitch (m, 0 none), weight of the texture, dust on what faces up (share),
-roughness over the ordinary.
+scale along, rib pitch (m, 0 none), weight of the texture, dust on what faces up (share) or, of a box,
+the number of the code on its third axis' upper face from 1 (0 none), roughness over the ordinary.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, kernel
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings import SimulationSettings, YardSettings
 from barsight.simulation.stock import DunnageBeam, StackedBundle, Stock
 
 STRAP_WIDTH_M = 0.032
 STRAP_THICKNESS_M = 0.0012
 LABEL_HALF_M = (0.032, 0.018, 0.0015)
+CODE = 8
+"""Column of `Primitives.material` that holds a box's code."""
 
 
 class Primitives(NamedTuple):
@@ -58,15 +60,22 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
     cylinder_materials: list[list[float]] = []
     boxes: list[Float64] = []
     box_materials: list[list[float]] = []
-    for bundle in stock.bundles:
+    for number, bundle in enumerate(stock.bundles, start=1):
         shapes, materials = _bars(bundle, settings, rng)
         cylinders += shapes
         cylinder_materials += materials
-        for rounds, facets, label in _straps(bundle, settings.yard.strap_spacing_m, rng):
+        straps = _straps(bundle, settings.yard, rng)
+        for k, (rounds, facets, label) in enumerate(straps):
             cylinders += rounds
             cylinder_materials += [_plain(0.13, 0.5, rng) for _ in rounds]
-            boxes += [*facets, label]
-            box_materials += [_plain(0.13, 0.5, rng) for _ in facets] + [_plain(0.75, 0.0, rng, weight=0.3)]
+            boxes += facets
+            box_materials += [_plain(0.13, 0.5, rng) for _ in facets]
+            paper = _plain(0.75, 0.0, rng, weight=0.3)
+            if max(settings.yard.label_m) > 0:
+                paper[CODE] = number
+            if max(settings.yard.label_m) == 0 or k == len(straps) // 2:
+                boxes.append(label)
+                box_materials.append(paper)
     for beam in stock.beams:
         boxes.append(_beam_shape(beam))
         box_materials.append(_plain(rng.uniform(0.3, 0.42), 0.0, rng))
@@ -212,20 +221,24 @@ def _beam_shape(beam: DunnageBeam) -> Float64:
 
 
 def _straps(
-    bundle: StackedBundle, spacing: float, rng: np.random.Generator
+    bundle: StackedBundle, yard: YardSettings, rng: np.random.Generator
 ) -> list[tuple[list[Float64], list[Float64], Float64]]:
     """Build per strap: arcs on the corner bars (thin cylinders), flat runs between them (boxes),
     one label.
     """
+    spacing = yard.strap_spacing_m
+    half_m = LABEL_HALF_M
+    if max(yard.label_m) > 0:
+        half_m = (yard.label_m[0] / 2, yard.label_m[1] / 2, LABEL_HALF_M[2])
     if spacing == 0 or bundle.kind.rings == 0:
         return []
     count = max(2, round(bundle.length_m / spacing))
     places = (np.arange(count) + 0.5) / count - 0.5
-    return [_strap(bundle, float(s) * bundle.length_m + rng.normal(0, 0.05), rng) for s in places]
+    return [_strap(bundle, float(s) * bundle.length_m + rng.normal(0, 0.05), half_m, rng) for s in places]
 
 
 def _strap(
-    bundle: StackedBundle, place: float, rng: np.random.Generator
+    bundle: StackedBundle, place: float, label_half_m: tuple[float, ...], rng: np.random.Generator
 ) -> tuple[list[Float64], list[Float64], Float64]:
     sideways, along, up = bundle.axes
     radius, half_width, thick = bundle.kind.diameter_m / 2, STRAP_WIDTH_M / 2, STRAP_THICKNESS_M
@@ -251,6 +264,6 @@ def _strap(
         facets.append(np.concatenate([centre, axes, [half_edge, half_width, thick / 2]]))
         if normal[2] > best:
             best = float(normal[2])
-            spot = centre + rng.uniform(-0.5, 0.5) * half_edge * tangent + LABEL_HALF_M[2] * normal
-            label = np.concatenate([spot, axes, LABEL_HALF_M])
+            spot = centre + rng.uniform(-0.5, 0.5) * half_edge * tangent + label_half_m[2] * normal
+            label = np.concatenate([spot, axes, label_half_m])
     return rounds, facets, label

@@ -115,6 +115,9 @@ class YardSettings:
     """Height and width of the wooden beams between the layers."""
     strap_spacing_m: float = 1.7
     """Distance between a bundle's straps; 0 leaves them out."""
+    label_m: tuple[float, float] = (0.0, 0.0)
+    """Length and width of a label with a QR code of its own on each strapped bundle, over the middle strap;
+    0 0 leaves the straps' small plain ones."""
     ribbed_ratio: float = 0.25
     """Share of sections that hold ribbed bars."""
     gloss: float = 1.0
@@ -126,8 +129,9 @@ class YardSettings:
         expect_ranges(
             self, "yard.", max_layers=(1, 5), bar_length_m=(1, 20), skew_deg=(0, 2), missing_ratio=(0, 0.6),
             crossed_ratio=SHARE, dunnage_m=(0.02, 0.3), ribbed_ratio=SHARE, gap_m=(0, 1),
-            uneven_ends_m=(0, 0.5), gloss=NOT_NEGATIVE, texture_ratio=(0, 2),
+            uneven_ends_m=(0, 0.5), label_m=(0, 0.6), gloss=NOT_NEGATIVE, texture_ratio=(0, 2),
         )  # fmt: skip
+        _expect((min(self.label_m) == 0) == (max(self.label_m) == 0), "yard.label_m needs both sizes, or 0 0")
         _expect(
             self.strap_spacing_m == 0 or self.strap_spacing_m >= 0.3,
             "yard.strap_spacing_m must be 0 or at least 0.3",

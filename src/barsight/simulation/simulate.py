@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.camera import Camera
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Float64, Int64, UInt8
 from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
@@ -22,14 +22,14 @@ from barsight.simulation.effects.faults import SpoiledLens, exposure_gain
 from barsight.simulation.hanging_plate import paint_plate, plate_at
 from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
-from barsight.simulation.render import Shading, render_view
+from barsight.simulation.render import NO_CODES, Shading, render_view
 from barsight.simulation.scene import Scene, build_scene, select_primitives
 from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, record_imu, seconds, stamps
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.stock import Stock, stack_yard
-from barsight.simulation.textures import surface_tile
+from barsight.simulation.textures import label_codes, surface_tile
 from barsight.simulation.trajectory import SimulatedTrajectory
-from barsight.simulation.truth import SurfaceTruth, bundle_rows, true_depth, write_rig_truth
+from barsight.simulation.truth import SurfaceTruth, bundle_rows, label_rows, true_depth, write_rig_truth
 
 CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
 GROUND_TRUTH_HZ = 200
@@ -41,10 +41,13 @@ SUNK_M = 5.0
 
 @dataclass(frozen=True, eq=False)
 class LaidYard:
-    """Geometry of all that lies in the yard. truth: JSON values by the names of their files in `truth`."""
+    """Geometry of all that lies in the yard. truth: JSON values by the names of their files in `truth`.
+    codes: see `Shading`.
+    """
 
     scene: Scene
     truth: Mapping[str, Any]
+    codes: UInt8 = field(default_factory=lambda: NO_CODES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +188,7 @@ def _write_pictures(
     lamps = hall_lamps(settings.camera.above_floor_m, settings.light)
     footprint_m = settings.camera.above_floor_m / settings.camera.focal_px
     tile = surface_tile(stream(settings, 7), footprint_m, settings.yard.texture_ratio)
-    look = Shading(lamps, bake(world.scene, lamps, stream(settings, 8)), tile)
+    look = Shading(lamps, bake(world.scene, lamps, stream(settings, 8)), tile, world.laid.codes)
     side = settings.camera.samples_per_side
     cameras = (
         ("cam0", rig.cam0, rig.body_from_cam0, 1.0),
@@ -246,7 +249,11 @@ def lay_stock(stock: Stock, settings: SimulationSettings, gone: Collection[int] 
         kept = scene.primitives.shape[:, 2] > -SUNK_M / 2
         scene = select_primitives(scene, kept)
     there = tuple(b for k, b in enumerate(stock.bundles) if k not in gone)
-    return LaidYard(scene, {"bundles.json": bundle_rows(there)})
+    rows = bundle_rows(there)
+    if max(settings.yard.label_m) == 0:
+        return LaidYard(scene, {"bundles.json": rows})
+    truth = {"bundles.json": rows, "labels.json": label_rows(scene, settings.seed)}
+    return LaidYard(scene, truth, label_codes(settings.seed, len(stock.bundles)))
 
 
 def stream(settings: SimulationSettings, *number: int) -> np.random.Generator:

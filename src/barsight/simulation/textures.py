@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64
+from barsight.core.arrays import Float32, Float64, UInt8
 
 TILE = 1024
 """Texels per side; a power of two, so that an index wraps with a mask."""
@@ -53,3 +54,17 @@ def _noise(rng: np.random.Generator, around_m: float, along_m: float) -> Float64
     noise = np.fft.irfft2(spectrum, s=(TILE, TILE))
     scaled: Float64 = noise / noise.std()
     return scaled
+
+
+def label_text(seed: int, number: int) -> str:
+    """Return the nine digits on the label of bundle `number`, from 1."""
+    return f"{seed % 100000:05d}{number:04d}"
+
+
+def label_codes(seed: int, count: int) -> UInt8:
+    """Encode the texts of bundles 1 to count as QR codes (count, S, S), one module a cell, 0 dark, with a
+    quiet zone of two modules.
+    """
+    encoder = cv2.QRCodeEncoder.create()
+    codes = [encoder.encode(label_text(seed, number)) for number in range(1, count + 1)]
+    return np.stack(codes)

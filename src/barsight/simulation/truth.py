@@ -18,10 +18,11 @@ from barsight.core.pose import Pose
 from barsight.simulation.hanging_plate import MagnetPlate
 from barsight.simulation.optics import sample_rays
 from barsight.simulation.rays import cast_rays
-from barsight.simulation.scene import Scene
+from barsight.simulation.scene import CODE, Scene
 from barsight.simulation.sensors import heights
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.stock import StackedBundle
+from barsight.simulation.textures import label_text
 
 CELL_X_M, CELL_Y_M = 0.01, 0.02
 HALF_WIDTH_M = 3.8
@@ -133,6 +134,16 @@ def bundle_rows(bundles: tuple[StackedBundle, ...]) -> list[dict[str, Any]]:
         }
         for b in bundles
     ]  # fmt: skip
+
+
+def label_rows(scene: Scene, seed: int) -> list[dict[str, Any]]:
+    """Describe the labels as truth: text, and the middle of the paper in the yard, m."""
+    shape, material, cylinders = scene.primitives
+    boxes = np.arange(cylinders, len(shape))
+    return [
+        {"text": label_text(seed, int(material[p, CODE])), "center": shape[p, :3].tolist()}
+        for p in boxes[material[boxes, CODE] > 0]
+    ]
 
 
 def write_rig_truth(

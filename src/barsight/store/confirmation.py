@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,12 @@ def newest_survey(connection: Connection) -> Row[Any] | None:
     """Return the row of the survey with the newest frames, None where there is none."""
     order = (SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
     return connection.execute(select(SURVEYS).where(counts()).order_by(*order).limit(1)).first()
+
+
+def survey_folder(connection: Connection, map_id: str) -> Path:
+    """Find the result folder of a survey by its map."""
+    query = select(SURVEYS.c.folder).where(SURVEYS.c.map_id == map_id)
+    return Path(connection.execute(query).scalar_one())
 
 
 def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:

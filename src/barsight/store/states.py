@@ -8,7 +8,7 @@ from barsight.store.audit import Entry
 from barsight.store.tables import ALARM_STATES, ALARMS, LIFT_STATES
 
 with extra("store"):
-    from sqlalchemy import Connection, Table, select
+    from sqlalchemy import Connection, Table, func, select
 
 LIFT_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("offered",),
@@ -51,6 +51,20 @@ def lift_state(connection: Connection, lift_id: int) -> str | None:
 def alarm_state(connection: Connection, alarm_id: int) -> str | None:
     """Return an alarm's state, None where there is no such alarm."""
     return _last(connection, ALARM_STATES, "alarm", alarm_id)[1]
+
+
+def standing_alarms(connection: Connection) -> list[tuple[str, str, str]]:
+    """List code, reason and state of the alarms that aren't cleared, the newest first."""
+    last = select(ALARM_STATES.c.alarm_id, func.max(ALARM_STATES.c.step).label("step"))
+    newest = last.group_by(ALARM_STATES.c.alarm_id).subquery()
+    rows = connection.execute(
+        select(ALARMS.c.code, ALARMS.c.reason, ALARM_STATES.c.state)
+        .join(ALARM_STATES, ALARM_STATES.c.alarm_id == ALARMS.c.id)
+        .join(newest, (newest.c.alarm_id == ALARMS.c.id) & (newest.c.step == ALARM_STATES.c.step))
+        .where(ALARM_STATES.c.state != "cleared")
+        .order_by(ALARMS.c.id.desc())
+    ).all()
+    return [(row.code, row.reason, row.state) for row in rows]
 
 
 def _last(connection: Connection, table: Table, owner: str, number: int) -> tuple[int, str | None]:

@@ -128,6 +128,19 @@ class Bar:
 
 
 @dataclass(frozen=True)
+class BundleLabel:
+    """The label on a bundle. text: None where one is seen but can't be read for sure. kind: of code, or
+    `illegible`. reads: pictures that read it so. confidence: probability that a further picture reads the
+    same, (reads + 1) / (all readings there + 2); 0 where it is illegible.
+    """
+
+    text: str | None
+    kind: str
+    reads: int
+    confidence: float
+
+
+@dataclass(frozen=True)
 class BundleSigma:
     """One standard deviation of each figure of a bundle; NaN where the figure is unknown."""
 
@@ -155,6 +168,7 @@ class Bundle:
     be seen. cover_doubts: sentences on what may hold it down all the same, as dunnage or a neighbour's flank.
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
     confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
+    label: None where none was seen, or they weren't read.
     """
 
     id: int
@@ -180,6 +194,7 @@ class Bundle:
     ends_sigma_m: tuple[float, float] = (float("nan"), float("nan"))
     section_m2: float = float("nan")
     cover_doubts: tuple[str, ...] = ()
+    label: BundleLabel | None = None
 
     @property
     def is_free(self) -> bool:

@@ -7,29 +7,38 @@ from pathlib import Path
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import Failed, MeasurementError
-from barsight.plant.checking import check_telegram
+from barsight.core.errors import ConfigError, MeasurementError
+from barsight.plant.links.checks import check_links, write_protocol
 from barsight.plant.settings import read_plant
+from barsight.report.signing import sign_file
 
 
 def run(arguments: Sequence[str]) -> None:
     """Parse, check and print."""
 
-    def command(config: Path) -> None:
-        """Connect to the telegram's server as a PLC, show both sides' bytes, and measure the cycle.
+    def command(config: Path, protocol: Path | None = None, key: Path | None = None) -> None:
+        """Check each link that plant.toml names from its other side: what is sent, how often, and whether
+        the life counter moves.
 
-        Nothing is claimed. Ends with exit code 5 where cycle or life counter don't hold.
+        Nothing is claimed. Ends with exit code 5 where a link doesn't hold.
 
         Args:
             config: plant.toml.
+            protocol: A text file to write for the commissioning folder.
+            key: Ed25519 key (PEM) that signs the protocol; the signature lies beside it as NAME.sig.
         """
-        checked = check_telegram(read_plant(config).telegram)
-        if isinstance(checked, Failed):
-            raise MeasurementError(f"{checked}; is barsight plant run running?")
-        console = SafeConsole()
-        for line in checked.lines:
-            console.print(line, highlight=False, markup=False)
-        if not checked.is_good:
-            raise MeasurementError("cycle or life counter don't hold; see above")
+        if key is not None and protocol is None:
+            raise ConfigError("--key signs a protocol: give --protocol too")
+        checks, console = check_links(read_plant(config)), SafeConsole()
+        for one in checks:
+            console.print(f"{one.link}: {'holds' if one.is_good else 'does not hold'}", highlight=False)
+            for line in one.lines:
+                console.print(f"  {line}", highlight=False, markup=False)
+        if protocol is not None:
+            write_protocol(protocol, config, checks)
+        if protocol is not None and key is not None:
+            sign_file(protocol, key)
+        if wrong := [one.link for one in checks if not one.is_good]:
+            raise MeasurementError(f"{', '.join(wrong)}: does not hold; see above")
 
     call(command, "plant check", arguments)

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from barsight.cli.arguments import pass_on
 
 KINDS = {
-    "run": "Serve the cyclic telegram to a PLC by TCP; Ctrl-C ends it",
-    "check": "Connect as a PLC, show the bytes, measure the cycle; exit code 5 where it doesn't hold",
+    "run": "Serve the state by telegram, OPC UA, MQTT and S7; Ctrl-C ends it",
+    "user": "Add a user of the OPC UA server, or change role and password",
+    "check": "Check each link from the other side, and write a protocol; exit code 5 where one does not hold",
 }
 
 

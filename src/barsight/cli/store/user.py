@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import getpass
-import sys
 from collections.abc import Sequence
 
 import tyro
 
 from barsight.cli.arguments import call
-from barsight.core.errors import ConfigError
+from barsight.cli.store.password import ask_password
 from barsight.store.accounts import Role, add_person, withdraw
 from barsight.store.audit import entry, user_name
 from barsight.store.opening import open_store
@@ -32,7 +30,7 @@ def run(arguments: Sequence[str]) -> None:
             role: viewer, operator, engineer or service.
             remove: Withdraw the account.
         """
-        password = "" if remove else _password()
+        password = "" if remove else ask_password()
         with open_store(url) as store, entry(store, user_name(), f"account {name}") as opened:
             if remove:
                 withdraw(opened, name)
@@ -40,12 +38,3 @@ def run(arguments: Sequence[str]) -> None:
                 add_person(opened, name, role, password)
 
     call(command, "store user", arguments)
-
-
-def _password() -> str:
-    if not sys.stdin.isatty():
-        return sys.stdin.readline().rstrip("\n")
-    password = getpass.getpass("password: ")
-    if getpass.getpass("again: ") != password:
-        raise ConfigError("the two passwords differ")
-    return password

@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
+from barsight.plant.link_settings import OpcUaSettings
 from barsight.plant.opcua.alarms import Conditions
 from barsight.plant.opcua.events import Emitter
 from barsight.plant.opcua.jobs import JobMethods
@@ -15,7 +16,6 @@ from barsight.plant.opcua.recipes import RecipeMethods, Recipes
 from barsight.plant.opcua.security.access import BoundedServer, PasswordUsers, PlantRules, read_users
 from barsight.plant.opcua.security.binding import Node, Server, ua
 from barsight.plant.opcua.security.certificates import own_certificate
-from barsight.plant.opcua.security.settings import OpcUaSettings
 from barsight.plant.opcua.surveys import PlantSource, Told
 from barsight.plant.opcua.variables import StateVariables
 from barsight.plant.opcua.vision import ERROR_CONDITION, VisionSystem
@@ -44,7 +44,7 @@ async def opcua_server(
     users = PasswordUsers(read_users(settings.users), settings.allow_anonymous)
     server = Server(BoundedServer(settings, users))
     await server.init()
-    server.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/barsight")
+    server.set_endpoint(settings.url)
     server.set_server_name("Barsight")
     await server.set_application_uri(URI)
     server.set_security_policy(

@@ -14,7 +14,7 @@ from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.stock_list import MatchedEntry, StockMatch
-from barsight.yard.types import Bar, Bundle, BundleSigma
+from barsight.yard.types import Bar, Bundle, BundleLabel, BundleSigma
 from barsight.yard.weight import bundle_mass, bundle_section
 
 SCHEMA_VERSION = 2
@@ -107,6 +107,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "known_share": bundle.known_share,
         "confidence": bundle.confidence,
         "reasons": list(bundle.reasons),
+        "label": None if bundle.label is None else asdict(bundle.label),
         "bar_axes": [
             {
                 "centre_m": bar.centre_m,
@@ -153,6 +154,7 @@ def bundle_of(record: dict[str, Any]) -> Bundle:
         confidence=record["confidence"],
         reasons=tuple(record["reasons"]),
         section_m2=figure(record.get("section_m2")),
+        label=BundleLabel(**record["label"]) if record.get("label") else None,
         ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
         bar_axes=tuple(
             Bar(

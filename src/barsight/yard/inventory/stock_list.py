@@ -138,11 +138,11 @@ def match_stock(listed: tuple[ListedBundle, ...], bundles: tuple[Bundle, ...]) -
     pairs = zip(*linear_sum_assignment(np.minimum(cost, 2 * _REACH_M)), strict=True)
     partner = {int(i): int(k) for i, k in pairs if cost[i, k] <= _REACH_M}
     matched, moved = [], []
+    names = {one.name for one in listed}
     for i, k in partner.items():
         shift = _shift(listed[i], bundles[k])
-        matched.append(
-            MatchedEntry(listed[i].name, bundles[k].id, shift, _disagreements(listed[i], bundles[k]))
-        )
+        differs = (*_disagreements(listed[i], bundles[k]), *_other_label(listed[i], bundles[k], names))
+        matched.append(MatchedEntry(listed[i].name, bundles[k].id, shift, differs))
         if _has_moved(shift, bundles[k]):
             moved.append(listed[i].name)
     absent = [one for i, one in enumerate(listed) if i not in partner]
@@ -243,6 +243,14 @@ def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
     if one.bars is not None and bundle.bars not in (None, one.bars):
         out.append(f"{bundle.bars} bars instead of {one.bars}")
     return tuple(out)
+
+
+def _other_label(one: ListedBundle, bundle: Bundle, names: set[str]) -> tuple[str, ...]:
+    """Say so where a bundle's label reads another name than the list's; nothing where it wasn't read."""
+    if bundle.label is None or bundle.label.text in (None, one.name):
+        return ()
+    known = "another one's of the list" if bundle.label.text in names else "which the list lacks"
+    return (f"its label reads {bundle.label.text!r}, {known}",)
 
 
 def _is_covered(one: ListedBundle, bundles: tuple[Bundle, ...]) -> bool:

@@ -17,6 +17,7 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
 from barsight.core.reading.bounded_reading import read_text
+from barsight.plant.link_settings import OPCUA_ROLES, OpcUaSettings
 from barsight.plant.opcua.security.binding import (
     InternalServer,
     InternalSession,
@@ -27,7 +28,6 @@ from barsight.plant.opcua.security.binding import (
     ua,
 )
 from barsight.plant.opcua.security.certificates import judge_certificate
-from barsight.plant.opcua.security.settings import OPCUA_ROLES, OpcUaSettings
 
 with extra("opcua"):
     from cryptography import x509

@@ -46,12 +46,13 @@ def check_telegram(one: TelegramSettings) -> TelegramCheck | Failed:
     counts = [(later - before) & 0xFFFF for before, later in itertools.pairwise(lives)]
     is_alive = all(0 < each < 1000 for each in counts)
     cycle = f"cycle {min(gaps_s) * 1e3:.1f}...{max(gaps_s) * 1e3:.1f} ms, set {one.cycle_s * 1e3:g} ms"
-    lines = [*_told("in", sent, one.byte_order), *_told("out", content, one.byte_order), cycle]
+    lines = [*told_fields("in", sent, one.byte_order), *told_fields("out", content, one.byte_order), cycle]
     lines.append("life counter: " + ("goes up in each telegram" if is_alive else "stands still"))
     return TelegramCheck(tuple(lines), is_alive and max(gaps_s) < one.silent_s)
 
 
-def _told(side: str, content: bytes, byte_order: str) -> list[str]:
+def told_fields(side: str, content: bytes, byte_order: str) -> list[str]:
+    """List the fields of a telegram with offset, bytes, value and meaning; of another its length alone."""
     found = unpack(side, content, byte_order)
     at, lines = 0, [f"{side}: {len(content)} bytes"]
     for name, kind, meaning in table_of(side) if not isinstance(found, Failed) else ():

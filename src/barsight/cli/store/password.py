@@ -1,0 +1,18 @@
+"""Ask for a password at the terminal."""
+
+from __future__ import annotations
+
+import getpass
+import sys
+
+from barsight.core.errors import ConfigError
+
+
+def ask_password() -> str:
+    """Ask twice; where the input is no terminal its first line is the password. Raises ConfigError."""
+    if not sys.stdin.isatty():
+        return sys.stdin.readline().rstrip("\n")
+    password = getpass.getpass("password: ")
+    if getpass.getpass("again: ") != password:
+        raise ConfigError("the two passwords differ")
+    return password

@@ -1,0 +1,86 @@
+"""Read the labels of a yard while it is measured, and put on each bundle what its label says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.parallel import ordered_map
+from barsight.core.pose import Pose
+from barsight.core.types import RectifiedPair, RefusedFrame
+from barsight.labels.attachment import Label, PlacedCode, unite
+from barsight.labels.code_reading import SeenCode, read_codes
+from barsight.labels.placing import PlacedCamera, first_surface
+from barsight.labels.plates import find_plates
+from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.label_settings import LabelSettings
+from barsight.yard.sections import part_about
+from barsight.yard.types import Bundle, BundleLabel, YardMap
+
+ILLEGIBLE = BundleLabel(None, "illegible", 0, 0.0)
+_BELOW_M = 1.0
+"""A line of sight is followed so far below the floor."""
+
+
+def label_bundles(
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...],
+    settings: LabelSettings,
+) -> tuple[Bundle, ...]:  # fmt: skip
+    """Read the codes in the pairs that have a pose, and give each bundle its label.
+
+    poses: reference_from_body by stamp. A bundle has a label where one text is sure on it and no other is;
+    where codes are read but aren't sure, or only a bright plate of a label's size is seen, it is illegible.
+    Raises ConfigError without the extra `labels`.
+    """
+    found = [code for codes in placed_codes(pairs, poses, heights) for code in codes]
+    labels = unite(found, bundles)
+    return tuple(replace(bundle, label=bundle_label(bundle, labels, heights, settings)) for bundle in bundles)
+
+
+def placed_codes(
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap
+) -> Iterator[list[PlacedCode]]:
+    """Read the pairs that have a pose, and yield the codes of each at their places on the map; a frame that
+    can't be decoded yields none.
+
+    poses: reference_from_body by stamp.
+    """
+    rectifier = pairs.rectifier
+
+    def read(pair: RectifiedPair | RefusedFrame) -> tuple[int, list[tuple[SeenCode, ...]]]:
+        pictures = () if isinstance(pair, RefusedFrame) else (pair.left, pair.right)
+        return pair.stamp_ns, [read_codes(image) for image in pictures]
+
+    for stamp_ns, seen in ordered_map(read, pairs(poses)):
+        cameras = PlacedCamera.of_pair(poses[stamp_ns] @ rectifier.body_from_rect0, rectifier.camera)
+        yield [
+            PlacedCode(code.text, code.kind, place, (stamp_ns, number))
+            for number, (codes, camera) in enumerate(zip(seen, cameras, strict=False)) for code in codes
+            if (place := _on_the_map(heights, *camera.sight(code.middle_px))) is not None
+        ]  # fmt: skip
+
+
+def _on_the_map(heights: YardMap, origin: Float64, direction: Float64) -> Float64 | None:
+    """Intersect a line of sight with the part of the map that it crosses."""
+    if direction[2] >= 0:
+        return None
+    ends = np.array([origin, origin - (origin[2] + _BELOW_M) / direction[2] * direction])
+    return first_surface(part_about(heights, ends[:, 0], ends[:, 1]), origin, direction)
+
+
+def bundle_label(
+    bundle: Bundle, labels: Iterable[Label], heights: YardMap, settings: LabelSettings
+) -> BundleLabel | None:
+    """Choose what a bundle's label says from all that were read; see `label_bundles`."""
+    here = [label for label in labels if label.bundle == bundle.id]
+    sure = {label.text for label in here if label.is_sure}
+    if len(sure) == 1 and all(label.text in sure for label in here):
+        best = max(here, key=lambda label: label.pictures)
+        read = round(best.pictures / best.agreement_ratio)
+        return BundleLabel(best.text, best.kind, best.pictures, (best.pictures + 1) / (read + 2))
+    if here or find_plates(bundle, heights, settings.size_m):
+        return ILLEGIBLE
+    return None

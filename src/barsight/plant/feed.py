@@ -1,0 +1,71 @@
+"""Read the plant's state from the store again and again, for all links together."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from types import TracebackType
+
+from barsight.core.errors import BarsightError
+from barsight.plant.live_folder import with_live_run
+from barsight.plant.settings import PlantSettings
+from barsight.plant.state import PlantState, state_of_store
+from barsight.store.opening import Store
+
+MAX_AGE_S = 0.3
+"""A state that was read longer ago is not valid."""
+READ_EVERY_S = 0.1
+
+
+class StateFeed:
+    """Hold the newest state; a thread reads it while the block runs, so that no link waits for the store."""
+
+    def __init__(self, store: Store, settings: PlantSettings) -> None:
+        self._store, self._settings = store, settings
+        self._read_s = time.monotonic()
+        self._state = read_state(store, settings)
+        self._stop, self._turn = threading.Event(), threading.Lock()
+        self._thread = threading.Thread(target=self._follow, name="plant state", daemon=True)
+
+    def __enter__(self) -> StateFeed:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join(5)
+
+    def newest(self, life_counter: int) -> PlantState:
+        """Return the newest state with the link's own life counter; not valid where it is old."""
+        state, age_s = self._state, time.monotonic() - self._read_s
+        if age_s > MAX_AGE_S:
+            reason = f"state-too-old: the store was read {age_s:.1f} s ago"
+            state = replace(state, is_valid=False, reasons=(*state.reasons, reason))
+        return replace(state, life_counter=life_counter)
+
+    def refresh(self) -> None:
+        """Read the state now, as after a step of the handshake."""
+        with self._turn:
+            began = time.monotonic()
+            self._state = read_state(self._store, self._settings)
+            self._read_s = began
+
+    def _follow(self) -> None:
+        while not self._stop.wait(READ_EVERY_S):
+            self.refresh()
+
+
+def read_state(store: Store, settings: PlantSettings) -> PlantState:
+    """Read the state; one that isn't valid where the store or the live run can't be read."""
+    source = settings.store
+    try:
+        state = state_of_store(
+            store, 0, approach_height_m=source.approach_height_m, magnet_steps_kg=source.magnet_steps_kg,
+            allow_simulated=source.allow_simulated,
+        )  # fmt: skip
+    except BarsightError as error:
+        state = PlantState("idle", False, (f"store: {error}",), 0, time.time_ns(), "none")
+    return state if settings.live is None else with_live_run(state, settings.live.folder)

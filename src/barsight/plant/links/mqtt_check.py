@@ -1,0 +1,53 @@
+"""Check the MQTT publisher as a reader of its broker."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import time
+
+from barsight.core.errors import Failed
+from barsight.plant.link_settings import MqttSettings
+from barsight.plant.mqtt import MqttError, mqtt_client
+
+STATES = 20
+WAIT_S = 5.0
+
+
+def check_mqtt(settings: MqttSettings) -> tuple[tuple[str, ...], bool] | Failed:
+    """Read the retained topics and some states: lines for people, and whether the link holds."""
+    try:
+        return asyncio.run(_read(settings))
+    except TimeoutError:
+        return Failed("mqtt-silent", f"{settings.host}:{settings.port}: no state came within {WAIT_S:g} s")
+    except (MqttError, OSError) as error:
+        return Failed("mqtt-link", f"{settings.host}:{settings.port}: {error}")
+
+
+async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
+    online, stamps, lives, last, retained = "", list[float](), list[int](), "", False
+    async with asyncio.timeout(WAIT_S), mqtt_client(settings, will=False) as client:
+        await client.subscribe(f"{settings.prefix}/#", qos=1)
+        async for message in client.messages:
+            text = bytes(message.payload).decode() if isinstance(message.payload, bytes | bytearray) else ""
+            topic = str(message.topic).removeprefix(f"{settings.prefix}/")
+            if topic == "online":
+                online = text
+            elif topic == "state":
+                retained = retained or bool(message.retain)
+                stamps.append(time.monotonic())
+                lives.append(int(json.loads(text)["life_counter"]))
+                last = text
+            if len(lives) >= STATES:
+                break
+    gaps_s = [later - before for before, later in itertools.pairwise(stamps[1:])]
+    is_alive = all(later > before for before, later in itertools.pairwise(lives))
+    lines = (
+        f"{settings.prefix}/online: {online or 'nothing'} (retained; the last will sets it to false)",
+        f"{settings.prefix}/state: {'' if retained else 'NOT '}retained, {len(last)} characters",
+        last[:300],
+        f"interval {min(gaps_s):.3f}...{max(gaps_s):.3f} s, at least {settings.state_every_s:g} s",
+        "life counter: " + ("goes up in each state" if is_alive else "stands still"),
+    )
+    return lines, online == "true" and retained and is_alive

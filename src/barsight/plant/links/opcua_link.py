@@ -1,0 +1,63 @@
+"""Show the state to the OPC UA server's process, and take the handshakes that it passes on."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import itertools
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from barsight.core.errors import Failed, OutputError
+from barsight.measure_settings import MeasureSettings
+from barsight.plant.feed import READ_EVERY_S, StateFeed
+from barsight.plant.link_settings import OpcUaSettings
+from barsight.plant.state import PlantState
+from barsight.plant.steps import LiftSteps, take_named_step
+from barsight.store.confirmation import survey_folder
+from barsight.store.opening import Store
+
+
+async def serve_opcua(
+    store: Store, settings: OpcUaSettings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
+) -> None:
+    """Serve until cancelled. Raises OutputError where the server's process ends."""
+    from barsight.plant.opcua.process import OpcUaProcess  # an extra that other links don't need
+    from barsight.plant.opcua.recipes import Recipes
+    from barsight.plant.opcua.surveys import AlarmLine, Survey, Told
+
+    def handshake(step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed:
+        taken = take_named_step(steps, step, f"{who} by OPC UA", arguments)
+        feed.refresh()
+        return taken
+
+    folders: dict[str, Path] = {}
+
+    def told(state: PlantState) -> Told:
+        alarms = tuple(
+            AlarmLine(alarm.code, alarm.text, "error" if alarm.priority == 1 else "warning")
+            for alarm in state.alarms if alarm.is_active
+        )  # fmt: skip
+        if state.map_id is not None and state.map_id not in folders:
+            folders.clear()
+            with store.reading() as connection:
+                folders[state.map_id] = survey_folder(connection, state.map_id)
+        survey = None if state.map_id is None else Survey(state.map_id, folders[state.map_id])
+        return Told(state, alarms, survey)
+
+    presets = typing.get_args(typing.get_type_hints(MeasureSettings)["preset"])
+    state = feed.newest(0)
+    captured = datetime.datetime.fromtimestamp(state.stamp_ns / 1e9, datetime.UTC)
+    recipes = Recipes(presets, state.calibration_id or "", captured)
+    process = await asyncio.to_thread(OpcUaProcess, settings, PlantState, recipes, handshake)
+    say(f"OPC UA at {settings.url}")
+    try:
+        for counter in itertools.count(1):
+            if not process.is_alive:
+                raise OutputError("OPC UA: its process ended; its own lines above say why")
+            process.show(told(feed.newest(counter)))
+            await asyncio.sleep(READ_EVERY_S)
+    finally:
+        await asyncio.to_thread(process.stop)

@@ -1,0 +1,86 @@
+"""Serve telegram, OPC UA, MQTT and S7 from one state, until stopped or one of them ends."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Awaitable, Callable
+
+from barsight.core.errors import OutputError
+from barsight.plant.feed import READ_EVERY_S, StateFeed
+from barsight.plant.links.changes import changes_between
+from barsight.plant.links.opcua_link import serve_opcua
+from barsight.plant.links.s7_link import serve_s7
+from barsight.plant.serving import TelegramServer
+from barsight.plant.settings import PlantSettings
+from barsight.plant.state import PlantState
+from barsight.plant.steps import LiftSteps
+from barsight.store.opening import Store
+
+Say = Callable[[str], None]
+
+
+async def serve_plant(store: Store, settings: PlantSettings, say: Say) -> None:
+    """Serve all links until cancelled. say: told where each is served, and what is wrong with one.
+
+    Raises OutputError where a link can't be served.
+    """
+    with StateFeed(store, settings) as feed:
+        links = _links(store, settings, feed, say)
+        tasks = [asyncio.create_task(_named(name, link), name=name) for name, link in links.items()]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> dict[str, Awaitable[None]]:
+    steps = LiftSteps(store, settings)
+    links: dict[str, Awaitable[None]] = {}
+    if (one := settings.telegram) is not None:
+        host = one.host
+        links[f"telegram at {host}:{one.port}"] = TelegramServer(feed, steps, one).run(
+            lambda port: say(f"telegram at {host}:{port}")
+        )
+    if settings.opcua is not None:
+        links[f"OPC UA at {settings.opcua.url}"] = serve_opcua(store, settings.opcua, feed, steps, say)
+    if settings.mqtt is not None:
+        links[f"MQTT at {settings.mqtt.host}:{settings.mqtt.port}"] = _serve_mqtt(settings, feed, say)
+    if settings.s7 is not None:
+        links[f"S7 at {settings.s7.host}:{settings.s7.port}"] = serve_s7(settings.s7, feed, steps, say)
+    return links
+
+
+async def _named(name: str, link: Awaitable[None]) -> None:
+    try:
+        await link
+    except OSError as error:
+        raise OutputError(f"{name}: {error}; choose another address") from error
+
+
+async def _serve_mqtt(settings: PlantSettings, feed: StateFeed, say: Say) -> None:
+    from barsight.plant.mqtt import MqttPublisher  # an extra that other links don't need
+
+    one = settings.mqtt
+    assert one is not None
+    publisher = MqttPublisher(one)
+    running = asyncio.create_task(publisher.run())
+    say(f"MQTT to {one.host}:{one.port}, topics {one.prefix}/...")
+    last: PlantState | None = None
+    try:
+        for counter in itertools.count(1):
+            state = feed.newest(counter)
+            publisher.show(state)
+            for change in changes_between(last, state):
+                publisher.tell(change)
+            last = state
+            await asyncio.wait({running}, timeout=READ_EVERY_S)
+            if running.done():
+                running.result()
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)

@@ -1,0 +1,50 @@
+"""Exchange telegrams with a PLC's data blocks by S7 PUT and GET, in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+
+from barsight.core.errors import Failed
+from barsight.plant.feed import StateFeed
+from barsight.plant.link_settings import S7Settings
+from barsight.plant.partner import PlcPartner
+from barsight.plant.steps import LiftSteps
+from barsight.plant.telegram import layout, out_values, pack, unpack
+
+
+async def serve_s7(
+    settings: S7Settings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
+) -> None:
+    """Exchange until cancelled. say: told once when the PLC can't be reached or gives no telegram, and once
+    when it does again.
+    """
+    from barsight.plant.s7 import S7Exchange, run_s7  # an extra that other links don't need
+
+    at = f"{settings.host}:{settings.port}"
+    partner = PlcPartner(f"plc {at} by S7", steps, settings.silent_s)
+    counter, wrong, stop = 0, "not reached yet", threading.Event()
+
+    def outputs() -> bytes:
+        nonlocal counter
+        counter += 1
+        return pack("out", out_values(partner.seen(feed.newest(counter)), partner.answer))
+
+    def take(exchanged: S7Exchange | Failed) -> None:
+        nonlocal wrong
+        found = exchanged if isinstance(exchanged, Failed) else unpack("in", exchanged.inputs)
+        now = found.reason if isinstance(found, Failed) else ""
+        if bool(now) != bool(wrong):
+            say(f"S7 with {at}: {now or 'exchanging'}")
+        wrong = now
+        if not isinstance(found, Failed) and partner.hears(found):
+            partner.obey(found)
+            feed.refresh()
+
+    thread = asyncio.create_task(asyncio.to_thread(run_s7, settings, layout("in").size, outputs, take, stop))
+    try:
+        await asyncio.shield(thread)
+    finally:
+        stop.set()
+        await asyncio.gather(thread, return_exceptions=True)

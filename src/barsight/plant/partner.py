@@ -1,0 +1,68 @@
+"""Follow a PLC at the other end of telegrams: its life counter, its commands and the answers to them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+from barsight.core.errors import BarsightError, Failed
+from barsight.plant.state import PlantState
+from barsight.plant.steps import LiftReport, LiftSteps
+
+DONE, REFUSED, CONTRADICTED = 1, 2, 3
+NOTHING, CLAIM, EXECUTING, EXECUTED = 0, 1, 2, 3
+_WEIGHED, _SLACK, _REACHED = 2, 4, 8
+
+
+class PlcPartner:
+    """A PLC that exchanges telegrams. answer: fields that go out with the next one."""
+
+    def __init__(self, name: str, steps: LiftSteps, silent_s: float) -> None:
+        self.name, self._steps, self._silent_s = name, steps, silent_s
+        self.answer: dict[str, int] = {}
+        self._life: int | None = None
+        self._alive_s = 0.0
+        self._number: int | None = None
+
+    def hears(self, found: dict[str, int]) -> bool:
+        """Take a telegram; tell whether it brings a new command, which `obey` is to be called for."""
+        if found["life"] != self._life:
+            self._life, self._alive_s = found["life"], time.monotonic()
+        is_new = found["command"] != NOTHING and found["command_number"] != self._number
+        if is_new or found["command"] == NOTHING:
+            self._number = found["command_number"]
+        return is_new
+
+    def seen(self, state: PlantState) -> PlantState:
+        """Form the state that this PLC may act on: not valid where its life counter stands still."""
+        if self._life is not None and time.monotonic() - self._alive_s <= self._silent_s:
+            return state
+        reason = "partner-silent: the PLC's life counter stands still"
+        return replace(state, is_valid=False, reasons=(*state.reasons, reason))
+
+    def obey(self, found: dict[str, int]) -> None:
+        """Take a command to the store; `answer` holds what came of it."""
+        try:
+            answer, token = self._step(found)
+        except BarsightError:
+            answer, token = REFUSED, 0
+        self.answer = {"answer_number": found["command_number"], "answer": answer, "token": token}
+
+    def _step(self, found: dict[str, int]) -> tuple[int, int]:
+        lift = (found["lift_id"], found["checksum"])
+        if found["command"] == CLAIM:
+            claim = self._steps.claim(self.name, *lift)
+            return (REFUSED, 0) if isinstance(claim, Failed) else (DONE, claim.token)
+        token, flags = found["token"], found["flags"]
+        told: str | int | Failed
+        if found["command"] == EXECUTING:
+            told = self._steps.executing(token, *lift)
+        elif found["command"] == EXECUTED:
+            load_kg = found["load"] / 10 if flags & _WEIGHED else None
+            report = LiftReport(bool(flags & _REACHED), bool(flags & _SLACK), load_kg)
+            told = self._steps.executed(token, report, *lift)
+        else:
+            told = self._steps.failed(token, f"the PLC says so, flags {flags}", *lift)
+        if isinstance(told, Failed):
+            return REFUSED, 0 if told.code in ("unknown", "checksum", "token") else token
+        return (CONTRADICTED if told == "contradicted" else DONE), token

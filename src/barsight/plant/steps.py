@@ -1,0 +1,119 @@
+"""Take steps of a lift's handshake to the store, whichever link they come by."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from barsight.core.errors import BarsightError, Failed
+from barsight.plant.feed import read_state
+from barsight.plant.handshake import LiftClaim, claim_lift, claim_of, report_executed, report_failed
+from barsight.plant.settings import PlantSettings
+from barsight.plant.state import OfferedLift
+from barsight.store.opening import Store
+
+
+@dataclass(frozen=True)
+class LiftReport:
+    """Report of a crane on a lift that it has made. load_kg: None where the load wasn't weighed."""
+
+    is_reached: bool
+    is_slack: bool
+    load_kg: float | None
+
+
+class LiftSteps:
+    """Judge each step against the state in the store, and take it. Steps are taken one at a time."""
+
+    def __init__(self, store: Store, settings: PlantSettings) -> None:
+        self._store, self._settings = store, settings
+        self._turn = threading.Lock()
+
+    def claim(self, who: str, lift_id: int, checksum: int | None = None) -> LiftClaim | Failed:
+        """Claim the lift that is offered. checksum: first four bytes of its SHA-256, if known."""
+        with self._turn:
+            lift = self._lift(lift_id, checksum, needs_valid=True)
+            return lift if isinstance(lift, Failed) else claim_lift(self._store, lift, who)
+
+    def executing(self, token: int, lift_id: int | None = None, checksum: int | None = None) -> int | Failed:
+        """Check that a claim stands before its lift begins; return its token."""
+        found = self._claimed(token, lift_id, checksum)
+        return found if isinstance(found, Failed) else found[0].token
+
+    def executed(
+        self, token: int, report: LiftReport, lift_id: int | None = None, checksum: int | None = None
+    ) -> str | Failed:
+        """Record a lift that was made: `confirmed`, `contradicted` or `unweighed`; see `report_executed`."""
+        with self._turn:
+            found = self._claimed(token, lift_id, checksum)
+            if isinstance(found, Failed):
+                return found
+            if not report.is_reached or report.is_slack:
+                return Failed("not-lifted", "position not reached, or slack rope: report the lift as failed")
+            return report_executed(self._store, *found, report.load_kg)
+
+    def failed(
+        self, token: int, note: str, lift_id: int | None = None, checksum: int | None = None
+    ) -> str | Failed:
+        """Record a lift that failed."""
+        with self._turn:
+            found = self._claimed(token, lift_id, checksum)
+            return found if isinstance(found, Failed) else report_failed(self._store, found[0], note)
+
+    def _lift(
+        self, lift_id: int | None, checksum: int | None, *, needs_valid: bool = False
+    ) -> OfferedLift | Failed:
+        state = read_state(self._store, self._settings)
+        if needs_valid and not state.is_valid:
+            return Failed("invalid", "; ".join(state.reasons))
+        if state.lift is None or lift_id not in (None, state.lift.lift_id):
+            return Failed("unknown", "that lift isn't offered or claimed (any more)")
+        if checksum not in (None, int(state.lift.sha256[:8], 16)):
+            return Failed("checksum", "the lift isn't as it was read")
+        return state.lift
+
+    def _claimed(
+        self, token: int, lift_id: int | None, checksum: int | None
+    ) -> tuple[LiftClaim, OfferedLift] | Failed:
+        lift = self._lift(lift_id, checksum)
+        if isinstance(lift, Failed):
+            return lift
+        claim = claim_of(self._store, lift.lift_id)
+        if claim is None or claim.token != token:
+            return Failed("token", f"lift {lift.lift_id} isn't claimed with this token")
+        return claim, lift
+
+
+def take_named_step(
+    steps: LiftSteps, step: str, who: str, arguments: Mapping[str, Any]
+) -> str | Failed:  # fmt: skip
+    """Take a step by its name with the arguments that OPC UA's methods have; return the token as text.
+
+    mass_kg: 0 or less where the load wasn't weighed.
+    """
+    try:
+        if step == "claim":
+            claim = steps.claim(who, _number(arguments["lift"]))
+            return claim if isinstance(claim, Failed) else str(claim.token)
+        token = _number(arguments["token"])
+        told: str | int | Failed
+        if step == "executing":
+            told = steps.executing(token)
+        elif step == "executed":
+            mass_kg = arguments["mass_kg"]
+            load_kg = mass_kg if mass_kg > 0 else None
+            report = LiftReport(arguments["position_reached"], arguments["slack_rope"], load_kg)
+            told = steps.executed(token, report)
+        else:
+            told = steps.failed(token, arguments["reason"] or "the crane says so")
+    except (BarsightError, ValueError) as error:
+        return Failed("refused", str(error))
+    return told if isinstance(told, Failed) else str(token)
+
+
+def _number(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or len(text) > 10:
+        raise ValueError(f"{text[:20]!r} is no number")
+    return int(text)

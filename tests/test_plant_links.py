@@ -1,0 +1,239 @@
+"""`barsight plant run` and `plant check`, every link at once, against mosquitto, snap7 and openssl."""
+
+import json
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("sqlalchemy")
+
+from barsight.cli.main import run
+from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.plant.feed import StateFeed
+from barsight.plant.links.changes import changes_between
+from barsight.plant.live_folder import with_live_run
+from barsight.plant.settings import PlantSettings, StoreSource, read_plant
+from barsight.plant.state import PlantAlarm, PlantState, state_of_store
+from barsight.plant.steps import LiftSteps, take_named_step
+from barsight.report.signing import sign_file
+from barsight.store.opening import open_store
+from opcua_servers import free_port
+from page_yards import fill_store
+
+MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+QUIET = PlantState("surveyed", True, (), 1, 5, "done")
+
+
+class Plc:
+    """snap7's server with both data blocks; its life counter goes up twenty times a second."""
+
+    def __init__(self) -> None:
+        snap7 = pytest.importorskip("snap7")
+        self.port = free_port()
+        self.mine, self.theirs = bytearray(48), bytearray(96)
+        self.mine[:4] = struct.pack(">HH", 0xB51B, 1)
+        self._server = snap7.Server(log=False)
+        self._server.register_area(snap7.SrvArea.DB, 100, self.mine)
+        self._server.register_area(snap7.SrvArea.DB, 101, self.theirs)
+        self._server.start(self.port)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._live)
+        self._thread.start()
+
+    def _live(self) -> None:
+        life = 0
+        while not self._stop.wait(0.05):
+            life = life % 65535 + 1
+            self.mine[4:6] = struct.pack(">H", life)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._server.stop()
+        self._server.destroy()
+
+
+@pytest.fixture
+def plc() -> Iterator[Plc]:
+    one = Plc()
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[int]:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (run .ci/servers)")
+    port = free_port()
+    config = tmp_path / "mosquitto.conf"
+    config.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\n")
+    with subprocess.Popen([str(MOSQUITTO), "-c", str(config)], stderr=subprocess.DEVNULL) as process:
+        yield port
+        process.kill()
+
+
+def wait_for(port: int) -> None:
+    for _ in range(600):
+        with socket.socket() as one:
+            if one.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.1)
+    raise AssertionError(f"nothing listens at {port}")
+
+
+@pytest.mark.slow  # OPC UA's server takes some ten seconds to start
+def test_all_links_are_served_and_checked(
+    tmp_path: Path, plc: Plc, broker: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("asyncua")
+    telegram, opcua = free_port(), free_port()
+    config = tmp_path / "plant.toml"
+    config.write_text(
+        f'[store]\nurl = "{fill_store(tmp_path)}"\nallow_simulated = true\n[telegram]\nport = {telegram}\n'
+        f'[opcua]\nport = {opcua}\nfolder = "opcua"\n[mqtt]\nport = {broker}\n[s7]\nport = {plc.port}\n'
+    )
+    key, public = tmp_path / "key.pem", tmp_path / "public.pem"
+    subprocess.run(["openssl", "genpkey", "-algorithm", "ed25519", "-out", str(key)], check=True)
+    subprocess.run(["openssl", "pkey", "-in", str(key), "-pubout", "-out", str(public)], check=True)
+    command = [sys.executable, "-m", "barsight", "plant", "run", "--config", str(config)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        wait_for(telegram)
+        wait_for(opcua)
+        protocol = tmp_path / "protocol.txt"
+        arguments = ["plant", "check", "--config", str(config), "--protocol", str(protocol)]
+        checked = run([*arguments, "--key", str(key)])
+        seen = capsys.readouterr()
+        lift = struct.unpack_from(">HHHH8xI", plc.theirs)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130, process.communicate()
+    assert checked == 0, seen
+    for link in ("telegram", "opcua", "mqtt", "s7"):
+        assert f"{link}: holds" in seen.out
+    assert "SignAndEncrypt" in seen.out
+    assert lift[0] == 0xB51A and lift[3] & 1 and lift[4] > 0, (
+        "the PLC's data block holds the lift that is offered"
+    )
+    verify = [
+        "openssl",
+        "pkeyutl",
+        "-verify",
+        "-pubin",
+        "-inkey",
+        str(public),
+        "-rawin",
+        "-in",
+        str(protocol),
+    ]
+    assert subprocess.run([*verify, "-sigfile", f"{protocol}.sig"], stdout=subprocess.DEVNULL).returncode == 0
+    protocol.write_text(protocol.read_text() + " ")
+    assert subprocess.run([*verify, "-sigfile", f"{protocol}.sig"], stdout=subprocess.DEVNULL).returncode != 0
+    assert run(arguments) == 5
+    assert "telegram, opcua, mqtt, s7: does not hold" in capsys.readouterr().err
+
+
+def test_steps_by_name_claim_and_end_a_lift_once(tmp_path: Path) -> None:
+    url = fill_store(tmp_path)
+    settings = PlantSettings(store=StoreSource(url=url, allow_simulated=True))
+    with open_store(url) as store:
+        steps = LiftSteps(store, settings)
+        lift = state_of_store(store, 1, allow_simulated=True).lift
+        assert lift is not None
+        token = take_named_step(steps, "claim", "crane", {"lift": str(lift.lift_id)})
+        assert isinstance(token, str) and token.isdigit()
+        for number in ("x", "-1", "9" * 20, str(lift.lift_id + 100)):
+            assert isinstance(take_named_step(steps, "claim", "other", {"lift": number}), Failed)
+        assert isinstance(take_named_step(steps, "claim", "other", {"lift": str(lift.lift_id)}), Failed)
+        done = {"token": token, "mass_kg": 0.0, "slack_rope": False, "position_reached": True}
+        assert isinstance(take_named_step(steps, "executed", "crane", done | {"slack_rope": True}), Failed)
+        assert isinstance(
+            take_named_step(steps, "executed", "crane", done | {"position_reached": False}), Failed
+        )
+        assert take_named_step(steps, "executing", "crane", {"token": token}) == token
+        heavy = done | {"mass_kg": 10 * lift.mass_kg}
+        assert take_named_step(steps, "executed", "crane", heavy) == token
+        assert isinstance(take_named_step(steps, "executed", "crane", done), Failed)
+        alarms = state_of_store(store, 1).alarms
+    assert [(one.code, one.priority, one.is_active) for one in alarms] == [("load-contradicts", 1, True)]
+
+
+def test_a_store_that_is_gone_makes_the_state_invalid(tmp_path: Path) -> None:
+    url = fill_store(tmp_path)
+    settings = PlantSettings(store=StoreSource(url=url, allow_simulated=True))
+    with open_store(url) as store, StateFeed(store, settings) as feed:
+        assert feed.newest(7).is_valid and feed.newest(7).life_counter == 7
+        feed._read_s -= 1.0
+        feed._stop.set()
+        old = feed.newest(8)
+        assert not old.is_valid and "state-too-old" in old.reasons[-1]
+
+
+def live_folder(folder: Path, **changes: object) -> Path:
+    folder.mkdir(exist_ok=True)
+    lifts = {"may_stand": changes.pop("may_stand", True), "offered": None}
+    state = {"phase": "measuring", "mode": "full", "reasons": [], "now_ns": 10_000_000_000, "lifts": lifts}
+    pose = {
+        "stamp_ns": 9_800_000_000, "frame": "yard", "position_m": [3.0, 1.0, 8.0],
+        "quaternion_xyzw": [0.0, 0.0, 0.7071067811865476, 0.7071067811865476], "sigma_m": [0.001] * 3,
+    }  # fmt: skip
+    for name, content in (("state.json", state), ("pose.json", pose)):
+        content |= {key: value for key, value in changes.items() if key in content}
+        (folder / name).write_text(json.dumps(content))
+    return folder
+
+
+def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:
+    seen = with_live_run(QUIET, live_folder(tmp_path / "live"))
+    assert seen.is_valid and seen.mode == "full" and seen.survey == "measuring"
+    assert seen.pose is not None and seen.pose.yaw_deg == pytest.approx(90)
+    blind = with_live_run(
+        QUIET, live_folder(tmp_path / "live", may_stand=False, mode="blind", reasons=["dark"])
+    )
+    assert not blind.is_valid and blind.reasons == ("live-state: blind: dark",)
+    for change in (
+        {"frame": "world"},
+        {"stamp_ns": 1},
+        {"stamp_ns": 10_000_000_001},
+        {"sigma_m": [float("nan")] * 3},
+    ):
+        assert with_live_run(QUIET, live_folder(tmp_path / "live", **change)).pose is None
+    for phase in ("done", "failed"):
+        assert not with_live_run(QUIET, live_folder(tmp_path / "live", phase=phase)).is_valid
+    (tmp_path / "live/state.json").write_text("{")
+    assert "live-stopped" in with_live_run(QUIET, tmp_path / "live").reasons[0]
+
+
+def test_changes_are_told_once() -> None:
+    alarm = PlantAlarm("live-stopped", 2, "no word", True, False)
+    raised = replace(QUIET, alarms=(alarm,), is_valid=False, reasons=("why",), map_id="m")
+    assert changes_between(None, QUIET) == [] == changes_between(raised, raised)
+    assert [one["event"] for one in changes_between(QUIET, raised)] == ["validity", "survey", "alarm-raised"]
+    assert [one["event"] for one in changes_between(raised, QUIET)] == ["validity", "alarm-ended"]
+
+
+def test_bad_configurations_and_keys_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "plant.toml"
+    config.write_text("[store]\n")
+    with pytest.raises(ConfigError, match="names no link"):
+        read_plant(config)
+    config.write_text("[telegram]\nport = 1\n")
+    assert run(["plant", "user", "crane", "--config", str(config)]) == 2
+    assert "users.json" in capsys.readouterr().err
+    assert run(["plant", "check", "--config", str(config), "--key", str(config)]) == 2
+    assert "--protocol" in capsys.readouterr().err
+    pytest.importorskip("cryptography")
+    with pytest.raises(InputError, match="no private key"):
+        sign_file(config, config)
+    config.write_text('[mqtt]\npassword_file = "secret"\n[opcua]\nfolder = "pki"\n')
+    told = read_plant(config)
+    assert told.links == ("opcua", "mqtt") and told.opcua is not None and told.mqtt is not None
+    assert told.opcua.folder == tmp_path / "pki" and told.mqtt.password_file == tmp_path / "secret"
