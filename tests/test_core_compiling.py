@@ -144,6 +144,6 @@ def test_an_interrupt_ends_the_processes(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.slow
 def test_every_listed_kernel_compiles() -> None:
-    """A list of an earlier version's types would leave kernels to their first call (run tools/signatures.py)."""
+    """Types of an earlier version would leave kernels to their first call (run tools/signatures.py)."""
     for one in listed("simulate", "measure"):
         one.compile()
