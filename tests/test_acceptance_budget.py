@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.acceptance.budget import ERRORS, FIGURES, ErrorSource, Load, budget
+from barsight.acceptance.budget import ERRORS, FIGURES, BudgetedLoad, ErrorSource, budget
 from barsight.acceptance.observation import ViewGeometry
 from barsight.cli.main import run
 from barsight.core.arrays import Float64
 
 VIEW = ViewGeometry(np.array([4.0, 0.2, 8.0]), 1250.0, 0.5)
 ORIGIN = np.array([0.0, -2.0, 0.0])
-LOAD = Load(np.array([4.0, 1.1, 0.6]), 0.12, 6.0, 0.31, 900.0)
+LOAD = BudgetedLoad(np.array([4.0, 1.1, 0.6]), 0.12, 6.0, 0.31, 900.0)
 YAW, BASE, FOCAL, TURN, MOVE = np.radians(0.004), 6e-4, 5e-4, np.radians(0.02), 0.002
 FRAME = np.diag([TURN**2] * 3 + [MOVE**2] * 3)
 FRAME[0, 3] = FRAME[3, 0] = 0.6 * TURN * MOVE
@@ -101,7 +101,7 @@ def test_what_is_not_known_is_not_budgeted() -> None:
     figures = {one.name: one for one in budget(LOAD, VIEW, ORIGIN, (*sources(), blind))}
     assert np.isnan(figures["lift y"].combined.expanded) and not figures["lift y"].agree
     assert np.isfinite(figures["lift z"].combined.expanded)
-    unweighed = Load(LOAD.top_m, LOAD.yaw_rad, LOAD.length_m, LOAD.width_m, np.nan)
+    unweighed = BudgetedLoad(LOAD.top_m, LOAD.yaw_rad, LOAD.length_m, LOAD.width_m, np.nan)
     assert np.isnan(budget(unweighed, VIEW, ORIGIN, sources())[6].combined.expanded)
 
 

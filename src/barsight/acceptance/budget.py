@@ -41,7 +41,7 @@ class ErrorSource:
 
 
 @dataclass(frozen=True, eq=False)
-class Load:
+class BudgetedLoad:
     """A bundle as it lies: its top's middle (3,) in the yard, yaw from +Y, lengths in m, mass in kg."""
 
     top_m: Float64
@@ -66,7 +66,7 @@ class BudgetedFigure:
     agree: bool
 
 
-def measured(load: Load, view: ViewGeometry, frame_origin_m: Float64, errors: Float64) -> Float64:
+def measured(load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, errors: Float64) -> Float64:
     """Compute what is measured of a load under errors (N, 19), in the order of `ERRORS`: FIGURES (N, 7), SI.
 
     The bundle's ends are seen from the cameras' mean place over it, triangulated with a wrong rig, and moved
@@ -114,7 +114,7 @@ def _placed(
 
 
 def budget(
-    load: Load, view: ViewGeometry, frame_origin_m: Float64, sources: Sequence[ErrorSource],
+    load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, sources: Sequence[ErrorSource],
     samples: int = 20_000, seed: int = 0,
 ) -> tuple[BudgetedFigure, ...]:  # fmt: skip
     """Budget every figure: parts by the model's derivatives, combined by GUM, and by sampling."""

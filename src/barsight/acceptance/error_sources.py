@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from barsight.acceptance.budget import ErrorSource, Load
+from barsight.acceptance.budget import BudgetedLoad, ErrorSource
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.observation import ViewGeometry, view_geometry
 from barsight.acceptance.yard_area import measured_rig
@@ -30,7 +30,7 @@ class MeasuredLoad:
     """A bundle of a folder with all that its budget takes. assumed: sentences on what nobody measured."""
 
     bundle: int
-    load: Load
+    load: BudgetedLoad
     view: ViewGeometry
     origin_m: Float64
     sources: tuple[ErrorSource, ...]
@@ -69,7 +69,7 @@ def measured_load(
     sources += _magnet_source(certificate, assumed)
     mass = bundle_mass(bundle)
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
-    load = Load(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
+    load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
     return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed))
 
 
