@@ -79,10 +79,11 @@ def _plant(folder: Path) -> int:
 
 def _telegram(folder: Path) -> int:
     from barsight.core.errors import Failed, InputError
+    from barsight.core.reading.bounded_reading import read_bytes
     from barsight.plant.telegram import unpack
 
     path = folder / "telegram.bin"
-    found = unpack("in", path.read_bytes() if path.is_file() else b"")
+    found = unpack("in", read_bytes(path, 1000))
     if isinstance(found, Failed):
         raise InputError(path, found.reason, "send what telegram.toml says")
     return 0

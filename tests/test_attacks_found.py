@@ -1,5 +1,6 @@
 """What fuzzing found, each once: a damaged file ends soon in one line that names it."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -7,10 +8,11 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from fuzz.mutators import png_bomb
+from fuzz.mutators import png_bomb, reseal_folder
 from fuzz.seeds import write_kitti, write_results
 
 from barsight.calibration.files.euroc import read_rig
@@ -36,6 +38,18 @@ def number(of: str, value: str) -> Damage:
     return damage
 
 
+def resealed(change: Callable[[dict[str, Any]], object]) -> Damage:
+    """Change result.json and seal it again, as a program of another version might write it."""
+
+    def damage(path: Path) -> None:
+        result = json.loads(path.read_text())
+        change(result)
+        path.write_text(json.dumps(result))
+        reseal_folder(path.parent)
+
+    return damage
+
+
 def link_to_itself(path: Path) -> None:
     path.unlink()
     path.symlink_to(path.name)
@@ -55,6 +69,15 @@ EXPORT = "calibrate export F/rig.xml -o F/made.yaml --to kalibr"
 FOUND: list[tuple[str, Damage, str, str]] = [
     ("mcap/mcap.mcap", link_to_itself, "info F/mcap", "mcap.mcap: can't be read"),
     ("one.bag", sparse, "info F/one.bag", "is no ROS 1 bag"),
+    (
+        "mcap/metadata.yaml", number(r"(?<=  - message_count: )\d+", "[]"),
+        "info F/mcap", "no whole number",
+    ),
+    ("out/result.json", resealed(lambda of: of.pop("warnings")), "report F/out", "lacks what the report"),
+    (
+        "out/result.json", resealed(lambda result: result["map"].update(median_sigma_m={})),
+        "report F/out", "median_sigma_m",
+    ),
     ("kitti/calib.txt", number("-150", "1e300"), "info F/kitti", "line 2: expected 12 numbers in range"),
     ("kitti/calib.txt", number("312.5", "5e-324"), "info F/kitti", "the focal lengths 5e-324"),
     ("euroc/mav0/imu0/sensor.yaml", number(A_NUMBER, "-1e308"), "info F/euroc", "out of range"),

@@ -13,6 +13,7 @@ from typing import Any
 import jinja2
 from plotly.offline import get_plotlyjs
 
+from barsight.core.errors import InputError
 from barsight.core.files import atomic_path, atomic_paths
 from barsight.core.parallel import in_background
 from barsight.report.map_images import preview_uri, read_raster
@@ -109,8 +110,8 @@ def render_page(out_dir: Path, pictures: PagePictures | None = None) -> str:
         if found is not None
     ]
     ways = path_plots(path, str(result.get("reference", "world"))) if path else ()
-    template = environment().get_template("page.html.jinja")
-    return template.render(
+    return _filled(
+        out_dir,
         result=result,
         figures=key_figures(result),
         maps=drawn.maps,
@@ -129,6 +130,17 @@ def render_page(out_dir: Path, pictures: PagePictures | None = None) -> str:
         css=resource("page.css"),
         script=resource("page_script.js.jinja"),
     )
+
+
+def _filled(out_dir: Path, **content: Any) -> str:
+    """Fill the page. Raises InputError where result.json lacks something of it."""
+    try:
+        return environment().get_template("page.html.jinja").render(**content)
+    except jinja2.UndefinedError as error:
+        path = out_dir / "result.json"
+        raise InputError(
+            path, f"lacks what the report shows ({error.message})", "measure it again"
+        ) from error
 
 
 def key_figures(result: dict[str, Any]) -> list[KeyFigure]:

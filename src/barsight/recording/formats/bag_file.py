@@ -74,8 +74,8 @@ class BagFile:
             counts: dict[tuple[str, str], int] = {}
             for connection in reader.all_connections:
                 key = (connection.topic, connection.msgtype)
-                counts[key] = counts.get(key, 0) + connection.msgcount
-            self.duration_s = reader.duration / NS_PER_S if any(counts.values()) else 0.0
+                counts[key] = counts.get(key, 0) + self._whole(connection.msgcount)
+            self.duration_s = self._whole(reader.duration) / NS_PER_S if any(counts.values()) else 0.0
         self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
     def _expect_bag(self) -> None:
@@ -135,6 +135,12 @@ class BagFile:
             yield reader
         finally:
             reader.close()
+
+    def _whole(self, number: Any) -> int:
+        """Expect a number of metadata.yaml, which rosbags takes as it stands."""
+        if not isinstance(number, int):
+            raise self._torn(ValueError(f"{number!r} is no whole number"))
+        return number
 
     def _torn(self, error: Exception) -> InputError:
         remedy = "copy it again, or repair it with `ros2 bag reindex` or `mcap recover`"
