@@ -25,6 +25,11 @@ from fuzz.mutators import MARK, SECRET, mutate, reseal_folder
 from fuzz.seeds import make_seeds
 from fuzz.targets import TARGETS, Target
 
+Runs = dict[str, list[Verdict]]
+"""Verdicts by target."""
+Finding = tuple[int, str, str, Verdict]
+"""Number of the input, target, what was damaged, verdict."""
+
 
 def main() -> int:
     """Parse, attack, print; 1 where something was found."""
@@ -40,7 +45,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         chosen = [target for target in TARGETS if given.only in target.name]
         seeds = prepared(given.seeds or Path(place) / "seeds", Path(place), chosen)
-        runs, found = attack(chosen, seeds, Path(place), given)
+        runs: Runs = defaultdict(list)
+        found: list[Finding] = []
+        with contextlib.suppress(KeyboardInterrupt):  # what was found till then is told
+            attack(chosen, seeds, Path(place), given, runs, found)
     print(table(runs, found, given.seed))
     return 1 if found else 0
 
@@ -94,14 +102,13 @@ def copied(target: Target, seeds: Path, scratch: Path) -> Path:
 
 
 def attack(
-    targets: list[Target], seeds: Path, place: Path, given: argparse.Namespace
-) -> tuple[dict[str, list[Verdict]], list[tuple[int, str, str, Verdict]]]:
-    """Run inputs until time or count is up; verdicts by target, and findings: number, target, how, verdict.
+    targets: list[Target], seeds: Path, place: Path, given: argparse.Namespace, runs: Runs,
+    found: list[Finding],
+) -> None:  # fmt: skip
+    """Run inputs until time or count is up, and add verdicts to `runs` and findings to `found`.
 
     Input k of a seed is the same whatever ran before it.
     """
-    runs: dict[str, list[Verdict]] = defaultdict(list)
-    found = []
     end = time.monotonic() + 60 * given.minutes
     number = given.first
     while number < given.first + given.inputs and time.monotonic() < end:
@@ -115,7 +122,6 @@ def attack(
                 tail = "\n    ".join(verdict.text.strip().splitlines()[-6:])
                 print(f"{number} {target.name}: {verdict.fault} ({how})\n    {tail}", flush=True)
         number += 1
-    return runs, found
 
 
 def one(target: Target, seeds: Path, scratch: Path, draw: random.Random) -> tuple[str, Verdict]:
@@ -136,7 +142,7 @@ def one(target: Target, seeds: Path, scratch: Path, draw: random.Random) -> tupl
     return "; ".join(how), judge(lambda: target.call(scratch), scratch, outputs)
 
 
-def table(runs: dict[str, list[Verdict]], found: list[tuple[int, str, str, Verdict]], seed: int) -> str:
+def table(runs: Runs, found: list[Finding], seed: int) -> str:
     """Format counts by target."""
     kinds = Counter((name, verdict.fault.partition(":")[0]) for _, name, _, verdict in found)
     lines = ["| target | inputs | findings | slowest s | exit codes |", "|---|---:|---|---:|---|"]

@@ -140,3 +140,10 @@ def test_an_interrupt_ends_the_processes(monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(KeyboardInterrupt):
         ahead.compile_ahead(interrupt, "measure")
     assert len(started) == 2 and all(one.returncode for one in started)
+
+
+@pytest.mark.slow
+def test_every_listed_kernel_compiles() -> None:
+    """Types of an earlier version would leave kernels to their first call (run tools/signatures.py)."""
+    for one in listed("simulate", "measure"):
+        one.compile()

@@ -10,7 +10,7 @@ import barsight
 
 FLOORS = {
     "core": 0,
-    "calibration": 1,
+    "calibration": 1, "artefacts": 1,
     "recording": 2, "sensors": 2, "stereo": 2, "features": 2, "inertial": 2, "registration": 2,
     "motion": 3,
     "mapping": 4,
@@ -23,7 +23,7 @@ FLOORS = {
     "live_map": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
     "result": 11, "pair_matching": 11, "page": 11, "measure_folder": 11,
-    "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12,
+    "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12, "acceptance": 12,
     "fleet": 13,
     "cli": 14,
 }  # fmt: skip
@@ -46,7 +46,7 @@ ROOMS = {
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),
     "plant": (".", "opcua.security", "opcua", "links"),
-    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant"),
+    "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant", "acceptance"),
 }  # fmt: skip
 """A room imports only from itself and from those before it; "." stands for the package's own modules."""
 APART = {
@@ -76,7 +76,7 @@ ROOT = Path(barsight.__file__).parent
 OPTIONAL = {
     "viser": 1, "plotly": 1, "rosbags": 3, "pymunk": 1, "alembic": 5, "viva_genicam": 1, "fastapi": 1,
     "uvicorn": 1, "zxingcpp": 1, "obstore": 1, "distributed": 1, "dask": 1,
-    "asyncua": 1, "aiomqtt": 1, "snap7": 1,
+    "asyncua": 1, "aiomqtt": 1, "snap7": 1, "reportlab": 1,
 }  # fmt: skip
 """Optional libraries, and the number of files that import them: of rosbags two read and one writes."""
 

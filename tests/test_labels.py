@@ -16,7 +16,6 @@ from barsight.labels.attachment import PlacedCode, contradictions, unite
 from barsight.labels.bundle_labels import bundle_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
-from barsight.labels.plates import find_plates
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_heights, read_path
 from barsight.simulation.lighting import bake, hall_lamps
@@ -27,8 +26,7 @@ from barsight.simulation.simulate import simulate
 from barsight.simulation.textures import label_codes, label_text, surface_tile
 from barsight.simulation.truth import label_rows
 from barsight.yard.inventory.stock_list import ListedBundle, contradicted_bundles, match_stock
-from barsight.yard.label_settings import LabelSettings
-from barsight.yard.types import Bundle, BundleLabel, HeightMap
+from barsight.yard.types import BundleLabel
 from cli_runs import FAST
 from lift_yards import laid, record
 
@@ -238,50 +236,18 @@ def test_measure_reads_labels_and_holds_the_stock_list_against_them(tmp_path: Pa
     assert any(w["code"].startswith("stock-") and "OTHER" in w["message"] for w in warned)
 
 
-def paper_on(bundle: Bundle, *plates: tuple[float, float, float, float]) -> HeightMap:
-    """A map of 10 mm cells over a bundle along Y at x = 1 m, of gray level 60; plates of 180: middle x and y,
-    sizes along x and y, m."""
-    z = np.full((300, 200), bundle.top_z_m, np.float32)
-    gray = np.full(z.shape, 60, np.uint8)
-    for x, y, wide, high in plates:
-        rows, columns = (
-            slice(round((at - size / 2) / 0.01), round((at + size / 2) / 0.01))
-            for at, size in ((y + 1.5, high), (x, wide))
-        )
-        gray[rows, columns] = 180
-    seen = np.ones(z.shape, np.uint8)
-    return HeightMap(0.0, -1.5, 0.01, z, z * 0 + 0.003, z * 0 + 4, seen, gray)
-
-
-def test_plates_of_a_labels_size_are_found_and_gleams_are_not() -> None:
-    bundle = record(laid(1.0), 0)
-    x, y = bundle.centre_m[:2]
-    (found,) = find_plates(bundle, paper_on(bundle, (x, y + 0.2, 0.1, 0.06)), (0.1, 0.06))
-    np.testing.assert_allclose(found, [x, y + 0.2], atol=0.015)
-    assert find_plates(bundle, paper_on(bundle, (x, y, 0.06, 0.1)), (0.1, 0.06)) != []
-    assert find_plates(bundle, paper_on(bundle, (x, y, 0.02, 1.0)), (0.1, 0.06)) == []
-    assert find_plates(bundle, paper_on(bundle), (0.1, 0.06)) == []
-    assert find_plates(bundle, paper_on(bundle, (x + 0.6, y, 0.1, 0.06)), (0.1, 0.06)) == []
-    assert find_plates(bundle, replace(paper_on(bundle), gray=None), (0.1, 0.06)) == []
-
-
 def test_a_bundle_has_the_text_that_is_sure_or_is_illegible() -> None:
     bundle = record(laid(1.0), 3)
-    at, blank = bundle.centre_m.copy(), paper_on(bundle)
+    at = bundle.centre_m.copy()
     at[2] = bundle.top_z_m
 
-    def of(*readings: tuple[str, int], heights: HeightMap = blank) -> BundleLabel | None:
-        codes = [
-            PlacedCode(text, "QRCode", at, (k, len(text))) for text, count in readings for k in range(count)
-        ]
-        return bundle_label(bundle, unite(codes, (bundle,)), heights, LabelSettings())
+    def of(*readings: tuple[str, int]) -> BundleLabel | None:
+        codes = [PlacedCode(text, "QRCode", at, (k, len(text))) for text, n in readings for k in range(n)]
+        return bundle_label(bundle, unite(codes, (bundle,)))
 
     assert of(("N7", 3)) == BundleLabel("N7", "QRCode", 3, 0.8)
     assert of(("N7", 1)) == of(("N7", 3), ("N99", 1)) == BundleLabel(None, "illegible", 0, 0.0)
     assert of() is None
-    plate = paper_on(bundle, (at[0], at[1], 0.1, 0.06))
-    assert of(heights=plate) == BundleLabel(None, "illegible", 0, 0.0)
-    assert of(("N7", 2), heights=plate) == BundleLabel("N7", "QRCode", 2, 0.75)
 
 
 def test_a_label_that_reads_another_name_contradicts_the_list() -> None:

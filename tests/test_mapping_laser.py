@@ -141,6 +141,13 @@ def test_the_higher_one_counts_and_the_unknown_takes_the_laser(tmp_path: Path) -
     assert (row[1][53:57] >= 0.1).all() and (row[2][53:57] == HeightSource.VISION).all()
     np.testing.assert_allclose(row[0][103:107], 0.8)
     assert (row[1][103:107] >= 0.15).all() and (row[2][103:107] == HeightSource.LASER).all()
+    # An unsure map agrees with a laser that is 20 mm higher, but that says nothing of the cells beside it.
+    unsure = surface(np.full((ROWS, COLUMNS), 0.5), tmp_path / "c", 0.02)
+    (tmp_path / "d").mkdir()
+    higher = replace(profile, z_m=np.full(COLUMNS, 0.52))
+    beside = window(fuse_laser(unsure, [higher], SETTINGS, tmp_path / "d")).z_m
+    np.testing.assert_allclose(beside[LASER_ROW], 0.52, atol=1e-3)
+    np.testing.assert_array_equal(beside[LASER_ROW + 1], window(unsure).z_m[LASER_ROW + 1])
     np.testing.assert_allclose(row[0][200:220], 0.5)
     assert (row[2][200:220] == HeightSource.LASER).all()
     assert np.isnan(new.z_m[LASER_ROW + 1, 200:220]).all()

@@ -73,6 +73,7 @@ EXTRAS = {
     "mqtt": {"plant/mqtt.py"},
     "s7": {"plant/s7.py"},
     "labels": {"labels/code_reading.py"},
+    "acceptance": {"acceptance/pdf.py"},
 }
 """Which modules may import what an extra installs."""
 

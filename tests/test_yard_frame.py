@@ -12,10 +12,12 @@ from barsight.cli.main import run
 from barsight.core.errors import CalibrationError, InputError
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, Trajectory
+from barsight.mapping.surface.laser_profiles import runs_along_x
 from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.yard_frame import (
+    RecordingInYard,
     calibration_id,
     crane_in_yard,
     in_yard,
@@ -135,3 +137,18 @@ def test_another_rigs_or_cranes_file_is_refused(tmp_path: Path) -> None:
     write_document(path, {**values, **own, "covariance": unsure.covariance.tolist()})
     with pytest.raises(InputError, match="too unsure"):
         in_yard(recording, path)
+
+
+def test_the_laser_moves_with_the_encoders_and_an_askew_profile_is_left_out(
+    tmp_path: Path, data: Path
+) -> None:
+    whole = open_recording(data / "yard_dev")
+    frame, _ = calibrated(tmp_path, 3, "encoders")
+    moved = RecordingInYard(whole, frame).laser()
+    for one, other in zip(whole.laser(), moved, strict=True):
+        there = frame.yard_from.apply(np.column_stack([one.x_m, one.y_m, one.z_m]))
+        assert np.column_stack([other.x_m, other.y_m, other.z_m]) == pytest.approx(there)
+        assert (other.profile, other.range_std_m) == (one.profile, one.range_std_m)
+        assert runs_along_x(one) and not runs_along_x(other), "23 degrees askew"
+    turned = RecordingInYard(whole, replace(frame, yard_from=Pose("yard", "encoders", np.eye(3), SHIFT)))
+    assert all(runs_along_x(one) for one in turned.laser())

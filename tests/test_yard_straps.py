@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from barsight.core.types import HeightSource
+from barsight.simulation.worlds.packing import packed
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, ShadeProfile
 from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.pack_edges import hold_off
 from barsight.yard.bundles.section.bar_pitch import dark_lines
-from barsight.yard.bundles.section.pack_sides import PackSide, _widest
+from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
 from barsight.yard.bundles.section.seen_section import section_of_pack
 from barsight.yard.bundles.section.strap_lines import split_columns
@@ -145,9 +147,11 @@ def level_of(*points: tuple[float, float]) -> np.ndarray:
     return np.interp(BESIDE, *np.array(points).T)
 
 
-def pack_beside(level: np.ndarray, rows: tuple[tuple[float, float], ...], begins_m: float) -> Pack:
+def pack_beside(
+    level: np.ndarray, rows: tuple[tuple[float, float], ...], begins_m: float, thick_m: float = 0.1
+) -> Pack:
     spans = StrapSpan(-0.12, 0.09, ROWS, 0.0), StrapSpan(begins_m, begins_m + 0.15, rows, 0.0)
-    pack = find_pack(spans, 0.24, BESIDE, level)
+    pack = find_pack(spans, 0, BESIDE, level, thick_m)
     assert pack is not None
     return pack
 
@@ -175,6 +179,57 @@ def test_a_single_gully_before_other_straps_is_the_flank(
     if seen:
         assert pack.low_m == pytest.approx(-0.135, abs=CELL)
         assert pack.high_m == pytest.approx(0.13, abs=1.1 * CELL)
+
+
+DEEP = (0.09, -0.05), (0.13, -0.12), (0.2, -0.01), (0.4, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("right", "thick_m", "side"),
+    [
+        (DEEP, 0.1, PackSide.SEEN),
+        (DEEP, 0.13, PackSide.OPEN),
+        (DEEP, math.nan, PackSide.OPEN),
+        (((0.09, -0.03), (0.13, -0.06), (0.2, -0.01), (0.4, 0.0)), 0.02, PackSide.OPEN),
+        (((0.09, -0.05), (0.13, -0.12), (0.2, -0.05), (0.4, -0.05)), 0.1, PackSide.OPEN),
+        (((0.09, -0.04), (0.12, -0.07), (0.15, -0.04), (0.19, -0.12), (0.25, 0.0), (0.4, 0.0)), 0.1,
+         PackSide.OPEN),
+        (((0.09, -0.03), (0.26, -0.12), (0.33, 0.0), (0.4, 0.0)), 0.1, PackSide.OPEN),
+        (((0.09, -0.05), (0.13, -0.12), (0.2, 0.35), (0.4, 0.35)), 0.1, PackSide.SEEN),
+        (((0.09, -0.05), (0.13, -0.1), (0.2, 0.06), (0.4, 0.06)), 0.095, PackSide.COVERED),
+    ],
+    ids=[
+        "deeper than a bar", "no deeper than a bar", "bars of unknown thickness", "thin bars, shallow",
+        "one side is low", "a low bar before it", "too far from the straps", "a wall beside a steep flank",
+        "a higher neighbour over a shallow flank",
+    ],
+)  # fmt: skip
+def test_a_gully_deeper_than_one_pack_leaves_parts_two_whatever_their_straps(
+    right: tuple[tuple[float, float], ...], thick_m: float, side: PackSide
+) -> None:
+    """All straps lie in line."""
+    pack = pack_beside(level_of(*LEFT, *right), ROWS, 0.35, thick_m)
+    assert pack.sides == (PackSide.SEEN, side)
+
+
+def test_no_drawn_pack_has_a_gully_that_parts_two() -> None:
+    rng = np.random.default_rng(17)
+    for _ in range(60):
+        diameter = float(rng.choice([0.016, 0.032, 0.06, 0.1]))
+        cross, radius = packed(int(rng.integers(3, 40)), diameter, rng), diameter / 2
+        u = np.arange(cross[:, 0].min() - radius, cross[:, 0].max() + radius, 0.002)
+        under = np.maximum(radius**2 - (u[:, None] - cross[:, 0]) ** 2, 0.0)
+        level = np.where(under > 0, cross[:, 1] + np.sqrt(under), cross[:, 1].min()).max(axis=1)
+        crest = int(level.argmax())
+        for outwards in (level[crest:], level[crest::-1]):
+            assert _parting(outwards, len(outwards), level[crest], max(1.2 * diameter, 0.06)) is None
+
+
+@pytest.mark.parametrize(("rows", "side"), [(OTHER_ROWS, PackSide.SEEN), (ROWS, PackSide.OPEN)])
+def test_straps_of_the_layer_below_end_no_pack(rows: tuple[tuple[float, float], ...], side: PackSide) -> None:
+    """Those that lie in line with its own may hold its own lower bars."""
+    below = (0.09, -0.05), (0.11, -0.07), (0.12, -0.23), (0.4, -0.3)
+    assert pack_beside(level_of(*LEFT, *below), rows, 0.1).sides == (PackSide.SEEN, side)
 
 
 def test_a_low_bar_at_the_flank_is_still_the_bundle_s() -> None:

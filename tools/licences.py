@@ -16,7 +16,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-EXTRAS = ("view", "export", "bench", "store", "page", "postgres", "fleet")
+EXTRAS = ("view", "export", "bench", "store", "page", "postgres", "fleet", "acceptance")
 _HEAD = """# Licences
 
 Barsight is under the Apache License 2.0 (`LICENSE`). Neither its repository nor its wheel holds code of

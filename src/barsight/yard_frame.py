@@ -13,9 +13,10 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
 from barsight.core.pose import skew
-from barsight.core.types import CraneSamples, Trajectory
+from barsight.core.types import CraneSamples, LaserProfile, Trajectory
 from barsight.measurement import to_json
 from barsight.recording.base import Recording
+from barsight.recording.sensor_samples import make_laser
 from barsight.recording.wrapper import RecordingProxy
 from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.yard.identity import ID_DIGITS
@@ -26,7 +27,7 @@ MAX_TURN_DEG, MAX_PLACE_M = 1.0, 0.5
 
 @dataclass(frozen=True, eq=False)
 class RecordingInYard(RecordingProxy):
-    """`whole` with its encoders' readings in the surveyed yard."""
+    """`whole` with its encoders' readings and laser profiles in the surveyed yard."""
 
     frame: YardFrame
 
@@ -34,6 +35,19 @@ class RecordingInYard(RecordingProxy):
         """Return the readings, moved into the yard or with the attitude that was calibrated."""
         crane = self.whole.crane()
         return None if crane is None else crane_in_yard(crane, self.frame)
+
+    def laser(self) -> tuple[LaserProfile, ...]:
+        """Return the profiles, moved as the encoders that placed them."""
+        pose = self.frame.yard_from
+        if pose.source != "encoders":
+            return self.whole.laser()
+        return tuple(
+            make_laser(
+                np.full(one.x_m.size, one.profile),
+                pose.apply(np.column_stack([one.x_m, one.y_m, one.z_m])), one.range_std_m,
+            )[0]
+            for one in self.whole.laser()
+        )  # fmt: skip
 
 
 def in_yard(recording: Recording, yard: Path | None) -> Recording:

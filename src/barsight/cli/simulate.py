@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from barsight.artefacts.plan import read_plan
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
@@ -16,6 +17,7 @@ from barsight.core.settings.values import MAX_VALUE
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
+from barsight.simulation.worlds.artefacts import lay_artefacts
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -27,6 +29,7 @@ def run(arguments: Sequence[str]) -> None:
         settings: Annotated[SimulationSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
         draw: int | None = None,
+        artefacts: Path | None = None,
     ) -> None:
         """Render a recording of a bar yard, with exact truth, as an EuRoC folder.
 
@@ -37,10 +40,17 @@ def run(arguments: Sequence[str]) -> None:
             draw: Seed of a whole world that is drawn: irregular bundles and heaps settled by physics, what
                 stands around them, crane, light, faults of the pictures. Only length, frames, pictures and
                 laser are taken from the settings then; truth/world.json says what was drawn.
+            artefacts: Plan of an acceptance (see barsight accept): its plates, spheres and dummy bundles
+                stand there instead of a stock, exactly where it says.
         """
         console = SafeConsole(stderr=True)
+        if artefacts is not None and (draw is not None or settings.passes.trolley_y_m):
+            raise ConfigError("simulate: --artefacts takes no drawn world and no passes")
         with stages(console) as advance:
-            if draw is None and settings.passes.trolley_y_m:
+            if artefacts is not None:
+                laid = lay_artefacts(read_plan(artefacts), settings)
+                simulate(out, settings, lambda done, total: advance("render", done, total), laid)
+            elif draw is None and settings.passes.trolley_y_m:
                 simulate_passes(out, settings, lambda done, total: advance("render", done, total))
             elif draw is None:
                 simulate(out, settings, lambda done, total: advance("render", done, total))

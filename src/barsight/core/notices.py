@@ -10,6 +10,7 @@ WARNINGS = {
     "calibration-drift": "The crane's travel contradicts the calibration; no lift is offered.",
     "frames-refused": "Frames were refused; `frames.refused` gives each one's stamp, stage and reason.",
     "laser-frame": "Without a crane the map isn't in the laser's yard, so there is no agreement.",
+    "laser-askew": "A laser profile doesn't run along X of the yard, so it isn't compared or fused.",
     "laser-off": "A laser profile contradicts vision, or couldn't be told off: it isn't fused into the map.",
     "live-state": "The live run ended in a mode that forbids lifts; the message says why.",
     "mounting-doubtful": "Gravity or floor contradict the stated mounting; no lift is offered.",

@@ -14,9 +14,7 @@ from barsight.core.types import RectifiedPair, RefusedFrame
 from barsight.labels.attachment import Label, PlacedCode, unite
 from barsight.labels.code_reading import SeenCode, read_codes
 from barsight.labels.placing import PlacedCamera, first_surface
-from barsight.labels.plates import find_plates
 from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.yard.label_settings import LabelSettings
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, BundleLabel, YardMap
 
@@ -26,18 +24,17 @@ _BELOW_M = 1.0
 
 
 def label_bundles(
-    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...],
-    settings: LabelSettings,
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...]
 ) -> tuple[Bundle, ...]:  # fmt: skip
     """Read the codes in the pairs that have a pose, and give each bundle its label.
 
     poses: reference_from_body by stamp. A bundle has a label where one text is sure on it and no other is;
-    where codes are read but aren't sure, or only a bright plate of a label's size is seen, it is illegible.
+    where codes are read but aren't sure it is illegible.
     Raises ConfigError without the extra `labels`.
     """
     found = [code for codes in placed_codes(pairs, poses, heights) for code in codes]
     labels = unite(found, bundles)
-    return tuple(replace(bundle, label=bundle_label(bundle, labels, heights, settings)) for bundle in bundles)
+    return tuple(replace(bundle, label=bundle_label(bundle, labels)) for bundle in bundles)
 
 
 def placed_codes(
@@ -71,9 +68,7 @@ def _on_the_map(heights: YardMap, origin: Float64, direction: Float64) -> Float6
     return first_surface(part_about(heights, ends[:, 0], ends[:, 1]), origin, direction)
 
 
-def bundle_label(
-    bundle: Bundle, labels: Iterable[Label], heights: YardMap, settings: LabelSettings
-) -> BundleLabel | None:
+def bundle_label(bundle: Bundle, labels: Iterable[Label]) -> BundleLabel | None:
     """Choose what a bundle's label says from all that were read; see `label_bundles`."""
     here = [label for label in labels if label.bundle == bundle.id]
     sure = {label.text for label in here if label.is_sure}
@@ -81,6 +76,4 @@ def bundle_label(
         best = max(here, key=lambda label: label.pictures)
         read = round(best.pictures / best.agreement_ratio)
         return BundleLabel(best.text, best.kind, best.pictures, (best.pictures + 1) / (read + 2))
-    if here or find_plates(bundle, heights, settings.size_m):
-        return ILLEGIBLE
-    return None
+    return ILLEGIBLE if here else None

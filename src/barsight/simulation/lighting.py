@@ -231,8 +231,9 @@ def _texel(
         )  # fmt: skip
     face, sign = a // 2, 2.0 * (a % 2) - 1.0
     longest = longest_axis(shape, p)
-    out = sign * (shape[p, 12 + face] + lift)
-    length = share * shape[p, 12 + longest] if longest != face else 0.0
+    is_sphere = shape[p, 13] == 0.0
+    out = sign * (shape[p, 12 if is_sphere else 12 + face] + lift)
+    length = share * shape[p, 12 + longest] if longest != face and not is_sphere else 0.0
     i, j = 3 + 3 * face, 3 + 3 * longest
     return (
         shape[p, 0] + out * shape[p, i] + length * shape[p, j],

@@ -43,13 +43,33 @@ def hit_cylinder(
 
 
 @kernel()
+def _hit_sphere(
+    shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
+) -> float:
+    """Find the first ray parameter over `near` at which the ray enters the sphere, else FAR.
+
+    shape: (P, 15), see `Primitives`; p: its number. Origin o in m, direction d of any length.
+    """
+    cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
+    a = dx * dx + dy * dy + dz * dz
+    b = cx * dx + cy * dy + cz * dz
+    root = b * b - a * (cx * cx + cy * cy + cz * cz - shape[p, 12] * shape[p, 12])
+    if root < 0:
+        return FAR
+    t: float = (-b - math.sqrt(root)) / a
+    return t if t > near else FAR
+
+
+@kernel()
 def hit_box(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """Find the first ray parameter over `near` at which the ray enters the box, else FAR.
+    """Find the first ray parameter over `near` at which the ray enters the box or sphere, else FAR.
 
-    shape: (P, 15), see `Primitives`; p: the box's number. Origin o in m, direction d of any length.
+    shape: (P, 15), see `Primitives`; p: its number. Origin o in m, direction d of any length.
     """
+    if shape[p, 13] == 0.0:
+        return _hit_sphere(shape, p, ox, oy, oz, dx, dy, dz, near)
     cx, cy, cz = ox - shape[p, 0], oy - shape[p, 1], oz - shape[p, 2]
     enter: float = -FAR
     leave: float = FAR

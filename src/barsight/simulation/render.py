@@ -244,6 +244,8 @@ def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float
     """
     lamps, lightmap, tile, codes = look
     shape, material = primitives.shape, primitives.material
+    if shape[p, 13] == 0.0:
+        return _shade_sphere(primitives, look, p, x, y, z)
     cx, cy, cz = x - shape[p, 0], y - shape[p, 1], z - shape[p, 2]
     longest = longest_axis(shape, p)
     face, sign, deepest, along, across = 0, 0, -1.0, 0.0, 0.0
@@ -274,6 +276,34 @@ def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float
         row, column = math.floor((1 - v) / 2 * count), math.floor((1 + u) / 2 * count)
         if 0 <= row < count and 0 <= column < count and codes[int(material[p, CODE]) - 1, row, column] == 0:
             radiance *= INK
+    return radiance
+
+
+@kernel()
+def _shade_sphere(primitives: Primitives, look: Shading, p: int, x: float, y: float, z: float) -> float:
+    """Shade sphere `p` at (x, y, z) m in `yard`: its diffuse radiance, between those of its axes' six ends.
+
+    An end counts as the square of the normal along it. The texture runs around the first axis. tile:
+    (TILE, TILE, 4); x, y, z: in `yard`, m.
+    """
+    lamps, lightmap, tile, _ = look
+    shape, material = primitives.shape, primitives.material
+    radius = shape[p, 12]
+    nx, ny, nz = (x - shape[p, 0]) / radius, (y - shape[p, 1]) / radius, (z - shape[p, 2]) / radius
+    diffuse, sun = 0.0, 0.0
+    n0, n1, n2 = 0.0, 0.0, 0.0
+    for k in range(3):
+        n = nx * shape[p, 3 + 3 * k] + ny * shape[p, 4 + 3 * k] + nz * shape[p, 5 + 3 * k]
+        n0, n1, n2 = n1, n2, n
+        t = lightmap.start[p] + 2 * k + (1 if n > 0 else 0)
+        diffuse += n * n * lightmap.diffuse[t]
+        if lightmap.sun.size > 0:
+            sun += n * n * lightmap.sun[t]
+    if sun > 0:
+        diffuse += sun * sun_patch(lamps.sun, x, y, z)
+    around, along = math.atan2(n2, n1) * radius, math.asin(min(max(n0, -1.0), 1.0)) * radius
+    _, _, _, pattern = _texels(tile, (around + material[p, 2]) / ALONG_M, (along + material[p, 3]) / ALONG_M)
+    radiance: float = material[p, 0] * (1 + material[p, 7] * (pattern - 1)) * diffuse
     return radiance
 
 

@@ -1,8 +1,9 @@
-"""Build the stock as primitives, capped cylinders and boxes with materials, in a grid of cells.
+"""Build the stock as primitives, capped cylinders, boxes and spheres with materials, in a grid of cells.
 
-Primitives 0 .. cylinders-1 are cylinders, the rest boxes. Rows of `shape` (float64, `yard`, metres):
+Primitives 0 .. cylinders-1 are cylinders, the rest boxes and spheres. Rows of `shape` (float64, `yard`, m):
 cylinder: centre 0:3, axis 3:6 (unit), direction of angle 0 6:9, of angle 90 degrees 9:12, radius 12,
-half length 13. Box: centre 0:3, three unit axes 3:12, half sizes 12:15.
+half length 13. Box: centre 0:3, three unit axes 3:12, half sizes 12:15. A sphere has its radius at 12 and
+no sizes at 13 and 14.
 Rows of `material` (float32): base albedo, gloss, texture offsets (m) around and along, twist (m/m), texture
 scale along, rib pitch (m, 0 none), weight of the texture, dust on what faces up (share) or, of a box,
 the number of the code on its third axis' upper face from 1 (0 none), roughness over the ordinary.
@@ -67,10 +68,10 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
         straps = _straps(bundle, settings.yard, rng)
         for k, (rounds, facets, label) in enumerate(straps):
             cylinders += rounds
-            cylinder_materials += [_plain(0.13, 0.5, rng) for _ in rounds]
+            cylinder_materials += [plain_material(0.13, 0.5, rng) for _ in rounds]
             boxes += facets
-            box_materials += [_plain(0.13, 0.5, rng) for _ in facets]
-            paper = _plain(0.75, 0.0, rng, weight=0.3)
+            box_materials += [plain_material(0.13, 0.5, rng) for _ in facets]
+            paper = plain_material(0.75, 0.0, rng, weight=0.3)
             if max(settings.yard.label_m) > 0:
                 paper[CODE] = number
             if max(settings.yard.label_m) == 0 or k == len(straps) // 2:
@@ -78,7 +79,7 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
                 box_materials.append(paper)
     for beam in stock.beams:
         boxes.append(_beam_shape(beam))
-        box_materials.append(_plain(rng.uniform(0.3, 0.42), 0.0, rng))
+        box_materials.append(plain_material(rng.uniform(0.3, 0.42), 0.0, rng))
     shape = np.array([np.resize(np.append(s, np.zeros(15 - len(s))), 15) for s in cylinders + boxes])
     material = np.array(cylinder_materials + box_materials, dtype=np.float32)
     primitives = Primitives(shape.reshape(-1, 15), material.reshape(-1, 10), len(cylinders))
@@ -120,6 +121,8 @@ def _bounds(primitives: Primitives) -> tuple[Float64, Float64]:
     reach[:n] = axis * shape[:n, 13:14] + shape[:n, 12:13] * np.sqrt(np.maximum(1 - axis**2, 0))
     turned = np.abs(shape[n:, 3:12].reshape(-1, 3, 3))
     reach[n:] = np.einsum("pij,pi->pj", turned, shape[n:, 12:15])
+    spheres = n + np.flatnonzero(shape[n:, 13] == 0)
+    reach[spheres] = shape[spheres, 12:13]
     return shape[:, :3] - reach, shape[:, :3] + reach
 
 
@@ -137,6 +140,8 @@ def _fill(shape: Float64, cylinders: int, grid: Grid) -> None:
         s = shape[p]
         if p < cylinders:
             y_reach = abs(s[4]) * s[13] + s[12] * np.sqrt(max(1 - s[4] * s[4], 0.0))
+        elif s[13] == 0:
+            y_reach = s[12]
         else:
             y_reach = abs(s[4]) * s[12] + abs(s[7]) * s[13] + abs(s[10]) * s[14]
         j0 = max(int(np.floor((s[1] - y_reach - 1e-6 - low[1]) / cell[1])), 0)
@@ -163,6 +168,9 @@ def _slab_extent(s: Float64, round_bar: bool, y0: float, y1: float) -> tuple[flo
 
     s: (15,), a row of `Primitives.shape`. Returns the least and the largest x, then z, m.
     """
+    if not round_bar and s[13] == 0:
+        reach = s[12] + 1e-6
+        return s[0] - reach, s[0] + reach, s[2] - reach, s[2] + reach
     if not round_bar:
         rx = abs(s[3]) * s[12] + abs(s[6]) * s[13] + abs(s[9]) * s[14]
         rz = abs(s[5]) * s[12] + abs(s[8]) * s[13] + abs(s[11]) * s[14]
@@ -200,7 +208,7 @@ def _bars(
     return shapes, materials
 
 
-def _plain(albedo: float, gloss: float, rng: np.random.Generator, weight: float = 0.8) -> list[float]:
+def plain_material(albedo: float, gloss: float, rng: np.random.Generator, weight: float = 0.8) -> list[float]:
     return [
         albedo * float(np.exp(rng.normal(0, 0.08))),
         gloss,

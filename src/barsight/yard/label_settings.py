@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from barsight.core.settings.values import expect_ranges
-
 
 @dataclass(frozen=True)
 class LabelSettings:
@@ -14,9 +12,3 @@ class LabelSettings:
     read: bool = False
     """Whether they are read in the pictures (extra `labels`; a tenth of a second a picture), attached to the
     bundles and held against the stock list."""
-    size_m: tuple[float, float] = (0.1, 0.06)
-    """Length and width of a label: a bright plate of this size on a bundle that no picture reads is called
-    illegible."""
-
-    def __post_init__(self) -> None:
-        expect_ranges(self, "labels.", size_m=(0.02, 1.0))

@@ -129,7 +129,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class BundleLabel:
-    """The label on a bundle. text: None where one is seen but can't be read for sure. kind: of code, or
+    """The label on a bundle. text: None where codes were read but none for sure. kind: of code, or
     `illegible`. reads: pictures that read it so. confidence: probability that a further picture reads the
     same, (reads + 1) / (all readings there + 2); 0 where it is illegible.
     """

@@ -60,10 +60,14 @@ def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> Non
 
 
 def load_kernels(*groups: str) -> None:
-    """Load the kernels of some groups from the cache now, not each at its first call."""
+    """Load the kernels of some groups from the cache now, not each at its first call.
+
+    One whose listed types are those of an earlier version is left to its first call.
+    """
     if not numba.config.DISABLE_JIT:
         for one in listed(*groups):
-            one.compile()
+            with contextlib.suppress(numba.errors.NumbaError):
+                one.compile()
 
 
 def main() -> None:

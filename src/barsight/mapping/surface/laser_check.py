@@ -16,7 +16,7 @@ from barsight.mapping.surface.contours import SPACING_M
 
 FALSE_RATIO, CONTRADICTS_SIGMAS = 0.01, 2.576
 """Share of right profiles whose offset contradicts, and the sigmas that this is."""
-PLACE_SIGMA_M = 0.001
+PLACE_SIGMA_M = 0.002
 """Sigma of a place along x that all of a profile shares: the map's own."""
 MIN_ALIKE_RATIO = 0.7
 """Share of a profile's points that must lie on the map's surface, or on one within two samples along x."""

@@ -44,7 +44,8 @@ def fuse_laser(
     edge), the cell takes the mean of both by their sigmas, or the laser's height. Else the higher one counts,
     with half their difference as sigma at the least. Cells that vision left unknown or filled take the
     laser's height. Further along Y, on the same surface, vision's error is taken to be the same by
-    exp(-distance / CARRIED_M): it is taken off by as much, and the source stays vision.
+    exp(-distance / CARRIED_M): where it is within min_gate_m it is taken off by as much, and the source stays
+    vision.
     """
     points = [_at_cells(profile, surface.cell_m, settings) for profile in laser]
     carry = round(3 * CARRIED_M / surface.cell_m)
@@ -110,6 +111,7 @@ def _fused_tile(
         here = (i >= 0) & (i < rows) & (j >= _REACH) & (j < columns - _REACH)
         i, j, z, sigma = i[here], j[here], one.z_m[here], one.sigma_m[here]
         agrees = _fuse_points(around, fused, i, j, z, sigma, settings)
+        agrees &= np.abs(z - np.nan_to_num(around.z_m[i, j])) <= settings.min_gate_m
         i, j, z, sigma = i[agrees], j[agrees], z[agrees], sigma[agrees]
         own = around.sigma_m[i, j].astype(np.float64) ** 2
         carried = (z - around.z_m[i, j], own / (own + sigma**2))

@@ -20,12 +20,16 @@ from barsight.mapping.surface.laser_fusion import fuse_laser
 from barsight.mapping.surface.surface import Surface
 from barsight.recording.base import Recording
 
+MAX_ASKEW_M = 0.03
+"""A profile's places may lie so far apart across X: three cells of 10 mm."""
+
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
     """The surface, with the laser where it was fused, and its contours. laser: its profiles in the map's
     frame. agreed: of vision alone with each, or why there is none. checks: of each before it was fused; None
-    where that wasn't asked for. left_out: the laser is of another frame.
+    where that wasn't asked for. left_out: the laser is of another frame. askew: numbers of profiles that
+    don't run along X.
     """
 
     surface: Surface
@@ -34,6 +38,7 @@ class Profiles:
     agreed: tuple[Agreement | Failed, ...]
     checks: tuple[LaserCheck, ...] | None
     left_out: bool
+    askew: tuple[int, ...] = ()
 
     @property
     def agreements(self) -> tuple[Agreement, ...]:
@@ -51,6 +56,9 @@ class Profiles:
         if self.left_out:
             reason = "without a crane the map isn't in the laser's yard: no agreement"
             yield Notice("laser-frame", reason)
+        if self.askew:
+            reason = f"profiles {', '.join(map(str, self.askew))} don't run along X: no agreement"
+            yield Notice("laser-askew", reason)
         for check in self.checks or ():
             if not check.is_believed:
                 yield Notice("laser-off", f"profile {check.profile} is not fused: {check.reason}")
@@ -65,7 +73,9 @@ def cut_profiles(
     of vision alone: a fused map would be compared with itself. folder: takes the fused surface.
     """
     whole = source.laser()
-    laser = whole if trajectory.reference == "yard" else ()
+    in_frame = whole if trajectory.reference == "yard" else ()
+    laser = tuple(profile for profile in in_frame if runs_along_x(profile))
+    askew = tuple(profile.profile for profile in in_frame if not runs_along_x(profile))
 
     def cut(of: Surface) -> tuple[Contour, ...]:
         return cut_contours(of, laser, settings.profile_y_m, settings.contours)
@@ -88,7 +98,12 @@ def cut_profiles(
             with_laser.mkdir()
             surface = fuse_laser(surface, believed, settings, with_laser)
             contours = cut(surface)
-    return Profiles(surface, contours, laser, agreed, checks, len(laser) < len(whole))
+    return Profiles(surface, contours, laser, agreed, checks, len(in_frame) < len(whole), askew)
+
+
+def runs_along_x(profile: LaserProfile) -> bool:
+    """Check that a profile keeps its y, so that a contour at that y shows the same places."""
+    return bool(np.ptp(profile.y_m) <= MAX_ASKEW_M)
 
 
 def _speed_along_x(trajectory: Trajectory) -> float:

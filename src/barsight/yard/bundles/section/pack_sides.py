@@ -18,6 +18,10 @@ _WIDEST_RATIO, _WIDEST_M = 0.6, 0.1
 """Depth under the top, of the straps' width and at least, under which no pack is wider."""
 _LEDGE_SLOPE = 0.5
 """A bar low at the side shows as a ledge: two steps in a row that fall by less than this slope."""
+_PARTING_M, _PARTING_RATIO = 0.06, 0.3
+"""Least depth of a gully that parts two packs, whatever their straps, and of the straps' width; it is as deep
+as a bar is thick besides. Within 3757 packs as worlds draw them none is deeper than 86 mm; in 1956 of them
+than 1.7 bars of up to 25 mm, 1.05 of up to 60 mm, 0.85 of 80 to 100 mm."""
 _HIDDEN_CELLS = 12
 """Largest number of places out of sight in a flank before the surface is seen to have fallen away."""
 _STEP_M, _DEEP_CELLS = 0.05, 2
@@ -55,15 +59,15 @@ class PackSide(IntEnum):
 
 def find_side(
     outwards: Float64, inwards: Float64, begin: int | None, shared: bool | None, top: float, width_m: float,
-    cell_m: float,
+    cell_m: float, thick_m: float,
 ) -> tuple[int, PackSide]:  # fmt: skip
     """Find the last place of a bundle that is in sight on one side, and what is there.
 
     outwards, inwards: heights from the last place that its straps hold: NaN unseen, -inf floor. begin: places
     to the next straps, None where there are none; shared: whether those lie in line with its own. top,
-    width_m: of what the straps hold.
+    width_m: of what the straps hold. thick_m: the most that its bars may be, NaN unknown.
     """
-    deep = top - max(_FLANK_RATIO * width_m, _FLANK_DEPTH_M)
+    deep = flank_depth(top, width_m)
     limit = round(_FLANK_M / cell_m)
     last, falls = _fall(outwards, limit if begin is None else min(begin, limit), deep)
     if falls:
@@ -72,10 +76,13 @@ def find_side(
         known = behind[~np.isnan(behind)]
         open_below = (known[:_DEEP_CELLS] <= deep).sum() >= _DEEP_CELLS
         return last, PackSide.SEEN if open_below or not is_overhung(inwards, behind) else PackSide.COVERED
-    if begin is None or shared or begin > round(_FAR_M / cell_m):
-        return last, PackSide.OPEN
-    alone = shared is None or begin > round(_NEAR_M / cell_m)
-    bottom = _gully(outwards[: begin + 1], top, alone)
+    bottom = None
+    if begin is not None and not shared and begin <= round(_FAR_M / cell_m):
+        alone = shared is None or begin > round(_NEAR_M / cell_m)
+        bottom = _gully(outwards[: begin + 1], top, alone)
+    if bottom is None:
+        least = float(np.max((thick_m, _PARTING_M, _PARTING_RATIO * width_m)))
+        bottom = _parting(outwards, limit, top, least)
     if bottom is None:
         return last, PackSide.OPEN
     last = int(np.flatnonzero(np.isfinite(outwards[: bottom + 1]))[-1])
@@ -94,6 +101,30 @@ def find_side(
     if steep or not (higher or is_overhung(before, beside)):
         return last, PackSide.SEEN
     return last, PackSide.OPEN if rise > width_m else PackSide.COVERED
+
+
+def flank_depth(top: float, width_m: float) -> float:
+    """Compute the height under which nothing is a pack's but what goes on there without a step. width_m: of
+    its straps."""
+    return top - max(_FLANK_RATIO * width_m, _FLANK_DEPTH_M)
+
+
+def _parting(level: Float64, limit: int, top: float, least: float) -> int | None:
+    """Find the bottom, within `limit` places, of the first gully where it sinks by `least` under both of its
+    sides, as none does within one pack. Places out of sight count as no deeper than what is seen.
+
+    None where there is none, or `least` is NaN.
+    """
+    lowest, rises = 0, False
+    for k, height in enumerate(level):
+        if height < level[lowest]:
+            if rises or k > limit:
+                return None
+            lowest = k
+        if min(top, height) - level[lowest] >= least:
+            return lowest
+        rises |= bool(height > level[lowest] + _RISES_M)
+    return None
 
 
 def _adjoining(behind: Float64, bottom: float) -> Float64:

@@ -10,11 +10,12 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
-from barsight.yard.bundles.section.bar_pitch import bar_diameter
-from barsight.yard.bundles.section.pack_sides import PackSide, find_side
+from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO, bar_diameter
+from barsight.yard.bundles.section.pack_sides import PackSide, find_side, flank_depth
 from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 from barsight.yard.bundles.section.strap_lines import FLOOR_M
 from barsight.yard.bundles.section.straps import MIN_ROWS, REACH_M, StrapSpan, strap_spans
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import HeightMap
 
 _OWN_RATIO = 0.5
@@ -73,29 +74,36 @@ def strapped_pack(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> Pack | 
     if height_map.gray is None or rows.size < MIN_ROWS:
         return None
     beside, level = mean_section(sheet, fit, rows, round(REACH_M / sheet.cell_m))
-    pack = find_pack(strap_spans(height_map, sheet, fit, level), fit.width_m, beside, level)
-    if pack is None:
-        return pack
-    ends = (pack.low_m, pack.high_m) if pack.is_bounded else (pack.span.low_m, pack.span.high_m)
-    return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, *ends))
+    spans = strap_spans(height_map, sheet, fit, level)
+    number = find_own(spans, fit.width_m)
+    if number is None:
+        return None
+    own = spans[number]
+    thick = bar_diameter(height_map, sheet, fit, own.low_m, own.high_m)
+    pack = find_pack(spans, number, beside, level, thick * (1 + UPPER * DIAMETER_SIGMA_RATIO))
+    if pack is None or not pack.is_bounded:
+        return pack and replace(pack, diameter_m=thick)
+    return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, pack.low_m, pack.high_m))
 
 
-def find_pack(
-    spans: tuple[StrapSpan, ...], width_m: float, beside_m: Float64, level_m: Float64
-) -> Pack | None:
-    """Extend the straps over a fit's axis to its flanks; None where no straps lie over it.
-
-    width_m: of the fit. level_m: (N,) mean heights over the axis at beside_m: NaN unknown, -inf floor.
-    A flank is seen where the surface falls to the floor, or far under the top, or where a neighbour
-    begins that is no higher and whose straps lie elsewhere. What may be a bar of the same bundle leaves it
-    open.
-    """
+def find_own(spans: tuple[StrapSpan, ...], width_m: float) -> int | None:
+    """Find the number of the straps over a fit's axis, of this width; None where none lie over it."""
     shares = [
         (min(s.high_m, 0.5 * width_m) - max(s.low_m, -0.5 * width_m)) / min(s.width_m, width_m) for s in spans
     ]
-    if not shares or max(shares) < _OWN_RATIO:
-        return None
-    number = int(np.argmax(shares))
+    return int(np.argmax(shares)) if shares and max(shares) >= _OWN_RATIO else None
+
+
+def find_pack(
+    spans: tuple[StrapSpan, ...], number: int, beside_m: Float64, level_m: Float64, thick_m: float
+) -> Pack | None:
+    """Extend straps, one of `spans`, to the flanks of what they hold; None where none of it is seen.
+
+    level_m: (N,) mean heights over the axis at beside_m: NaN unknown, -inf floor. thick_m: upper bound of the
+    bars' diameter, NaN where it isn't known. A flank is seen where the surface falls to the floor, or far
+    under the top, where a gully is deeper than one pack's bars leave, or where a neighbour begins that is no
+    higher and whose straps lie elsewhere. What may be a bar of the same bundle leaves it open.
+    """
     own = spans[number]
     inside = np.flatnonzero((beside_m >= own.low_m) & (beside_m <= own.high_m) & np.isfinite(level_m))
     if inside.size == 0:
@@ -105,19 +113,28 @@ def find_pack(
     level_inside = level_m[inside[0] : inside[-1] + 1]
     is_one = own.spread_m <= _SPREAD_M and _dip(level_inside) < _DIP_RATIO * own.width_m
     ends, others, sides = [], [], []
-    for step, at, number_beside in ((-1, inside[0], number - 1), (1, inside[-1], number + 1)):
-        next_one = spans[number_beside] if 0 <= number_beside < len(spans) else None
-        near, begin = np.inf, None
-        shared = None
-        if next_one is not None:
-            shared = _shared(next_one, own) if step < 0 else _shared(own, next_one)
-            near = next_one.high_m if step < 0 else next_one.low_m
+    for step, at, beyond in ((-1, inside[0], spans[:number][::-1]), (1, inside[-1], spans[number + 1 :])):
+        near, begin, shared = np.inf, None, None
+        for other in beyond:
+            shared = _shared(other, own) if step < 0 else _shared(own, other)
+            if not shared and _lies_below(other, beside_m, level_m, flank_depth(top, own.width_m)):
+                continue
+            near = other.high_m if step < 0 else other.low_m
             begin = max(round((abs(near - float(beside_m[at])) - cell / 2) / cell), 0)
-        others.append(float(near) if shared is False else step * np.inf)
-        last, side = find_side(level_m[at::step], level_m[at::-step], begin, shared, top, own.width_m, cell)
+            break
+        others.append(float(near) if begin is not None and shared is False else step * np.inf)
+        last, side = find_side(
+            level_m[at::step], level_m[at::-step], begin, shared, top, own.width_m, cell, thick_m
+        )
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
         sides.append(side if is_one else PackSide.OPEN)
     return Pack(ends[0], ends[1], own, (others[0], others[1]), top, (sides[0], sides[1]))
+
+
+def _lies_below(span: StrapSpan, beside_m: Float64, level_m: Float64, deep_m: float) -> bool:
+    """Check whether straps are another layer's: most of what they hold lies under a pack's flanks."""
+    seen = level_m[(beside_m >= span.low_m) & (beside_m <= span.high_m) & ~np.isnan(level_m)]
+    return bool(seen.size and np.median(seen) <= deep_m)
 
 
 def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:

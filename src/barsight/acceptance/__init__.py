@@ -1,0 +1,1 @@
+"""Accept a rig by artefacts: find them, judge errors with their uncertainty, name causes, certify."""

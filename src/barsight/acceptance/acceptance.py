@@ -1,0 +1,102 @@
+"""Run an acceptance: measure each recording, find the artefacts, judge every quantity, name causes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import nan
+from pathlib import Path
+
+import numpy as np
+
+from barsight.acceptance.causes import Cause, name_causes
+from barsight.acceptance.observation import Observation, observe
+from barsight.acceptance.pictures import FRAMES, PictureHealth, check_pictures
+from barsight.acceptance.quantities import Decision, JudgedQuantity, decide, judge_all
+from barsight.acceptance.uncertainty import combine
+from barsight.artefacts.plan import AcceptancePlan, ErrorLimits
+from barsight.core.errors import Failed, InputError
+from barsight.core.types import StereoFrame
+from barsight.map_building import ProgressCallback
+from barsight.measure_folder import measure_into
+from barsight.measure_settings import MeasureSettings
+from barsight.motion.batch.fusion import FusionSettings
+from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, RigCheck, check_rig
+from barsight.recording.base import Recording
+from barsight.recording.open import open_recording
+from barsight.yard_frame import in_yard
+
+
+@dataclass(frozen=True, eq=False)
+class Acceptance:
+    """All that a certificate says. rig: check of each recording, pictures: of each; inputs: digests of each
+    recording's inputs, by its path.
+    """
+
+    plan: AcceptancePlan
+    observations: tuple[Observation, ...]
+    quantities: tuple[JudgedQuantity, ...]
+    rig: tuple[RigCheck, ...]
+    pictures: tuple[tuple[PictureHealth, ...] | Failed, ...]
+    causes: tuple[Cause, ...]
+    inputs: dict[str, dict[str, str]]
+
+    @property
+    def is_passed(self) -> bool:
+        """Check that every quantity passed and no recording shows a drifted rig."""
+        sound = not any(one.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION) for one in self.rig)
+        return sound and all(one.decision is Decision.PASSED for one in self.quantities)
+
+
+def accept(
+    plan: AcceptancePlan, recordings: Sequence[Path], settings: MeasureSettings, work: Path,
+    advance: ProgressCallback,
+) -> Acceptance:  # fmt: skip
+    """Accept or refuse by one or several recordings of the artefacts; results are kept in folders of `work`.
+
+    Raises a BarsightError where one can't be measured at all.
+    """
+    seen, rig, pictures, inputs = [], [], [], {}
+    for number, path in enumerate(recordings, 1):
+        folder = work / f"measured_{number}"
+        measure_into(path, folder, settings, advance=advance, report=False)
+        source = in_yard(open_recording(path, settings.recording), settings.yard)
+        seen.append(observe(folder, plan, source.rig, str(path)))
+        rig.append(check_rig(source, FusionSettings(), CheckSettings(), lambda: None))
+        pictures.append(check_pictures(some_frames(source)))
+        inputs[str(path)] = dict(source.digests())
+    _expect_one_rig(seen)
+    judged = judge_all(plan, seen) + tuple(_dirt(pictures, plan.limits))
+    causes = name_causes(plan, seen, rig, pictures)
+    return Acceptance(plan, tuple(seen), judged, tuple(rig), tuple(pictures), causes, inputs)
+
+
+def _expect_one_rig(seen: Sequence[Observation]) -> None:
+    first = seen[0]
+    for other in seen[1:]:
+        for what in ("calibration_id", "yard_frame_id"):
+            if getattr(other, what) != getattr(first, what):
+                problem = f"has another {what.removesuffix('_id').replace('_', ' ')} than {first.recording}"
+                raise InputError(other.recording, problem, "accept one rig at a time")
+
+
+def some_frames(source: Recording) -> Iterator[StereoFrame]:
+    """Yield frames spread evenly over a recording, as many as the check of the pictures takes."""
+    stamps = list(source.index.stamps_ns)
+    chosen = np.linspace(0, max(len(stamps) - 1, 0), min(FRAMES, len(stamps))).astype(int)
+    for frame in source.frames({stamps[k] for k in chosen.tolist()}):
+        if isinstance(frame, StereoFrame):
+            yield frame
+
+
+def _dirt(
+    pictures: Sequence[tuple[PictureHealth, ...] | Failed], limits: ErrorLimits
+) -> Iterator[JudgedQuantity]:
+    for side in range(2):
+        shares = [nan if isinstance(row, Failed) else row[side].dirt_pct for row in pictures]
+        why = "; ".join(str(row) for row in pictures if isinstance(row, Failed))
+        worst = nan if np.isnan(shares).any() else max(shares)
+        yield JudgedQuantity(
+            f"cam{side}: dirt", "dirt_pct", "%", tuple(shares), worst, combine(()), (), limits.dirt_pct,
+            decide(worst, 0.0, limits.dirt_pct), why,
+        )  # fmt: skip

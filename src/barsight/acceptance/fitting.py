@@ -1,0 +1,209 @@
+"""Find spheres and plates in a height map near where a plan says they stand, and fit them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from barsight.artefacts.plan import Plate, Sphere
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import Failed
+from barsight.core.types import HeightSource
+from barsight.yard.types import YardMap
+
+CAP_RATIO = 0.7
+"""Share of the radius up to which a sphere's cap is used: its flank slopes by 44 degrees there."""
+EDGE_M = 0.08
+"""Margin of a plate that isn't used: matching blurs its edge."""
+STEP_M = 0.02
+"""Steps in which a place is sought; the fit goes on from the best."""
+NEAR_M = 0.02
+"""A height further off isn't the artefact's."""
+TIGHT_RATIO = 0.07
+"""Share of the radius by which a sphere's heights may be off at last."""
+ROUND_RATIO = 0.5
+"""Share of a plane's misfit that a sphere's may have."""
+STARTS = 6
+THINNED = 5
+"""Of so many heights one takes part in the search for a plate."""
+CORRELATED_M = 0.03
+"""Cells nearer than this see the same pixels: their errors are alike."""
+MIN_SHARE = 0.5
+"""Share of the cells that must be there and fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedSphere:
+    """centre_m: (3,) with the calibrated diameter. sigma_m: one coordinate's noise by the residuals.
+    diameter_m: fitted too. form_m: span of 95 % of the radii. cells: used.
+    """
+
+    centre_m: Float64
+    sigma_m: float
+    diameter_m: float
+    form_m: float
+    cells: int
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPlate:
+    """z_m: height at the plate's middle; sigma_m: its noise by the residuals. shift_m: (2,) from where the
+    plan has it, to a step of the search. tilt_deg: of its plane. flatness_m: span of 95 % about the plane.
+    """
+
+    z_m: float
+    sigma_m: float
+    shift_m: Float64
+    tilt_deg: float
+    flatness_m: float
+    cells: int
+
+
+def fit_sphere(yard: YardMap, sphere: Sphere, search_m: float) -> FittedSphere | Failed:
+    """Fit a sphere's cap. Failed `not-found` where too few heights near its place fit one."""
+    radius = sphere.diameter_m / 2
+    points = _known(yard, sphere.x_m, sphere.y_m, search_m + radius)
+    expected = np.pi * (CAP_RATIO * radius / yard.cell_m) ** 2
+    best: tuple[Float64, Float64] | None = None
+    for start in _starts(points, sphere, search_m, expected):
+        centre, cap = start, points
+        for near in (NEAR_M, NEAR_M, TIGHT_RATIO * radius):
+            away = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) < CAP_RATIO * radius
+            off = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+            cap = points[away & (off < near)]
+            if len(cap) < MIN_SHARE * expected:
+                break
+            centre = _solve(cap, centre, radius)
+        if len(cap) >= MIN_SHARE * expected and (best is None or len(cap) > len(best[1])):
+            best = centre, cap
+    if best is None or not _is_round(best[1], best[0], radius):
+        return Failed("not-found", f"{sphere.name}: no sphere within {search_m:g} m of its place")
+    centre, cap = best
+    free = _solve(cap, np.append(centre, radius), None)
+    residual = np.linalg.norm(cap - centre, axis=1) - radius
+    low, high = np.percentile(np.linalg.norm(cap - free[:3], axis=1), (2.5, 97.5))
+    alone = max(len(cap) * (yard.cell_m / CORRELATED_M) ** 2, 1.0)
+    sigma = float(residual.std()) * np.sqrt(1 + 1 / CAP_RATIO**2) / np.sqrt(alone)
+    return FittedSphere(centre, float(sigma), 2 * float(free[3]), float(high - low), len(cap))
+
+
+def _is_round(cap: Float64, centre: Float64, radius: float) -> bool:
+    """Check that a sphere fits heights (N, 3) far better than a plane does."""
+    flat = np.column_stack([cap[:, :2], np.ones(len(cap))])
+    off_plane = cap[:, 2] - flat @ np.linalg.lstsq(flat, cap[:, 2], rcond=None)[0]
+    off_sphere = np.linalg.norm(cap - centre, axis=1) - radius
+    return bool(off_sphere.std() < ROUND_RATIO * off_plane.std())
+
+
+def _starts(points: Float64, sphere: Sphere, search_m: float, expected: float) -> list[Float64]:
+    """List the centres (3,) from which the heights look most like the sphere."""
+    radius, scored = sphere.diameter_m / 2, list[tuple[float, Float64]]()
+    for dx in _steps(search_m):
+        for dy in _steps(search_m):
+            x, y = sphere.x_m + dx, sphere.y_m + dy
+            square = (points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2
+            near = square < (CAP_RATIO * radius) ** 2
+            if near.sum() < MIN_SHARE * expected:
+                continue
+            z = points[near, 2] - np.sqrt(radius**2 - square[near])
+            middle = float(np.median(z))
+            if abs(middle - sphere.z_m) < search_m:
+                fits = np.maximum(1 - ((z - middle) / NEAR_M) ** 2, 0).sum()
+                scored.append((float(fits), np.array([x, y, middle])))
+    scored.sort(key=lambda one: -one[0])
+    return [centre for _, centre in scored[:STARTS]]
+
+
+def fit_plate(yard: YardMap, plate: Plate, search_m: float) -> FittedPlate | Failed:
+    """Fit a plate's plane. Failed `not-found` where too few heights near its place lie level there."""
+    points = _known(yard, plate.x_m, plate.y_m, search_m + max(plate.size_m))
+    points = points[np.abs(points[:, 2] - plate.z_m) < search_m]
+    turn = np.radians(plate.yaw_deg)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    half = np.array(plate.size_m) / 2
+    expected = float(np.prod(2 * (half - EDGE_M))) / yard.cell_m**2
+    shift = _plate_shift(points[::THINNED], plate, search_m, axes, expected / THINNED)
+    if shift is None:
+        return Failed("not-found", f"{plate.name}: no level plate within {search_m:g} m of its place")
+    at = (points[:, :2] - (plate.x_m, plate.y_m) - shift) @ axes.T
+    used = points[_inside(at, half - EDGE_M)]
+    used = used[np.abs(used[:, 2] - np.median(used[:, 2])) < NEAR_M]
+    flat = np.column_stack([used[:, :2] - (plate.x_m, plate.y_m) - shift, np.ones(len(used))])
+
+    def off_plane(plane: Float64) -> Float64:
+        off: Float64 = flat @ plane - used[:, 2]
+        return off
+
+    start = [0.0, 0.0, np.median(used[:, 2])]
+    plane = least_squares(off_plane, start, loss="soft_l1", f_scale=2e-3).x
+    residual = used[:, 2] - flat @ plane
+    low, high = np.percentile(residual, (2.5, 97.5))
+    alone = max(len(used) * (yard.cell_m / CORRELATED_M) ** 2, 1.0)
+    return FittedPlate(
+        float(plane[2]), float(residual.std() / np.sqrt(alone)), shift,
+        float(np.degrees(np.arctan(np.hypot(*plane[:2])))), float(high - low), len(used),
+    )  # fmt: skip
+
+
+def _plate_shift(
+    points: Float64, plate: Plate, search_m: float, axes: Float64, expected: float
+) -> Float64 | None:
+    """Find the shift (2,) at which most heights lie level on the plate and fewest around it."""
+    half, shift, best = np.array(plate.size_m) / 2, None, -np.inf
+    for dx in _steps(search_m):
+        for dy in _steps(search_m):
+            at = (points[:, :2] - (plate.x_m + dx, plate.y_m + dy)) @ axes.T
+            inner = _inside(at, half - EDGE_M)
+            if inner.sum() < MIN_SHARE * expected:
+                continue
+            level = np.abs(points[:, 2] - np.median(points[inner, 2])) < NEAR_M
+            beside = _inside(at, half + EDGE_M) & ~_inside(at, half)
+            score = (
+                (inner & level).sum() - (beside & level).sum() - 0.01 * expected * np.hypot(dx, dy) / search_m
+            )
+            if score > best:
+                best, shift = float(score), np.array([dx, dy])
+    return shift
+
+
+def _known(yard: YardMap, x_m: float, y_m: float, reach_m: float) -> Float64:
+    """Read the heights (N, 3) that vision measured in a square of half side `reach_m`."""
+    spans = [
+        slice(
+            min(max(int((at - reach_m - low) / yard.cell_m), 0), size),
+            min(max(int((at + reach_m - low) / yard.cell_m) + 2, 0), size),
+        )
+        for at, low, size in ((y_m, yard.y0_m, yard.shape[0]), (x_m, yard.x0_m, yard.shape[1]))
+    ]
+    if any(span.start >= span.stop for span in spans):
+        return np.empty((0, 3))
+    part = yard.part(*spans)
+    known = (part.source == HeightSource.VISION) & np.isfinite(part.z_m)
+    rows, columns = np.nonzero(known)
+    return np.column_stack([part.x_m[columns], part.y_m[rows], part.z_m[known].astype(np.float64)])
+
+
+def _steps(search_m: float) -> Float64:
+    """List offsets to try, the smallest first: of equals the nearest is taken."""
+    count = round(search_m / STEP_M)
+    steps = STEP_M * np.arange(-count, count + 1, dtype=np.float64)
+    return steps[np.argsort(np.abs(steps), kind="stable")]
+
+
+def _inside(at: Float64, half: Float64) -> Bool:
+    inside: Bool = np.all(np.abs(at) < half, axis=1)
+    return inside
+
+
+def _solve(cap: Float64, start: Float64, radius: float | None) -> Float64:
+    """Solve for centre (3,), or centre and radius (4,) where that is None, by distances to the cap (N, 3)."""
+
+    def off(unknown: Float64) -> Float64:
+        wanted = unknown[3] if radius is None else radius
+        distance: Float64 = np.linalg.norm(cap - unknown[:3], axis=1) - wanted
+        return distance
+
+    found: Float64 = least_squares(off, start, loss="soft_l1", f_scale=2e-3).x
+    return found

@@ -1,0 +1,254 @@
+"""Judge errors against limits by the rule of ISO 14253-1: passed only where |error| + U lies within."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import inf, isfinite, nan
+
+import numpy as np
+from scipy.stats import chi2
+
+from barsight.acceptance.observation import Observation
+from barsight.acceptance.uncertainty import CombinedUncertainty, UncertaintyPart, combine
+from barsight.artefacts.plan import (
+    AcceptancePlan,
+    Artefact,
+    DummyBundle,
+    HeightStep,
+    Plate,
+    Sphere,
+    SphereBar,
+    TouchDown,
+)
+from barsight.core.arrays import Float64
+from barsight.core.errors import Failed
+from barsight.yard.types import Bundle
+from barsight.yard.weight import bundle_mass
+
+REPEATED = ("height_mm", "position_mm", "length_mm", "step_mm", "lift_mm")
+"""Groups of lengths whose scatter over the recordings is judged."""
+
+
+class Decision(StrEnum):
+    """Passed: the error with its uncertainty lies within the limit. Failed: it lies outside. Not proven: the
+    limit lies in between. Not measured: the artefact wasn't found, or nothing was told of it."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    UNPROVEN = "not proven"
+    NOT_MEASURED = "not measured"
+
+
+@dataclass(frozen=True)
+class JudgedQuantity:
+    """A quantity: errors of each recording in `unit` (NaN where not measured), the worst of them, its test
+    value uncertainty [ISO/TS 23165], the limit and the decision. group: which limit.
+    """
+
+    name: str
+    group: str
+    unit: str
+    errors: tuple[float, ...]
+    error: float
+    uncertainty: CombinedUncertainty
+    parts: tuple[UncertaintyPart, ...]
+    limit: float
+    decision: Decision
+    reason: str = ""
+
+
+def judge_all(plan: AcceptancePlan, seen: Sequence[Observation]) -> tuple[JudgedQuantity, ...]:
+    """Judge every quantity that the plan names, over all recordings."""
+    judge = _Judge(plan, seen)
+    judged = [
+        *(q for one in plan.plate for q in judge.plate(one)),
+        *(q for one in plan.sphere for q in judge.sphere(one)),
+        *(judge.bar(one) for one in plan.sphere_bar),
+        *(judge.step(one) for one in plan.step),
+        *(q for one in plan.dummy_bundle for q in judge.dummy(one)),
+        *(q for one in plan.touch_down for q in judge.touch(one)),
+        *judge.laser(),
+    ]
+    return (*judged, *judge.repeats(judged))
+
+
+def decide(error: float, expanded: float, limit: float) -> Decision:
+    """Decide by ISO 14253-1: NaN is not measured."""
+    if not isfinite(error):
+        return Decision.NOT_MEASURED
+    if abs(error) + expanded <= limit:
+        return Decision.PASSED
+    return Decision.FAILED if abs(error) - expanded > limit else Decision.UNPROVEN
+
+
+class _Judge:
+    def __init__(self, plan: AcceptancePlan, seen: Sequence[Observation]) -> None:
+        self._plan, self._seen, self._limits = plan, seen, plan.limits
+
+    def plate(self, one: Plate) -> Iterator[JudgedQuantity]:
+        found = [view.plates[one.name] for view in self._seen]
+        z = [nan if isinstance(f, Failed) else 1e3 * (f.z_m - one.z_m) for f in found]
+        flat = [nan if isinstance(f, Failed) else 1e3 * f.flatness_m for f in found]
+        yield self._judged(f"{one.name}: height", "height_mm", z, [self._own(one.sigma_m)], _why(found))
+        parts = [self._own(one.flatness_sigma_m)]
+        yield self._judged(f"{one.name}: flatness", "flatness_mm", flat, parts, _why(found))
+
+    def sphere(self, one: Sphere) -> Iterator[JudgedQuantity]:
+        found = [view.spheres[one.name] for view in self._seen]
+        place = np.array([one.x_m, one.y_m, one.z_m])
+        if one.place_sigma_m is not None:
+            off = [np.full(3, nan) if isinstance(f, Failed) else 1e3 * (f.centre_m - place) for f in found]
+            for k, axis in enumerate("xyz"):
+                group = "height_mm" if axis == "z" else "position_mm"
+                survey = self._own(one.place_sigma_m, "survey of its place")
+                yield self._judged(f"{one.name}: {axis}", group, [o[k] for o in off], [survey], _why(found))
+        if one.probing:
+            wanted = one.diameter_m * self._expansion
+            form = [nan if isinstance(f, Failed) else 1e3 * f.form_m for f in found]
+            size = [nan if isinstance(f, Failed) else 1e3 * (f.diameter_m - wanted) for f in found]
+            parts = [self._own(one.diameter_sigma_m), self._thermal(one.diameter_m)]
+            yield self._judged(f"{one.name}: form", "form_mm", form, parts[:1], _why(found))
+            yield self._judged(f"{one.name}: size", "size_mm", size, parts, _why(found))
+
+    def bar(self, one: SphereBar) -> JudgedQuantity:
+        errors, found = [], []
+        for view in self._seen:
+            first, second = (view.spheres[name] for name in one.spheres)
+            found += [first, second]
+            missing = isinstance(first, Failed) or isinstance(second, Failed)
+            length = nan if missing else float(np.linalg.norm(first.centre_m - second.centre_m))  # type: ignore[union-attr]
+            errors.append(1e3 * (length - one.length_m * self._expansion))
+        parts = [self._own(one.sigma_m), self._thermal(one.length_m)]
+        return self._judged(f"{one.name}: length", "length_mm", errors, parts, _why(found))
+
+    def step(self, one: HeightStep) -> JudgedQuantity:
+        errors, found = [], []
+        for view in self._seen:
+            low, high = view.plates[one.lower], view.plates[one.upper]
+            found += [low, high]
+            missing = isinstance(low, Failed) or isinstance(high, Failed)
+            height = nan if missing else high.z_m - low.z_m  # type: ignore[union-attr]
+            errors.append(1e3 * (height - one.height_m * self._expansion))
+        parts = [self._own(one.sigma_m), self._thermal(one.height_m)]
+        return self._judged(f"{one.name}: height", "step_mm", errors, parts, _why(found))
+
+    def dummy(self, one: DummyBundle) -> Iterator[JudgedQuantity]:
+        found = [view.bundles[one.name] for view in self._seen]
+        nothing = np.full(7, nan)
+        rows = np.array([nothing if isinstance(f, Failed) else _bundle_errors(f, one) for f in found])
+        own, yaw = self._own(one.sigma_m), self._own(one.yaw_sigma_deg, unit=1.0)
+        for k, (what, group, part) in enumerate((
+            ("lift x", "lift_mm", own), ("lift y", "lift_mm", own), ("lift z", "lift_mm", own),
+            ("yaw", "yaw_deg", yaw), ("width", "width_mm", own), ("length", "bundle_length_mm", own),
+        )):  # fmt: skip
+            yield self._judged(f"{one.name}: {what}", group, rows[:, k].tolist(), [part], _why(found))
+        if one.mass_kg is not None:
+            part = self._own(one.mass_sigma_kg / one.mass_kg, "weighing", unit=100.0)
+            yield self._judged(f"{one.name}: mass", "mass_pct", rows[:, 6].tolist(), [part], _why(found))
+
+    def touch(self, one: TouchDown) -> Iterator[JudgedQuantity]:
+        tops = [_top(view, one.on, self._plan.artefacts) for view in self._seen]
+        crane = np.array([one.x_m, one.y_m, one.z_m])
+        off = [np.full(3, nan) if isinstance(top, Failed) else 1e3 * (top - crane) for top in tops]
+        part = self._own(one.sigma_m, "the crane's place at the touch-down")
+        for k, axis in enumerate("xyz"):
+            errors = [o[k] for o in off]
+            if all(np.isnan(errors)) and not all(isinstance(top, Failed) for top in tops):
+                continue  # a plate shows its height only
+            yield self._judged(f"{one.name}: {axis}", "touch_mm", errors, [part], _why(tops))
+
+    def laser(self) -> Iterator[JudgedQuantity]:
+        for profile in sorted({row.profile for view in self._seen for row in view.laser}):
+            rows = [row for view in self._seen for row in view.laser if row.profile == profile]
+            worst = max(rows, key=lambda row: row.equivalence_mm)
+            # The margin of two one-sided tests is the bias and this.
+            half = worst.equivalence_mm - abs(worst.bias_mm)
+            part = UncertaintyPart("independent samples of the profile", half / 2, "t", inf, "this test")
+            yield self._judged(
+                f"laser profile {profile}: equivalence", "laser_mm", [row.bias_mm for row in rows], [part],
+                "", expanded=half, error=worst.bias_mm,
+            )  # fmt: skip
+
+    def repeats(self, judged: Sequence[JudgedQuantity]) -> Iterator[JudgedQuantity]:
+        """Judge twice the pooled scatter over the recordings; U reaches to its upper bound of 95 %."""
+        rows = [np.array(q.errors) for q in judged if q.group in REPEATED]
+        rows = [row[np.isfinite(row)] for row in rows]
+        free = sum(row.size - 1 for row in rows if row.size > 1)
+        if free < 1:
+            return
+        scatter = np.sqrt(sum(float(row.var(ddof=1)) * (row.size - 1) for row in rows if row.size > 1) / free)
+        upper = float(2 * scatter * (np.sqrt(free / chi2.ppf(0.05, free)) - 1))
+        part = UncertaintyPart("few repeats", upper / 2, "chi-square", float(free), "this test")
+        yield self._judged(
+            "repeatability, 2 s", "repeat_mm", [2 * float(scatter)], [part], "", expanded=upper
+        )  # fmt: skip
+
+    def _judged(
+        self, name: str, group: str, errors: Sequence[float], parts: Sequence[UncertaintyPart], reason: str,
+        *, expanded: float | None = None, error: float | None = None,
+    ) -> JudgedQuantity:  # fmt: skip
+        limit = float(getattr(self._limits, group))
+        known = [e for e in errors if isfinite(e)]
+        worst = error if error is not None else (max(known, key=abs) if known else nan)
+        if len(known) < len(errors):
+            worst = nan  # every recording must show it
+        whole = combine(parts)
+        if expanded is not None:
+            whole = CombinedUncertainty(whole.sigma, whole.degrees_of_freedom, 2.0, expanded)
+        decision = decide(worst, whole.expanded, limit)
+        return JudgedQuantity(
+            name, group, group.rpartition("_")[2].replace("pct", "%"), tuple(float(e) for e in errors), worst,
+            whole, tuple(parts), limit, decision, reason if decision is Decision.NOT_MEASURED else "",
+        )  # fmt: skip
+
+    def _own(
+        self, sigma: float, source: str = "calibration of the artefact", unit: float = 1e3
+    ) -> UncertaintyPart:
+        free = self._plan.conditions.degrees_of_freedom
+        return UncertaintyPart(source, unit * sigma, "normal", free, "the plan")
+
+    def _thermal(self, length_m: float) -> UncertaintyPart:
+        about = self._plan.conditions
+        sigma = 1e3 * length_m * about.expansion_per_k * about.temperature_sigma_c
+        return UncertaintyPart("temperature of the artefact", sigma, "normal", inf, "the plan")
+
+    @property
+    def _expansion(self) -> float:
+        about = self._plan.conditions
+        return 1 + about.expansion_per_k * (about.temperature_c - 20)
+
+
+def _why(found: Sequence[object]) -> str:
+    return "; ".join(dict.fromkeys(str(one) for one in found if isinstance(one, Failed)))
+
+
+def _bundle_errors(bundle: Bundle, dummy: DummyBundle) -> Float64:
+    """Compute errors (7,) of a bundle: x, y, z (mm), yaw (deg), width, length (mm), mass (%)."""
+    turn = (np.degrees(bundle.yaw_rad) - dummy.yaw_deg + 90) % 180 - 90
+    ended = not any(bundle.ends_open)
+    kg = bundle_mass(bundle).kg
+    return np.array([
+        1e3 * (bundle.centre_m[0] - dummy.x_m), 1e3 * (bundle.centre_m[1] - dummy.y_m),
+        1e3 * (bundle.top_z_m - dummy.top_z_m), turn, 1e3 * (bundle.width_m - dummy.width_m),
+        1e3 * (bundle.length_m - dummy.length_m) if ended else nan,
+        nan if dummy.mass_kg is None or not ended else 100 * (kg / dummy.mass_kg - 1),
+    ])  # fmt: skip
+
+
+def _top(view: Observation, name: str, artefacts: Sequence[Artefact]) -> Float64 | Failed:
+    """Find where a magnet touches an artefact, (3,) m; a plate's x and y aren't seen (NaN)."""
+    if name in view.plates:
+        plate = view.plates[name]
+        return plate if isinstance(plate, Failed) else np.array([nan, nan, plate.z_m])
+    if name in view.bundles:
+        bundle = view.bundles[name]
+        return bundle if isinstance(bundle, Failed) else np.array([*bundle.centre_m[:2], bundle.top_z_m])
+    sphere = view.spheres[name]
+    if isinstance(sphere, Failed):
+        return sphere
+    (own,) = (one for one in artefacts if one.name == name)
+    assert isinstance(own, Sphere)
+    top: Float64 = sphere.centre_m + np.array([0.0, 0.0, own.diameter_m / 2])
+    return top

@@ -1,0 +1,1 @@
+"""Describe the artefacts of an acceptance: plates, spheres, bars, steps, dummy bundles, limits."""

@@ -1,0 +1,141 @@
+"""Run `barsight accept PLAN RECORDING... -o CERTIFICATE` and `barsight accept --plan OUT -o PLAN`."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from barsight.acceptance.acceptance import Acceptance, accept
+from barsight.acceptance.certificate import certificate_content, certificate_files, write_certificate
+from barsight.acceptance.layout import Area, lay_out
+from barsight.acceptance.quantities import Decision
+from barsight.acceptance.yard_area import measured_area
+from barsight.artefacts.plan import plan_text, read_plan
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.files import atomic_path, expect_output
+from barsight.measure_settings import MeasureSettings
+from barsight.recording.base import RecordingSettings
+from barsight.report.signing import sign_file
+from barsight.result_folder import read_heights
+
+COLOURS = {Decision.PASSED: "green", Decision.FAILED: "red"}
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, accept and print."""
+
+    def command(
+        files: tyro.conf.Positional[tuple[Path, ...]],
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        plan: bool = False,
+        yard: Path | None = None,
+        rig: Path | None = None,
+        preset: Literal["best", "fast"] = "best",
+        key: Path | None = None,
+        signer: str = "",
+        keep: Path | None = None,
+    ) -> None:
+        """Accept a rig by artefacts in the yard, in the manner of VDI/VDE 2634-3 and ISO 10360-13.
+
+        Each quantity passes only where |error| + U lies within its limit (ISO 14253-1). The exit code is 5
+        where one doesn't, or where the crane's travel shows a drifted rig; the certificate is written all
+        the same and names the cause.
+
+        Args:
+            files: PLAN.toml, then one or more recordings of the artefacts; several show the repeatability.
+                With --plan: a folder that barsight measure wrote of the yard.
+            out: The certificate: .json, .html and, with the extra `acceptance`, .pdf are written under this
+                name. With --plan: the plan to write, PLAN.toml.
+            plan: Make a plan for the yard instead: artefacts on its free floor, limits by what a pixel is.
+            yard: The file that barsight calibrate yard wrote.
+            rig: A rig file to use instead of the recordings' own calibration.
+            preset: As of barsight measure.
+            key: Ed25519 private key (PEM) that signs each file of the certificate; the signature lies beside
+                it as NAME.sig.
+            signer: Who answers for the certificate.
+            keep: A new folder for what was measured of each recording.
+        """
+        if plan:
+            _make_plan(files, out)
+            return
+        if len(files) < 2:
+            raise ConfigError("accept needs PLAN.toml and at least one recording; --plan makes a plan")
+        settings = MeasureSettings(preset=preset, yard=yard, recording=RecordingSettings(rig=rig))
+        _accept(files, out, settings, key, signer, keep)
+
+    call(command, "accept", arguments)
+
+
+def _accept(
+    files: tuple[Path, ...], out: Path, settings: MeasureSettings, key: Path | None, signer: str,
+    keep: Path | None,
+) -> None:  # fmt: skip
+    console = SafeConsole(stderr=True)
+    wanted = read_plan(files[0])
+    page = certificate_files(out)[1]
+    expect_output(page, ".html")
+    has_pdf = find_spec("reportlab") is not None
+    with tempfile.TemporaryDirectory(prefix="barsight.") as scratch:
+        if key is not None:  # a wrong key shows before the measuring, not after
+            probe = Path(scratch) / "probe"
+            probe.touch()
+            sign_file(probe, key)
+        work = Path(scratch) if keep is None else keep
+        work.mkdir(parents=True, exist_ok=True)
+        with stages(console) as advance:
+            found = accept(wanted, files[1:], settings, work, advance)
+    write_certificate(certificate_content(found, signer), out, key, has_pdf)
+    print_acceptance(found)
+    console.print(f"certificate: {page}", soft_wrap=True, highlight=False, markup=False)
+    if not has_pdf:
+        console.print("no PDF: run pip install 'barsight[acceptance]'", highlight=False, markup=False)
+    if not found.is_passed:
+        raise MeasurementError(f"{files[0]}: not accepted: {why_refused(found)}")
+
+
+def why_refused(found: Acceptance) -> str:
+    """Say in one line what is wrong: the causes, else the quantities."""
+    if found.causes:
+        return ", ".join(f"{one.name} ({one.value:+.3g} {one.unit})" for one in found.causes)
+    bad = [q for q in found.quantities if q.decision is not Decision.PASSED]
+    said = [f"{q.name} {q.decision}" for q in bad[:3]] + ([f"{len(bad) - 3} more"] if len(bad) > 3 else [])
+    return ", ".join(said) or "the crane's travel contradicts the rig"
+
+
+def print_acceptance(found: Acceptance) -> None:
+    """Print every quantity with its decision, and the causes."""
+    table = Table(box=SIMPLE_HEAD, title="Acceptance: passed" if found.is_passed else "Acceptance: failed")
+    for head in ("quantity", "error", "U", "limit", "", "decision"):
+        table.add_column(head, justify="left" if head in ("quantity", "decision") else "right", no_wrap=True)
+    for q in found.quantities:
+        colour = COLOURS.get(q.decision, "yellow")
+        error = "-" if q.decision is Decision.NOT_MEASURED else f"{q.error:+.2f}"
+        decision = f"[{colour}]{q.decision}[/{colour}]"
+        table.add_row(q.name, error, f"{q.uncertainty.expanded:.2f}", f"{q.limit:.2f}", q.unit, decision)
+    console = SafeConsole()
+    console.print(table)
+    for one in found.causes:
+        console.print(f"cause: {one.name}, {one.value:+.3g} ± {one.sigma:.2g} {one.unit}", highlight=False)
+
+
+def _make_plan(files: tuple[Path, ...], out: Path) -> None:
+    if len(files) != 1:
+        raise ConfigError("accept --plan takes one folder that barsight measure wrote")
+    expect_output(out, ".toml")
+    area: Area = measured_area(files[0])
+    made = lay_out(area, files[0].name, read_heights(files[0]))
+    if isinstance(made, Failed):
+        raise MeasurementError(f"{files[0]}: {made.reason}; clear more floor, or write the plan by hand")
+    with atomic_path(out) as path:
+        path.write_text(plan_text(made), encoding="utf-8")
+    SafeConsole(stderr=True).print(f"plan: {out}", soft_wrap=True, highlight=False, markup=False)
