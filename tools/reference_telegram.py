@@ -24,9 +24,9 @@ def telegram_page() -> str:
         "[How to connect a plant](../how-to/connect-a-plant.md) says what each side has to do.\n\n",
         "For TIA Portal (S7-1500) there are source texts: [telegram.udt](telegram.udt) has both sides as "
         "data types, [telegram.scl](telegram.scl) the function blocks `BarsightUnpack` and `BarsightPack` "
-        "for the bytes of TRCV and TSEND. Add them as external source files, the data types first. They were tested "
-        "outside TIA Portal only. `BarsightUnpack.mayAct` is false where the state isn't valid or `life` "
-        "stands for 300 ms: call it in every cycle.\n",
+        "for the bytes of TRCV and TSEND. Add them as external source files, the data types first. They were "
+        "tested outside TIA Portal only. `BarsightUnpack.mayAct` is false where the state isn't valid or "
+        "`life` stands for 300 ms: call it in every cycle.\n",
     ]
     for side, head in _HEADS.items():
         rows = "".join(f"| {at} | `{name}` | {kind} | {told} |\n" for at, name, kind, told in _placed(side))
