@@ -2,15 +2,11 @@
 
 import random
 import struct
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 from barsight.core.errors import Failed
 from barsight.plant.state import OfferedLift, PlantState
-from barsight.plant.telegram import layout, out_values, pack, table_of, unpack
+from barsight.plant.telegram import layout, out_values, pack, unpack
 
-ROOT = Path(__file__).parents[1]
 LIFT = OfferedLift(
     7, 1.5, -0.25, 0.7, 90.5, "ccw", 0.7, None, 2, 0.015, 0.03, 0.2, 1737.4, 522.2, 1, 3.0, 0.0, 0.1, 90.5,
     1_700_000_000_000_000_000, "map", "offered", "0a0b0c0d" + 56 * "0",
@@ -38,43 +34,3 @@ def test_what_is_no_telegram_is_refused() -> None:
     for _ in range(2000):
         content = draw.randbytes(draw.randrange(2 * layout("in").size))
         assert isinstance(unpack("in", content), Failed)
-
-
-def test_the_source_text_for_the_plc_takes_the_bytes_apart_as_we_do() -> None:
-    """The text's assignments, run as Python: SCL's functions are written here, by their manual."""
-    unpacking, packing = (
-        (ROOT / "docs/reference/telegram.scl").read_text(encoding="utf-8").split("BarsightPack")
-    )
-    draw = random.Random(5)
-    values = drawn(draw, "out")
-    telegram = run_scl(unpacking, "#telegram", {"bytes": list(pack("out", values))})["telegram"]
-    assert vars(telegram) == values
-    values = drawn(draw, "in")
-    parted = run_scl(packing, "#bytes", {"telegram": SimpleNamespace(**values), "bytes": [0] * 48})["bytes"]
-    assert bytes(parted) == pack("in", values)
-
-
-def drawn(draw: random.Random, side: str) -> dict[str, int]:
-    """A value of each field, over its whole range."""
-    bits = {name: (kind[0] == "i", int(kind[1:])) for name, kind, _ in table_of(side)}
-    return {name: draw.getrandbits(n) - is_signed * 2 ** (n - 1) for name, (is_signed, n) in bits.items()}
-
-
-def run_scl(text: str, assigned: str, names: dict[str, Any]) -> dict[str, Any]:
-    """Run the assignments to one variable."""
-    known: dict[str, Any] = {"telegram": SimpleNamespace()} | names
-    for bits, width in (("WORD", 16), ("DWORD", 32), ("LWORD", 64)):
-        whole = (1 << width) - 1
-        known[f"BYTE_TO_{bits}"] = lambda value: value
-        known[f"{bits}_TO_BYTE"] = lambda value: value & 0xFF
-        for kind in ("UINT", "UDINT"):
-            known[f"{bits}_TO_{kind}"] = known[f"{kind}_TO_{bits}"] = lambda value: value
-        for kind in ("DINT", "LINT"):
-            known[f"{kind}_TO_{bits}"] = lambda value, whole=whole: value & whole
-            known[f"{bits}_TO_{kind}"] = lambda value, whole=whole: value - (value > whole // 2) * (whole + 1)
-    known |= {"SHL": lambda IN, N: IN << N, "SHR": lambda IN, N: IN >> N}
-    for line in (line.strip() for line in text.splitlines()):
-        if line.startswith(assigned) and "#bytes" in line:
-            code = line.rstrip(";").replace(" OR ", " | ").replace("#", "")
-            exec(code.replace("IN :=", "IN=").replace("N :=", "N=").replace(" := ", " = "), known)
-    return known

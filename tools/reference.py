@@ -24,7 +24,6 @@ from barsight.cli import main
 from reference_codes import codes_page
 from reference_schemas import schemas_page
 from reference_settings import CRANE, MAGNET, PLANT, Use, settings_page, shown, type_text, walk
-from reference_telegram import scl_text, telegram_page, udt_text
 
 PAGES = Path(__file__).parents[1] / "docs" / "reference"
 PACKAGE = Path(barsight.__file__).parent
@@ -144,7 +143,7 @@ def settings_uses(all_commands: list[Command]) -> dict[type, list[tuple[str, str
 
 
 def pages() -> dict[str, str]:
-    """The text of each page, and of the sources for the PLC, by its file name."""
+    """The text of each page by its file name."""
     all_commands = list(commands())
     return {
         "commands.md": commands_page(all_commands),
@@ -152,9 +151,6 @@ def pages() -> dict[str, str]:
         "codes.md": HEAD
         + codes_page(find("BarsightError"), find("VETOES"), find("WARNINGS"), main.INTERRUPTED),
         "schemas.md": HEAD + schemas_page(PACKAGE),
-        "telegram.md": HEAD + telegram_page(),
-        "telegram.udt": udt_text(),
-        "telegram.scl": scl_text(),
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import contextlib
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from barsight.plant.telegram import layout, out_values, pack, unpack
 
 MIN_GAP_RATIO = 0.8
 """A telegram follows a late one no sooner than after so much of a cycle."""
-MAX_PARTNERS = 16
+MAX_PARTNERS = 32
 """Connections at once; one more is closed."""
 MAX_QUIET_S = 10.0
 """A connection ends whose partner's life counter stands for so long."""
@@ -30,26 +29,6 @@ class TelegramServer:
         self._feed, self._steps, self._settings = feed, steps, settings
         self._counter = self._partners = 0
         self.refused = 0
-
-    async def run_apart(self, ready: Callable[[int], None]) -> None:
-        """Run in a thread with a loop of its own until cancelled: other links make no telegram late."""
-        started = concurrent.futures.Future[tuple[asyncio.AbstractEventLoop, asyncio.Task[None]]]()
-
-        async def main() -> None:
-            task = asyncio.current_task()
-            assert task is not None
-            started.set_result((asyncio.get_running_loop(), task))
-            with contextlib.suppress(asyncio.CancelledError):
-                await self.run(ready)
-
-        thread = asyncio.create_task(asyncio.to_thread(asyncio.run, main()))
-        try:
-            await asyncio.shield(thread)
-        finally:
-            if not thread.done():
-                loop, task = await asyncio.wrap_future(started)
-                loop.call_soon_threadsafe(task.cancel)
-                await asyncio.gather(thread, return_exceptions=True)
 
     async def run(self, ready: Callable[[int], None]) -> None:
         """Listen until cancelled. ready: told the port."""

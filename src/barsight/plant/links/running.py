@@ -43,7 +43,7 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
     links: dict[str, Awaitable[None]] = {}
     if (one := settings.telegram) is not None:
         host = one.host
-        links[f"telegram at {host}:{one.port}"] = TelegramServer(feed, steps, one).run_apart(
+        links[f"telegram at {host}:{one.port}"] = TelegramServer(feed, steps, one).run(
             lambda port: say(f"telegram at {host}:{port}")
         )
     if settings.opcua is not None:
