@@ -1,13 +1,17 @@
-"""Serve telegram, OPC UA, MQTT and S7 from one state, until stopped or one of them ends."""
+"""Serve telegram, OPC UA, MQTT, S7 and webhooks from one state, until stopped or one of them ends."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
+from concurrent.futures import Future
+from typing import Any
 
 from barsight.core.errors import OutputError
 from barsight.plant.feed import READ_EVERY_S, StateFeed
+from barsight.plant.link_settings import WebhookSettings
 from barsight.plant.links.changes import changes_between
 from barsight.plant.links.opcua_link import serve_opcua
 from barsight.plant.links.s7_link import serve_s7
@@ -15,6 +19,7 @@ from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftSteps
+from barsight.plant.webhooks import Webhook
 from barsight.store.opening import Store
 
 Say = Callable[[str], None]
@@ -43,8 +48,9 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
     links: dict[str, Awaitable[None]] = {}
     if (one := settings.telegram) is not None:
         host = one.host
-        links[f"telegram at {host}:{one.port}"] = TelegramServer(feed, steps, one).run(
-            lambda port: say(f"telegram at {host}:{port}")
+        server = TelegramServer(feed, steps, one)
+        links[f"telegram at {host}:{one.port}"] = _in_own_thread(
+            lambda: server.run(lambda port: say(f"telegram at {host}:{port}"))
         )
     if settings.opcua is not None:
         links[f"OPC UA at {settings.opcua.url}"] = serve_opcua(store, settings.opcua, feed, steps, say)
@@ -52,7 +58,55 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
         links[f"MQTT at {settings.mqtt.host}:{settings.mqtt.port}"] = _serve_mqtt(settings, feed, say)
     if settings.s7 is not None:
         links[f"S7 at {settings.s7.host}:{settings.s7.port}"] = serve_s7(settings.s7, feed, steps, say)
+    if settings.webhooks is not None:
+        links["webhooks"] = _serve_webhooks(settings.webhooks, feed, say)
     return links
+
+
+async def _in_own_thread(link: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Await a link in a thread with an event loop of its own, so that no other link delays its cycle."""
+    begun = Future[tuple[asyncio.AbstractEventLoop, asyncio.Task[None]]]()
+
+    async def linked() -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        begun.set_result((asyncio.get_running_loop(), task))
+        await link()
+
+    def serve() -> None:
+        with contextlib.suppress(asyncio.CancelledError), asyncio.Runner() as runner:
+            runner.run(linked())
+
+    running = asyncio.create_task(asyncio.to_thread(serve))
+    try:
+        await asyncio.shield(running)
+    finally:
+        loop, task = await asyncio.wrap_future(begun)
+        with contextlib.suppress(RuntimeError):  # its loop has ended by itself
+            loop.call_soon_threadsafe(task.cancel)
+        await asyncio.gather(running, return_exceptions=True)
+
+
+async def _serve_webhooks(one: WebhookSettings, feed: StateFeed, say: Say) -> None:
+    hooks = [Webhook(url, one) for url in one.urls]
+    told = {hook.url: "" for hook in hooks}
+    last: PlantState | None = None
+    try:
+        while True:
+            state = feed.newest(0)
+            for change in changes_between(last, state):
+                for hook in hooks:
+                    hook.tell(change)
+            last = state
+            for hook in hooks:
+                now = hook.problem or "takes posts"
+                if now != told[hook.url]:
+                    say(f"webhook {hook.url}: {now}")
+                told[hook.url] = now
+            await asyncio.sleep(READ_EVERY_S)
+    finally:
+        for hook in hooks:
+            await asyncio.to_thread(hook.stop)
 
 
 async def _named(name: str, link: Awaitable[None]) -> None:
