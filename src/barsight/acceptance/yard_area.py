@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from barsight.acceptance.layout import Area
 from barsight.acceptance.observation import view_geometry
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
 from barsight.core.types import HeightSource
 from barsight.recording.base import RecordingSettings
@@ -24,9 +26,7 @@ def measured_area(folder: Path) -> Area:
     summary, _ = open_folder(folder, lifts=False)
     if summary["reference"] != "yard":
         raise InputError(folder, "isn't in the yard's frame", "measure with encoders, or with --yard")
-    recording = Path((summary.get("recording") or {}).get("path") or "")
-    rig = open_recording(recording, RecordingSettings(rig=_rig_file(summary))).rig
-    view = view_geometry(folder, rig)
+    view = view_geometry(folder, measured_rig(summary))
     heights = read_heights(folder)
     part = heights.part(slice(0, heights.shape[0]), slice(0, heights.shape[1]))
     seen = part.source == HeightSource.VISION
@@ -39,7 +39,13 @@ def measured_area(folder: Path) -> Area:
     return Area(spans[0], spans[1], float(view.camera_m[2]), view.focal_px, view.baseline_m)
 
 
-def _rig_file(summary: dict[str, object]) -> Path | None:
+def measured_rig(summary: dict[str, Any]) -> StereoRig:
+    """Read the rig that a folder was measured with; its recording must still be there."""
+    recording = Path((summary.get("recording") or {}).get("path") or "")
+    return open_recording(recording, RecordingSettings(rig=_rig_file(summary))).rig
+
+
+def _rig_file(summary: dict[str, Any]) -> Path | None:
     """Take the rig that the folder was measured with, None where it was the recording's own."""
     configuration = summary.get("configuration")
     reading = configuration.get("recording") if isinstance(configuration, dict) else None

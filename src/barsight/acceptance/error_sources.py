@@ -1,0 +1,141 @@
+"""Gather the sources of a measured bundle's errors from its folder, yard file and certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barsight.acceptance.budget import BudgetedLoad, ErrorSource
+from barsight.acceptance.certificate import read_certificate
+from barsight.acceptance.observation import ViewGeometry, view_geometry
+from barsight.acceptance.yard_area import measured_rig
+from barsight.core.arrays import Float64
+from barsight.core.errors import InputError, MeasurementError
+from barsight.registration.yard_file import read_yard_file
+from barsight.result_folder import open_folder, read_heights
+from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.types import Bundle, YardMap
+from barsight.yard.weight import bundle_mass
+
+EXPANSION_PER_K = 23e-6
+"""Of an aluminium bar that carries the cameras."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredLoad:
+    """A bundle of a folder with all that its budget takes. assumed: sentences on what nobody measured."""
+
+    bundle: int
+    load: BudgetedLoad
+    view: ViewGeometry
+    origin_m: Float64
+    sources: tuple[ErrorSource, ...]
+    assumed: tuple[str, ...]
+
+
+def measured_load(
+    folder: Path, number: int | None, certificate: Path | None, temperature_k: float
+) -> MeasuredLoad:
+    """Gather a bundle's sources. number: its id, the surest one where None. temperature_k: largest change
+    since the calibration.
+
+    Raises InputError, or MeasurementError where the folder has no such bundle.
+    """
+    summary, _ = open_folder(folder, lifts=False)
+    if summary["reference"] != "yard":
+        raise InputError(folder, "isn't in the yard's frame", "measure with encoders, or with --yard")
+    bundle = _chosen(folder, number)
+    view = view_geometry(folder, measured_rig(summary))
+    heights = read_heights(folder)
+    assumed: list[str] = []
+    yaw_rad = float(summary["configuration"]["stereo"]["calibration_sigma_px"]) / view.focal_px
+    change = temperature_k * EXPANSION_PER_K / 3**0.5
+    sources = [
+        ErrorSource(
+            "calibration of the cameras", ("yaw",), np.array([[yaw_rad**2]]), "stereo.calibration_sigma_px"
+        ),
+        ErrorSource(
+            "temperature of the rig", ("baseline",), np.array([[change**2]]),
+            f"up to {temperature_k:g} K of aluminium", "rectangular",
+        ),
+        *_fit_sources(bundle, heights),
+    ]  # fmt: skip
+    frame, origin = _frame_source(summary, assumed)
+    sources += frame
+    sources += _magnet_source(certificate, assumed)
+    mass = bundle_mass(bundle)
+    top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
+    load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
+    return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed))
+
+
+def _chosen(folder: Path, number: int | None) -> Bundle:
+    bundles = read_bundles(folder / "bundles.json")
+    if number is not None:
+        bundles = tuple(one for one in bundles if one.id == number)
+    if not bundles:
+        what = "no bundle" if number is None else f"no bundle {number}"
+        raise MeasurementError(f"{folder}: {what} was found there; nothing can be budgeted")
+    return max(bundles, key=lambda one: (not any(one.ends_open), one.confidence))
+
+
+def _fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
+    row = round((bundle.centre_m[1] - heights.y0_m) / heights.cell_m)
+    column = round((bundle.centre_m[0] - heights.x0_m) / heights.cell_m)
+    part = heights.part(
+        slice(max(row - 5, 0), min(row + 6, heights.shape[0])),
+        slice(max(column - 5, 0), min(column + 6, heights.shape[1])),
+    )
+    known = np.isfinite(part.sigma_m)
+    views = float(np.median(part.views[known])) if known.any() else 1.0
+    cell_m = float(np.median(part.sigma_m[known])) if known.any() else nan
+    sigma, free = bundle.sigma, max(views - 1, 1.0)
+    told = {
+        "fit_along": sigma.along_m, "fit_across": sigma.lateral_m, "fit_top": sigma.top_z_m,
+        "fit_yaw": sigma.yaw_rad, "fit_width": sigma.width_m, "fit_mass": bundle_mass(bundle).sigma_kg,
+    }  # fmt: skip
+    sources = [
+        ErrorSource(
+            "matching, travel and fit", (name,), np.array([[value**2]]), "bundles.json", "t",
+            free,
+        )
+        for name, value in told.items()
+    ]  # fmt: skip
+    cell = np.array([[cell_m**2]])
+    return [*sources, ErrorSource("noise of a cell", ("fit_height",), cell, "height.tif", "t", free)]
+
+
+def _frame_source(summary: dict[str, Any], assumed: list[str]) -> tuple[list[ErrorSource], Float64]:
+    file = summary["configuration"].get("yard")
+    if not file:
+        assumed.append("no yard file was used: how the rig hangs is taken as the recording says it")
+        return [], np.zeros(3)
+    frame = read_yard_file(Path(str(file)))
+    names = ("turn_x", "turn_y", "turn_z", "move_x", "move_y", "move_z")
+    source = ErrorSource("yard frame", names, frame.covariance, f"calibrate yard, {frame.path.name}")
+    return [source], frame.yard_from.translation.copy()
+
+
+def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSource]:
+    """Take the touch-downs' errors, which nothing corrects, as uncertainty: mean squares about 0."""
+    rows = [] if certificate is None else read_certificate(certificate)["quantities"]
+    sources = []
+    for axis in "xyz":
+        errors = [
+            1e-3 * row["error"]
+            for row in rows
+            if row["group"] == "touch_mm" and row["name"].endswith(f": {axis}") and row["error"] is not None
+        ]
+        if errors:
+            mean = np.array([[float(np.mean(np.square(errors)))]])
+            by = f"{len(errors)} touch-downs of {Path(str(certificate)).name}"
+            sources.append(
+                ErrorSource("camera to magnet", (f"magnet_{axis}",), mean, by, "t", float(len(errors)))
+            )
+    if len(sources) < 3:
+        assumed.append("no touch-downs along all axes: the magnet is taken to hang where the crane says")
+    return sources

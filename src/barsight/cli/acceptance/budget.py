@@ -1,0 +1,89 @@
+"""Run `barsight budget OUT [-o budget.json]`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from barsight.acceptance.budget import BudgetedFigure, budget
+from barsight.acceptance.error_sources import MeasuredLoad, measured_load
+from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError
+from barsight.core.files import atomic_path, expect_output
+from barsight.core.json_values import json_value
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, budget and print."""
+
+    def command(
+        measured: tyro.conf.Positional[Path],
+        out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
+        bundle: int | None = None,
+        certificate: Path | None = None,
+        temperature_k: float = 10.0,
+    ) -> None:
+        """Budget the uncertainty of what a crane uses of a bundle, by GUM: lift x, y, z, yaw, height, width,
+        mass.
+
+        Each part names its source, distribution, degrees of freedom and what measured it. The whole is
+        checked by sampling (JCGM 101). What nobody measured is named, not guessed.
+
+        Args:
+            measured: A folder that barsight measure wrote; its recording must still be there.
+            out: JSON file for all parts.
+            bundle: Id of the bundle; the surest with both ends seen when not given.
+            certificate: That of barsight accept, whose touch-downs say how the magnet hangs.
+            temperature_k: How much warmer or colder than at its calibration the rig may be.
+        """
+        if not 0 <= temperature_k <= 100:
+            raise ConfigError(f"budget: --temperature-k must lie in 0...100, not {temperature_k:g}")
+        if out is not None:
+            expect_output(out, ".json")
+        found = measured_load(measured, bundle, certificate, temperature_k)
+        figures = budget(found.load, found.view, found.origin_m, found.sources)
+        if out is not None:
+            _write(found, figures, out)
+        _print(found, figures)
+
+    call(command, "budget", arguments)
+
+
+def _write(found: MeasuredLoad, figures: Sequence[BudgetedFigure], out: Path) -> None:
+    content = {
+        "bundle": found.bundle,
+        "figures": [asdict(one) for one in figures],
+        "assumed": list(found.assumed),
+    }
+    with atomic_path(out) as path:
+        path.write_text(json.dumps(json_value(content, 9), indent=1) + "\n", encoding="utf-8")
+
+
+def _print(found: MeasuredLoad, figures: Sequence[BudgetedFigure]) -> None:
+    table = Table(box=SIMPLE_HEAD, title=f"Bundle {found.bundle}: standard uncertainties, and U (k x sigma)")
+    for head in ("figure", "part", "sigma", "", "distribution", "dof", "measured by"):
+        table.add_column(head)
+    for one in figures:
+        for part in one.parts:
+            free = f"{part.degrees_of_freedom:.0f}"
+            sigma = f"{part.sigma:.3g}"
+            table.add_row(one.name, part.source, sigma, one.unit, part.distribution, free, part.measured_by)
+        whole = one.combined
+        total = f"{whole.expanded:.3g}" if whole.expanded == whole.expanded else "not known"
+        check = "sampling agrees" if one.agree else f"by sampling {one.sampled_expanded:.3g}"
+        table.add_row(
+            f"[bold]{one.name}[/bold]", f"[bold]U, k = {whole.coverage:.2f}[/bold]", f"[bold]{total}[/bold]",
+            one.unit, "", f"{whole.degrees_of_freedom:.0f}", check, end_section=True,
+        )  # fmt: skip
+    console = SafeConsole()
+    console.print(table)
+    for line in found.assumed:
+        console.print(f"assumed: {line}", highlight=False, markup=False)

@@ -1,0 +1,132 @@
+"""Budgets: against commissionings simulated ray by ray, sampling, and what isn't known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barsight.acceptance.budget import ERRORS, FIGURES, BudgetedLoad, ErrorSource, budget
+from barsight.acceptance.observation import ViewGeometry
+from barsight.cli.main import run
+from barsight.core.arrays import Float64
+
+VIEW = ViewGeometry(np.array([4.0, 0.2, 8.0]), 1250.0, 0.5)
+ORIGIN = np.array([0.0, -2.0, 0.0])
+LOAD = BudgetedLoad(np.array([4.0, 1.1, 0.6]), 0.12, 6.0, 0.31, 900.0)
+YAW, BASE, FOCAL, TURN, MOVE = np.radians(0.004), 6e-4, 5e-4, np.radians(0.02), 0.002
+FRAME = np.diag([TURN**2] * 3 + [MOVE**2] * 3)
+FRAME[0, 3] = FRAME[3, 0] = 0.6 * TURN * MOVE
+
+
+def sources() -> tuple[ErrorSource, ...]:
+    def one(name: str, *sigmas: float, names: tuple[str, ...], **more: object) -> ErrorSource:
+        return ErrorSource(name, names, np.diag(np.square(sigmas)), "a test", **more)  # type: ignore[arg-type]
+
+    frame = ErrorSource("frame", ERRORS[3:9], FRAME, "targets")
+    return (
+        one("yaw", YAW, names=("yaw",)), one("base", BASE, names=("baseline",), distribution="rectangular"),
+        one("focal", FOCAL, names=("focal",)), frame,
+        one("fit", 2e-3, 1e-3, 1.5e-3, 3e-4, names=("fit_along", "fit_across", "fit_top", "fit_yaw")),
+    )  # fmt: skip
+
+
+def commissioned(rng: np.random.Generator) -> Float64:
+    """Commission once: a rig and a frame with errors; see both ends of the axis with it as cameras do.
+
+    Rays and rotations as they are, without the model's steps. Returns x, y, z, yaw.
+    """
+    yaw, focal = rng.normal(0, YAW), 1 + rng.normal(0, FOCAL)
+    base = 0.5 * (1 + rng.uniform(-1, 1) * 3**0.5 * BASE)
+    turn_move = rng.multivariate_normal(np.zeros(6), FRAME)
+    right_turn = Rotation.from_rotvec([0, yaw, 0])
+    frame_turn = Rotation.from_rotvec(turn_move[:3])
+    found = []
+    way = np.array([-np.sin(LOAD.yaw_rad), np.cos(LOAD.yaw_rad), 0.0])
+    for share in (-0.5, 0.5):
+        point = LOAD.top_m + share * LOAD.length_m * way
+        local = (point - [4.0, 0.2, 8.0]) * (1, -1, -1)
+        pixel = 1250 * local[:2] / local[2]
+        right = right_turn.inv().apply(local - [0.5, 0, 0])
+        depth = 1250 * focal * base / (pixel[0] - 1250 * right[0] / right[2])
+        seen = np.array([*(pixel / (1250 * focal)), 1.0]) * depth * (1, -1, -1) + [4.0, 0.2, 8.0]
+        found.append(frame_turn.apply(seen - ORIGIN) + ORIGIN + turn_move[3:])
+    middle, along = (found[0] + found[1]) / 2, found[1] - found[0]
+    across = np.array([way[1], -way[0], 0])
+    middle = middle + rng.normal(0, 2e-3) * way + rng.normal(0, 1e-3) * across
+    middle[2] += rng.normal(0, 1.5e-3)
+    return np.array([*middle, np.arctan2(-along[0], along[1]) + rng.normal(0, 3e-4)])
+
+
+def scatter_ratios(commissionings: int, seed: int) -> Float64:
+    """Scatter of x, y, z and yaw over the budget's sigma, (4,)."""
+    figures = budget(LOAD, VIEW, ORIGIN, sources())
+    stated = np.array([one.combined.sigma for one in figures[:4]]) / [one[2] for one in FIGURES[:4]]
+    rng = np.random.default_rng(seed)
+    drawn = np.array([commissioned(rng) for _ in range(commissionings)])
+    ratios: Float64 = drawn.std(axis=0, ddof=1) / stated
+    return ratios
+
+
+def test_the_budget_is_what_commissionings_scatter() -> None:
+    np.testing.assert_allclose(scatter_ratios(1000, 21), 1, atol=0.08)
+
+
+def test_sampling_agrees_and_parts_are_told() -> None:
+    figures = {one.name: one for one in budget(LOAD, VIEW, ORIGIN, sources())}
+    assert all(figures[name].agree for name in ("lift x", "lift y", "lift z", "yaw"))
+    z = {part.source: part.sigma for part in figures["lift z"].parts}
+    assert z["yaw"] == pytest.approx(1e3 * YAW * 7.4**2 / 0.5, rel=1e-2)
+    assert z["base"] == pytest.approx(1e3 * BASE * 7.4, rel=1e-2)
+    turn_m = LOAD.top_m[1] - ORIGIN[1]  # a roll lifts by the way from the frame's origin; it moves with it
+    variance = (turn_m * TURN) ** 2 + MOVE**2 + (4.0 * TURN) ** 2
+    assert z["frame"] == pytest.approx(1e3 * np.sqrt(variance), rel=0.01)
+    assert figures["lift z"].combined.expanded == pytest.approx(
+        2 * figures["lift z"].combined.sigma, rel=1e-3
+    )
+    lean = {part.source for part in figures["yaw"].parts}
+    assert {"frame", "fit"} <= lean
+
+
+def test_a_rectangular_part_alone_is_told_apart_by_sampling() -> None:
+    """k = 2 covers all of a rectangle: GUM's U is larger than what 95.45 % need, and that is said."""
+    only = ErrorSource("warm", ("baseline",), np.array([[BASE**2]]), "a test", "rectangular")
+    z = budget(LOAD, VIEW, ORIGIN, (only,))[2]
+    assert not z.agree and z.sampled_expanded == pytest.approx(0.9545 * 3**0.5 * z.combined.sigma, rel=0.02)
+
+
+def test_what_is_not_known_is_not_budgeted() -> None:
+    blind = ErrorSource("fit", ("fit_along",), np.array([[np.nan]]), "open end", "t", 4)
+    figures = {one.name: one for one in budget(LOAD, VIEW, ORIGIN, (*sources(), blind))}
+    assert np.isnan(figures["lift y"].combined.expanded) and not figures["lift y"].agree
+    assert np.isfinite(figures["lift z"].combined.expanded)
+    unweighed = BudgetedLoad(LOAD.top_m, LOAD.yaw_rad, LOAD.length_m, LOAD.width_m, np.nan)
+    assert np.isnan(budget(unweighed, VIEW, ORIGIN, sources())[6].combined.expanded)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "reason"),
+    [
+        (["nowhere"], 3, "no such folder"),
+        (["nowhere", "-o", "budget.txt"], 4, "ends in .json"),
+        (["nowhere", "--temperature-k", "-1"], 2, "must lie in 0...100"),
+    ],
+)
+def test_bad_input(arguments: list[str], code: int, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["budget", *arguments]) == code
+    assert reason in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_measured_bundle_is_budgeted(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(["measure", str(data / "yard_dev"), "-o", str(out), "--preset", "fast"]) == 0
+    assert run(["budget", str(out), "-o", str(tmp_path / "budget.json")]) == 0
+    told = json.loads((tmp_path / "budget.json").read_text())
+    assert len(told["assumed"]) == 2 and "no yard file" in told["assumed"][0]
+    figures = {one["name"]: one for one in told["figures"]}
+    assert 1 < figures["lift z"]["combined"]["expanded"] < 40
+    assert 0 < figures["yaw"]["combined"]["expanded"] < 1
