@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -17,28 +19,41 @@ from opcua_servers import free_port
 from plant_commands import LinkedPlc, plant_run, read_out, write_config
 
 
-def telegrams_left(plc: LinkedPlc) -> int:
-    """The telegrams that still come, until the link is closed or none came for 300 ms: the PLC's rule."""
+def valid_telegrams_left(plc: LinkedPlc) -> int:
+    """The telegrams that still let the PLC act, until one doesn't, or none came for 300 ms."""
     plc.link.settimeout(0.3)
     count = 0
     with contextlib.suppress(OSError):
-        while count < 50:
-            plc.turn()
+        while plc.turn()["status"] & 1:
             count += 1
     return count
 
 
-def test_a_run_that_hangs_or_was_killed_sends_no_life(tmp_path: Path) -> None:
-    """So that the PLC sees 300 ms later that nothing is valid any more."""
+def children(process: subprocess.Popen[str]) -> list[int]:
+    """The processes that a run has started, but for Python's own tracker of resources."""
+    tasks = Path(f"/proc/{process.pid}/task").iterdir()
+    found = [one for task in tasks for one in (task / "children").read_text().split()]
+    return [int(one) for one in found if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
+
+
+@pytest.mark.parametrize("victim", ["run", "telegram"])
+def test_whichever_process_hangs_or_is_killed_nothing_stays_valid(tmp_path: Path, victim: str) -> None:
+    """Within 300 ms, which are three telegrams and one on its way, or by the PLC's own count of them."""
     config = write_config(tmp_path, telegram={"port": (port := free_port())})
     with plant_run(config) as process, LinkedPlc(port) as first, LinkedPlc(port) as second:
+        (child,) = children(process)
+        pid = process.pid if victim == "run" else child
         first.until_valid()
-        process.send_signal(signal.SIGSTOP)
-        assert telegrams_left(first) <= 1
-        process.send_signal(signal.SIGCONT)
+        os.kill(pid, signal.SIGSTOP)
+        assert valid_telegrams_left(first) <= 4
+        os.kill(pid, signal.SIGCONT)
         second.until_valid()
-        process.kill()
-        assert telegrams_left(second) <= 1
+        os.kill(pid, signal.SIGKILL)
+        assert valid_telegrams_left(second) <= 1
+        assert process.wait(10) != 0
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, 0)
+            assert (Path(f"/proc/{child}/stat")).read_text().split()[2] == "Z"
 
 
 def test_a_plc_whose_life_counter_stands_gets_no_lift(tmp_path: Path) -> None:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
-from collections.abc import Awaitable, Callable, Coroutine
-from concurrent.futures import Future
-from typing import Any
+from collections.abc import Awaitable, Callable
 
 from barsight.core.errors import OutputError
 from barsight.plant.feed import READ_EVERY_S, StateFeed
@@ -15,7 +12,7 @@ from barsight.plant.link_settings import WebhookSettings
 from barsight.plant.links.changes import changes_between
 from barsight.plant.links.opcua_link import serve_opcua
 from barsight.plant.links.s7_link import serve_s7
-from barsight.plant.serving import TelegramServer
+from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftSteps
@@ -46,12 +43,9 @@ async def serve_plant(store: Store, settings: PlantSettings, say: Say) -> None:
 def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> dict[str, Awaitable[None]]:
     steps = LiftSteps(store, settings)
     links: dict[str, Awaitable[None]] = {}
-    if (one := settings.telegram) is not None:
-        host = one.host
-        server = TelegramServer(feed, steps, one)
-        links[f"telegram at {host}:{one.port}"] = _in_own_thread(
-            lambda: server.run(lambda port: say(f"telegram at {host}:{port}"))
-        )
+    if settings.telegram is not None:
+        at = f"telegram at {settings.telegram.host}:{settings.telegram.port}"
+        links[at] = serve_telegram(settings.telegram, feed, steps, say)
     if settings.opcua is not None:
         links[f"OPC UA at {settings.opcua.url}"] = serve_opcua(store, settings.opcua, feed, steps, say)
     if settings.mqtt is not None:
@@ -61,30 +55,6 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
     if settings.webhooks is not None:
         links["webhooks"] = _serve_webhooks(settings.webhooks, feed, say)
     return links
-
-
-async def _in_own_thread(link: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Await a link in a thread with an event loop of its own, so that no other link delays its cycle."""
-    begun = Future[tuple[asyncio.AbstractEventLoop, asyncio.Task[None]]]()
-
-    async def linked() -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        begun.set_result((asyncio.get_running_loop(), task))
-        await link()
-
-    def serve() -> None:
-        with contextlib.suppress(asyncio.CancelledError), asyncio.Runner() as runner:
-            runner.run(linked())
-
-    running = asyncio.create_task(asyncio.to_thread(serve))
-    try:
-        await asyncio.shield(running)
-    finally:
-        loop, task = await asyncio.wrap_future(begun)
-        with contextlib.suppress(RuntimeError):  # its loop has ended by itself
-            loop.call_soon_threadsafe(task.cancel)
-        await asyncio.gather(running, return_exceptions=True)
 
 
 async def _serve_webhooks(one: WebhookSettings, feed: StateFeed, say: Say) -> None:
