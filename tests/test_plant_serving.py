@@ -55,7 +55,7 @@ class Plc:
 
 
 def serve(store: Store, url: str, talk: Callable[[Plc, Plc], Awaitable[None]]) -> None:
-    """Run a server on a store, with two PLCs from one address."""
+    """Run a server on a store, with two PLCs."""
     telegram = TelegramSettings(host="127.0.0.1", port=0, cycle_s=0.02)
     settings = replace(PlantSettings(), telegram=telegram, store=StoreSource(url=url, allow_simulated=True))
 
@@ -63,7 +63,10 @@ def serve(store: Store, url: str, talk: Callable[[Plc, Plc], Awaitable[None]]) -
         port = asyncio.get_running_loop().create_future()
         server = TelegramServer(feed, LiftSteps(store, settings), telegram)
         running = asyncio.create_task(server.run(port.set_result))
-        streams = [await asyncio.open_connection("127.0.0.1", await port) for _ in range(2)]
+        to = ("127.0.0.1", await port)
+        streams = [
+            await asyncio.open_connection(*to, local_addr=(host, 0)) for host in ("127.0.0.1", "127.0.0.2")
+        ]
         try:
             await talk(*(Plc(*one) for one in streams))
         finally:
@@ -87,7 +90,8 @@ def test_one_plc_claims_and_executes_and_another_can_not(tmp_path: Path) -> None
         assert (await second.turn(3, 13, flags=REACHED, token=claim["token"] ^ 1, **lift))["answer"] == 2
         heavy = await first.turn(3, 14, 10 * state["mass"], WEIGHED | REACHED, token=claim["token"], **lift)
         assert heavy["answer"] == 3
-        assert (await first.turn(3, 15, flags=REACHED, token=claim["token"], **lift))["answer"] == 2
+        assert (await first.turn(3, 15, flags=REACHED, token=claim["token"], **lift))["answer"] == 1
+        assert (await first.turn(4, 16, token=claim["token"], **lift))["answer"] == 2
 
     url = fill_store(tmp_path)
     with open_store(url) as store:

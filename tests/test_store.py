@@ -94,7 +94,7 @@ def test_states_follow_only_as_they_may(store: Store) -> None:
     with pytest.raises(InputError, match="is None"), entry(store, "bob", "lift") as opened:
         step_lift(opened, 7, "claimed")
     assert {state for after in LIFT_STEPS.values() for state in after} == {
-        "offered", "claimed", "executed", "failed", "verified", "expired",
+        "offered", "claimed", "executing", "executed", "failed", "verified", "expired",
     }  # fmt: skip
 
 

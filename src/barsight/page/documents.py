@@ -11,7 +11,7 @@ from typing import Any
 
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
-from barsight.store.confirmation import newest_survey, open_lifts, yard_clock_ns
+from barsight.store.confirmation import map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
 from barsight.store.matching import has_moved
 from barsight.store.promotion import counts
@@ -51,9 +51,9 @@ def state_document(connection: Connection) -> dict[str, Any]:
     return {
         "clock_ns": yard_clock_ns(connection),
         "survey": None if newest is None else _survey_of(newest),
-        "map_vetoes": [] if newest is None else _map_vetoes(connection, newest.id),
+        "map_vetoes": [] if newest is None else map_vetoes(connection, newest.id),
         "offered": sum(lift.state == "offered" for lift in open_lifts(connection)),
-        "claimed": sum(lift.state == "claimed" for lift in open_lifts(connection)),
+        "claimed": sum(lift.state != "offered" for lift in open_lifts(connection)),
         "alarms": len(active),
         "unacknowledged": sum(one["state"] in ("raised", "returned") for one in active),
         "top_alarm": top,
@@ -257,14 +257,6 @@ def _survey_of(row: Row[Any]) -> dict[str, Any]:
         "software_version",
     )  # fmt: skip
     return {name: getattr(row, name) for name in names}
-
-
-def _map_vetoes(connection: Connection, survey_id: int) -> list[dict[str, str]]:
-    query = select(SURVEY_VETOES).where(
-        SURVEY_VETOES.c.survey_id == survey_id, SURVEY_VETOES.c.bundle_id.is_(None)
-    )
-    rows = connection.execute(query.order_by(SURVEY_VETOES.c.id)).all()
-    return [{"code": row.code, "reason": row.reason} for row in rows]
 
 
 def _bundles_of_lifts(connection: Connection) -> dict[int, list[int]]:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import dataclass
 
-from barsight.core.errors import BarsightError, Failed
+from barsight.core.errors import BarsightError, Failed, InputError
 from barsight.core.extras import extra
 from barsight.plant.state import OfferedLift
-from barsight.store.audit import entry
-from barsight.store.confirmation import confirm_lift, end_lift, take_lift, yard_clock_ns
+from barsight.store.confirmation import begin_lift, confirm_lift, end_lift, note_unrecorded, take_lift
 from barsight.store.opening import Store
-from barsight.store.states import raise_alarm
-from barsight.store.tables import LIFT_STATES
+from barsight.store.tables import LIFT_STATES, LIFTS
 
 with extra("store"):
-    from sqlalchemy import select
+    from sqlalchemy import Row, select
 
 LOAD_SIGMAS = 3.0
 """A load farther from the mass than so many of its standard deviations contradicts it."""
+MAX_CLAIMS = 1000
+"""Newest claims among which a token without its lift is looked for."""
 
 
 @dataclass(frozen=True)
@@ -33,68 +34,90 @@ class LiftClaim:
 def claim_lift(store: Store, lift: OfferedLift, who: str) -> LiftClaim | Failed:
     """LiftClaim an offered lift. The same claim again returns the same token; another's is refused."""
     found = claim_of(store, lift.lift_id)
-    if found is not None:
-        return found if found.who == who else Failed("claimed", f"lift {lift.lift_id} is {found.who}'s")
-    try:
-        confirm_lift(store, lift.lift_id, lift.map_id, who)
-    except BarsightError as error:
-        return Failed("refused", str(error))
-    return claim_of(store, lift.lift_id) or Failed("refused", f"lift {lift.lift_id} ended meanwhile")
+    if found is None:
+        try:
+            confirm_lift(store, lift.lift_id, lift.map_id, who)
+        except InputError as error:
+            return Failed("refused", str(error))
+        found = claim_of(store, lift.lift_id)
+    if found is None or states_of(store, lift.lift_id)[-1] not in ("claimed", "executing"):
+        return Failed("refused", f"lift {lift.lift_id} ended meanwhile")
+    return found if found.who == who else Failed("claimed", f"lift {lift.lift_id} is {found.who}'s")
 
 
 def claim_of(store: Store, lift_id: int) -> LiftClaim | None:
-    """Find the claim that a lift stands in; None where its last state is another."""
+    """Find the claim of a lift, whatever came after it; a lift is claimed once in its life."""
     with store.reading() as connection:
-        row = connection.execute(
-            select(LIFT_STATES)
-            .where(LIFT_STATES.c.lift_id == lift_id)
-            .order_by(LIFT_STATES.c.step.desc())
-            .limit(1)
-        ).first()
-    if row is None or row.state != "claimed":
-        return None
-    digest = hashlib.sha256(f"{lift_id} {row.who} {row.at_ns}".encode()).digest()
-    return LiftClaim(lift_id, row.who, int.from_bytes(digest[:4], "big") or 1)
+        query = select(LIFT_STATES).where(LIFT_STATES.c.lift_id == lift_id, LIFT_STATES.c.state == "claimed")
+        row = connection.execute(query).first()
+    return None if row is None else _claim(row)
 
 
-def report_executed(store: Store, claim: LiftClaim, lift: OfferedLift, load_kg: float | None) -> str | Failed:
+def claim_by_token(store: Store, token: int) -> LiftClaim | None:
+    """Find a claim by its token alone, among the newest ones."""
+    newest = select(LIFT_STATES).where(LIFT_STATES.c.state == "claimed").order_by(LIFT_STATES.c.id.desc())
+    with store.reading() as connection:
+        rows = connection.execute(newest.limit(MAX_CLAIMS)).all()
+    return next((found for row in rows if (found := _claim(row)).token == token), None)
+
+
+def _claim(row: Row[tuple[object, ...]]) -> LiftClaim:
+    digest = hashlib.sha256(f"{row.lift_id} {row.who} {row.at_ns}".encode()).digest()
+    return LiftClaim(row.lift_id, row.who, int.from_bytes(digest[:4], "big") or 1)
+
+
+def states_of(store: Store, lift_id: int) -> list[str]:
+    """List the states that a lift was in, the present one last."""
+    steps = select(LIFT_STATES.c.state).where(LIFT_STATES.c.lift_id == lift_id).order_by(LIFT_STATES.c.step)
+    with store.reading() as connection:
+        return list(connection.execute(steps).scalars())
+
+
+def begin_claimed(store: Store, claim: LiftClaim) -> LiftClaim | Failed:
+    """Begin a claimed lift, once: who has forgotten that it began must not lift again."""
+    try:
+        begin_lift(store, claim.lift_id, claim.who)
+    except InputError as error:
+        return Failed("refused", str(error))
+    return claim
+
+
+def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> str | Failed:
     """Report a claimed lift as executed: `confirmed`, `contradicted` by the load cell, or `unweighed`.
 
-    A contradiction raises the alarm `load-contradicts`; the next survey tells what truly moved.
+    A contradiction raises the alarm `load-contradicts`; the next survey tells what truly moved. Reported
+    again, it is answered again and changes nothing. A lift that has ended otherwise can't be recorded: that
+    raises the alarm `lift-unrecorded` and ends all offers. Raises BarsightError where the store can't be
+    written: report it again.
     """
-    if claim_of(store, claim.lift_id) != claim:
-        return Failed("token", f"lift {claim.lift_id} isn't claimed with this token")
-    try:
-        take_lift(store, claim.lift_id, claim.who)
-    except BarsightError as error:
-        told = (
-            f"lift {claim.lift_id} was executed and can't be recorded ({error}): survey before the next lift"
-        )
-        _raise(store, claim.who, "lift-unrecorded", told)
-        return Failed("refused", str(error))
-    if load_kg is None:
-        return "unweighed"
-    if abs(load_kg - lift.mass_kg) <= LOAD_SIGMAS * lift.mass_sigma_kg:
-        return "confirmed"
-    told = f"lift {claim.lift_id}: {load_kg:.0f} kg were weighed, {lift.mass_kg:.0f} kg were told"
-    _raise(store, claim.who, "load-contradicts", told)
-    return "contradicted"
-
-
-def _raise(store: Store, who: str, code: str, told: str) -> None:
-    """Raise an alarm in the store, at the yard's clock."""
     with store.reading() as connection:
-        clock_ns = yard_clock_ns(connection)
-    with entry(store, who, code, clock_ns) as opened:
-        raise_alarm(opened, code, told)
+        query = select(LIFTS.c.record).where(LIFTS.c.id == claim.lift_id)
+        record = json.loads(connection.execute(query).scalar_one())
+    told, alarm = "unweighed", None
+    if load_kg is not None:
+        told = "confirmed"
+        if abs(load_kg - record["mass_kg"]) > LOAD_SIGMAS * record["mass_sigma_kg"]:
+            weighed = f"{load_kg:.0f} kg were weighed, {record['mass_kg']:.0f} kg were told"
+            told, alarm = "contradicted", ("load-contradicts", f"lift {claim.lift_id}: {weighed}")
+    if "executed" in states_of(store, claim.lift_id):
+        return told
+    try:
+        take_lift(store, claim.lift_id, claim.who, alarm)
+    except InputError:
+        state = note_unrecorded(store, claim.lift_id, claim.who)
+        return Failed("refused", f"lift {claim.lift_id} is {state}: survey before the next lift")
+    return told
 
 
 def report_failed(store: Store, claim: LiftClaim, note: str) -> str | Failed:
-    """Report that a claimed lift failed."""
-    if claim_of(store, claim.lift_id) != claim:
-        return Failed("token", f"lift {claim.lift_id} isn't claimed with this token")
+    """Report that a claimed lift failed; reported again, it changes nothing."""
+    states = states_of(store, claim.lift_id)
+    if states[-1] == "failed" and "executed" not in states:
+        return "failed"
     try:
         end_lift(store, claim.lift_id, "failed", claim.who, note)
     except BarsightError as error:
+        if states_of(store, claim.lift_id)[-1] in ("claimed", "executing"):
+            raise
         return Failed("refused", str(error))
     return "failed"

@@ -41,11 +41,15 @@ class PlcPartner:
         return replace(state, is_valid=False, reasons=(*state.reasons, reason))
 
     def obey(self, found: dict[str, int]) -> None:
-        """Take a command to the store; `answer` holds what came of it."""
+        """Take a command to the store; `answer` holds what came of it.
+
+        Where the store can't be reached there is none: the command is taken again with the next telegram.
+        """
         try:
             answer, token = self._step(found)
         except BarsightError:
-            answer, token = REFUSED, 0
+            self._number = None
+            return
         self.answer = {"answer_number": found["command_number"], "answer": answer, "token": token}
 
     def _step(self, found: dict[str, int]) -> tuple[int, int]:
@@ -60,9 +64,9 @@ class PlcPartner:
         elif found["command"] == EXECUTED:
             load_kg = found["load"] / 10 if flags & _WEIGHED else None
             report = LiftReport(bool(flags & _REACHED), bool(flags & _SLACK), load_kg)
-            told = self._steps.executed(token, report, *lift)
+            told = self._steps.executed(token, report, found["lift_id"])
         else:
-            told = self._steps.failed(token, f"the PLC says so, flags {flags}", *lift)
+            told = self._steps.failed(token, f"the PLC says so, flags {flags}", found["lift_id"])
         if isinstance(told, Failed):
             return REFUSED, 0 if told.code in ("unknown", "checksum", "token") else token
         return (CONTRADICTED if told == "contradicted" else DONE), token

@@ -32,7 +32,7 @@ class TelegramServer:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         one = self._settings
-        name = "plc {}:{}".format(*writer.get_extra_info("peername")[:2])
+        name = "plc {}".format(writer.get_extra_info("peername")[0])  # as it is after a new connection
         partner = PlcPartner(name, self._steps, one.silent_s)
         listening = asyncio.create_task(self._listen(reader, partner))
         due = time.monotonic()

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from barsight.core.json_values import json_value
-from barsight.store.confirmation import OPEN, OpenLift, newest_survey, open_lifts, yard_clock_ns
+from barsight.store.confirmation import OPEN, OpenLift, map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.opening import Store
 from barsight.store.states import standing_alarms
 
@@ -103,14 +103,17 @@ def state_of_store(
     store: Store, life_counter: int, *, approach_height_m: float | None = None,
     magnet_steps_kg: tuple[float, ...] = (), allow_simulated: bool = False, now_ns: int | None = None,
 ) -> PlantState:  # fmt: skip
-    """Read the state: the claimed lift, or else the best offer, where its map is the newest and not too old.
+    """Read the state: the lift that has begun, or else the claimed one, or else the best offer.
 
+    It is valid where the lift's map is the newest and not too old. A lift that has begun stays until it is
+    reported, and nothing else is offered as long.
     approach_height_m, magnet_steps_kg, allow_simulated: see `PlantSettings`. now_ns: this computer's clock.
     """
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection, now_ns)
         survey = newest_survey(connection)
         lifts = open_lifts(connection)
+        vetoes = [] if survey is None else map_vetoes(connection, survey.id)
         alarms = tuple(_alarm(*one) for one in standing_alarms(connection)[:MAX_ALARMS])
     if survey is None:
         empty = ("no-survey: the store holds no survey",)
@@ -119,9 +122,15 @@ def state_of_store(
         one for one in lifts
         if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns
     ]  # fmt: skip
-    best = min(usable, key=lambda one: (OPEN.index(one.state) == 0, one.record["rank"]), default=None)
+    begun = next((one for one in lifts if one.state == "executing"), None)
+    best = begun or min(
+        usable, key=lambda one: (OPEN.index(one.state) == 0, one.record["rank"]), default=None
+    )
     lift = None if best is None else offered_lift(best, approach_height_m, magnet_steps_kg)
     reasons = _reasons(lift, survey.is_simulated and not allow_simulated, bool(magnet_steps_kg))
+    if begun is not None and (vetoes or begun not in usable):
+        old = "; ".join(one["reason"] for one in vetoes) or "its map is no longer the newest, or too old"
+        reasons = (*reasons, f"unfinished: lift {begun.lift_id} has begun and isn't reported; {old}")
     return PlantState(
         "simulated" if survey.is_simulated else "surveyed", not reasons, reasons, life_counter, clock_ns,
         "done", None, lift, alarms, survey.map_id, survey.calibration_id,

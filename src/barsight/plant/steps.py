@@ -9,7 +9,15 @@ from typing import Any
 
 from barsight.core.errors import BarsightError, Failed
 from barsight.plant.feed import read_state
-from barsight.plant.handshake import LiftClaim, claim_lift, claim_of, report_executed, report_failed
+from barsight.plant.handshake import (
+    LiftClaim,
+    begin_claimed,
+    claim_by_token,
+    claim_lift,
+    claim_of,
+    report_executed,
+    report_failed,
+)
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import OfferedLift
 from barsight.store.opening import Store
@@ -34,39 +42,36 @@ class LiftSteps:
     def claim(self, who: str, lift_id: int, checksum: int | None = None) -> LiftClaim | Failed:
         """Claim the lift that is offered. checksum: first four bytes of its SHA-256, if known."""
         with self._turn:
-            lift = self._lift(lift_id, checksum, needs_valid=True)
+            lift = self._valid_lift(lift_id, checksum)
             return lift if isinstance(lift, Failed) else claim_lift(self._store, lift, who)
 
     def executing(self, token: int, lift_id: int | None = None, checksum: int | None = None) -> int | Failed:
-        """Check that a claim stands before its lift begins; return its token."""
-        found = self._claimed(token, lift_id, checksum)
-        return found if isinstance(found, Failed) else found[0].token
+        """Begin the claimed lift, once, while the state is valid; return its token."""
+        with self._turn:
+            lift = self._valid_lift(lift_id, checksum)
+            claim = lift if isinstance(lift, Failed) else self._claimed(token, lift.lift_id)
+            begun = claim if isinstance(claim, Failed) else begin_claimed(self._store, claim)
+            return begun if isinstance(begun, Failed) else begun.token
 
-    def executed(
-        self, token: int, report: LiftReport, lift_id: int | None = None, checksum: int | None = None
-    ) -> str | Failed:
+    def executed(self, token: int, report: LiftReport, lift_id: int | None = None) -> str | Failed:
         """Record a lift that was made: `confirmed`, `contradicted` or `unweighed`; see `report_executed`."""
         with self._turn:
-            found = self._claimed(token, lift_id, checksum)
-            if isinstance(found, Failed):
-                return found
+            claim = self._claimed(token, lift_id)
+            if isinstance(claim, Failed):
+                return claim
             if not report.is_reached or report.is_slack:
                 return Failed("not-lifted", "position not reached, or slack rope: report the lift as failed")
-            return report_executed(self._store, *found, report.load_kg)
+            return report_executed(self._store, claim, report.load_kg)
 
-    def failed(
-        self, token: int, note: str, lift_id: int | None = None, checksum: int | None = None
-    ) -> str | Failed:
+    def failed(self, token: int, note: str, lift_id: int | None = None) -> str | Failed:
         """Record a lift that failed."""
         with self._turn:
-            found = self._claimed(token, lift_id, checksum)
-            return found if isinstance(found, Failed) else report_failed(self._store, found[0], note)
+            claim = self._claimed(token, lift_id)
+            return claim if isinstance(claim, Failed) else report_failed(self._store, claim, note)
 
-    def _lift(
-        self, lift_id: int | None, checksum: int | None, *, needs_valid: bool = False
-    ) -> OfferedLift | Failed:
+    def _valid_lift(self, lift_id: int | None, checksum: int | None) -> OfferedLift | Failed:
         state = read_state(self._store, self._settings)
-        if needs_valid and not state.is_valid:
+        if not state.is_valid:
             return Failed("invalid", "; ".join(state.reasons))
         if state.lift is None or lift_id not in (None, state.lift.lift_id):
             return Failed("unknown", "that lift isn't offered or claimed (any more)")
@@ -74,16 +79,12 @@ class LiftSteps:
             return Failed("checksum", "the lift isn't as it was read")
         return state.lift
 
-    def _claimed(
-        self, token: int, lift_id: int | None, checksum: int | None
-    ) -> tuple[LiftClaim, OfferedLift] | Failed:
-        lift = self._lift(lift_id, checksum)
-        if isinstance(lift, Failed):
-            return lift
-        claim = claim_of(self._store, lift.lift_id)
+    def _claimed(self, token: int, lift_id: int | None) -> LiftClaim | Failed:
+        store = self._store
+        claim = claim_by_token(store, token) if lift_id is None else claim_of(store, lift_id)
         if claim is None or claim.token != token:
-            return Failed("token", f"lift {lift.lift_id} isn't claimed with this token")
-        return claim, lift
+            return Failed("token", "no lift was claimed with this token")
+        return claim
 
 
 def take_named_step(

@@ -58,7 +58,7 @@ def out_values(state: PlantState, answer: Mapping[str, int]) -> dict[str, int]:
     }  # fmt: skip
     if lift is None:
         return values
-    values["status"] |= 2 if lift.handshake == "offered" else 4
+    values["status"] |= {"offered": 2, "claimed": 4, "executing": 4 | 32}[lift.handshake]
     values |= {
         "lift_id": lift.lift_id, "checksum": int(lift.sha256[:8], 16), "valid_until_ns": lift.valid_until_ns,
         "x": _fine(lift.x_m, 1e4), "y": _fine(lift.y_m, 1e4), "z": _fine(lift.hoist_height_m, 1e4),

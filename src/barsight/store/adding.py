@@ -13,6 +13,7 @@ from barsight.core.extras import extra
 from barsight.result_folder import file_digest, open_folder, read_heights
 from barsight.store.audit import Entry, entry
 from barsight.store.coarse_map import pack, unpack
+from barsight.store.confirmation import end_disturbed
 from barsight.store.history import (
     BundleSighting,
     executed_lifts,
@@ -129,6 +130,7 @@ def add_survey(store: Store, read: MeasuredSurvey, who: str) -> AddedSurvey:
         settle_lifts(opened, changes | absences, read.from_ns, is_newest=is_newest)
         if read.lifts is not None:
             add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest)
+            end_disturbed(opened, read.from_ns)
     named = {identity_name(number): change for number, change in changes.items()}
     return AddedSurvey(
         read.identity.map_id, True, named, {identity_name(n): kind for n, kind in absences.items()}

@@ -18,21 +18,21 @@ from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
-from barsight.store.states import lift_state, step_lift
+from barsight.store.states import has_alarm, lift_state, raise_alarm, step_lift
 from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, SURVEYS
 from barsight.yard.events import corners, gap_between
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.vetoes import VETOES
 
 with extra("store"):
-    from sqlalchemy import Connection, Row, func, select
+    from sqlalchemy import ColumnElement, Connection, Row, func, select
 
-OPEN = ("offered", "claimed")
+OPEN = ("offered", "claimed", "executing")
 
 
 @dataclass(frozen=True, eq=False)
 class OpenLift:
-    """A lift that is offered or claimed. record: its JSON of lifts.json, without poles and checks."""
+    """A lift that is offered, claimed or executing. record: its JSON of lifts.json, without poles, checks."""
 
     lift_id: int
     survey_id: int
@@ -54,6 +54,15 @@ def survey_folder(connection: Connection, map_id: str) -> Path:
     return Path(connection.execute(query).scalar_one())
 
 
+def map_vetoes(connection: Connection, survey_id: int) -> list[dict[str, str]]:
+    """List code and reason of the vetoes against all lifts of a survey."""
+    query = select(SURVEY_VETOES).where(
+        SURVEY_VETOES.c.survey_id == survey_id, SURVEY_VETOES.c.bundle_id.is_(None)
+    )
+    rows = connection.execute(query.order_by(SURVEY_VETOES.c.id)).all()
+    return [{"code": row.code, "reason": row.reason} for row in rows]
+
+
 def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
     """Tell the time of the yard: this computer's; of a simulated yard its own, which went on from the newest
     survey's last frame when that survey was added.
@@ -66,7 +75,12 @@ def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
 
 
 def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
-    """List the lifts that are offered or claimed, in the order of their ids."""
+    """List the lifts that are offered, claimed or executing, in the order of their ids."""
+    return _lifts(connection, LIFT_STATES.c.state.in_(OPEN))
+
+
+def _lifts(connection: Connection, which: ColumnElement[bool]) -> tuple[OpenLift, ...]:
+    """List lifts by a condition on their last state, in the order of their ids."""
     last = select(LIFT_STATES.c.lift_id, func.max(LIFT_STATES.c.step).label("step")).group_by(
         LIFT_STATES.c.lift_id
     )
@@ -79,7 +93,7 @@ def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
             LIFT_STATES,
             (LIFT_STATES.c.lift_id == LIFTS.c.id) & (LIFT_STATES.c.step == newest.c.step),
         )
-        .where(LIFT_STATES.c.state.in_(OPEN), counts())
+        .where(which, counts())
         .order_by(LIFTS.c.id)
     ).all()
     return tuple(
@@ -100,32 +114,105 @@ def confirm_lift(store: Store, lift_id: int, map_id: str, who: str) -> None:
     _change(store, lift_id, who, "lift confirmed", step)
 
 
-def take_lift(store: Store, lift_id: int, who: str) -> None:
-    """Report that a confirmed lift was executed; offers and confirmations beside it end."""
+def begin_lift(store: Store, lift_id: int, who: str) -> None:
+    """Begin a confirmed lift, once. Raises InputError where it may not begin, or another one has begun."""
+
+    def step(opened: Entry, lift: OpenLift) -> None:
+        for other in open_lifts(opened.connection):
+            if other.state == "executing":
+                raise InputError(
+                    f"lift {other.lift_id}", "has begun", "report it as executed or failed first"
+                )
+        step_lift(opened, lift_id, "executing")
+
+    _change(store, lift_id, who, "lift begun", step)
+
+
+def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | None = None) -> None:
+    """Report that a confirmed lift was executed; offers and confirmations beside it end.
+
+    alarm: code and reason of one to raise with it.
+    """
 
     def step(opened: Entry, lift: OpenLift) -> None:
         step_lift(opened, lift_id, "executed")
-        moved = _outlines(opened.connection, lift, with_set_down=True)
-        for other in open_lifts(opened.connection):
-            reach_m = other.record.get("disturbed_reach_m")
-            outlines = _outlines(opened.connection, other)
-            if reach_m is None or _gap(moved, outlines) < reach_m:
-                step_lift(opened, other.lift_id, "expired", f"disturbed: lift {lift_id} came near its place")
+        _end_beside(opened, lift)
+        if alarm is not None:
+            raise_alarm(opened, *alarm)
 
     _change(store, lift_id, who, "lift executed", step)
 
 
+def note_unrecorded(store: Store, lift_id: int, who: str) -> str:
+    """Note that a lift was executed after it had ended: an alarm, and every offer and confirmation ends.
+
+    Returns the state that it had ended in; noted twice, it is noted once. Raises InputError where it is open.
+    """
+    with store.reading() as connection:
+        clock_ns = yard_clock_ns(connection)
+    with entry(store, who, f"lift unrecorded {lift_id}", clock_ns) as opened:
+        state = lift_state(opened.connection, lift_id) or "unknown"
+        if state in OPEN:
+            raise InputError(f"lift {lift_id}", f"is {state}", "report it again")
+        told = (
+            f"lift {lift_id} was executed and can't be recorded, it is {state}: survey before the next lift"
+        )
+        if not has_alarm(opened.connection, "lift-unrecorded", told):
+            raise_alarm(opened, "lift-unrecorded", told)
+            for other in open_lifts(opened.connection):
+                if other.state != "executing":
+                    reason = f"disturbed: lift {lift_id} was executed and isn't recorded"
+                    step_lift(opened, other.lift_id, "expired", reason)
+    return state
+
+
 def end_lift(store: Store, lift_id: int, state: str, who: str, note: str) -> None:
-    """Decline an offer, take a confirmation back (`expired`), or report that a confirmed lift `failed`."""
+    """Decline an offer, take a confirmation back (`expired`), or report that a confirmed lift `failed`.
+
+    One that fails after it has begun may have moved something: offers and confirmations beside it end.
+    """
     if state not in ("expired", "failed"):
         raise ConfigError(f"a lift does not end as {state!r}")
     if not note.strip():
         raise ConfigError("say why, for the audit log")
-    _change(store, lift_id, who, f"lift {state}", lambda opened, _: step_lift(opened, lift_id, state, note))
+
+    def step(opened: Entry, lift: OpenLift) -> None:
+        step_lift(opened, lift_id, state, note)
+        if lift.state == "executing":
+            _end_beside(opened, lift)
+
+    _change(store, lift_id, who, f"lift {state}", step)
+
+
+def end_disturbed(opened: Entry, since_ns: int) -> None:
+    """End offers beside lifts that moved something after `since_ns`, as a map that is being added saw it."""
+    moving = select(LIFT_STATES.c.lift_id).where(
+        LIFT_STATES.c.state.in_(("executing", "executed")), LIFT_STATES.c.at_ns >= since_ns
+    )
+    begun = select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.state == "executing")
+    failed = select(LIFT_STATES.c.lift_id).where(
+        LIFT_STATES.c.state == "failed", LIFT_STATES.c.at_ns >= since_ns, LIFT_STATES.c.lift_id.in_(begun)
+    )
+    for lift in _lifts(opened.connection, LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed)):
+        _end_beside(opened, lift)
+
+
+def _end_beside(opened: Entry, lift: OpenLift) -> None:
+    """End offers and confirmations within reach of what a lift may have moved."""
+    moved = _outlines(opened.connection, lift, with_set_down=True)
+    for other in open_lifts(opened.connection):
+        reach_m = other.record.get("disturbed_reach_m")
+        if other.state != "executing" and (
+            reach_m is None or _gap(moved, _outlines(opened.connection, other)) < reach_m
+        ):
+            note = f"disturbed: lift {lift.lift_id} came near its place"
+            step_lift(opened, other.lift_id, "expired", note)
 
 
 def forbid(store: Store, code: str, reason: str, who: str) -> None:
-    """Add a veto against the newest map: what is offered or confirmed on it ends. Raises ConfigError."""
+    """Add a veto against the newest map: what is offered or confirmed on it ends, a lift that has begun stays
+    open until it is reported. Raises ConfigError.
+    """
     if code not in VETOES:
         raise ConfigError(f"{code!r} is no veto; the reference of codes lists them")
     with store.reading() as connection:
@@ -136,7 +223,8 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
             raise ConfigError("there is no survey to forbid lifts of")
         opened.add(SURVEY_VETOES, survey_id=newest.id, code=code, reason=reason)
         for lift in open_lifts(opened.connection):
-            step_lift(opened, lift.lift_id, "expired", f"{code}: {reason}")
+            if lift.state != "executing":
+                step_lift(opened, lift.lift_id, "expired", f"{code}: {reason}")
 
 
 def expire_stale(store: Store, who: str) -> int:
@@ -167,11 +255,13 @@ def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Ent
 
 
 def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
-    """Tell why open lifts may no longer be believed, by id."""
+    """Tell why offers and confirmations may no longer be believed, by id."""
     newest = newest_survey(connection)
     told = {}
     for lift in open_lifts(connection):
         until_ns = lift.record["valid_until_ns"]
+        if lift.state == "executing":
+            continue
         if newest is not None and lift.survey_id != newest.id:
             told[lift.lift_id] = "expired: a newer map came"
         elif until_ns is None or until_ns < clock_ns:

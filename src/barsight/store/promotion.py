@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from barsight.core.extras import extra
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
 
@@ -16,6 +18,7 @@ def promoted_version(connection: Connection) -> str:
     return str(connection.execute(newest).scalar() or "")
 
 
+@cache
 def counts() -> ColumnElement[bool]:
     """Build the condition on SURVEYS that keeps those that count.
 

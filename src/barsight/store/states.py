@@ -13,7 +13,8 @@ with extra("store"):
 LIFT_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("offered",),
     "offered": ("claimed", "expired"),
-    "claimed": ("executed", "failed", "expired"),
+    "claimed": ("executing", "executed", "failed", "expired"),
+    "executing": ("executed", "failed"),
     "executed": ("verified", "failed"),
 }
 """Which states may follow a lift's state; none follows `failed`, `verified` and `expired`."""
@@ -36,6 +37,12 @@ def raise_alarm(opened: Entry, code: str, reason: str) -> int:
     alarm_id = opened.add(ALARMS, code=code, reason=reason)
     _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, "raised", None)
     return alarm_id
+
+
+def has_alarm(connection: Connection, code: str, reason: str) -> bool:
+    """Tell whether this alarm was ever raised."""
+    query = select(ALARMS.c.id).where(ALARMS.c.code == code, ALARMS.c.reason == reason)
+    return connection.execute(query).first() is not None
 
 
 def step_alarm(opened: Entry, alarm_id: int, state: str, note: str | None = None) -> None:

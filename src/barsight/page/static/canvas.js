@@ -210,17 +210,17 @@ export class YardCanvas {
     const items = new Map(this.items.map((item) => [item.bundle.identity, item]));
     for (const lift of this.data.lifts) {
       const item = items.get(lift.bundles[0]);
-      if (!item || !["offered", "claimed"].includes(lift.state)) continue;
+      if (!item || !["offered", "claimed", "executing"].includes(lift.state)) continue;
       c.strokeStyle = SELECT;
       c.lineWidth = 3.5;
       c.beginPath(); this.path(c, item);
-      if (lift.state === "claimed") { c.fillStyle = "#1d4f9166"; c.fill(); }
+      if (lift.state !== "offered") { c.fillStyle = "#1d4f9166"; c.fill(); }
       c.stroke();
       const [px, py] = this.place(lift.target.x_m, lift.target.y_m);
-      c.fillStyle = lift.state === "claimed" ? SELECT : "#f2f2f2";
+      c.fillStyle = lift.state !== "offered" ? SELECT : "#f2f2f2";
       c.lineWidth = 2.5;
       c.beginPath(); c.arc(px, py, 13, 0, 7); c.fill(); c.stroke();
-      c.fillStyle = lift.state === "claimed" ? "#fff" : "#16191b";
+      c.fillStyle = lift.state !== "offered" ? "#fff" : "#16191b";
       c.font = "bold 14px sans-serif";
       c.textAlign = "center"; c.textBaseline = "middle";
       c.fillText(String(lift.rank), px, py + 1);

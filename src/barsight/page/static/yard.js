@@ -60,7 +60,7 @@ function sideOf(known) {
   if (!state.survey) return [h("h1", {}, t("yard.empty")), h("p", {}, t("yard.empty.help"))];
   const bundle = bundles.find((one) => one.identity === chosen);
   if (bundle) return bundlePanel(bundle, known);
-  const open = lifts.filter((lift) => ["offered", "claimed"].includes(lift.state)).sort((a, b) => a.rank - b.rank);
+  const open = lifts.filter((lift) => ["offered", "claimed", "executing"].includes(lift.state)).sort((a, b) => a.rank - b.rank);
   const vetoes = state.map_vetoes.map((veto) => h("div", { className: "why" }, h("strong", {}, t(`veto.${veto.code}`)), h("div", { className: "reason" }, `${veto.code}: ${veto.reason}`)));
   return [
     h("h1", {}, t("lifts.open")), vetoes,
@@ -104,7 +104,7 @@ export function liftPanel(lift) {
   const pull = lift.pull_low_n === null ? t("unknown") : `${(lift.pull_low_n / 1000).toFixed(0)} / ${(lift.pull_needed_n / 1000).toFixed(0)} kN`;
   const to = lift.set_down;
   return [
-    h("ol", { className: "steps" }, ["offered", "claimed", "executed", "verified"].map((state) => h("li", { className: state === lift.state ? "at" : "" }, t(`lift.${state}`))),
+    h("ol", { className: "steps" }, ["offered", "claimed", "executing", "executed", "verified"].map((state) => h("li", { className: state === lift.state ? "at" : "" }, t(`lift.${state}`))),
       ["expired", "failed"].includes(lift.state) && h("li", { className: "at" }, t(`lift.${lift.state}`))),
     h("dl", {}, [
       [t("lift.target"), `X ${lift.target.x_m.toFixed(2)}  Y ${lift.target.y_m.toFixed(2)}  Z ${lift.target.z_m === null ? "–" : lift.target.z_m.toFixed(2)} m · ${lift.target.yaw_deg.toFixed(1)}°`],
@@ -130,10 +130,12 @@ export function liftButtons(lift) {
     if (given) act("confirm", { map_id: lift.map_id, name: given.name || "" }, "told.confirmed");
   };
   const button = (id, word, onclick, className, right) => h("button", { id: `${id}-${lift.id}`, onclick, className, disabled: !may(right) }, t(word));
+  const ends = [button("taken", "lift.taken", () => act("taken", {}, "told.taken"), "main", "execute"),
+    button("failed", "lift.report.failed", () => ended("failed", "lift.report.failed"), "", "execute")];
   const buttons = {
     offered: () => [button("confirm", "lift.confirm", confirm, "main", "operate"), button("decline", "lift.decline", () => ended("expired", "lift.decline"), "", "operate")],
-    claimed: () => [button("taken", "lift.taken", () => act("taken", {}, "told.taken"), "main", "execute"),
-      button("failed", "lift.report.failed", () => ended("failed", "lift.report.failed"), "", "execute"), button("back", "lift.back", () => ended("expired", "lift.back"), "", "operate")],
+    executing: () => ends,
+    claimed: () => [...ends, button("back", "lift.back", () => ended("expired", "lift.back"), "", "operate")],
   }[lift.state];
   return buttons ? h("div", { className: "buttons" }, buttons()) : null;
 }

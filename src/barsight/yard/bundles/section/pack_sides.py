@@ -20,8 +20,8 @@ _LEDGE_SLOPE = 0.5
 """A bar low at the side shows as a ledge: two steps in a row that fall by less than this slope."""
 _PARTING_M, _PARTING_RATIO = 0.06, 0.3
 """Least depth of a gully that parts two packs, whatever their straps, and of the straps' width; it is as deep
-as a bar is thick besides. Within 6200 packs as worlds draw them none is deeper than 1.7 bars of up to 25 mm,
-1.1 of up to 60 mm and 0.95 of 100 mm."""
+as a bar is thick besides. Within 3757 packs as worlds draw them none is deeper than 86 mm; in 1956 of them
+than 1.7 bars of up to 25 mm, 1.05 of up to 60 mm, 0.85 of 80 to 100 mm."""
 _HIDDEN_CELLS = 12
 """Largest number of places out of sight in a flank before the surface is seen to have fallen away."""
 _STEP_M, _DEEP_CELLS = 0.05, 2

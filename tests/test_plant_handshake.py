@@ -1,0 +1,250 @@
+"""The handshake of a lift against a model, with kills, delays, repeats and reordering on both sides."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
+from hypothesis.strategies import booleans, integers, sampled_from
+
+pytest.importorskip("sqlalchemy")
+
+from barsight.core.errors import Failed, InputError
+from barsight.plant.feed import read_state
+from barsight.plant.handshake import LiftClaim
+from barsight.plant.settings import LiveSource
+from barsight.plant.state import PlantState
+from barsight.plant.steps import LiftReport, LiftSteps
+from barsight.store.confirmation import begin_lift, confirm_lift, open_lifts
+from handshake_plant import Plant, make_template
+
+CRANES = integers(0, 1)
+FAULTS = sampled_from(["", "", "", "before", "after", "locked"])
+
+
+class Handshakes(RuleBasedStateMachine):
+    """Disturb the plant between its cycles; `Plant` judges each lift-off, `settle` what is left."""
+
+    folder: Path
+    template: Path
+    counted: Counter[str]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._place = tempfile.TemporaryDirectory(dir=self.folder)
+        self.plant = Plant(self.template, Path(self._place.name))
+
+    @rule(who=CRANES, count=integers(1, 8))
+    def run_well(self, who: int, count: int) -> None:
+        for _ in range(count):
+            self.plant.cycle(self.plant.cranes[who])
+
+    @rule(who=CRANES, fault=FAULTS)
+    def cycle(self, who: int, fault: str) -> None:
+        self.plant.cycle(self.plant.cranes[who], fault)
+
+    @rule(who=CRANES)
+    def send(self, who: int) -> None:
+        self.plant.send(self.plant.wire_of(self.plant.cranes[who]))
+
+    @rule(who=CRANES, count=integers(1, 3))
+    def hear(self, who: int, count: int) -> None:
+        crane = self.plant.cranes[who]
+        wire = self.plant.wire_of(crane)
+        for _ in range(min(count, len(wire.down))):
+            crane.hear(wire.down.popleft())
+        wire.up.append(crane.turn())
+
+    @rule(who=CRANES, fault=FAULTS)
+    def take(self, who: int, fault: str) -> None:
+        self.plant.take(self.plant.wire_of(self.plant.cranes[who]), fault)
+
+    @rule(who=CRANES)
+    def repeat(self, who: int) -> None:
+        wire = self.plant.wire_of(self.plant.cranes[who])
+        wire.up.extend(list(wire.up)[-1:])
+
+    @rule(who=CRANES)
+    def connect_anew(self, who: int) -> None:
+        self.plant.connect(self.plant.cranes[who])
+
+    @rule(fault=FAULTS, is_last=booleans())
+    def take_late(self, fault: str, is_last: bool) -> None:
+        if self.plant.lost:
+            self.plant.take(self.plant.lost[-1 if is_last else 0], fault)
+
+    @rule(who=CRANES)
+    def start_cold(self, who: int) -> None:
+        self.plant.forget(self.plant.cranes[who])
+
+    @rule()
+    def kill_server(self) -> None:
+        self.plant.start_server()
+
+    @rule(wait_s=sampled_from([0.05, 0.2, 0.35, 4.0, 61.0]))
+    def wait(self, wait_s: float) -> None:
+        self.plant.now_s += wait_s
+
+    @rule()
+    def survey(self) -> None:
+        self.plant.survey()
+
+    @rule()
+    def veto(self) -> None:
+        self.plant.veto()
+
+    @invariant()
+    def judge(self) -> None:
+        self.plant.judge()
+
+    def teardown(self) -> None:
+        try:
+            self.plant.settle()
+        finally:
+            self.counted.update(handshakes=self.plant.handshakes, lifted=len(self.plant.began_s))
+            self.counted.update(self.plant.answers)
+            self.plant.close()
+            self._place.cleanup()
+
+
+def run_machine(folder: Path, examples: int, steps: int, *, is_same: bool) -> Counter[str]:
+    """Return the numbers of handshakes, of loads that were lifted, and of answers by their kind."""
+    folder.mkdir(exist_ok=True)
+    counted = Counter[str]()
+    known = {"folder": folder, "template": make_template(folder), "counted": counted}
+    machine = type("Machine", (Handshakes,), known)
+    quiet = settings(
+        max_examples=examples, stateful_step_count=steps, deadline=None, derandomize=is_same, database=None,
+        suppress_health_check=list(HealthCheck), phases=[Phase.generate],
+    )  # fmt: skip
+    run_state_machine_as_test(machine, settings=quiet)
+    return counted
+
+
+def test_no_lift_is_made_twice_or_late_or_lost(tmp_path: Path) -> None:
+    assert run_machine(tmp_path, 4, 20, is_same=True)["lifted"] > 10
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    one = Plant(make_template(tmp_path), tmp_path / "plant")
+    yield one
+    one.close()
+
+
+def claimed(plant: Plant, who: str = "crane") -> LiftClaim:
+    lift = offered(plant).lift
+    assert lift is not None
+    claim = plant.steps.claim(who, lift.lift_id)
+    assert isinstance(claim, LiftClaim)
+    return claim
+
+
+def offered(plant: Plant) -> PlantState:
+    return read_state(plant.store, plant.settings)
+
+
+DID = LiftReport(True, False, None)
+
+
+@pytest.mark.parametrize("change", ["survey", "veto", "age"])
+def test_a_lift_that_has_begun_stays_until_it_is_reported(plant: Plant, change: str) -> None:
+    claim = claimed(plant)
+    assert plant.steps.executing(claim.token) == claim.token
+    assert isinstance(plant.steps.executing(claim.token), Failed), "it may not begin again"
+    assert offered(plant).is_valid
+    plant.now_s += 61 if change == "age" else 1
+    plant.survey() if change == "survey" else plant.veto() if change == "veto" else None
+    state = offered(plant)
+    assert not state.is_valid and state.reasons[0].startswith(f"unfinished: lift {claim.lift_id} has begun")
+    with plant.store.reading() as connection:
+        others = [one.lift_id for one in open_lifts(connection) if one.lift_id != claim.lift_id]
+    for lift_id in others:
+        assert isinstance(plant.steps.claim("other", lift_id), Failed)
+    assert plant.steps.executed(claim.token, DID) == "unweighed"
+    assert plant.states_of(claim.lift_id)[1:] == ["claimed", "executing", "executed"]
+
+
+def test_one_lift_at_a_time_has_begun(plant: Plant) -> None:
+    claim, other = claimed(plant), offered(plant)
+    assert other.lift is not None and plant.steps.executing(claim.token) == claim.token
+    with plant.store.reading() as connection:
+        second = next(one for one in open_lifts(connection) if one.state == "offered")
+    confirm_lift(plant.store, second.lift_id, second.map_id, "ann")
+    with pytest.raises(InputError, match=f"lift {claim.lift_id}.*has begun"):
+        begin_lift(plant.store, second.lift_id, "ann")
+
+
+def test_a_report_is_taken_once_and_answered_again(plant: Plant) -> None:
+    claim = claimed(plant)
+    heavy = LiftReport(True, False, 9000.0)
+    assert [plant.steps.executed(claim.token, heavy) for _ in range(2)] == ["contradicted"] * 2
+    assert [one.code for one in offered(plant).alarms] == ["load-contradicts"]
+    assert isinstance(plant.steps.failed(claim.token, "no"), Failed)
+    claim = claimed(plant)
+    assert [plant.steps.failed(claim.token, "no") for _ in range(2)] == ["failed"] * 2
+    assert isinstance(plant.steps.executed(claim.token ^ 1, DID), Failed)
+
+
+def test_a_lift_that_was_made_after_its_end_ends_all_offers(plant: Plant) -> None:
+    claim = claimed(plant)
+    plant.survey()
+    assert offered(plant).is_valid
+    for _ in range(2):
+        assert isinstance(plant.steps.executed(claim.token, DID), Failed)
+    state = offered(plant)
+    assert state.lift is None and not state.is_valid
+    assert [(one.code, one.priority) for one in state.alarms] == [("lift-unrecorded", 1)]
+
+
+@pytest.mark.parametrize("end", ["executed", "failed"])
+def test_a_map_from_before_a_lift_offers_nothing_beside_it(plant: Plant, end: str) -> None:
+    claim = claimed(plant)
+    plant.now_s = 10.0
+    plant.steps.executing(claim.token)
+    plant.now_s = 20.0
+    told = (
+        plant.steps.executed(claim.token, DID) if end == "executed" else plant.steps.failed(claim.token, "no")
+    )
+    assert not isinstance(told, Failed)
+    plant.survey(begun_s=15.0, offset_m=100.0)  # lifts at the same places as the first survey's
+    assert ranks_offered(plant) == [2, 3, 4, 5, 6]
+    plant.survey(begun_s=20.1, offset_m=100.0)
+    assert ranks_offered(plant) == [1, 2, 3, 4, 5, 6]
+
+
+def ranks_offered(plant: Plant) -> list[int]:
+    with plant.store.reading() as connection:
+        newest = max(one.survey_id for one in open_lifts(connection))
+        return [one.record["rank"] for one in open_lifts(connection) if one.survey_id == newest]
+
+
+def test_a_live_run_that_forbids_lifts_lets_none_begin(plant: Plant, tmp_path: Path) -> None:
+    claim = claimed(plant)
+    live = replace(plant.settings, live=LiveSource(tmp_path / "live"))
+    assert isinstance(LiftSteps(plant.store, live).executing(claim.token), Failed)
+    assert plant.states_of(claim.lift_id)[-1] == "claimed"
+
+
+def test_a_command_is_taken_again_where_the_store_was_locked(plant: Plant) -> None:
+    crane = plant.cranes[0]
+    while crane.phase != "lifting":
+        plant.cycle(crane)
+    plant.cycle(crane, "locked")
+    assert crane.phase == "executed" and plant.states_of(crane.lift["lift_id"])[-1] == "executing"
+    plant.cycle(crane)
+    assert plant.states_of(crane.lift["lift_id"])[-1] == "executed"
+
+
+@pytest.mark.slow
+def test_ten_thousand_handshakes(tmp_path: Path) -> None:
+    counted = Counter[str]()
+    while counted["handshakes"] < 10_000:
+        counted += run_machine(tmp_path / str(counted["handshakes"]), 50, 60, is_same=False)
+        print(dict(counted), flush=True)
