@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import random
-import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("sqlalchemy")
@@ -28,11 +21,8 @@ from barsight.plant.feed import StateFeed
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import PlantSettings, TelegramSettings
 from barsight.plant.steps import LiftSteps
-from barsight.store.audit import AuditChain, verify_chain
 from barsight.store.opening import Store
 from handshake_plant import Plant, make_template
-from opcua_servers import free_port
-from page_yards import fill_store
 
 IN = struct.Struct(">HHHHqiiiIHHIII")
 STAY_S = 0.3

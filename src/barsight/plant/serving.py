@@ -78,18 +78,17 @@ class TelegramServer:
         While a command is at the store the next ones are heard and left: a PLC repeats them until answered.
         """
         size = layout("in").size
-        at_store = set[asyncio.Task[None]]()
+        step: asyncio.Task[None] | None = None
         with contextlib.suppress(asyncio.IncompleteReadError, OSError):
             while True:
                 found = unpack("in", await reader.readexactly(size), self._settings.byte_order)
                 if isinstance(found, Failed):
                     self.refused += 1
                     return
-                if partner.hears(found, is_busy=bool(at_store)):
-                    step = asyncio.create_task(self._obey(partner, found))
-                    at_store.add(step)
-                    step.add_done_callback(at_store.discard)
+                if partner.hears(found, is_busy=step is not None and not step.done()):
+                    step = asyncio.create_task(asyncio.to_thread(partner.obey, found))
+                    step.add_done_callback(self._refresh)
 
-    async def _obey(self, partner: PlcPartner, found: dict[str, int]) -> None:
-        await asyncio.to_thread(partner.obey, found)
-        await asyncio.to_thread(self._feed.refresh)
+    def _refresh(self, _: asyncio.Task[None]) -> None:
+        """Have the state read at once after a step; the telegrams don't wait for it."""
+        asyncio.get_running_loop().run_in_executor(None, self._feed.refresh)
