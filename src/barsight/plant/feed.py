@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from dataclasses import replace
@@ -11,12 +12,17 @@ from typing import Protocol
 from barsight.core.errors import BarsightError
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings
-from barsight.plant.state import PlantState, state_of_store
+from barsight.plant.state import CranePose, PlantState, PlcReading, state_of_store
+from barsight.store.confirmation import expire_claims
 from barsight.store.opening import Store
 
 MAX_AGE_S = 0.3
 """A state that was read longer ago is not valid."""
 READ_EVERY_S = 0.1
+JUDGE_EVERY_S = 1.0
+PLC_SILENT_S = 1.0
+"""What a PLC told of the crane is told for so long."""
+WHO = "barsight plant"
 
 
 class TellsState(Protocol):
@@ -28,12 +34,16 @@ class TellsState(Protocol):
     def refresh(self) -> None:
         """Read the state now."""
 
+    def hear(self, reading: PlcReading) -> None:
+        """Take what a PLC tells of the crane."""
+
 
 class StateFeed:
     """Hold the newest state; a thread reads it while the block runs, so that no link waits for the store."""
 
     def __init__(self, store: Store, settings: PlantSettings) -> None:
         self._store, self._settings = store, settings
+        self._plc: tuple[float, PlcReading] | None = None
         began_s = time.monotonic()
         self._read = read_state(store, settings), began_s
         self._stop, self._turn = threading.Event(), threading.Lock()
@@ -61,11 +71,35 @@ class StateFeed:
         """Read the state now, as after a step of the handshake."""
         with self._turn:
             began_s = time.monotonic()
-            self._read = read_state(self._store, self._settings), began_s
+            self._read = self._with_plc(read_state(self._store, self._settings)), began_s
+
+    def hear(self, reading: PlcReading) -> None:
+        """Take what a PLC tells of the crane; it is told with the states of the next second."""
+        self._plc = time.monotonic(), reading
+
+    def _with_plc(self, state: PlantState) -> PlantState:
+        known, crane = self._plc, self._settings.crane
+        if known is None or time.monotonic() - known[0] > PLC_SILENT_S:
+            return state
+        one, pose = known[1], state.pose
+        if pose is None and crane is not None and self._settings.live is None:
+            sigma_m = (crane.position_std_m,) * 3
+            pose = CranePose(one.bridge_m, one.trolley_m, one.hoist_m, None, sigma_m, one.stamp_ns)
+        return replace(state, plc=one, pose=pose)
 
     def _follow(self) -> None:
+        judged_s = time.monotonic()
         while not self._stop.wait(READ_EVERY_S):
             self.refresh()
+            if time.monotonic() - judged_s > JUDGE_EVERY_S:
+                judged_s = time.monotonic()
+                with contextlib.suppress(BarsightError):  # a store that is away comes back
+                    expire_claims(self._store, WHO, self._settings.store.claim_s, is_crane)
+
+
+def is_crane(who: str) -> bool:
+    """Tell a crane's name in the store from a person's, whose confirmations last as long as their map."""
+    return who.startswith("plc ") or who.endswith(" by OPC UA")
 
 
 def aged(state: PlantState, read_s: float, life_counter: int) -> PlantState:

@@ -20,6 +20,7 @@ MAX_SILENCE_S = 1.0
 
 def with_live_run(state: PlantState, folder: Path) -> PlantState:
     """Add the crane's pose, the run's mode and its survey to a state; one without a run is not valid."""
+    folder = folder / "current" if (folder / "current").is_dir() else folder
     try:
         told = read_json(folder / "state.json")
         silent_s = time.time() - (folder / "state.json").stat().st_mtime

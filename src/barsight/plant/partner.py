@@ -6,12 +6,12 @@ import time
 from dataclasses import replace
 
 from barsight.core.errors import BarsightError, Failed
-from barsight.plant.state import PlantState
+from barsight.plant.state import PlantState, PlcReading
 from barsight.plant.steps import LiftReport, LiftSteps
 
 DONE, REFUSED, CONTRADICTED = 1, 2, 3
 NOTHING, CLAIM, EXECUTING, EXECUTED = 0, 1, 2, 3
-_WEIGHED, _SLACK, _REACHED = 2, 4, 8
+_MAGNET_ON, _WEIGHED, _SLACK, _REACHED = 1, 2, 4, 8
 
 
 class PlcPartner:
@@ -42,6 +42,15 @@ class PlcPartner:
         if is_new or found["command"] == NOTHING:
             self._number = found["command_number"]
         return is_new
+
+    def reading(self, found: dict[str, int]) -> PlcReading:
+        """Form what a telegram tells of the crane."""
+        flags, now_ns = found["flags"], time.time_ns()
+        return PlcReading(
+            self.name, now_ns, (found["clock_ns"] - now_ns) / 1e9, found["bridge"] / 1e4,
+            found["trolley"] / 1e4, found["hoist"] / 1e4, found["load"] / 10 if flags & _WEIGHED else None,
+            bool(flags & _MAGNET_ON), bool(flags & _SLACK), bool(flags & _REACHED),
+        )  # fmt: skip
 
     def seen(self, state: PlantState) -> PlantState:
         """Form the state that this PLC may act on: not valid where its life counter stands still."""

@@ -85,6 +85,7 @@ class TelegramServer:
                 if isinstance(found, Failed):
                     self.refused += 1
                     return
+                self._feed.hear(partner.reading(found))
                 if partner.hears(found, is_busy=step is not None and not step.done()):
                     step = asyncio.create_task(asyncio.to_thread(partner.obey, found))
                     step.add_done_callback(self._refresh)

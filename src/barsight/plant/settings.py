@@ -29,8 +29,12 @@ class StoreSource:
     allow_simulated: bool = False
     """Offer lifts of a simulated yard too, to try a PLC's program; never with a crane."""
 
+    claim_s: float = 120.0
+    """A crane's claim that hasn't begun after so long expires."""
+
     def __post_init__(self) -> None:
         expect_values(self, "store.")
+        expect_ranges(self, "store.", claim_s=(1, 86400))
         if list(self.magnet_steps_kg) != sorted(set(self.magnet_steps_kg)):
             raise ConfigError("store.magnet_steps_kg: each step carries more than the one before")
 
@@ -61,10 +65,23 @@ class LiveSource:
     """A live run, from the table `[live]`: its mode may forbid lifts, and its pose is passed on."""
 
     folder: Path
-    """OUT of `barsight live`."""
+    """OUT of `barsight live`; of a run that takes survey after survey its `current` counts."""
 
     def __post_init__(self) -> None:
         expect_values(self, "live.")
+
+
+@dataclass(frozen=True)
+class PlantCrane:
+    """The crane's encoders, from the table `[crane]`: the position that the PLC sends is told as the pose where
+    no live run tells one."""
+
+    position_std_m: float
+    """Standard deviation of that position."""
+
+    def __post_init__(self) -> None:
+        expect_values(self, "crane.")
+        expect_ranges(self, "crane.", position_std_m=(1e-5, 10))
 
 
 @dataclass(frozen=True)
@@ -73,6 +90,7 @@ class PlantSettings:
 
     store: StoreSource = field(default_factory=StoreSource)
     live: LiveSource | None = None
+    crane: PlantCrane | None = None
     telegram: TelegramSettings | None = None
     opcua: OpcUaSettings | None = None
     mqtt: MqttSettings | None = None

@@ -26,9 +26,27 @@ class CranePose:
     x_m: float
     y_m: float
     z_m: float
-    yaw_deg: float
+    yaw_deg: float | None
     sigma_m: tuple[float, float, float]
     stamp_ns: int
+
+
+@dataclass(frozen=True)
+class PlcReading:
+    """A PLC's telegram, as it came at stamp_ns of this computer's clock. clock_offset_s: the PLC's less that one.
+    load_kg: None where it wasn't weighed.
+    """
+
+    who: str
+    stamp_ns: int
+    clock_offset_s: float
+    bridge_m: float
+    trolley_m: float
+    hoist_m: float
+    load_kg: float | None
+    is_magnet_on: bool
+    is_rope_slack: bool
+    is_position_reached: bool
 
 
 @dataclass(frozen=True)
@@ -97,6 +115,7 @@ class PlantState:
     alarms: tuple[PlantAlarm, ...] = ()
     map_id: str | None = None
     calibration_id: str | None = None
+    plc: PlcReading | None = None
 
 
 def state_of_store(

@@ -256,6 +256,28 @@ def expire_stale(store: Store, who: str) -> int:
     return len(stale)
 
 
+def expire_claims(store: Store, who: str, claim_s: float, is_of: Callable[[str], bool]) -> int:
+    """End claims that weren't begun in time, of those whose names `is_of` tells. Returns their number."""
+    with store.reading() as connection:
+        clock_ns = yard_clock_ns(connection)
+        before_ns = clock_ns - round(claim_s * 1e9)
+        if not _overdue(connection, before_ns, is_of):
+            return 0
+    with entry(store, who, "claims expired", clock_ns) as opened:
+        overdue = _overdue(opened.connection, before_ns, is_of)
+        for lift_id in overdue:
+            step_lift(opened, lift_id, "expired", f"it was claimed and not begun within {claim_s:g} s")
+    return len(overdue)
+
+
+def _overdue(connection: Connection, before_ns: int, is_of: Callable[[str], bool]) -> list[int]:
+    claimed = [lift.lift_id for lift in open_lifts(connection) if lift.state == "claimed"]
+    rows = connection.execute(
+        select(LIFT_STATES).where(LIFT_STATES.c.lift_id.in_(claimed), LIFT_STATES.c.state == "claimed")
+    ).all()
+    return [row.lift_id for row in rows if row.at_ns < before_ns and is_of(row.who)]
+
+
 def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Entry, OpenLift], None]) -> None:
     """Step a lift in one transaction with the check that it may still be believed."""
     expire_stale(store, who)

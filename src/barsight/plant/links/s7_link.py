@@ -38,7 +38,10 @@ async def serve_s7(
         if bool(now) != bool(wrong):
             say(f"S7 with {at}: {now or 'exchanging'}")
         wrong = now
-        if not isinstance(found, Failed) and partner.hears(found):
+        if isinstance(found, Failed):
+            return
+        feed.hear(partner.reading(found))
+        if partner.hears(found):
             partner.obey(found)
             feed.refresh()
 

@@ -23,7 +23,7 @@ from barsight.core.errors import BarsightError, OutputError
 from barsight.plant.feed import StateFeed, aged
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import TelegramSettings
-from barsight.plant.state import PlantState
+from barsight.plant.state import PlantState, PlcReading
 from barsight.plant.steps import LiftSteps
 
 SEND_EVERY_S = 0.05
@@ -79,9 +79,11 @@ def _begun(calls: Connection) -> int | str:
 
 
 def _send_states(states: Connection, feed: StateFeed, stop: threading.Event) -> None:
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(EOFError, OSError):
         while not stop.wait(SEND_EVERY_S):
             states.send(feed.read())
+            while states.poll():
+                feed.hear(states.recv())
 
 
 def _answer_calls(calls: Connection, feed: StateFeed, steps: LiftSteps) -> None:
@@ -118,6 +120,11 @@ class _SentFeed:
     def refresh(self) -> None:
         """Let the parent read the state now."""
         self._calls.ask("refresh")
+
+    def hear(self, reading: PlcReading) -> None:
+        """Pass on what a PLC tells of the crane."""
+        with contextlib.suppress(OSError):
+            self._states.send(reading)
 
     def _receive(self) -> None:
         try:
