@@ -87,7 +87,7 @@ class MqttPublisher:
         while True:
             began = time.monotonic()
             with contextlib.suppress(aiomqtt.MqttError, OSError):
-                async with mqtt_client(self._settings, will=True) as client:
+                async with mqtt_client(self._settings, "online") as client:
                     self._connections += 1
                     await client.publish(self._topic("online"), "true", qos=1, retain=True)
                     latest = self._state = self._state or latest
@@ -137,11 +137,11 @@ class MqttPublisher:
         return f"{self._settings.prefix}/{name}"
 
 
-def mqtt_client(one: MqttSettings, *, will: bool) -> aiomqtt.Client:
-    """Make a client of the broker. will: whether it tells `online` false where it is lost."""
+def mqtt_client(one: MqttSettings, will: str | None = None) -> aiomqtt.Client:
+    """Make a client of the broker. will: topic below the prefix that tells `false` where it is lost."""
     password = read_text(one.password_file).splitlines()[0] if one.password_file is not None else None
     context = ssl.create_default_context(cafile=one.authority) if one.authority is not None else None
-    last = aiomqtt.Will(f"{one.prefix}/online", "false", qos=1, retain=True) if will else None
+    last = aiomqtt.Will(f"{one.prefix}/{will}", "false", qos=1, retain=True) if will else None
     return aiomqtt.Client(
         one.host, one.port, username=one.user, password=password, keepalive=one.keepalive_s, will=last,
         timeout=5, tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,

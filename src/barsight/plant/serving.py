@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 from barsight.core.errors import Failed
-from barsight.plant.feed import StateFeed
+from barsight.plant.feed import TellsState
 from barsight.plant.partner import PlcPartner
 from barsight.plant.settings import TelegramSettings
 from barsight.plant.steps import LiftSteps
@@ -18,7 +18,7 @@ from barsight.plant.telegram import layout, out_values, pack, unpack
 class TelegramServer:
     """Serve the newest state while `run` runs. refused: telegrams that couldn't be one."""
 
-    def __init__(self, feed: StateFeed, steps: LiftSteps, settings: TelegramSettings) -> None:
+    def __init__(self, feed: TellsState, steps: LiftSteps, settings: TelegramSettings) -> None:
         self._feed, self._steps, self._settings = feed, steps, settings
         self._counter = 0
         self.refused = 0
