@@ -32,7 +32,7 @@ use_targets = false                     # true: targets.csv says where the crane
 
 @dataclass(frozen=True)
 class CommissionSettings:
-    """What a crane's commissioning needs to know. key: of the signature, beside the settings' file."""
+    """Settings of a commissioning. key: of the signature, beside the settings' file."""
 
     yard: str = ""
     signer: str = ""
