@@ -23,7 +23,7 @@ NEAR_M = 0.02
 """A height further off isn't the artefact's."""
 TIGHT_RATIO = 0.07
 """Share of the radius by which a sphere's heights may be off at last."""
-ROUND_RATIO = 0.5
+ROUND_RATIO = 0.75
 """Share of a plane's misfit that a sphere's may have."""
 STARTS = 6
 THINNED = 5

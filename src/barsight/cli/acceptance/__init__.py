@@ -1,1 +1,1 @@
-"""Run the commands of acceptance: accept."""
+"""Run the commands of acceptance: commission, accept, budget, verify."""

@@ -13,7 +13,12 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from barsight.acceptance.acceptance import Acceptance, accept
-from barsight.acceptance.certificate import certificate_content, certificate_files, write_certificate
+from barsight.acceptance.certificate import (
+    CommissioningStep,
+    certificate_content,
+    certificate_files,
+    write_certificate,
+)
 from barsight.acceptance.layout import Area, lay_out
 from barsight.acceptance.quantities import Decision
 from barsight.acceptance.yard_area import measured_area
@@ -71,15 +76,18 @@ def run(arguments: Sequence[str]) -> None:
         if len(files) < 2:
             raise ConfigError("accept needs PLAN.toml and at least one recording; --plan makes a plan")
         settings = MeasureSettings(preset=preset, yard=yard, recording=RecordingSettings(rig=rig))
-        _accept(files, out, settings, key, signer, keep)
+        found = run_acceptance(files, out, settings, key, signer, keep)
+        if not found.is_passed:
+            raise MeasurementError(f"{files[0]}: not accepted: {why_refused(found)}")
 
     call(command, "accept", arguments)
 
 
-def _accept(
+def run_acceptance(
     files: tuple[Path, ...], out: Path, settings: MeasureSettings, key: Path | None, signer: str,
-    keep: Path | None,
-) -> None:  # fmt: skip
+    keep: Path | None, steps: Sequence[CommissioningStep] = (),
+) -> Acceptance:  # fmt: skip
+    """Accept by a plan and recordings of it, write the certificate and print. steps: of the commissioning."""
     console = SafeConsole(stderr=True)
     wanted = read_plan(files[0])
     page = certificate_files(out)[1]
@@ -94,13 +102,12 @@ def _accept(
         work.mkdir(parents=True, exist_ok=True)
         with stages(console) as advance:
             found = accept(wanted, files[1:], settings, work, advance)
-    write_certificate(certificate_content(found, signer), out, key, has_pdf)
+    write_certificate(certificate_content(found, signer, steps), out, key, has_pdf)
     print_acceptance(found)
     console.print(f"certificate: {page}", soft_wrap=True, highlight=False, markup=False)
     if not has_pdf:
         console.print("no PDF: run pip install 'barsight[acceptance]'", highlight=False, markup=False)
-    if not found.is_passed:
-        raise MeasurementError(f"{files[0]}: not accepted: {why_refused(found)}")
+    return found
 
 
 def why_refused(found: Acceptance) -> str:

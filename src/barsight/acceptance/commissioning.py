@@ -1,0 +1,140 @@
+"""Walk a rig from the box to its certificate: what is done, what is next, all of it in one folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from barsight.acceptance.certificate import CommissioningStep
+from barsight.core.errors import InputError
+from barsight.core.json_values import json_digest
+from barsight.core.reading.sealed_json import read_sealed, write_sealed
+from barsight.core.settings.file import read_settings
+from barsight.core.settings.values import POSITIVE, expect_ranges, expect_values
+
+RECORD, SETTINGS = "commissioning.json", "commission.toml"
+SCHEMA_VERSION = 1
+REMEDY = "take the folder that barsight commission made, or begin a new one"
+HELP = "docs/how-to/commission.md explains the steps"
+FIRST_SETTINGS = """\
+# What barsight commission needs to know of this crane.
+yard = ""                               # which yard or crane it is
+signer = ""                             # who answers for the certificate
+board = "checkerboard:9x6:0.025"        # as barsight calibrate stereo takes it; measure the board
+range_m = 7.0                           # working distance, at which the calibration is judged
+use_targets = false                     # true: targets.csv says where the crane's readings lie in the yard
+"""
+
+
+@dataclass(frozen=True)
+class CommissionSettings:
+    """Settings of a commissioning. key: of the signature, beside the settings' file."""
+
+    yard: str = ""
+    signer: str = ""
+    board: str = "checkerboard:9x6:0.025"
+    range_m: float = 7.0
+    use_targets: bool = False
+    key: str | None = None
+
+    def __post_init__(self) -> None:
+        expect_values(self)
+        expect_ranges(self, "commission.", range_m=POSITIVE)
+
+
+@dataclass(frozen=True)
+class GuidedStep:
+    """A step: what it takes (files or folders in the folder), what it makes, what to bring where that isn't
+    there, and what does it, which returns its result in words.
+    """
+
+    name: str
+    takes: tuple[str, ...]
+    makes: tuple[str, ...]
+    bring: str
+    do: Callable[[], str]
+
+
+@dataclass(frozen=True)
+class DoneStep:
+    """A step that was done. given: digest of what it took, made: of what it made."""
+
+    name: str
+    result: str
+    given: str
+    made: str
+    done_at: str
+
+    def told(self) -> CommissioningStep:
+        """Return what a certificate says of it."""
+        return CommissioningStep(self.name, self.result, self.made, self.done_at)
+
+
+def begin(folder: Path) -> CommissionSettings:
+    """Read the folder's settings; write them for a new folder. Raises InputError and ConfigError."""
+    path = folder / SETTINGS
+    if not path.exists():
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(folder, f"holds no {SETTINGS}", REMEDY)
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(FIRST_SETTINGS, encoding="utf-8")
+    return read_settings(path, CommissionSettings, HELP, "folder")
+
+
+def walk(folder: Path, steps: Sequence[GuidedStep]) -> tuple[tuple[DoneStep, ...], GuidedStep | None]:
+    """Do every step that can be done, in order: those done, and the next one that waits for something.
+
+    A step is done again where what it took or made has changed since. Raises what a step raises; those
+    before it stay done.
+    """
+    known = {one.name: one for one in read_done(folder)}
+    done: list[DoneStep] = []
+    for step in steps:
+        if not all((folder / name).exists() for name in step.takes):
+            _write_done(folder, done)
+            return tuple(done), step
+        given = _digest(folder, step.takes)
+        before = known.get(step.name)
+        if before is None or (before.given, before.made) != (given, _digest(folder, step.makes)):
+            _write_done(folder, done)
+            result = step.do()
+            now = datetime.now(UTC).isoformat(timespec="seconds")
+            before = DoneStep(step.name, result, given, _digest(folder, step.makes), now)
+        done.append(before)
+        _write_done(folder, done)
+    return tuple(done), None
+
+
+def read_done(folder: Path) -> tuple[DoneStep, ...]:
+    """Read the steps that were done. Raises InputError where the record was changed."""
+    path = folder / RECORD
+    if not path.exists():
+        return ()
+    content = read_sealed(path, SCHEMA_VERSION, REMEDY)
+    try:
+        return tuple(DoneStep(**one) for one in content["steps"])
+    except (KeyError, TypeError) as error:
+        raise InputError(path, "is no record of a commissioning", REMEDY) from error
+
+
+def _write_done(folder: Path, done: Sequence[DoneStep]) -> None:
+    content = {"schema_version": SCHEMA_VERSION, "steps": [asdict(one) for one in done]}
+    write_sealed(json.loads(json.dumps(content)), folder / RECORD)
+
+
+def _digest(folder: Path, names: Sequence[str]) -> str:
+    """Compute a digest of files and folders: contents up to 16 MiB, of larger ones and pictures the sizes."""
+    found = []
+    for name in names:
+        path = folder / name
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if not file.is_file():
+                continue
+            small = file.stat().st_size < 1 << 24 and file.suffix not in (".png", ".jpg", ".tif", ".ply")
+            content = hashlib.sha256(file.read_bytes()).hexdigest() if small else str(file.stat().st_size)
+            found.append([file.relative_to(folder).as_posix(), content])
+    return json_digest(found)
