@@ -73,8 +73,8 @@ class LiveSource:
 
 @dataclass(frozen=True)
 class PlantCrane:
-    """The crane's encoders, from the table `[crane]`: the position that the PLC sends is told as the pose where
-    no live run tells one."""
+    """The crane's encoders, from the table `[crane]`: the position that the PLC sends is the pose where no
+    live run tells one."""
 
     position_std_m: float
     """Standard deviation of that position."""

@@ -33,7 +33,7 @@ class CranePose:
 
 @dataclass(frozen=True)
 class PlcReading:
-    """A PLC's telegram, as it came at stamp_ns of this computer's clock. clock_offset_s: the PLC's less that one.
+    """A PLC's telegram, as it came at stamp_ns of this computer's clock. clock_offset_s: the PLC's less it.
     load_kg: None where it wasn't weighed.
     """
 
