@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,8 +19,9 @@ from barsight.plant.partner import PlcPartner
 from barsight.plant.settings import LiveSource, PlantCrane, PlantSettings, StoreSource
 from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import out_values, unpack
+from barsight.store import confirmation
 from barsight.store.confirmation import expire_claims
-from barsight.store.opening import open_store
+from barsight.store.opening import Store, open_store
 from barsight.store.states import lift_state
 from plant_commands import IN, yard_store
 
@@ -102,3 +104,26 @@ def test_the_feed_ends_overdue_claims_by_itself(tmp_path: Path, monkeypatch: pyt
         while (told := feed.newest(1).lift) is None or told.lift_id == lift.lift_id:
             assert time.monotonic() < end_s
             time.sleep(0.05)
+
+
+def test_an_offer_whose_time_is_over_stays_so_though_the_clock_is_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed_module, "JUDGE_EVERY_S", 0.05)
+    url = yard_store(tmp_path)
+    with open_store(url) as store, StateFeed(store, settings_of(url)) as feed:
+        assert feed.newest(1).is_valid
+        with monkeypatch.context() as later:
+            clock = SimpleNamespace(time_ns=lambda: time.time_ns() + 86400 * 10**9)
+            later.setattr(confirmation, "time", clock)
+            end_s = time.monotonic() + 20
+            while offers(store):
+                assert time.monotonic() < end_s
+                time.sleep(0.05)
+        feed.refresh()
+        assert feed.newest(1).lift is None
+
+
+def offers(store: Store) -> int:
+    with store.reading() as connection:
+        return len(confirmation.open_lifts(connection))

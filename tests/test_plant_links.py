@@ -1,5 +1,6 @@
 """`barsight plant run` and `plant check`, every link at once, against mosquitto, snap7 and openssl."""
 
+import asyncio
 import json
 import shutil
 import signal
@@ -29,6 +30,7 @@ from barsight.report.signing import sign_file
 from barsight.store.opening import open_store
 from opcua_servers import free_port
 from page_yards import fill_store
+from plant_commands import Hooks, plant_run, write_config
 
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
 QUIET = PlantState("surveyed", True, (), 1, 5, "done")
@@ -71,6 +73,13 @@ def plc() -> Iterator[Plc]:
 
 
 @pytest.fixture
+def hooks() -> Iterator[Hooks]:
+    one = Hooks()
+    yield one
+    one.close()
+
+
+@pytest.fixture
 def broker(tmp_path: Path) -> Iterator[int]:
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (run .ci/servers)")
@@ -82,18 +91,22 @@ def broker(tmp_path: Path) -> Iterator[int]:
         process.kill()
 
 
+def listens(port: int) -> bool:
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", port)) == 0
+
+
 def wait_for(port: int) -> None:
     for _ in range(600):
-        with socket.socket() as one:
-            if one.connect_ex(("127.0.0.1", port)) == 0:
-                return
+        if listens(port):
+            return
         time.sleep(0.1)
     raise AssertionError(f"nothing listens at {port}")
 
 
 @pytest.mark.slow  # OPC UA's server takes some ten seconds to start
 def test_all_links_are_served_and_checked(
-    tmp_path: Path, plc: Plc, broker: int, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, plc: Plc, broker: int, hooks: Hooks, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("asyncua")
     telegram, opcua = free_port(), free_port()
@@ -101,6 +114,7 @@ def test_all_links_are_served_and_checked(
     config.write_text(
         f'[store]\nurl = "{fill_store(tmp_path)}"\nallow_simulated = true\n[telegram]\nport = {telegram}\n'
         f'[opcua]\nport = {opcua}\nfolder = "opcua"\n[mqtt]\nport = {broker}\n[s7]\nport = {plc.port}\n'
+        f'[webhooks]\nurls = ["{hooks.url}"]\n'
     )
     key, public = tmp_path / "key.pem", tmp_path / "public.pem"
     subprocess.run(["openssl", "genpkey", "-algorithm", "ed25519", "-out", str(key)], check=True)
@@ -117,7 +131,8 @@ def test_all_links_are_served_and_checked(
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130, process.communicate()
     assert checked == 0, seen
-    for link in ("telegram", "opcua", "mqtt", "s7"):
+    assert hooks.posts[0]["event"] == "check"
+    for link in ("telegram", "opcua", "mqtt", "s7", "webhooks"):
         assert f"{link}: holds" in seen.out
     assert "SignAndEncrypt" in seen.out
     assert lift[0] == 0xB51A and lift[3] & 1 and lift[4] > 0, (
@@ -139,6 +154,38 @@ def test_all_links_are_served_and_checked(
     assert subprocess.run([*verify, "-sigfile", f"{protocol}.sig"], stdout=subprocess.DEVNULL).returncode != 0
     assert run(arguments) == 5
     assert "telegram, opcua, mqtt, s7: does not hold" in capsys.readouterr().err
+
+
+@pytest.mark.slow  # OPC UA's server takes some ten seconds to start
+def test_no_link_outlives_a_run_that_is_killed(tmp_path: Path, plc: Plc, broker: int) -> None:
+    """OPC UA's process ends with it, the last will is told, the PLC's data block stands."""
+    pytest.importorskip("asyncua")
+    aiomqtt = pytest.importorskip("aiomqtt")
+    ports = {"telegram": free_port(), "opcua": free_port()}
+    config = write_config(
+        tmp_path, **{name: {"port": port} for name, port in ports.items()}, s7={"port": plc.port},
+        mqtt={"port": broker, "keepalive_s": 1},
+    )  # fmt: skip
+
+    async def online(wanted: bytes) -> None:
+        async with asyncio.timeout(20), aiomqtt.Client("127.0.0.1", broker) as client:
+            await client.subscribe("barsight/crane/online", qos=1)
+            async for message in client.messages:
+                if message.payload == wanted:
+                    return
+
+    with plant_run(config, 1) as process:
+        for port in ports.values():
+            wait_for(port)
+        asyncio.run(online(b"true"))
+        process.kill()
+        killed_s = time.monotonic()
+        while any(listens(port) for port in ports.values()):
+            assert time.monotonic() - killed_s < 2
+        asyncio.run(online(b"false"))
+        left = bytes(plc.theirs)
+        time.sleep(0.35)
+        assert bytes(plc.theirs) == left and left[:2] == b"\xb5\x1a"
 
 
 def test_steps_by_name_claim_and_end_a_lift_once(tmp_path: Path) -> None:

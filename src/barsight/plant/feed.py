@@ -13,7 +13,7 @@ from barsight.core.errors import BarsightError
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import CranePose, PlantState, PlcReading, state_of_store
-from barsight.store.confirmation import expire_claims
+from barsight.store.confirmation import expire_claims, expire_stale
 from barsight.store.opening import Store
 
 MAX_AGE_S = 0.3
@@ -94,6 +94,7 @@ class StateFeed:
             if time.monotonic() - judged_s > JUDGE_EVERY_S:
                 judged_s = time.monotonic()
                 with contextlib.suppress(BarsightError):  # a store that is away comes back
+                    expire_stale(self._store, WHO)  # in the store, so that no clock set back revives an offer
                     expire_claims(self._store, WHO, self._settings.store.claim_s, is_crane)
 
 
