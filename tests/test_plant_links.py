@@ -21,6 +21,7 @@ pytest.importorskip("sqlalchemy")
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.plant.feed import StateFeed
+from barsight.plant.link_settings import OpcUaSettings
 from barsight.plant.links.changes import changes_between
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings, StoreSource, read_plant
@@ -134,7 +135,7 @@ def test_all_links_are_served_and_checked(
     assert hooks.posts[0]["event"] == "check"
     for link in ("telegram", "opcua", "mqtt", "s7", "webhooks"):
         assert f"{link}: holds" in seen.out
-    assert "SignAndEncrypt" in seen.out
+    assert "SignAndEncrypt" in seen.out and "without certificate and encryption: refused" in seen.out
     assert lift[0] == 0xB51A and lift[3] & 1 and lift[4] > 0, (
         "the PLC's data block holds the lift that is offered"
     )
@@ -158,13 +159,17 @@ def test_all_links_are_served_and_checked(
 
 @pytest.mark.slow  # OPC UA's server takes some ten seconds to start
 def test_no_link_outlives_a_run_that_is_killed(tmp_path: Path, plc: Plc, broker: int) -> None:
-    """OPC UA's process ends with it, the last will is told, the PLC's data block stands."""
+    """OPC UA's process ends with it, the last will is told, the PLC's data block stands. And before that: a
+    server that lets clients in unsecured isn't what its check was told.
+    """
     pytest.importorskip("asyncua")
+    from barsight.plant.links.opcua_check import check_opcua
+
     aiomqtt = pytest.importorskip("aiomqtt")
     ports = {"telegram": free_port(), "opcua": free_port()}
     config = write_config(
-        tmp_path, **{name: {"port": port} for name, port in ports.items()}, s7={"port": plc.port},
-        mqtt={"port": broker, "keepalive_s": 1},
+        tmp_path, telegram={"port": ports["telegram"]}, s7={"port": plc.port},
+        mqtt={"port": broker, "keepalive_s": 1}, opcua={"port": ports["opcua"], "allow_unsecured": True},
     )  # fmt: skip
 
     async def online(wanted: bytes) -> None:
@@ -178,6 +183,8 @@ def test_no_link_outlives_a_run_that_is_killed(tmp_path: Path, plc: Plc, broker:
         for port in ports.values():
             wait_for(port)
         asyncio.run(online(b"true"))
+        found = check_opcua(OpcUaSettings(port=ports["opcua"], folder=tmp_path / "opcua"))
+        assert not isinstance(found, Failed) and "LET IN" in found[0][-1] and not found[1]
         process.kill()
         killed_s = time.monotonic()
         while any(listens(port) for port in ports.values()):

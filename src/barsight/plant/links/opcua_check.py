@@ -57,7 +57,18 @@ async def _read(settings: OpcUaSettings) -> tuple[tuple[str, ...], bool]:
     lines.append("life counter: " + ("moves" if is_alive else "STANDS STILL"))
     if settings.allow_unsecured:
         lines.append("NOT SECURED: opcua.allow_unsecured lets clients in without a certificate")
-    return tuple(lines), is_alive
+        return tuple(lines), is_alive
+    is_open = await _lets_in_unsecured(settings)
+    lines.append("a client without certificate and encryption: " + ("LET IN" if is_open else "refused"))
+    return tuple(lines), is_alive and not is_open
+
+
+async def _lets_in_unsecured(settings: OpcUaSettings) -> bool:
+    try:
+        async with Client(settings.url, timeout=10):
+            return True
+    except (OSError, TimeoutError, ua.UaError):
+        return False
 
 
 @contextlib.asynccontextmanager
