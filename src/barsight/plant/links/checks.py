@@ -26,7 +26,7 @@ class LinkCheck:
 
 
 def check_links(settings: PlantSettings) -> tuple[LinkCheck, ...]:
-    """Check each link that is configured; nothing is claimed and nothing of the plant's is written."""
+    """Check each link that is configured; nothing is claimed, and no data block of the PLC is written."""
     return tuple(_checked(name, _CHECKS[name], settings) for name in settings.links)
 
 

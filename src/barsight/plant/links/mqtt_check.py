@@ -9,7 +9,7 @@ import time
 
 from barsight.core.errors import Failed
 from barsight.plant.link_settings import MqttSettings
-from barsight.plant.mqtt import MqttError, mqtt_client
+from barsight.plant.mqtt import MqttError, mqtt_clients
 
 STATES = 20
 WAIT_S = 5.0
@@ -27,7 +27,7 @@ def check_mqtt(settings: MqttSettings) -> tuple[tuple[str, ...], bool] | Failed:
 
 async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
     online, stamps, lives, last, retained = "", list[float](), list[int](), "", False
-    async with asyncio.timeout(WAIT_S), mqtt_client(settings, will=False) as client:
+    async with asyncio.timeout(WAIT_S), mqtt_clients(settings, will=False)() as client:
         await client.subscribe(f"{settings.prefix}/#", qos=1)
         async for message in client.messages:
             text = bytes(message.payload).decode() if isinstance(message.payload, bytes | bytearray) else ""
